@@ -1,0 +1,1 @@
+"""BSDF plugins that Mitsuba lacks."""

@@ -1,0 +1,1 @@
+"""Independent estimates of a gradient, and the verdict on one."""

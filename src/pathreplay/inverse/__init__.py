@@ -1,0 +1,1 @@
+"""Recover scene parameters from pictures: problem, loop, run folder, report."""
