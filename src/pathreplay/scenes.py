@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
@@ -56,7 +57,7 @@ def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
     }
     scene["large-box"]["to_world"] = T().translate([-0.45, -0.65, 0.42]).rotate([0, 1, 0], 18).scale([0.26, 0.35, 0.26])
     scene["small-box"]["to_world"] = T().translate([0.45, -0.78, 0.5]).rotate([0, 1, 0], -17).scale(0.22)
-    grey = mi.Bitmap(mi.TensorXf(0.5, shape=(texture, texture, 3)))
+    grey = mi.Bitmap(dr.full(mi.TensorXf, 0.5, (texture, texture, 3)))
     scene["back"]["bsdf"] = {
         "type": "diffuse",
         # raw: the texels are linear reflectances, which is what is optimised.
@@ -82,7 +83,7 @@ def load_scene(spec: str | Path, base: Path | None = None, **parameters: Any) ->
     path = Path(spec) if base is None else Path(base) / spec
     if not path.is_file():
         raise PathreplayError(_unknown(str(spec), path))
-    arguments = {name: str(value) for name, value in parameters.items()}
+    arguments: dict[str, Any] = {name: str(value) for name, value in parameters.items()}
     try:
         # optimize=False: merging equal objects would lose the names by which parameters are addressed.
         scene = mi.load_file(str(path), optimize=False, **arguments)
@@ -100,7 +101,7 @@ def _load_builtin(name: str, parameters: dict[str, Any]) -> mi.Scene:
         if key not in known:
             raise PathreplayError(f"Built-in scene '{name}' has no parameter '{key}'; it has: {', '.join(known)}")
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise PathreplayError(f"Parameter '{key}' of scene '{name}' is {value!r}; it must be a whole number above 0")
+            raise PathreplayError(f"Parameter '{key}' of scene '{name}' is {value!r}; give a whole number above 0")
     return mi.load_dict(make(**parameters), optimize=False)
 
 
