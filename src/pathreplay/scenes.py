@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from pathreplay.errors import PathreplayError
 
@@ -57,7 +57,7 @@ def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
     }
     scene["large-box"]["to_world"] = T().translate([-0.45, -0.65, 0.42]).rotate([0, 1, 0], 18).scale([0.26, 0.35, 0.26])
     scene["small-box"]["to_world"] = T().translate([0.45, -0.78, 0.5]).rotate([0, 1, 0], -17).scale(0.22)
-    grey = mi.Bitmap(dr.full(mi.TensorXf, 0.5, (texture, texture, 3)))
+    grey = mi.Bitmap(np.full((texture, texture, 3), 0.5, np.float32))
     scene["back"]["bsdf"] = {
         "type": "diffuse",
         # raw: the texels are linear reflectances, which is what is optimised.
