@@ -1,0 +1,224 @@
+"""Scene parameters by name: find them, say which can be differentiated, and carry them to NumPy and back.
+
+A parameter is addressed by its key in ``mi.traverse(scene)``. Values keep their type: ``Float``, ``Color3f`` and its
+kind, ``TensorXf`` (textures, grids) and ``AffineTransform4f`` go through NumPy and come back as what they were.
+"""
+
+from __future__ import annotations
+
+import difflib
+import fnmatch
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+
+# What to do instead, for values that Mitsuba 3.9 stores without derivative: (class of the owner, last part of the key).
+_WAY_OUT = {
+    ("SmoothDielectric", "eta"): (
+        "BSDF 'dielectric' keeps it as a plain number; use BSDF 'smoothdielectric' of this package instead, "
+        "its eta is differentiable"
+    ),
+    ("SmoothPlastic", "eta"): (
+        "BSDF 'plastic' keeps it as a plain number and there is no replacement yet; "
+        "fix it, and differentiate the reflectances"
+    ),
+    ("BitmapTextureImpl[uint8]", "data"): (
+        "Mitsuba keeps the texels of this picture as 8-bit integers; give the 'bitmap' texture the option "
+        "format='variant', which stores them as floating-point numbers"
+    ),
+    ("HeterogeneousMedium", "scale"): (
+        "medium 'heterogeneous' keeps it as a plain number; leave it at 1 and multiply the values of 'sigma_t' instead"
+    ),
+    ("HomogeneousMedium", "scale"): (
+        "medium 'homogeneous' keeps it as a plain number; leave it at 1 and multiply the value of 'sigma_t' instead"
+    ),
+}
+
+
+# ------------------------------------------------------------------------------
+#  Names
+# ------------------------------------------------------------------------------
+
+
+def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> list[str]:
+    """The keys that ``patterns`` name, in the order of the patterns, then of the scene; each key once.
+
+    A pattern is an exact key or a shell-like glob (``*``, ``?``, ``[abc]``); globs match whole keys, dots included.
+    ``params`` is what ``mi.traverse(scene)`` returns.
+
+    Raises:
+        PathreplayError: a pattern matches nothing; the message suggests the nearest keys.
+    """
+    known = list(params.keys())
+    found: dict[str, None] = {}
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        matches = [pattern] if pattern in known else fnmatch.filter(known, pattern)
+        if not matches:
+            raise PathreplayError(_no_match(known, pattern))
+        found.update(dict.fromkeys(matches))
+    return list(found)
+
+
+def _no_match(known: list[str], pattern: str) -> str:
+    if not known:
+        return f"No parameter '{pattern}': the scene has no parameters"
+    # Lower case: a wrong capital should not hide the neighbour. 0.5 lets 'red.bsdf' find 'red.bsdf.reflectance.value'.
+    lower = {key.lower(): key for key in known}
+    close = [lower[match] for match in difflib.get_close_matches(pattern.lower(), lower, n=3, cutoff=0.5)]
+    if close:
+        return f"No parameter '{pattern}' in the scene; nearest: {', '.join(close)}"
+    return f"No parameter '{pattern}' in the scene, and none like it; mitsuba.traverse(scene) lists all {len(known)}"
+
+
+def owner_class(params: Any, key: str) -> str:
+    """Name of the class (not of the plugin: 'SmoothDielectric', not 'dielectric') that owns a parameter."""
+    return str(params.properties[key][2].class_name())
+
+
+# ------------------------------------------------------------------------------
+#  What can be differentiated, what may be used
+# ------------------------------------------------------------------------------
+
+
+def require_differentiable(params: Any, key: str) -> None:
+    """Return quietly if Mitsuba can carry a derivative to ``key``.
+
+    Raises:
+        PathreplayError: the key does not exist, is a plain number, holds integers, or is marked
+            ``mi.ParamFlags.NonDifferentiable``; where there is a replacement the message names it.
+    """
+    if key not in params:
+        raise PathreplayError(_no_match(list(params.keys()), key))
+    value = params[key]
+    owner = owner_class(params, key)
+    if _is_float(value) and not params.flags(key) & mi.ParamFlags.NonDifferentiable:
+        return
+    known = _WAY_OUT.get((owner, key.rsplit(".", 1)[-1]))
+    if known is not None:
+        raise PathreplayError(f"Parameter '{key}' carries no derivative: {known}")
+    if isinstance(value, (bool, int, float)):
+        why = f"its {owner} keeps it as a plain number ({value!r})"
+    elif not _is_float(value):
+        why = f"it is a {type(value).__name__}"
+    else:
+        why = f"Mitsuba marks this parameter of {owner} as not differentiable"
+    raise PathreplayError(f"Parameter '{key}' carries no derivative: {why}; choose one that mi.traverse marks with ∂")
+
+
+def _is_transform(value: Any) -> bool:
+    # Every Dr.Jit array answers to .matrix too. Scalar transforms (texture to_uv) hold no Dr.Jit array: no derivative.
+    return not dr.is_array_v(value) and hasattr(value, "matrix") and dr.is_diff_v(value.matrix)
+
+
+def _is_float(value: Any) -> bool:
+    inner = value.matrix if _is_transform(value) else value
+    return bool(dr.is_array_v(inner) and dr.is_float_v(inner) and dr.is_diff_v(inner))
+
+
+def require_finite(params: Any) -> None:
+    """Return quietly if no parameter of the scene holds a NaN or an infinity; one reduction per array.
+
+    A plain number may be infinite (distances are), but not NaN.
+
+    Raises:
+        PathreplayError: names the first offending key, how many of its entries are bad, and where the first one is.
+    """
+    counts: dict[str, Any] = {}
+    for key in params.keys():
+        value = params[key]
+        if isinstance(value, float) and math.isnan(value):
+            raise PathreplayError(f"Parameter '{key}' is NaN; give it a number in the scene file")
+        if _is_float(value):
+            counts[key] = dr.count(~dr.isfinite(_flat(value)))
+    dr.eval(*counts.values())
+    for key, count in counts.items():
+        if count[0] > 0:
+            values = get_array(params[key])
+            bad = np.argwhere(~np.isfinite(values))
+            first = tuple(int(i) for i in bad[0])
+            raise PathreplayError(
+                f"Parameter '{key}' holds {len(bad)} NaN or infinite of {values.size} values, the first "
+                f"({values[first]}) at index {first}; mend the source file, or set them with numpy.nan_to_num before loading"
+            )
+
+
+def _flat(value: Any) -> Any:
+    """All entries of a floating-point value as one flat Dr.Jit array, without derivatives."""
+    value = dr.detach(value.matrix if _is_transform(value) else value)
+    if dr.is_tensor_v(value):
+        return value.array
+    return dr.ravel(value) if dr.depth_v(value) > 1 else value
+
+
+# ------------------------------------------------------------------------------
+#  To NumPy and back
+# ------------------------------------------------------------------------------
+
+
+def get_array(value: Any) -> np.ndarray:
+    """A floating-point parameter value as a NumPy array of its own precision; a copy, without derivatives.
+
+    Shapes: ``Float`` (n,); ``Color3f`` and its kind (3,), or (3, n) where it holds n colours; ``TensorXf`` its own;
+    ``AffineTransform4f`` (4, 4).
+    """
+    if _is_transform(value):
+        value = value.matrix
+    array = np.array(dr.detach(value))
+    if not dr.is_tensor_v(value) and array.ndim > 1 and array.shape[-1] == 1:
+        array = array[..., 0]
+    return array
+
+
+def to_value(like: Any, array: Any) -> Any:
+    """The inverse of :func:`get_array`: ``array`` as a value of the type of ``like``, and of the same shape.
+
+    Raises:
+        PathreplayError: the shapes differ.
+    """
+    expected = get_array(like)
+    given = np.asarray(array)
+    if given.shape != expected.shape:
+        raise PathreplayError(f"Value of shape {given.shape} given for a parameter of shape {expected.shape}")
+    given = np.ascontiguousarray(given, dtype=expected.dtype)
+    if _is_transform(like):
+        return type(like)(type(like.matrix)(given))
+    if dr.is_tensor_v(like) or dr.depth_v(like) == 1 or dr.is_matrix_v(like):
+        return type(like)(given)
+    component = dr.value_t(like)
+    return type(like)(*(component(np.atleast_1d(row)) for row in given))
+
+
+def set_arrays(params: Any, arrays: Mapping[str, Any]) -> None:
+    """Write NumPy arrays into the scene, then let the scene know (``params.update()``), once for all of them.
+
+    Raises:
+        PathreplayError: a key does not exist, or a shape is not that of the parameter.
+    """
+    values = {}
+    for key, array in arrays.items():
+        if key not in params:
+            raise PathreplayError(_no_match(list(params.keys()), key))
+        values[key] = to_value(params[key], array)
+    for key, value in values.items():
+        params[key] = value
+    params.update()
+
+
+def displaced(value: Any, direction: np.ndarray, t: Any) -> Any:
+    """``value + t * direction``, for a differentiable scalar ``t`` (``mi.Float`` of size 1), in the type of ``value``.
+
+    ``direction`` has the shape of ``get_array(value)``. For transforms the sum is one of matrices, so ``direction``
+    need not be invertible. Derivatives flow from ``t``.
+    """
+    if _is_transform(value):
+        return type(value)(value.matrix + to_value(value.matrix, direction) * t)
+    step = to_value(value, direction)
+    if dr.is_tensor_v(value):
+        return type(value)(value.array + step.array * dr.array_t(value)(t), value.shape)
+    return value + step * t
