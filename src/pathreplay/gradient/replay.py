@@ -1,0 +1,56 @@
+"""The replay driver: walk the path again with the same random numbers and peel its radiance, vertex by vertex.
+
+This is path replay backpropagation (Vicini, Speierer, Jakob 2021): the first pass keeps one number, L_0; the second
+recovers what lies beyond each vertex from what has been met so far. Memory does not depend on the depth at all.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.path import Walk, first_arrival, next_arrival, survival
+from ..transport.step import surface_step
+from ..transport.vertex import Numbers, reciprocal
+from .primal import primal
+from .sweep import backward
+
+
+@dr.syntax
+def replay(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
+    """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
+
+    Peels β_{i+1} L_{i+1} = β_i L_i - β_i e_i and differentiates it as (β_i L_{i+1}) w_i through the relative
+    derivative of w_i. So where w_i is exactly zero its derivative is lost (the sweep driver keeps it); visibility and
+    all motion are not differentiated.
+    """
+    scene, options = walk.scene, walk.options
+    L, _ = primal(walk, sampler.clone(), ray, active)  # β_i L_i, peeled on the way
+
+    β = mi.Spectrum(1)  # throughput
+    η = mi.Float(1)  # relative index of refraction since the camera
+    depth = mi.UInt32(0)  # index of the vertex
+    active = mi.Bool(active) & (options.max_depth > 0)
+    at = first_arrival(walk, ray, active)
+
+    while dr.hint(active, max_iterations=options.max_depth, exclude=[walk, scene, options], label="pathreplay: replay"):
+        u = Numbers.draw(sampler)
+        go_on = depth + 1 < options.max_depth
+        step = surface_step(scene, at, u, go_on, options, active)
+        L -= β * step.e
+
+        with dr.resume_grad():
+            held = surface_step(scene, at, u, go_on, options, active, step.kept)
+            Lo = β * held.e + L * held.w * dr.detach(reciprocal(held.w))
+            backward(δL * Lo)
+
+        β *= step.w
+        η *= step.eta
+        rr_weight, survives = survival(β, η, depth, u.roulette, options)
+        active = step.active & survives & (dr.max(β) != 0)
+        β *= rr_weight
+
+        at = next_arrival(scene, step, active)
+        depth += 1

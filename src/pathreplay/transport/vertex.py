@@ -1,0 +1,94 @@
+"""The records that pass between the step and its drivers: options, random numbers, what is kept, the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is the same at every vertex: Python values, fixed when the kernel is traced.
+
+    ``attach`` says what the path follows when parameters move (``none``: nothing). ``hide_emitters`` leaves out
+    emitters that the camera sees directly. ``max_depth`` and ``rr_depth`` are Mitsuba's; an unbounded depth is
+    2^32 - 1. ``lobes`` is the number of BSDF components that may hold a delta lobe, 0 when the scene has none.
+    """
+
+    attach: str
+    hide_emitters: bool
+    max_depth: int
+    rr_depth: int
+    lobes: int
+
+
+@dataclass
+class Numbers:
+    """The random numbers of one vertex: an input of the step, so that a second walk repeats the first exactly."""
+
+    light: Any  # Point2f: which emitter, and where on it
+    lobe: Any  # Float: which lobe of the BSDF
+    direction: Any  # Point2f: which direction in the lobe
+    roulette: Any  # Float: whether the path goes on
+
+    @staticmethod
+    def draw(sampler: Any) -> Numbers:
+        """Draw the numbers of one vertex, in the order that all drivers share."""
+        return Numbers(sampler.next_2d(), sampler.next_1d(), sampler.next_2d(), sampler.next_1d())
+
+
+@dataclass
+class Arrival:
+    """How the path came to a vertex: the ray, its nearest hit, and the density with which it was sampled."""
+
+    ray: Any  # Ray3f
+    hit: Any  # PreliminaryIntersection3f
+    pdf: Any  # Float: solid-angle density of ray.d at the previous vertex
+    delta: Any  # Bool: it was a delta lobe, or the camera
+    camera: Any  # Bool: the previous vertex is the camera
+
+
+@dataclass
+class Kept:
+    """What a first walk chose at a vertex. Later passes hold these values while derivatives flow around them."""
+
+    d: Any  # Vector3f: sampled direction, world space
+    pdf: Any  # Float: its solid-angle density, or the probability of the delta lobe
+    delta: Any  # Bool: a delta lobe was sampled
+    lobe: Any  # UInt32: the BSDF component that was sampled
+    lit: Any  # Bool: an emitter sample was taken, and nothing is in its way
+    light: Any = None  # DirectionSample3f of that sample, where it need not be drawn again
+
+
+@dataclass
+class Step:
+    """One vertex of a path, L_i = e_i + w_i L_{i+1}, together with the continuation r_{i+1}."""
+
+    e: Any  # Spectrum: emission (MIS weighted) + next-event estimate
+    w: Any  # Spectrum: f/p or lobe weight, before Russian roulette
+    ray_next: Any  # Ray3f
+    kept: Kept
+    eta: Any  # Float: relative index of refraction that the continuation crosses
+    surface: Any  # Bool: the ray hit something
+    null: Any  # Bool: the sampled lobe passes straight through
+    active: Any  # Bool: there is a continuation
+
+
+def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
+    """Power heuristic of Veach, p_a² / (p_a² + p_b²); zero where that is not finite."""
+    a2 = dr.square(pdf_a)
+    weight = a2 / dr.fma(pdf_b, pdf_b, a2)
+    return dr.select(dr.isfinite(weight), weight, 0)
+
+
+def reciprocal(x: Any) -> Any:
+    """1/x where x is not zero, else zero."""
+    return dr.select(x != 0, dr.rcp(x), 0)
+
+
+def is_smooth(bsdf: Any) -> Any:
+    """True where next-event estimation can reach a lobe of the BSDF."""
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
