@@ -1,8 +1,8 @@
 """The commands, thin: each one reads its arguments, calls the room that does the work, and prints what came back.
 
-Exit status: 0 when the command did what it was asked and liked what it saw, 1 when it did but did not like it (a gradient
-that fails its check, a machine on which nothing runs), 2 when the user has to mend something first. Heavy modules
-are imported inside the commands, so that `pathreplay --help` answers at once.
+Exit status: 0 when the command did what it was asked and liked what it saw, 1 when it did but did not like it (a
+gradient that fails its check, a machine on which nothing runs), 2 when the user has to mend something first. Heavy
+modules are imported inside the commands, so that `pathreplay --help` answers at once.
 """
 
 from __future__ import annotations
@@ -44,9 +44,12 @@ def _global_options(
 @app.command()
 def doctor() -> None:
     """Say what runs on this machine, and the way out for what does not."""
-    from pathreplay import backend
+    from rich.console import Console
 
-    report = backend.doctor()
+    from pathreplay.doctor import examine
+
+    with Console(stderr=True).status("Trying every libLLVM and every variant ..."):
+        report = examine()
     report.print()
     raise typer.Exit(0 if report.works else 1)
 

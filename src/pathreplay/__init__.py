@@ -1,0 +1,47 @@
+"""pathreplay: reverse-mode differentiable light transport on Mitsuba 3.
+
+Importing it registers the plugins for the active variant of Mitsuba and for every later one with automatic
+differentiation. It sets no variant and raises nothing, even where Mitsuba is missing: `pathreplay doctor` then tells
+what to do.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pathreplay.errors import PathreplayError
+
+__version__ = "0.1.0"
+
+__all__ = ["PathreplayError", "__version__", "check_gradient", "optimize"]
+
+#: Public names that live in rooms which need more time to import than `import pathreplay` should take.
+_LAZY = {"check_gradient": "pathreplay.check", "optimize": "pathreplay.inverse"}
+
+
+def _set_up() -> None:
+    # Before the first import of mitsuba: Dr.Jit looks for libLLVM while it is imported.
+    from pathreplay import backend, plugins
+
+    backend.point_drjit()
+    try:
+        import mitsuba  # noqa: F401
+    except Exception:
+        return  # missing or broken: set_variant and the doctor say so, with the way out
+    plugins.install()
+
+
+_set_up()
+del _set_up
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        import importlib
+
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'pathreplay' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY})

@@ -1,0 +1,181 @@
+"""Says what runs on this machine: versions, the libLLVM files and their verdicts, the variants, and ways out.
+
+Everything is tried in processes of its own, since a libLLVM that does not fit kills the one it is loaded into.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.text import Text
+
+from pathreplay import __version__, libllvm
+from pathreplay.backend import is_usable_variant
+from pathreplay.libllvm import ENVIRONMENT_VARIABLE, LlvmLibrary
+
+
+@dataclass(frozen=True)
+class VariantVerdict:
+    """Whether a variant of Mitsuba renders and differentiates a small scene here; `message` says why not."""
+
+    name: str
+    works: bool
+    message: str
+
+
+@dataclass(frozen=True)
+class DoctorReport:
+    """What was found.
+
+    `mitsuba` and `drjit` are version numbers, or the reason why they cannot be imported. `ways_out` has one line for
+    each failure that can be mended.
+    """
+
+    pathreplay: str
+    python: str
+    platform: str
+    mitsuba: str
+    drjit: str
+    libraries: tuple[LlvmLibrary, ...]
+    variants: tuple[VariantVerdict, ...]
+    ways_out: tuple[str, ...]
+
+    @property
+    def works(self) -> bool:
+        """Whether at least one variant that pathreplay can use runs here."""
+        return any(variant.works for variant in self.variants)
+
+    def print(self, console: Console | None = None) -> None:
+        """Write the report for people. Lines are never wrapped, so that paths can be copied."""
+        console = console or Console(highlight=False)
+
+        def line(*parts: str | tuple[str, str]) -> None:
+            console.print(Text.assemble(*parts), soft_wrap=True)
+
+        def verdict(works: bool) -> tuple[str, str]:
+            return ("  ok    ", "green") if works else ("  fails ", "red")
+
+        line(("Versions", "bold"))
+        line(f"  pathreplay {self.pathreplay}, Mitsuba {self.mitsuba}, Dr.Jit {self.drjit}")
+        line(f"  Python {self.python}, {self.platform}")
+        line(("libLLVM", "bold"), " (in the order in which they are looked for)")
+        for library in self.libraries:
+            reason = f": {library.message}" if library.message else ""
+            line(verdict(library.works), f"{library.version or '?'}  {library.path}  ({library.origin}){reason}")
+        if not self.libraries:
+            line("  none found")
+        line(("Variants", "bold"))
+        for variant in self.variants:
+            line(verdict(variant.works), variant.name, f": {variant.message}" if variant.message else "")
+        if not self.variants:
+            line("  none tried")
+        if self.ways_out:
+            line(("Ways out", "bold"))
+            for way_out in self.ways_out:
+                line("  - ", way_out)
+        usable = ", ".join(variant.name for variant in self.variants if variant.works)
+        line(("Verdict", "bold"), f": pathreplay runs here ({usable})" if usable else ": pathreplay does not run here")
+
+
+#: A sphere under a constant light: ray tracing, virtual calls and a gradient that is known to be positive.
+_PROBE = """
+import json, sys
+task = json.loads(sys.argv[1])
+sys.path[:] = task["sys_path"]
+import ctypes
+for path in task["preload"]:
+    ctypes.CDLL(path)
+import drjit as dr, mitsuba as mi
+mi.set_variant(task["variant"])
+scene = mi.load_dict({
+    "type": "scene",
+    "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}},
+    "light": {"type": "constant"},
+    "sensor": {
+        "type": "perspective",
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 4, "height": 4},
+    },
+})
+params = mi.traverse(scene)
+key = next(key for key in params.keys() if "reflectance" in key)
+dr.enable_grad(params[key])
+params.update()
+image = mi.render(scene, params, spp=1, integrator=mi.load_dict({"type": "prb", "max_depth": 2}))
+dr.backward(dr.mean(image, axis=None))
+gradient = float(dr.sum(dr.ravel(dr.grad(params[key])))[0])
+if not 0.0 < gradient < 100.0:
+    raise SystemExit(f"wrong result: gradient {gradient}")
+"""
+
+
+def _versions() -> tuple[str, str, list[str], list[str]]:
+    """Versions of Mitsuba and Dr.Jit, the variants that Mitsuba has, and the ways out if they are missing."""
+    try:
+        import drjit as dr
+        import mitsuba as mi
+    except Exception as error:
+        reason = " ".join(str(error).split())
+        way_out = "install Mitsuba: pip install 'mitsuba>=3.9.1,<3.10'"
+        return f"cannot be imported ({reason})", "unknown", [], [way_out]
+    return str(mi.__version__), str(dr.__version__), list(mi.variants()), []  # type: ignore[attr-defined]
+
+
+def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[VariantVerdict]:
+    """Try each variant; once one of a back end fails to start, its others are not tried."""
+    environment = dict(os.environ)
+    if library is not None:
+        environment[ENVIRONMENT_VARIABLE] = library.path
+    preload = libllvm.unlinked_siblings(library.path) if library is not None else []
+    verdicts = []
+    dead: dict[str, str] = {}
+    for name in names:
+        backend = name.split("_")[0]
+        if backend == "llvm" and library is None:
+            dead["llvm"] = "no libLLVM works"
+        if backend not in dead:
+            task = {"sys_path": sys.path, "preload": preload, "variant": name}
+            _, message = libllvm.run_trial(_PROBE, task, environment)
+            verdicts.append(VariantVerdict(name, not message, message))
+            if message:
+                dead[backend] = f"as {name}"
+        else:
+            verdicts.append(VariantVerdict(name, False, dead[backend]))
+    return verdicts
+
+
+def examine() -> DoctorReport:
+    """Try every libLLVM and every variant on this machine (a few seconds). Raises nothing."""
+    mitsuba_version, drjit_version, known, ways_out = _versions()
+    libraries = tuple(libllvm.probe(path, origin) for path, origin in libllvm.candidates()) if known else ()
+    library = next((library for library in libraries if library.works), None)
+    names = sorted(filter(is_usable_variant, known), key=lambda name: (name.split("_")[0] != "llvm", known.index(name)))
+    variants = _try_variants(names, library)
+
+    broken = {variant.name.split("_")[0] for variant in variants if not variant.works}
+    if "llvm" in broken and library is None:
+        ways_out.append(f"libLLVM: {libllvm.WAY_OUT}")
+    asked_for = os.environ.get(ENVIRONMENT_VARIABLE)
+    if asked_for and library is not None and any(each.path == asked_for and not each.works for each in libraries):
+        ways_out.append(f"{ENVIRONMENT_VARIABLE} names a libLLVM that fails: unset it, or let it name {library.path}")
+    if "cuda" in broken:
+        ways_out.append(
+            "CUDA: needs an NVIDIA GPU and its driver (`nvidia-smi` has to list the GPU); "
+            "without one, LLVM does the work on the CPU"
+        )
+    if "metal" in broken:
+        ways_out.append("Metal: needs a Mac with Apple silicon; without one, LLVM does the work on the CPU")
+    return DoctorReport(
+        pathreplay=__version__,
+        python=f"{platform.python_version()} ({sys.executable})",
+        platform=platform.platform(),
+        mitsuba=mitsuba_version,
+        drjit=drjit_version,
+        libraries=libraries,
+        variants=tuple(variants),
+        ways_out=tuple(ways_out),
+    )

@@ -1,0 +1,277 @@
+"""Finds a libLLVM with which Dr.Jit works.
+
+LLVM 14 and older are refused by Dr.Jit; 15 and 16 it accepts, and then they abort the process at the first minimum or
+maximum ("Cannot select: fminimum"). A trial in this process is too dangerous, so candidates are tried in a process of
+their own (0.2-0.3 s each). Their order: DRJIT_LIBLLVM_PATH, the one that `pip install pathreplay` brought
+(karellen-llvm-core), the system's from new to old.
+"""
+
+from __future__ import annotations
+
+import functools
+import glob
+import importlib.metadata
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pathreplay.errors import PathreplayError
+
+ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
+PIP_DISTRIBUTION = "karellen-llvm-core"
+#: Dr.Jit 1.5 emits llvm.minimum/llvm.maximum, which LLVM 15 and 16 cannot select for x86; older ones it refuses itself.
+OLDEST_USABLE_MAJOR = 17
+#: A trial takes 0.3 s; a machine under load may need more, a hanging library must not hold us for ever.
+PROBE_TIMEOUT_S = 60.0
+
+WAY_OUT = (
+    f"install one (Linux x86-64: `pip install {PIP_DISTRIBUTION}`; macOS: `brew install llvm`; "
+    f"elsewhere your system's LLVM {OLDEST_USABLE_MAJOR} or newer), or let {ENVIRONMENT_VARIABLE} name it"
+)
+
+
+@dataclass(frozen=True)
+class LlvmLibrary:
+    """A libLLVM and the verdict of its trial.
+
+    `version` is the one it reports itself ("23.1.4"), or what its name says if it died before it could; "" if neither
+    tells. `message` is empty for one that works, otherwise the reason in one line.
+    """
+
+    path: str
+    origin: str
+    version: str
+    works: bool
+    message: str
+
+
+# ------------------------------------------------------------------------------------------------------------
+#  Candidates
+# ------------------------------------------------------------------------------------------------------------
+
+
+def pip_library() -> str | None:
+    """Path of the libLLVM that the wheel karellen-llvm-core installed, None without it.
+
+    Read from the wheel's own list of files, which is right in virtual environments and user installs alike.
+    (`pip install --target` drops the wheel's lib folder: nothing to find there.)
+    """
+    try:
+        files = importlib.metadata.files(PIP_DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    # The plain file, not one of its symbolic links: those appear only at the first start of Python after the install.
+    for file in files:
+        if re.fullmatch(r"libLLVM\.so\.[\d.]+", file.name):
+            path = Path(str(file.locate())).resolve()
+            if path.is_file():
+                return str(path)
+    return None
+
+
+_SYSTEM_PATTERNS = {
+    "linux": (
+        os.path.join(sys.prefix, "lib", "libLLVM*.so*"),  # conda environments
+        "/usr/lib/*-linux-gnu/libLLVM*.so*",  # Debian, Ubuntu
+        "/usr/lib/llvm-*/lib/libLLVM*.so*",  # apt.llvm.org
+        "/usr/lib64/libLLVM*.so*",  # Fedora, SUSE
+        "/usr/lib64/llvm*/lib/libLLVM*.so*",
+        "/usr/lib64/llvm*/lib64/libLLVM*.so*",
+        "/usr/lib/libLLVM*.so*",  # Arch
+        "/usr/lib/llvm/*/lib64/libLLVM*.so*",  # Gentoo
+        "/usr/local/lib/libLLVM*.so*",
+    ),
+    "darwin": (
+        os.path.join(sys.prefix, "lib", "libLLVM*.dylib"),
+        "/opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
+        "/usr/local/opt/llvm*/lib/libLLVM*.dylib",
+        "/opt/local/libexec/llvm-*/lib/libLLVM*.dylib",  # MacPorts
+    ),
+    "win32": (r"C:\Program Files\LLVM\bin\LLVM-C.dll",),
+}
+
+
+def version_in_path(path: str) -> tuple[int, ...]:
+    """The LLVM version that a path spells out, as a tuple; empty if it does not.
+
+    libLLVM.so.19.1 -> (19, 1); libLLVM-15.so.1 -> (15,); .../llvm@20/20.1.8/lib/libLLVM.dylib -> (20, 1, 8).
+    """
+    name = os.path.basename(path)
+    for pattern in (r"^libLLVM-(\d+(?:\.\d+)*)", r"^libLLVM\.so\.(\d+(?:\.\d+)*)", r"^libLLVM\.(\d+(?:\.\d+)*)\.dylib"):
+        if match := re.search(pattern, name):
+            return tuple(int(number) for number in match[1].split("."))
+    if match := re.search(r"llvm[^/]*/(\d+(?:\.\d+)+)/", path) or re.search(r"llvm[-@]?(\d+(?:\.\d+)*)/", path):
+        return tuple(int(number) for number in match[1].split("."))
+    return ()
+
+
+def _known_to_linker() -> list[str]:
+    """What ldconfig lists, so that folders which only this system knows are found as well."""
+    if sys.platform != "linux":
+        return []
+    for program in ("ldconfig", "/sbin/ldconfig", "/usr/sbin/ldconfig"):
+        try:
+            listing = subprocess.run([program, "-p"], capture_output=True, text=True, timeout=10, check=False).stdout
+        except (OSError, subprocess.TimeoutExpired):
+            continue
+        return re.findall(r"^\s*libLLVM\S* .*=> (\S+)$", listing, re.MULTILINE)
+    return []
+
+
+def system_libraries() -> list[str]:
+    """The system's libLLVM files, from new to old, each file once."""
+    found = _known_to_linker()
+    for pattern in _SYSTEM_PATTERNS.get(sys.platform, ()):
+        found += glob.glob(pattern)
+    files = {os.path.realpath(path) for path in found if os.path.isfile(path)}
+    return sorted(files, key=lambda path: (version_in_path(path), path), reverse=True)
+
+
+def candidates() -> Iterator[tuple[str, str]]:
+    """(path, origin) of every libLLVM worth a look, best first, each file once."""
+    pip = pip_library()
+    seen = set()
+    asked_for = os.environ.get(ENVIRONMENT_VARIABLE)
+    if asked_for:
+        seen.add(os.path.realpath(asked_for))
+        # We set the variable ourselves when it is empty; then the library is still pip's.
+        yield asked_for, "pip" if asked_for == pip else ENVIRONMENT_VARIABLE
+    if pip and os.path.realpath(pip) not in seen:
+        seen.add(os.path.realpath(pip))
+        yield pip, "pip"
+    for path in system_libraries():
+        if path not in seen:
+            seen.add(path)
+            yield path, "system"
+
+
+# ------------------------------------------------------------------------------------------------------------
+#  Trial in a process of its own
+# ------------------------------------------------------------------------------------------------------------
+
+_PROBE = """
+import json, sys
+task = json.loads(sys.argv[1])
+sys.path[:] = task["sys_path"]
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # an abort is an answer here, not a case for a core dump
+except ImportError:
+    pass
+import ctypes
+for path in task["preload"]:
+    ctypes.CDLL(path)
+import drjit as dr
+if not dr.has_backend(dr.JitBackend.LLVM):
+    print("refused by Dr.Jit", file=sys.stderr)
+    raise SystemExit(3)
+print(".".join(str(number) for number in dr.detail.llvm_version()), flush=True)
+from drjit.llvm.ad import Float
+x = Float([1.0, 2.0, 3.0] * 7)  # more lanes than any vector register has, so that both full and partial packets run
+dr.enable_grad(x)
+y = dr.minimum(x, 2.0) * dr.maximum(x, 1.5)
+dr.backward(dr.sum(y))
+gradient = dr.grad(x)
+dr.eval(y, gradient)
+if [y[i] for i in range(3)] != [1.5, 4.0, 6.0] or [gradient[i] for i in range(3)] != [1.5, 4.0, 2.0]:
+    print(f"wrong result: {y}, gradient {gradient}", file=sys.stderr)
+    raise SystemExit(4)
+"""
+
+
+def unlinked_siblings(path: str) -> list[str]:
+    """Run-time libraries that the wheel's libLLVM needs but cannot find yet.
+
+    The wheel makes the links libc++.so.1 -> libc++.so.1.0 (and two more) at the first start of Python after it was
+    installed. Where it could not (a folder that is not ours to write to), loading these files beforehand does the
+    same: the loader matches the names inside them.
+    """
+    folder = Path(path).parent / "x86_64-unknown-linux-gnu"
+    files = [folder / name for name in ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")]
+    linked = (folder / "libc++.so.1").exists()
+    return [] if linked or not all(file.is_file() for file in files) else [str(file) for file in files]
+
+
+def _reason(returncode: int, stderr: str) -> str:
+    """One line that says why a trial failed, from what the process left behind."""
+    lines = [re.sub(r"^\w+\(\): ", "", line.strip()) for line in stderr.splitlines() if line.strip()]
+    # We switch the kernel cache off ourselves (see `probe`), and Dr.Jit says so.
+    lines = [line for line in lines if "kernel cache" not in line]
+    crash = returncode < 0 and returncode != -signal.SIGTERM
+    wanted = next((line for line in lines if line.startswith("LLVM ERROR")), None) if crash else None
+    detail = wanted or (lines[-1] if lines and "Traceback" in stderr else lines[0] if lines else "")
+    detail = re.sub(r"0x[0-9a-f]+(: |, )?", "", detail).strip(" ,")
+    if len(detail) > 200:
+        detail = detail[:200] + " ..."
+    if crash:
+        try:
+            name = signal.Signals(-returncode).name
+        except ValueError:
+            name = f"signal {-returncode}"
+        return f"kills the process with {name}" + (f" ({detail})" if detail else "")
+    return detail or f"the trial ended with exit status {returncode}"
+
+
+def run_trial(code: str, task: Mapping[str, object], environment: Mapping[str, str]) -> tuple[str, str]:
+    """Run `code` in a Python of its own, with `task` as JSON in its first argument.
+
+    Returns what it printed, and why it failed in one line ("" if it did not). Raises nothing.
+    """
+    if not sys.executable:
+        return "", "cannot be tried: this Python does not know its own executable"
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code, json.dumps(task)],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=PROBE_TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return "", f"gave no answer within {PROBE_TIMEOUT_S:g} s"
+    except OSError as error:
+        return "", f"cannot be tried: {error}"
+    return done.stdout, "" if done.returncode == 0 else _reason(done.returncode, done.stderr)
+
+
+@functools.cache
+def probe(path: str, origin: str = "") -> LlvmLibrary:
+    """Try one libLLVM in a process of its own: minimum, maximum and a gradient, compared with known values.
+
+    An empty `path` tries what Dr.Jit chooses by itself.
+    The verdict is kept for the life of this process. Nothing is raised: whatever happens is in `works` and `message`.
+    """
+    version = ".".join(str(number) for number in version_in_path(os.path.realpath(path)))
+    task = {"sys_path": sys.path, "preload": unlinked_siblings(path)}
+    environment = {
+        **os.environ,
+        ENVIRONMENT_VARIABLE: path,
+        # A kernel from the cache would never meet the compiler that is on trial.
+        "DRJIT_CACHE_DIR": os.devnull,
+    }
+    stdout, message = run_trial(_PROBE, task, environment)
+    return LlvmLibrary(path, origin, stdout.strip() or version, not message, message)
+
+
+def find_llvm() -> LlvmLibrary:
+    """The first candidate that works.
+
+    Raises PathreplayError if none does.
+    """
+    failed = []
+    for path, origin in candidates():
+        library = probe(path, origin)
+        if library.works:
+            return library
+        failed.append(library)
+    looked_at = "; ".join(f"{library.path}: {library.message}" for library in failed) or "none found"
+    raise PathreplayError(f"no libLLVM that Dr.Jit can use ({looked_at}): {WAY_OUT}")
