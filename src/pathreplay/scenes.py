@@ -61,7 +61,14 @@ def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
     scene["back"]["bsdf"] = {
         "type": "diffuse",
         # raw: the texels are linear reflectances, which is what is optimised.
-        "reflectance": {"type": "bitmap", "bitmap": grey, "raw": True, "wrap_mode": "clamp"},
+        # to_uv turns v round: the first row of an image belongs at the top of the wall.
+        "reflectance": {
+            "type": "bitmap",
+            "bitmap": grey,
+            "raw": True,
+            "wrap_mode": "clamp",
+            "to_uv": T().translate([0, 1, 0]).scale([1, -1, 1]),
+        },
     }
     return scene
 

@@ -1,0 +1,79 @@
+"""Checkpoints: variables, Adam state and history in one safetensors file, so that a run goes on as if never stopped."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import safetensors
+import safetensors.numpy
+from drjit.opt import Adam
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.values import Array
+from pathreplay.parameters import get_array, to_value
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One iteration of the history: loss before the step, wall-clock seconds, L2 norm of each variable's gradient.
+
+    ``dropped`` counts gradient entries that were NaN or infinite and were taken as zero in this step.
+    """
+
+    iteration: int
+    loss: float
+    seconds: float
+    gradient_norms: dict[str, float]
+    dropped: int = 0
+
+
+def save(adam: Adam, iteration: int, history: list[Entry]) -> bytes:
+    """The state after ``iteration`` completed iterations, as the bytes of a safetensors file."""
+    tensors: dict[str, Array] = {}
+    steps: dict[str, int] = {}
+    state: dict[str, Any] = adam.state
+    for key, (value, _, _, (step, first, second, _)) in state.items():
+        tensors[f"value:{key}"] = get_array(value)
+        tensors[f"first:{key}"] = get_array(first)
+        tensors[f"second:{key}"] = get_array(second)
+        steps[key] = int(step[0])
+    metadata = {
+        "iteration": str(iteration),
+        "steps": json.dumps(steps),
+        "history": json.dumps([asdict(entry) for entry in history]),
+    }
+    return safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata)
+
+
+def restore(path: Path, adam: Adam) -> tuple[int, list[Entry]]:
+    """Put the saved state into ``adam``, which already holds the same variables; returns iteration and history.
+
+    Raises:
+        PathreplayError: the file is damaged or belongs to other variables.
+    """
+    try:
+        with safetensors.safe_open(str(path), framework="numpy") as file:
+            metadata = file.metadata()
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+        steps = json.loads(metadata["steps"])
+        history = [Entry(**entry) for entry in json.loads(metadata["history"])]
+        iteration = int(metadata["iteration"])
+    except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        raise PathreplayError(f"Checkpoint {path} cannot be read ({error}); start the job from its config") from None
+    if set(steps) != set(adam.state):
+        raise PathreplayError(
+            f"Checkpoint {path} holds the parameters {', '.join(steps)}, the config names {', '.join(adam.state)}; "
+            "start a new run"
+        )
+    for key, step in steps.items():
+        value, promoted, rate, (count, first, second, greatest) = adam.state[key]
+        stored = to_value(value, tensors[f"value:{key}"])
+        dr.enable_grad(stored)
+        moments = (to_value(first, tensors[f"first:{key}"]), to_value(second, tensors[f"second:{key}"]))
+        adam.state[key] = (stored, promoted, rate, (type(count)(step), *moments, greatest))
+    return iteration, history

@@ -1,0 +1,126 @@
+"""Images in and out: always linear radiance in memory, whatever the file holds.
+
+8- and 16-bit files (PNG, JPEG) are taken as sRGB encoded and are decoded; EXR, HDR and PFM are taken as linear. Written
+PNGs are sRGB encoded after multiplication with an exposure; written EXRs are linear float32.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from pathreplay.errors import PathreplayError
+from pathreplay.scenes import one_line
+
+Image = NDArray[np.float32]
+"""Linear pixels, shape (height, width, channels)."""
+
+SAMPLE = "matplotlib:"
+"""Prefix of a picture that matplotlib ships, e.g. ``matplotlib:grace_hopper.jpg``."""
+
+
+def find_image(name: str, base: Path) -> Path:
+    """Path of an image file: relative to ``base``, or one of matplotlib's sample pictures."""
+    if name.startswith(SAMPLE):
+        from matplotlib import cbook
+
+        path = Path(cbook.get_sample_data(name[len(SAMPLE) :], asfileobj=False))
+    else:
+        path = base / name
+    if not path.is_file():
+        raise PathreplayError(f"No image file '{name}': {path} does not exist; correct the path or create the file")
+    return path
+
+
+def read_image(path: Path, *, raw: bool = False) -> Image:
+    """Read an image as linear float32 (height, width, channels); ``raw`` keeps stored values (normal maps, masks).
+
+    Raises:
+        PathreplayError: the file is no image that Mitsuba can read.
+    """
+    try:
+        bitmap = mi.Bitmap(str(path))
+    except RuntimeError as error:
+        raise PathreplayError(f"Image {path} cannot be read: {one_line(error)}") from None
+    if raw:
+        bitmap.set_srgb_gamma(False)
+    bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
+    pixels = np.array(bitmap, dtype=np.float32)
+    return pixels[:, :, None] if pixels.ndim == 2 else pixels
+
+
+def with_channels(image: Image, channels: int) -> Image | None:
+    """The image with that many channels: alpha is dropped, grey repeated, colour averaged by luminance; else None."""
+    have = image.shape[2]
+    if have in (2, 4) and channels in (1, 3):
+        image, have = image[:, :, : have - 1], have - 1
+    if have == channels:
+        return image
+    if have == 1:
+        return np.repeat(image, channels, axis=2)
+    if have == 3 and channels == 1:
+        return (image @ LUMINANCE)[:, :, None].astype(np.float32)
+    return None
+
+
+# Rec. 709 luminance of linear RGB.
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+
+
+def resized(image: Image, height: int, width: int, *, crop: bool = False) -> Image:
+    """Resample (Lanczos, clamped to the image's own range); ``crop`` first cuts the middle to the new aspect."""
+    if crop:
+        h, w = image.shape[:2]
+        keep_h, keep_w = min(h, round(w * height / width)), min(w, round(h * width / height))
+        top, left = (h - keep_h) // 2, (w - keep_w) // 2
+        image = image[top : top + keep_h, left : left + keep_w]
+    if image.shape[:2] == (height, width):
+        return image
+    bitmap = mi.Bitmap(np.ascontiguousarray(image))
+    own_range = (float(image.min()), float(image.max()))
+    result = np.array(bitmap.resample(mi.ScalarVector2u(width, height), clamp=own_range), dtype=np.float32)
+    return result.reshape(height, width, image.shape[2])
+
+
+def exr_bytes(image: Image) -> bytes:
+    """The image as a float32 OpenEXR file."""
+    return _encoded(mi.Bitmap(np.ascontiguousarray(_displayable(image))), mi.Bitmap.FileFormat.OpenEXR)
+
+
+def png_bytes(image: Image, exposure: float = 1.0) -> bytes:
+    """The image times ``exposure`` as an 8-bit sRGB PNG file."""
+    shown = np.clip(_displayable(image) * exposure, 0, 1).astype(np.float32)
+    bitmap = mi.Bitmap(np.ascontiguousarray(shown))
+    return _encoded(bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True), mi.Bitmap.FileFormat.PNG)
+
+
+def exposure_for(image: Image) -> float:
+    """Exposure under which 98 % of the pixels stay below white (1 for a black picture)."""
+    level = float(np.quantile(image[..., :3].max(axis=2), 0.98))
+    return 1.0 / level if level > 0 else 1.0
+
+
+def difference(image: Image, target: Image) -> Image:
+    """Signed difference as a picture: luminance above the target in red, below in blue, equal in black."""
+    delta = (with_channels(image, 1) if image.shape[2] != 1 else image) - (  # type: ignore[operator]
+        with_channels(target, 1) if target.shape[2] != 1 else target  # type: ignore[operator]
+    )
+    delta = delta[:, :, 0]
+    zero = np.zeros_like(delta)
+    return np.stack([np.maximum(delta, 0), zero, np.maximum(-delta, 0)], axis=2).astype(np.float32)
+
+
+def _displayable(image: Image) -> Image:
+    if image.shape[2] == 2:
+        return image[:, :, :1]
+    return image
+
+
+def _encoded(bitmap: mi.Bitmap, file_format: mi.Bitmap.FileFormat) -> bytes:
+    # Through memory, so that the disk is touched in one place (run_folder), which handles a full one.
+    stream = mi.MemoryStream()
+    bitmap.write(stream, file_format)
+    return bytes(stream.raw_buffer())

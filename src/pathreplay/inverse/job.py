@@ -1,0 +1,192 @@
+"""One optimisation job from config to report: the function behind ``pathreplay optimize``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.numpy
+from drjit.opt import Adam
+
+from pathreplay import backend
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse import checkpoint
+from pathreplay.inverse.config import Config, load_config
+from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes, read_image
+from pathreplay.inverse.loop import ctrl_c_stops, iterate, make_adam, render_views
+from pathreplay.inverse.problem import Problem, build_problem
+from pathreplay.inverse.progress import Progress
+from pathreplay.inverse.report import Outcome, Recovered, ViewPictures, report_files
+from pathreplay.inverse.run_folder import CHECKPOINT, RunFolder, create_run_folder, default_output, open_run_folder
+from pathreplay.inverse.values import Array
+from pathreplay.parameters import get_array
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run came to; everything in it is also in ``folder``."""
+
+    folder: Path
+    report: Path
+    iterations: int
+    """Completed iterations; fewer than the job's when it was stopped."""
+    stopped: bool
+    """True when Ctrl-C ended the run early; it can be resumed."""
+    history: tuple[checkpoint.Entry, ...]
+    parameters: dict[str, Array]
+    errors: dict[str, float]
+    """Root mean square error of each parameter whose truth is known."""
+
+
+def optimize(
+    config: str | Path | Config | None = None,
+    *,
+    resume: str | Path | None = None,
+    output: str | Path | None = None,
+    progress: bool = True,
+) -> RunResult:
+    """Recover the parameters that a job names, and write its run folder.
+
+    Args:
+        config: path of a TOML file, or a Config (relative paths in it start at the current folder).
+        resume: run folder of an earlier, unfinished run, to go on with; excludes ``config`` and ``output``.
+        output: run folder to make; the default is the config's ``output``, else ``runs/<name of the config>``. Where it
+            exists, a number is appended: an earlier run is never touched.
+        progress: draw a progress bar on stderr.
+
+    The first Ctrl-C ends the run after the current iteration with everything written; the second one aborts.
+
+    Raises:
+        PathreplayError: anything in the job that cannot work, told before the first iteration; a full disk.
+    """
+    start = _resumed(Path(resume), config, output) if resume is not None else _fresh(config, output)
+    variant = backend.set_variant(start.config.variant)
+    with Progress(progress) as bar:
+        bar.say("loading the scene, preparing the targets")
+        problem = build_problem(start.config, start.base, start.targets())
+        adam = make_adam(problem)
+        history: list[checkpoint.Entry] = []
+        if start.folder is None:
+            before = render_views(problem, start.config)
+            folder = create_run_folder(start.output, start.config, start.source, start.base)
+            folder.write(_first_files(problem, before, adam))
+        else:
+            folder = start.folder
+            _, history = checkpoint.restore(folder.path / CHECKPOINT, adam)
+            if len(history) >= start.config.iterations:
+                raise PathreplayError(
+                    f"Run {folder.path} has all its {len(history)} iterations; raise 'iterations' in its config"
+                )
+            before = {view.name: read_image(folder.path / f"images/start-{view.name}.exr") for view in problem.views}
+        bar.start(len(history), start.config.iterations)
+
+        def after(entry: checkpoint.Entry) -> None:
+            bar.advance(entry.loss)
+            if (entry.iteration + 1) % start.config.checkpoint_every == 0:
+                folder.write({CHECKPOINT: checkpoint.save(adam, len(history), history)})
+
+        with ctrl_c_stops() as stop:
+            iterate(problem, start.config, adam, history, stop, after)
+            bar.say("writing the pictures and the report")
+            return _finish(start, folder, problem, adam, history, before, variant)
+
+
+@dataclass(frozen=True)
+class _Start:
+    config: Config
+    source: Path | None
+    base: Path
+    output: Path
+    folder: RunFolder | None
+
+    def targets(self) -> dict[str, Image] | None:
+        if self.folder is None:
+            return None
+        pictures = sorted((self.folder.path / "images").glob("target-*.exr"))
+        return {path.stem.removeprefix("target-"): read_image(path) for path in pictures}
+
+
+def _fresh(config: str | Path | Config | None, output: str | Path | None) -> _Start:
+    if config is None:
+        raise PathreplayError("Nothing to do: give a config file, or --resume RUN_FOLDER")
+    source = None if isinstance(config, Config) else Path(config)
+    job = config if isinstance(config, Config) else load_config(Path(config))
+    base = Path.cwd() if source is None else source.parent
+    wanted = output or job.output
+    return _Start(job, source, base, Path(wanted) if wanted else default_output(source), None)
+
+
+def _resumed(path: Path, config: object, output: object) -> _Start:
+    if config is not None or output is not None:
+        raise PathreplayError("--resume takes config and output from the run folder; leave CONFIG and --output out")
+    folder, job, source = open_run_folder(path)
+    return _Start(job, None if source is None else Path(source), folder.origin, path, folder)
+
+
+def _first_files(problem: Problem, before: dict[str, Image], adam: Adam) -> dict[str, bytes]:
+    files = {f"images/target-{view.name}.exr": exr_bytes(view.target) for view in problem.views}
+    files |= {f"images/start-{name}.exr": exr_bytes(image) for name, image in before.items()}
+    return {**files, CHECKPOINT: checkpoint.save(adam, 0, [])}
+
+
+def _finish(
+    start: _Start,
+    folder: RunFolder,
+    problem: Problem,
+    adam: Adam,
+    history: list[checkpoint.Entry],
+    before: dict[str, Image],
+    variant: str,
+) -> RunResult:
+    config = start.config
+    result = render_views(problem, config)
+    values = {key: get_array(value) for key, value in adam.items()}
+    views = tuple(
+        ViewPictures(v.name, v.target, before[v.name], result[v.name], exposure_for(v.target)) for v in problem.views
+    )
+    recovered = tuple(Recovered(v.key, v.start, values[v.key], v.truth) for v in problem.variables)
+    outcome = Outcome(config, start.source, folder.path, views, recovered, tuple(history), variant)
+    files = {
+        CHECKPOINT: checkpoint.save(adam, len(history), history),
+        "parameters.safetensors": safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in values.items()}),
+        "parameters.json": _parameters_json(recovered).encode(),
+        "history.jsonl": "".join(json.dumps(asdict(entry)) + "\n" for entry in history).encode(),
+    }
+    for view in views:
+        files[f"images/result-{view.name}.exr"] = exr_bytes(view.result)
+        for kind, image in view.pictures().items():
+            files[f"images/{kind}-{view.name}.png"] = png_bytes(image, view.exposure)
+    for item in recovered:
+        for kind, image in item.textures().items():
+            files[f"images/texture-{kind}-{item.file_name()}.png"] = png_bytes(image)
+    folder.write({**files, **report_files(outcome)})
+    return RunResult(
+        folder=folder.path,
+        report=folder.path / "report.html",
+        iterations=len(history),
+        stopped=len(history) < config.iterations,
+        history=tuple(history),
+        parameters=values,
+        errors={item.key: error for item in recovered if (error := item.error()) is not None},
+    )
+
+
+def _parameters_json(recovered: tuple[Recovered, ...]) -> str:
+    """Small values in full, large ones by shape, mean and range (their numbers are in parameters.safetensors)."""
+    table: dict[str, Any] = {}
+    for item in recovered:
+        value = item.result
+        entry: dict[str, Any] = {"shape": list(value.shape)}
+        if value.size <= 16:
+            entry |= {"value": value.tolist(), "start": item.start.tolist()}
+            if item.truth is not None:
+                entry["truth"] = item.truth.tolist()
+        else:
+            entry |= {"mean": float(value.mean()), "min": float(value.min()), "max": float(value.max())}
+        if item.truth is not None:
+            entry |= {"rmse": item.error(), "rmse_at_start": item.error_at_start()}
+        table[item.key] = entry
+    return json.dumps(table, indent=2) + "\n"

@@ -1,0 +1,174 @@
+"""The optimisation loop: render, compare, differentiate, step, project; interruptible and resumable."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from drjit.opt import Adam
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.checkpoint import Entry
+from pathreplay.inverse.config import Config
+from pathreplay.inverse.images import Image
+from pathreplay.inverse.problem import ITERATION, PICTURE, Problem, seeds
+from pathreplay.parameters import get_array, to_value
+
+# Adam's second moment remembers about 1 / (1 - beta_2) steps. Its usual 0.999 outlasts a whole run of a few hundred.
+BETA_1, BETA_2 = 0.9, 0.99
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Tells the loop to end after the iteration that is under way (Ctrl-C)."""
+
+    event: threading.Event
+
+    def wanted(self) -> bool:
+        return self.event.is_set()
+
+
+@contextmanager
+def ctrl_c_stops() -> Iterator[Stop]:
+    """Within this block the first Ctrl-C asks for a stop, the second one interrupts at once."""
+    stop = Stop(threading.Event())
+    if threading.current_thread() is not threading.main_thread():
+        yield stop  # signals belong to the main thread
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if stop.wanted():
+            raise KeyboardInterrupt
+        stop.event.set()
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def make_adam(problem: Problem) -> Adam:
+    """Adam over the problem's variables at their start values."""
+    adam = Adam(lr=1.0, beta_1=BETA_1, beta_2=BETA_2)
+    for variable in problem.variables:
+        adam[variable.key] = to_value(problem.params[variable.key], variable.start)
+    return adam
+
+
+def iterate(
+    problem: Problem,
+    config: Config,
+    adam: Adam,
+    history: list[Entry],
+    stop: Stop,
+    after: Callable[[Entry], None],
+) -> None:
+    """Take steps from ``len(history)`` to ``config.iterations``; ``after`` is called at the end of each.
+
+    One step: render every view with seeds of its own, back-propagate the mean of the views' losses, step Adam with the
+    learning rate lr·decay^(i / iterations), project every variable into its bounds. What is differentiated is decided
+    by the integrator; targets, bounds and the seeds' choice of paths are not.
+
+    Raises:
+        PathreplayError: the loss is no longer finite.
+    """
+    for i in range(len(history), config.iterations):
+        begin = time.perf_counter()
+        _put(problem, adam)
+        loss = _loss(problem, config, i)
+        dr.backward(loss)
+        norms, dropped = _gradients(adam)
+        value = float(dr.detach(loss)[0]) if dr.width(loss) else float("nan")
+        if not np.isfinite(value):
+            raise PathreplayError(
+                f"The loss is {value} at iteration {i}; lower the learning rates, or bound the parameters that ran away"
+            )
+        _set_rates(problem, config, adam, i)
+        adam.step()
+        _project(problem, adam)
+        entry = Entry(i, value, time.perf_counter() - begin, norms, dropped)
+        history.append(entry)
+        after(entry)
+        if stop.wanted():
+            break
+    _put(problem, adam)
+
+
+def render_views(problem: Problem, config: Config) -> dict[str, Image]:
+    """Pictures of all views with the scene as it is now, by the job's integrator; same noise at every call."""
+    pictures: dict[str, Image] = {}
+    for view in problem.views:
+        seed, _ = seeds(config.seed, PICTURE, 0, view.sensor)
+        with dr.suspend_grad():
+            image = mi.render(
+                problem.scene,
+                sensor=view.sensor,
+                integrator=problem.integrator,
+                spp=config.picture_spp,
+                seed=mi.UInt32(seed),
+            )
+        pictures[view.name] = np.array(image, dtype=np.float32)
+    return pictures
+
+
+def _loss(problem: Problem, config: Config, iteration: int) -> mi.Float:
+    total = mi.Float(0)
+    for view in problem.views:
+        seed, seed_grad = seeds(config.seed, ITERATION, iteration, view.sensor)
+        image = mi.render(
+            problem.scene,
+            problem.params,
+            sensor=view.sensor,
+            integrator=problem.integrator,
+            spp=config.spp,
+            seed=mi.UInt32(seed),
+            seed_grad=seed_grad,
+        )
+        total += problem.loss(image, mi.TensorXf(view.target)).array / len(problem.views)
+    return total
+
+
+def _put(problem: Problem, adam: Adam) -> None:
+    for variable in problem.variables:
+        problem.params[variable.key] = adam[variable.key]
+    problem.params.update()
+
+
+def _gradients(adam: Adam) -> tuple[dict[str, float], int]:
+    """Norm per variable; non-finite entries are zeroed, so that one bad path does not end a long run, and counted."""
+    norms: dict[str, float] = {}
+    dropped = 0
+    for key, value in adam.items():
+        gradient = get_array(dr.grad(value))
+        fine = np.isfinite(gradient)
+        if not fine.all():
+            gradient = np.where(fine, gradient, 0)
+            dr.set_grad(value, to_value(value, gradient))
+            dropped += int((~fine).sum())
+        norms[key] = float(np.linalg.norm(gradient))
+    return norms, dropped
+
+
+def _set_rates(problem: Problem, config: Config, adam: Adam, iteration: int) -> None:
+    decay = config.learning_rate_decay ** (iteration / config.iterations)
+    # Opaque: as a literal the changing rate would be compiled into the kernel anew in every iteration.
+    adam.set_learning_rate({v.key: dr.opaque(mi.Float, v.learning_rate * decay) for v in problem.variables})
+
+
+def _project(problem: Problem, adam: Adam) -> None:
+    for variable in problem.variables:
+        value = adam[variable.key]
+        if variable.lower is not None:
+            value = dr.maximum(value, variable.lower)
+        if variable.upper is not None:
+            value = dr.minimum(value, variable.upper)
+        adam[variable.key] = value
