@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import sys
+from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
@@ -52,6 +53,58 @@ def doctor() -> None:
         report = examine()
     report.print()
     raise typer.Exit(0 if report.works else 1)
+
+
+@app.command()
+def check(
+    scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or a built-in scene such as cornell-box.")],
+    param: Annotated[list[str], typer.Option(help="Parameter key or glob; may be given several times.")],
+    integrator: Annotated[
+        str | None, typer.Option(help="Plugin to test (default: the scene's, if made for gradients; else pathreplay).")
+    ] = None,
+    seeds: Annotated[int, typer.Option(help="Independent seeds.")] = 16,
+    spp: Annotated[int, typer.Option(help="Samples per pixel of a gradient.")] = 16,
+    fd_spp: Annotated[int | None, typer.Option(help="Samples per pixel of a difference (default: --spp).")] = None,
+    step: Annotated[float | None, typer.Option(help="Step of the differences (default: 1 % of the parameter).")] = None,
+    max_depth: Annotated[int | None, typer.Option(help="Path length (default: the scene's).")] = None,
+    mode: Annotated[str, typer.Option(help="backward or forward.")] = "backward",
+    sensor: Annotated[int, typer.Option(help="Index of the sensor.")] = 0,
+    seed: Annotated[int, typer.Option(help="Chooses all random numbers.")] = 0,
+    variant: Annotated[str | None, typer.Option(help="Mitsuba variant (default: the best that runs here).")] = None,
+    json: Annotated[Path | None, typer.Option(help="Also write the results, samples included, to this file.")] = None,
+) -> None:
+    """Compare gradients with finite differences of Mitsuba's path tracer; exit status 1 if one does not pass."""
+    from pathreplay import backend
+    from pathreplay.check import report
+    from pathreplay.scenes import load_scene
+
+    if json is not None:
+        report.require_writable(json)
+    backend.set_variant(variant)
+    results = report.check_all(
+        load_scene(scene), param, integrator=integrator, seeds=seeds, spp=spp, fd_spp=fd_spp, step=step,
+        max_depth=max_depth, mode=mode, sensor=sensor, seed=seed,
+    )  # fmt: skip
+    report.print_checks(results)
+    if json is not None:
+        report.write_checks(results, json)
+    raise typer.Exit(0 if all(result.passed for result in results) else 1)
+
+
+@app.command()
+def optimize(
+    config: Annotated[Path | None, typer.Argument(help="Job in TOML; see docs/optimize.md.")] = None,
+    resume: Annotated[
+        Path | None, typer.Option(metavar="RUN_FOLDER", help="Go on with an unfinished run instead.")
+    ] = None,
+    output: Annotated[Path | None, typer.Option(help="Run folder to make; default: runs/<name of the config>.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+) -> None:
+    """Recover scene parameters from pictures; Ctrl-C ends early with everything written."""
+    from pathreplay.inverse import optimize as run_job
+
+    result = run_job(config, resume=resume, output=output, progress=not quiet)
+    typer.echo(result.describe())
 
 
 def _fail(message: str) -> NoReturn:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,17 @@ class RunResult:
     parameters: dict[str, Array]
     errors: dict[str, float]
     """Root mean square error of each parameter whose truth is known."""
+
+    def describe(self) -> str:
+        """A few lines for the terminal: loss, errors, where the report is, how to go on."""
+        lines = []
+        if self.history:
+            lines.append(f"loss {self.history[0].loss:.4g} -> {self.history[-1].loss:.4g} in {self.iterations} iterations")
+        lines += [f"{key}: root mean square error {error:.4g}" for key, error in self.errors.items()]
+        lines.append(f"report: {self.report}")
+        if self.stopped:
+            lines.append(f"stopped early; go on with: pathreplay optimize --resume {shlex.quote(str(self.folder))}")
+        return "\n".join(lines)
 
 
 def optimize(
