@@ -97,7 +97,7 @@ def require_differentiable(params: Any, key: str) -> None:
         raise PathreplayError(_no_match(list(params.keys()), key))
     value = params[key]
     owner = owner_class(params, key)
-    if _is_float(value) and not params.flags(key) & mi.ParamFlags.NonDifferentiable:
+    if carries_derivative(params, key):
         return
     known = _WAY_OUT.get((owner, key.rsplit(".", 1)[-1]))
     if known is not None:
@@ -109,6 +109,27 @@ def require_differentiable(params: Any, key: str) -> None:
     else:
         why = f"Mitsuba marks this parameter of {owner} as not differentiable"
     raise PathreplayError(f"Parameter '{key}' carries no derivative: {why}; choose one that mi.traverse marks with ∂")
+
+
+def resolve_differentiable(params: Any, patterns: str | Iterable[str]) -> list[str]:
+    """Like :func:`resolve_keys`, but a glob takes only those matches that carry a derivative.
+
+    Raises:
+        PathreplayError: a pattern matches nothing, an exact key carries no derivative, or no match of a glob does.
+    """
+    found: dict[str, None] = {}
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        matches = resolve_keys(params, pattern)
+        usable = [key for key in matches if carries_derivative(params, key)]
+        if not usable:
+            require_differentiable(params, matches[0])
+        found.update(dict.fromkeys(usable))
+    return list(found)
+
+
+def carries_derivative(params: Any, key: str) -> bool:
+    """Whether Mitsuba can carry a derivative to a parameter: Dr.Jit floats that it does not mark as excluded."""
+    return _is_float(params[key]) and not params.flags(key) & mi.ParamFlags.NonDifferentiable
 
 
 def _is_transform(value: Any) -> bool:
@@ -144,7 +165,7 @@ def require_finite(params: Any) -> None:
             first = tuple(int(i) for i in bad[0])
             raise PathreplayError(
                 f"Parameter '{key}' holds {len(bad)} NaN or infinite of {values.size} values, the first "
-                f"({values[first]}) at index {first}; mend the source file, or set them with numpy.nan_to_num before loading"
+                f"({values[first]}) at index {first}; mend the source file (numpy.nan_to_num helps)"
             )
 
 

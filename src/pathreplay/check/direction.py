@@ -1,0 +1,108 @@
+"""Where to look: the direction in parameter space along which a gradient is checked, and the points on it.
+
+A gradient of a thousand texels is checked through one number, its product with a direction. The direction is random,
+so that no particular error can hide, and all its entries are of one sign: contributions then add up, where random
+signs would make the derivative smaller by the square root of their number and leave its noise as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+
+RELATIVE_STEP = 1e-2
+"""h over the size of the parameter: truncation (h² after division) near 1e-4, float32 rounding of images near 1e-5."""
+
+# Parameters in which a sign means nothing; all others that are nowhere negative are taken as bounded by 0.
+_SIGNED = ("vertex_positions", "vertex_normals", "vertex_texcoords", "to_world", "to_uv", "position", "direction")
+
+
+@dataclass(frozen=True)
+class Stencil:
+    """Two finite differences of second order, with steps h and h/2, from the same four evaluations f(offset * h).
+
+    D(h) = Σ full[i] f(offset[i] h) / h and D(h/2) = Σ half[i] f(offset[i] h) / h.
+    """
+
+    name: str
+    offsets: tuple[float, ...]
+    full: tuple[float, ...]
+    half: tuple[float, ...]
+
+
+CENTRAL_STENCIL = Stencil("central", (-1, -0.5, 0.5, 1), (-0.5, 0, 0, 0.5), (0, -1, 1, 0))
+FORWARD_STENCIL = Stencil("one-sided, up", (0, 0.5, 1, 2), (-1.5, 0, 2, -0.5), (-3, 4, -1, 0))
+BACKWARD_STENCIL = Stencil("one-sided, down", (0, -0.5, -1, -2), (1.5, 0, -2, 0.5), (3, -4, 1, 0))
+
+
+@dataclass(frozen=True)
+class Line:
+    """The points value + t * direction of a parameter, and the step h that the finite differences take along it."""
+
+    value: np.ndarray
+    direction: np.ndarray
+    description: str
+    size: float
+    """The size of the parameter: its largest absolute entry along the direction, but at least 1."""
+    step: float
+    stencil: Stencil
+
+
+def choose_line(key: str, value: np.ndarray, direction: Any = None, step: float | None = None, seed: int = 0) -> Line:
+    """The line through ``value`` along ``direction``, or along a random direction whose largest entry is 1.
+
+    The default step moves the entry that moves most by a hundredth of the parameter's size. Where a parameter that is
+    nowhere negative would become so (a black texel), the differences are one-sided: a negative reflectance is no
+    harm to a linear texture, but a negative roughness or density is.
+
+    Raises:
+        PathreplayError: the direction has the wrong shape, is zero or is not finite; the step is not a positive number.
+    """
+    if value.size == 0:
+        raise PathreplayError(f"Parameter '{key}' is empty; there is nothing to check")
+    transform = key.rsplit(".", 1)[-1] == "to_world"
+    if direction is not None:
+        v = np.asarray(direction, np.float64)
+        description = "given"
+        if v.shape != value.shape and v.size == value.size == 1:
+            v = v.reshape(value.shape)
+        if v.shape != value.shape:
+            raise PathreplayError(f"Direction of shape {v.shape} given for '{key}', whose shape is {value.shape}")
+        if not np.isfinite(v).all() or not v.any():
+            raise PathreplayError(f"Direction for '{key}' is zero, NaN or infinite; give finite numbers, not all zero")
+    elif value.size == 1:
+        v, description = np.ones(value.shape), "scalar"
+    elif transform:
+        v, description = np.zeros(value.shape), f"random translation, seed {seed}"
+        v[:3, 3] = _random_entries((3,), seed)
+    else:
+        v, description = _random_entries(value.shape, seed), f"random, seed {seed}"
+    size = max(1.0, float(np.abs(value[v != 0]).max()))
+    if step is None:
+        step = RELATIVE_STEP * size
+    elif not (np.isfinite(step) and step > 0):
+        raise PathreplayError(
+            f"Step {step} for '{key}' is not a positive number; leave it out, or give one such as 0.01"
+        )
+    return Line(value, v, description, size, float(step), _choose_stencil(key, value, v * step))
+
+
+def _random_entries(shape: tuple[int, ...], seed: int) -> np.ndarray:
+    entries = np.random.default_rng(seed).uniform(0.5, 1.0, shape)
+    return entries / entries.max()
+
+
+def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
+    bounded = key.rsplit(".", 1)[-1] not in _SIGNED and (value >= 0).all()
+    if not bounded or (value >= np.abs(move)).all():
+        return CENTRAL_STENCIL
+    if (value + 2 * move >= 0).all():
+        return FORWARD_STENCIL
+    if (value - 2 * move >= 0).all():
+        return BACKWARD_STENCIL
+    # Both ways lead below zero (a given direction of mixed signs over zeros): linear parameters do not mind.
+    return CENTRAL_STENCIL

@@ -1,0 +1,210 @@
+"""Check a gradient: any integrator's derivative against finite differences of a plain path tracer.
+
+Two sets of independent samples of one directional derivative, their standard errors, and a verdict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.check.direction import choose_line
+from pathreplay.check.objective import Mode, View, alone, integrator_name
+from pathreplay.check.reference import integrator_under_test, reference_integrator
+from pathreplay.check.verdict import NEGLIGIBLE, Verdict, judge
+from pathreplay.errors import PathreplayError
+from pathreplay.parameters import get_array, require_differentiable, require_finite
+
+
+@dataclass(frozen=True)
+class GradientCheck:
+    """One directional derivative, estimated twice, and what follows. Derivatives are those of the objective."""
+
+    key: str
+    direction: str
+    """How the direction was chosen: 'scalar', 'random, seed 0', 'given'."""
+    integrator: str
+    reference_integrator: str
+    mode: Mode
+    objective: float
+    """Value of the objective F where the gradient was taken."""
+    gradient: float
+    gradient_se: float
+    reference: float
+    reference_se: float
+    step: float
+    """h: how far the entry with direction 1 moves."""
+    stencil: str
+    """'central', or 'one-sided' where the parameter stands at its bound 0."""
+    step_error: float
+    """Bound on the error of the reference that is not noise: truncation and float32 rounding."""
+    z: float
+    resolution: float
+    """Combined error over the larger of the two values; four times this is the smallest error that would show."""
+    verdict: Verdict
+    reason: str
+    seeds: int
+    spp: int
+    fd_spp: int
+    gradient_samples: tuple[float, ...]
+    reference_samples: tuple[float, ...]
+
+    @property
+    def passed(self) -> bool:
+        """True for the verdicts 'pass' and 'zero'."""
+        return self.verdict in ("pass", "zero")
+
+    def __str__(self) -> str:
+        rows = (
+            (f"gradient ({self.integrator}, {self.mode})", f"{self.gradient:+.6g} ± {self.gradient_se:.2g}"),
+            (
+                f"reference ({self.reference_integrator}, {self.stencil})",
+                f"{self.reference:+.6g} ± {self.reference_se:.2g}",
+            ),
+            ("step, error left by it", f"{self.step:.3g}, {self.step_error:.2g}"),
+            ("seeds, spp, reference spp", f"{self.seeds}, {self.spp}, {self.fd_spp}"),
+            ("z", f"{self.z:+.2f}"),
+            ("verdict", f"{self.verdict.upper()}: {self.reason}"),
+        )
+        width = max(len(name) for name, _ in rows)
+        return "\n".join([f"{self.key} ({self.direction})", *(f"  {name:<{width}}  {value}" for name, value in rows)])
+
+
+def check_gradient(
+    scene: Any,
+    key: str,
+    *,
+    integrator: Any = None,
+    reference: Any = None,
+    max_depth: int | None = None,
+    sensor: int = 0,
+    seeds: int = 16,
+    spp: int = 16,
+    fd_spp: int | None = None,
+    step: float | None = None,
+    direction: Any = None,
+    mode: Mode = "backward",
+    loss: Callable[[Any], Any] | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> GradientCheck:
+    """Compare dF/dt at t = 0 of the parameter value + t · direction with finite differences, over independent seeds.
+
+    Args:
+        scene: a scene of an AD variant; it is left as it was, parameters and gradients, whatever happens.
+        key: a differentiable parameter of ``mi.traverse(scene)``.
+        integrator: what is tested: object, dictionary, plugin name, or None for the scene's own if it is made for
+            differentiation and ``pathreplay`` otherwise. Names get the path limits of the scene's integrator.
+        reference: what is differenced; None for Mitsuba's ``path`` (``volpath`` with media) with the same limits.
+        max_depth: path length, where ``integrator`` is None or a name.
+        sensor: index of the sensor; its film gives the resolution.
+        seeds: number n of independent seeds, for the gradient and, others, for the reference.
+        spp, fd_spp: samples per pixel of one gradient and of one image of the reference (None: the same). Each
+            reference seed costs four images, at ±h and ±h/2 with common random numbers.
+        step: h; None for a hundredth of max(1, largest absolute entry).
+        direction: array of the parameter's shape, taken as it is; None for 1 (scalars), a random translation
+            (``to_world``), or random positive entries, the largest being 1.
+        mode: 'backward' (``dr.backward`` through ``mi.render``) or 'forward' (``dr.forward``).
+        loss: None for the mean of the image under smooth weights between 0.5 and 1.5 that differ by channel, so
+            that errors of opposite sign in two places do not cancel. Otherwise a function from the image (TensorXf,
+            height x width x channels) to a scalar, which is linearised once at a rendered image: the check
+            is one of the renderer, and a nonlinear loss of a noisy image would be biased.
+        seed: chooses all random numbers, and the direction.
+        progress: called with (renderings done, renderings in all).
+
+    Returns:
+        the estimates, their standard errors and the verdict (see :mod:`pathreplay.check.verdict`).
+
+    Not checked: what no direction of ``key`` moves, the loss itself, and the alpha channel (no integrator
+    differentiates it).
+
+    Raises:
+        PathreplayError: a bad argument, a parameter without derivative, NaN in the scene, an integrator that cannot
+            differentiate this parameter.
+    """
+    _require_arguments(scene, sensor, seeds, spp, fd_spp, mode)
+    params = mi.traverse(scene)
+    require_differentiable(params, key)
+    require_finite(params)
+    if get_array(params[key]).dtype == np.float16:
+        raise PathreplayError(
+            f"Parameter '{key}' is stored in half precision, too coarse for finite differences; give the texture the "
+            "option format='variant'"
+        )
+    line = choose_line(key, get_array(params[key]).astype(np.float64), direction, step, seed)
+    tested = integrator_under_test(integrator, scene, max_depth)
+    plain = reference_integrator(reference, scene, tested)
+    fd_spp = spp if fd_spp is None else fd_spp
+    # Distinct 32-bit words: seeds of the gradient's primal image, of its derivative, of the reference, of the weights.
+    words = np.random.SeedSequence(seed).generate_state(3 * seeds + 1)
+    primal_seeds, gradient_seeds, reference_seeds, (weight_seed,) = np.split(words, [seeds, 2 * seeds, 3 * seeds])
+
+    offsets = line.stencil.offsets
+    total, done = 1 + seeds * (1 + len(offsets)), 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    gradients = np.empty(seeds)
+    values = np.empty((seeds, len(offsets)))
+    with alone(params, key) as value:
+        view = View(scene, params, key, value, line, scene.sensors()[sensor])
+        weights, scale = view.weights(plain, loss, int(weight_seed), fd_spp)
+        tick()
+        for i in range(seeds):
+            gradients[i] = view.derivative(tested, mode, weights, int(primal_seeds[i]), int(gradient_seeds[i]), spp)
+            tick()
+        for i in range(seeds):
+            for j, offset in enumerate(offsets):
+                values[i, j] = view.objective(plain, weights, offset * line.step, int(reference_seeds[i]), fd_spp)
+                tick()
+
+    full, half = values @ line.stencil.full / line.step, values @ line.stencil.half / line.step
+    # A rounding error of one half unit in the last place of every image, all of one sign, at worst.
+    unit = np.finfo(get_array(value).dtype).eps / 2
+    rounding = float(np.abs(np.subtract(np.multiply(4, line.stencil.half), line.stencil.full)).sum() / 3) * unit * scale
+    result = judge(gradients, full, half, rounding=rounding / line.step, negligible=NEGLIGIBLE * scale / line.size)
+    return GradientCheck(
+        key=key,
+        direction=line.description,
+        integrator=integrator_name(tested),
+        reference_integrator=integrator_name(plain),
+        mode=mode,
+        objective=float(values[:, offsets.index(0) if 0 in offsets else slice(None)].mean()),
+        step=line.step,
+        stencil=line.stencil.name,
+        seeds=seeds,
+        spp=spp,
+        fd_spp=fd_spp,
+        gradient_samples=tuple(gradients.tolist()),
+        reference_samples=tuple(((4 * half - full) / 3).tolist()),
+        **vars(result),
+    )
+
+
+def _require_arguments(scene: Any, sensor: int, seeds: int, spp: int, fd_spp: int | None, mode: str) -> None:
+    if mi.variant() is None or not dr.is_diff_v(mi.Float):
+        raise PathreplayError(
+            f"Variant '{mi.variant()}' has no derivatives; call mi.set_variant('llvm_ad_rgb') before loading the scene"
+        )
+    if not isinstance(scene, mi.Scene):
+        raise PathreplayError(
+            f"scene is a {type(scene).__name__}, not a mitsuba.Scene; load it with mi.load_file or load_dict"
+        )
+    if not 0 <= sensor < len(scene.sensors()):
+        raise PathreplayError(f"Sensor {sensor} does not exist; the scene has {len(scene.sensors())}, counted from 0")
+    if seeds < 2:
+        raise PathreplayError(f"seeds is {seeds}; a standard error needs at least 2, and 8 or more make sense")
+    for name, count in (("spp", spp), ("fd_spp", fd_spp)):
+        if count is not None and count < 1:
+            raise PathreplayError(f"{name} is {count}; give at least 1 sample per pixel")
+    if mode not in ("backward", "forward"):
+        raise PathreplayError(f"mode is '{mode}'; choose 'backward' or 'forward'")

@@ -1,0 +1,118 @@
+"""Which integrators a check compares: the one under test, and the plain path tracer that serves as its reference.
+
+The reference must estimate the same image: same path length, same treatment of directly visible emitters. These are
+read off the integrator under test.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+
+from pathreplay.errors import PathreplayError
+from pathreplay.scenes import one_line
+
+UNBOUNDED = 0xFFFFFFFF
+"""What Mitsuba's Python integrators keep for ``max_depth = -1``."""
+
+NO_ROULETTE = 2**30
+"""A ``rr_depth`` that no path reaches."""
+
+LONGEST_WITHOUT_ROULETTE = 64
+"""Above this length the reference keeps Russian roulette: without it, no path of a closed room ends before its time."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What decides the image that an integrator estimates. ``max_depth`` -1: no bound."""
+
+    max_depth: int
+    rr_depth: int
+    hide_emitters: bool
+
+
+def read_limits(integrator: Any) -> Limits | None:
+    """The limits of an integrator of Mitsuba's or ours, or None where it has no path length to read."""
+    # Python integrators have attributes; C++ ones only print them.
+    printed = dict(re.findall(r"(max_depth|rr_depth) = (-?\d+)", str(integrator)))
+    max_depth = getattr(integrator, "max_depth", printed.get("max_depth"))
+    rr_depth: Any = getattr(integrator, "rr_depth", printed.get("rr_depth", 5))
+    if max_depth is None:
+        return None
+    depth = int(max_depth)
+    return Limits(-1 if depth >= UNBOUNDED else depth, int(rr_depth), bool(getattr(integrator, "hide_emitters", False)))
+
+
+def integrator_under_test(spec: Any, scene: Any, max_depth: int | None = None) -> Any:
+    """The integrator that ``spec`` means: an object (taken as it is), a dictionary, a plugin name, or None.
+
+    None is the scene's own integrator if that one is made for differentiation, else ``pathreplay``. A plugin given by
+    name, or chosen by None, gets the path limits of the scene's own integrator; ``max_depth`` overrides them.
+
+    Raises:
+        PathreplayError: Mitsuba cannot make it, or ``max_depth`` is given along with a finished integrator.
+    """
+    own = scene.integrator()
+    if spec is None and max_depth is None and isinstance(own, mi.CppADIntegrator):
+        return own
+    if isinstance(spec, mi.Integrator):
+        if max_depth is not None:
+            raise PathreplayError("max_depth cannot be given along with a finished integrator; set it there")
+        return spec
+    if isinstance(spec, Mapping):
+        description = dict(spec)
+    else:
+        description = {"type": spec or "pathreplay"}
+        limits = read_limits(own) if own is not None else None
+        if limits is not None:
+            description.update(vars(limits))
+    if max_depth is not None:
+        description["max_depth"] = max_depth
+    return _load(description)
+
+
+def reference_integrator(spec: Any, scene: Any, tested: Any) -> Any:
+    """The integrator whose images are differenced: ``spec`` if given, else ``path``, or ``volpath`` with media.
+
+    Its Russian roulette is switched off where paths are short enough. That leaves the expected image alone, keeps
+    decisions from flipping between +h and -h, and lets throughputs be negative, as they are beside a reflectance of 0.
+
+    Raises:
+        PathreplayError: the path length of the integrator under test cannot be read, or ``spec`` cannot be made.
+    """
+    if isinstance(spec, mi.Integrator):
+        return spec
+    if isinstance(spec, Mapping):
+        return _load(dict(spec))
+    limits = read_limits(tested)
+    if limits is None:
+        raise PathreplayError(
+            f"Integrator {type(tested).__name__} does not say its max_depth; pass a reference integrator that computes "
+            "the same image, such as reference={'type': 'path', 'max_depth': 6}"
+        )
+    short = 0 <= limits.max_depth <= LONGEST_WITHOUT_ROULETTE
+    name = spec or ("volpath" if has_media(scene) else "path")
+    rr_depth = NO_ROULETTE if short else limits.rr_depth
+    return _load({"type": name, **vars(limits), "rr_depth": rr_depth})
+
+
+def has_media(scene: Any) -> bool:
+    """Whether light may be scattered between surfaces: a shape bounds a medium, or a camera stands in one."""
+    if any(shape.is_medium_transition() for shape in scene.shapes()):
+        return True
+    # Sensors do not tell their medium to Python, but it is among their parameters.
+    return any(key.startswith("medium.") for sensor in scene.sensors() for key in mi.traverse(sensor).keys())
+
+
+def _load(description: dict[str, Any]) -> Any:
+    try:
+        integrator = mi.load_dict(description)
+    except Exception as error:  # Mitsuba raises RuntimeError, plugins in Python whatever they like
+        raise PathreplayError(f"Integrator '{description.get('type')}' cannot be made: {one_line(error)}") from error
+    if not isinstance(integrator, mi.Integrator):
+        raise PathreplayError(f"'{description.get('type')}' is no integrator but a {type(integrator).__name__}")
+    return integrator

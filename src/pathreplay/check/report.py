@@ -1,0 +1,104 @@
+"""Checks for a reader: a progress bar while they run, a page when they are done, a JSON file for other programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from pathreplay.check.gradient import GradientCheck, check_gradient
+from pathreplay.errors import PathreplayError
+from pathreplay.parameters import resolve_differentiable
+
+_STYLES = {"pass": "green", "zero": "green", "fail": "bold red", "inconclusive": "yellow"}
+
+
+def check_all(scene: Any, patterns: Sequence[str], **options: Any) -> list[GradientCheck]:
+    """``check_gradient(scene, key, **options)`` for every key that the patterns name, with a bar on standard error.
+
+    Raises:
+        PathreplayError: see :func:`check_gradient` and :func:`resolve_differentiable`.
+    """
+    keys = resolve_differentiable(mi.traverse(scene), patterns)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    results = []
+    # Standard error, and gone when done: what is printed or piped is the result alone.
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        for i, key in enumerate(keys):
+            task = bar.add_task(Text(f"{key} ({i + 1}/{len(keys)})").plain, total=None)
+
+            def progress(done: int, total: int, task: Any = task) -> None:
+                bar.update(task, completed=done, total=total)
+
+            results.append(check_gradient(scene, key, progress=progress, **options))
+            bar.remove_task(task)
+    return results
+
+
+def print_checks(results: Sequence[GradientCheck]) -> None:
+    """Print what was compared, then for each parameter the verdict, the two estimates, and what the verdict means."""
+    first = results[0]
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(
+        f"{first.integrator} ({first.mode}) against finite differences of {first.reference_integrator}: "
+        f"{first.seeds} seeds, {first.spp} spp (differences {first.fd_spp} spp)\n"
+    )
+    for result in results:
+        console.print(
+            Text(f"{result.verdict.upper():<6}", style=_STYLES[result.verdict]), Text(result.key, style="bold")
+        )
+        for name, estimate in (
+            ("gradient", _with_error(result.gradient, result.gradient_se)),
+            ("reference", _with_error(result.reference, math.hypot(result.reference_se, result.step_error))),
+        ):
+            console.print(f"       {name:<9}  {estimate}")
+        console.print(f"       z = {result.z:+.2f}   {result.reason}\n")
+    counts = Counter(result.verdict for result in results)
+    console.print(f"{len(results)} checked: " + ", ".join(f"{n} {verdict}" for verdict, n in counts.items()))
+
+
+def _with_error(value: float, error: float) -> str:
+    """'+0.03199 ± 0.00015': the value as far as its error, which has two digits, lets it be known."""
+    if not (math.isfinite(value) and math.isfinite(error)):
+        return f"{value:+.4g}"
+    if error == 0:
+        return f"{value:+.5g} ± 0"
+    digits = 1 - math.floor(math.log10(error))
+    if not 0 <= digits <= 7:
+        return f"{value:+.3e} ± {error:.1e}"
+    return f"{value:+.{digits}f} ± {error:.{digits}f}"
+
+
+def write_checks(results: Sequence[GradientCheck], path: Path) -> None:
+    """Write all fields of the checks as a JSON list, the samples too; NaN and infinity become null."""
+    records = [{**asdict(result), "passed": result.passed, "variant": mi.variant()} for result in results]
+    path.write_text(json.dumps(_finite(records), indent=2) + "\n", encoding="utf-8")
+
+
+def require_writable(path: Path) -> None:
+    """Return quietly if ``path`` can be written later.
+
+    Raises:
+        PathreplayError: it is a folder, or its folder does not exist.
+    """
+    if path.is_dir():
+        raise PathreplayError(f"{path} is a folder; give --json the name of a file")
+    if not path.parent.is_dir():
+        raise PathreplayError(f"Folder {path.parent} for {path.name} does not exist; make it first")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,135 @@
+"""The verdict on a gradient: what two sets of independent samples allow to say, in pure arithmetic.
+
+Given are n samples of the gradient under test and n of its reference, all from independent seeds. The reference comes
+as two finite differences per seed, one with the step h and one with h/2, whose error is O(h²). Their Richardson
+combination (4 D(h/2) - D(h)) / 3 removes that term; what halving the step changed, beyond noise, bounds what is left.
+
+    σ² = se(gradient)² + se(reference)² + step_error²,      z = (mean gradient - mean reference) / σ
+
+The standard errors are estimated from few samples, so the ratio follows Student's distribution. ``z`` is that ratio
+turned into the normal deviate of the same probability (Welch), so that |z| < 4 means the same for 3 seeds and for 300.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+Verdict = Literal["pass", "zero", "fail", "inconclusive"]
+
+Z_LIMIT = 4.0
+"""A right gradient exceeds it once in 16 000 checks: a battery of hundreds of cells stays quiet."""
+
+RESOLUTION = 0.1
+"""Largest σ, as a share of the larger of the two means, with which agreement says anything."""
+
+NEGLIGIBLE = 1e-3
+"""A gradient is called zero if moving the parameter by its own size changes the objective by less than this share."""
+
+SUMMATION = 1e-4
+"""Relative error granted to a float32 gradient: sums of 10⁶ atomic additions round by about 10³ · 2⁻²⁴ = 6e-5."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the samples say. All quantities are derivatives of the objective along the direction, but z and reason."""
+
+    gradient: float
+    gradient_se: float
+    reference: float
+    reference_se: float
+    step_error: float
+    """Bound on the systematic error of the reference: truncation that noise does not explain, and rounding."""
+    z: float
+    resolution: float
+    """σ / max(|gradient|, |reference|); infinite where both are zero."""
+    verdict: Verdict
+    reason: str
+
+
+def judge(
+    gradient: np.ndarray,
+    full_step: np.ndarray,
+    half_step: np.ndarray,
+    *,
+    rounding: float = 0.0,
+    negligible: float = 0.0,
+) -> Judgement:
+    """Compare n gradient samples with n finite differences of step h and n of step h/2 (same seeds for these two).
+
+    ``rounding`` bounds the error that floating-point arithmetic leaves in the reference; ``negligible`` is the size
+    below which a derivative counts as zero. Shapes (n,), n >= 2.
+
+    Rule: |z| >= 4 or a gradient that is not finite *fails*. Otherwise, if σ is at most a tenth of the larger mean, it
+    *passes*; if not, it passes as *zero* where both means are within 4 σ of zero and 4 σ is negligible; if not, nothing
+    was resolved and it is *inconclusive*.
+    """
+    reference = (4 * half_step - full_step) / 3
+    g, g_se = _mean(gradient)
+    r, r_se = _mean(reference)
+    # D(h/2) is off by a third of what halving changed; that it is a bound for the better combination makes it safe.
+    change, change_se = _mean((half_step - full_step) / 3)
+    truncation = math.sqrt(max(0.0, change**2 - change_se**2))
+    scale = max(abs(g), abs(r))
+    known = Judgement(g, g_se, r, r_se, math.hypot(truncation, rounding), math.nan, math.inf, "inconclusive", "")
+    if not np.isfinite(gradient).all():
+        bad = int(np.count_nonzero(~np.isfinite(gradient)))
+        return replace(known, verdict="fail", reason=f"{bad} of {gradient.size} gradient samples are NaN or infinite")
+    if not (np.isfinite(full_step).all() and np.isfinite(half_step).all()):
+        return replace(known, reason="the reference is NaN or infinite: look at the image, or choose a smaller step")
+
+    σ = math.sqrt(g_se**2 + r_se**2 + known.step_error**2 + (SUMMATION * scale) ** 2)
+    z = _deviate(g - r, σ, (g_se, gradient.size), (r_se, reference.size))
+    resolution = σ / scale if scale > 0 else math.inf
+    verdict: Verdict
+    if abs(z) >= Z_LIMIT:
+        verdict, reason = "fail", _disagreement(g, r)
+    elif resolution <= RESOLUTION:
+        verdict, reason = "pass", f"agrees; an error above {Z_LIMIT * resolution:.1%} would have shown"
+    elif scale <= Z_LIMIT * σ <= negligible or scale == σ == 0:
+        verdict, reason = "zero", f"both are zero to within {Z_LIMIT * σ:.1g}, which is nothing against the image"
+    else:
+        verdict, reason = "inconclusive", _unresolved(resolution, known.step_error, σ)
+    return replace(known, z=z, resolution=resolution, verdict=verdict, reason=reason)
+
+
+def _mean(samples: np.ndarray) -> tuple[float, float]:
+    """Mean and its standard error."""
+    samples = np.asarray(samples, np.float64)
+    with np.errstate(invalid="ignore"):  # infinite samples: the caller looks for them and says so
+        return float(samples.mean()), float(samples.std(ddof=1) / math.sqrt(samples.size))
+
+
+def _deviate(difference: float, σ: float, *parts: tuple[float, int]) -> float:
+    """The normal deviate as improbable as difference/σ is under Student's distribution (Welch-Satterthwaite)."""
+    if difference == 0:
+        return 0.0
+    if σ == 0:
+        return math.copysign(math.inf, difference)
+    t = abs(difference) / σ
+    noise = sum(se**4 / (n - 1) for se, n in parts)
+    if noise > 0:
+        # σ holds the systematic bounds too: they are known, not estimated, and so add no uncertainty to σ.
+        t = float(stats.norm.isf(max(stats.t.sf(t, σ**4 / noise), 1e-300)))
+    return math.copysign(max(t, 0.0), difference)
+
+
+def _disagreement(g: float, r: float) -> str:
+    if r == 0:
+        return "differs from a reference of zero"
+    return f"differs: {g / r:.4g} times the reference"
+
+
+def _unresolved(resolution: float, step_error: float, σ: float) -> str:
+    if step_error > 0.5 * σ:
+        return "the finite differences depend on the step; change --step"
+    if not math.isfinite(resolution):
+        return "nothing was resolved; use more --spp or --seeds"
+    factor = (resolution / RESOLUTION) ** 2
+    if factor > 1000:
+        return "the noise hides everything; use another direction or objective, or very many more samples"
+    return f"the noise hides it; use about {max(2, math.ceil(factor))} times the --seeds or --spp"
