@@ -159,7 +159,7 @@ def examine() -> DoctorReport:
     broken = {variant.name.split("_")[0] for variant in variants if not variant.works}
     if "llvm" in broken and library is None:
         ways_out.append(f"libLLVM: {libllvm.WAY_OUT}")
-    asked_for = os.environ.get(ENVIRONMENT_VARIABLE)
+    asked_for = libllvm.ASKED_FOR
     if asked_for and library is not None and any(each.path == asked_for and not each.works for each in libraries):
         ways_out.append(f"{ENVIRONMENT_VARIABLE} names a libLLVM that fails: unset it, or let it name {library.path}")
     if "cuda" in broken:

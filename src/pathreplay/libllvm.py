@@ -24,6 +24,8 @@ from pathlib import Path
 from pathreplay.errors import PathreplayError
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
+#: What the user set, before `import pathreplay` fills the variable in or replaces a value that cannot work.
+ASKED_FOR = os.environ.get(ENVIRONMENT_VARIABLE, "")
 PIP_DISTRIBUTION = "karellen-llvm-core"
 #: Dr.Jit 1.5 emits llvm.minimum/llvm.maximum, which LLVM 15 and 16 cannot select for x86; older ones it refuses itself.
 OLDEST_USABLE_MAJOR = 17
@@ -100,10 +102,15 @@ _SYSTEM_PATTERNS = {
 def version_in_path(path: str) -> tuple[int, ...]:
     """The LLVM version that a path spells out, as a tuple; empty if it does not.
 
-    libLLVM.so.19.1 -> (19, 1); libLLVM-15.so.1 -> (15,); .../llvm@20/20.1.8/lib/libLLVM.dylib -> (20, 1, 8).
+    libLLVM.so.19.1 -> (19, 1); libLLVM-15.so.1 -> (15,); .../llvm@20/20.1.8/lib/libLLVM.dylib -> (20, 1, 8). A lone
+    digit after .so is the version of the interface, not LLVM's.
     """
     name = os.path.basename(path)
-    for pattern in (r"^libLLVM-(\d+(?:\.\d+)*)", r"^libLLVM\.so\.(\d+(?:\.\d+)*)", r"^libLLVM\.(\d+(?:\.\d+)*)\.dylib"):
+    for pattern in (
+        r"^libLLVM-(\d+(?:\.\d+)*)",
+        r"^libLLVM\.so\.(\d+(?:\.\d+)+|\d\d+)",
+        r"^libLLVM\.(\d+(?:\.\d+)*)\.dylib",
+    ):
         if match := re.search(pattern, name):
             return tuple(int(number) for number in match[1].split("."))
     if match := re.search(r"llvm[^/]*/(\d+(?:\.\d+)+)/", path) or re.search(r"llvm[-@]?(\d+(?:\.\d+)*)/", path):
@@ -137,11 +144,10 @@ def candidates() -> Iterator[tuple[str, str]]:
     """(path, origin) of every libLLVM worth a look, best first, each file once."""
     pip = pip_library()
     seen = set()
-    asked_for = os.environ.get(ENVIRONMENT_VARIABLE)
-    if asked_for:
-        seen.add(os.path.realpath(asked_for))
-        # We set the variable ourselves when it is empty; then the library is still pip's.
-        yield asked_for, "pip" if asked_for == pip else ENVIRONMENT_VARIABLE
+    if ASKED_FOR:
+        seen.add(os.path.realpath(ASKED_FOR))
+        # A process that we started has inherited the variable from us; then the library is still pip's.
+        yield ASKED_FOR, "pip" if ASKED_FOR == pip else ENVIRONMENT_VARIABLE
     if pip and os.path.realpath(pip) not in seen:
         seen.add(os.path.realpath(pip))
         yield pip, "pip"

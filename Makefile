@@ -1,0 +1,51 @@
+# Everything from a clean checkout: each target makes its own .venv when it has to. Needs make and Python 3.10 or newer.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-all lint bench clean
+
+help:
+	@echo "make demo      recover a texture, two wall colours and a light from rendered pictures, write a report"
+	@echo "make test      lint and the quick tests"
+	@echo "make test-all  lint and every test"
+	@echo "make lint      ruff and mypy"
+	@echo "make bench     time, memory and variance next to Mitsuba's own integrators"
+	@echo "make clean     remove .venv and caches, keep runs/"
+	@echo "Another Python: make demo PYTHON=python3.12"
+
+# The stamp depends on what decides the versions, so that nothing is installed twice. An interrupted set-up has no stamp and
+# is gone on with; a .venv whose Python has vanished is made anew.
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || { \
+	  echo "make: error: $(PYTHON) is $$($(PYTHON) --version 2>&1), Python 3.10 or newer is needed: make PYTHON=python3.12 ..." >&2; \
+	  exit 2; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	  echo "make: error: $(PYTHON) cannot make virtual environments: install its venv package (Debian: apt install python3-venv)" >&2; \
+	  exit 2; }
+	@echo "make: setting up $(VENV) (once; about a minute)"
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: $(READY)
+	$(BIN)/pathreplay optimize examples/cornell-photo/config.toml
+
+lint: $(READY)
+	$(BIN)/ruff check
+	$(BIN)/mypy
+
+test: lint
+	$(BIN)/python -m pytest -q -m "not slow"
+
+test-all: lint
+	$(BIN)/python -m pytest -q
+
+bench: $(READY)
+	$(BIN)/python -m benchmarks.surface
+
+clean:
+	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache build src/*.egg-info

@@ -1,0 +1,60 @@
+"""Sets the variant that the tests run in, before any of them builds a scene.
+
+Every test runs in `llvm_ad_rgb`; what needs another variant, or a Python that has not imported us yet, starts one
+of its own with `run_python`.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+
+import pytest
+
+from pathreplay.backend import set_variant
+
+VARIANT = "llvm_ad_rgb"
+#: Far above what any of these takes (a few seconds): a hanging process must not hang the tests.
+TIMEOUT_S = 120
+
+
+def pytest_configure() -> None:
+    """Set the variant before test modules are imported, so that module-level `mi.<Type>` works in them."""
+    set_variant(VARIANT)
+
+
+@pytest.fixture(autouse=True)
+def _variant() -> None:
+    """Give every test the variant back, whatever the one before it has set."""
+    set_variant(VARIANT)
+
+
+@pytest.fixture
+def run_python() -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run code in a fresh Python: `run_python(code, env={"NAME": "value" or None}, args=[...])`.
+
+    DRJIT_LIBLLVM_PATH, which this process has set for itself, is not handed on. None in `env` removes a variable.
+    """
+
+    def run(
+        code: str, env: dict[str, str | None] | None = None, args: tuple[str, ...] = ()
+    ) -> subprocess.CompletedProcess[str]:
+        environment = dict(os.environ)
+        for name, value in {"DRJIT_LIBLLVM_PATH": None, **(env or {})}.items():
+            if value is None:
+                environment.pop(name, None)
+            else:
+                environment[name] = value
+        return subprocess.run(
+            [sys.executable, "-c", code, *args],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+            check=False,
+        )
+
+    return run
