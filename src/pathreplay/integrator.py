@@ -12,12 +12,11 @@ from .gradient.forward import forward
 from .gradient.primal import primal
 from .gradient.replay import replay
 from .gradient.sweep import MAX_DEPTH, sweep
-from .transport.path import Walk
-from .transport.traits import delta_lobes
-from .transport.vertex import Options
+from .transport.traits import attachable_bsdfs, delta_lobes, scene_bsdfs
+from .transport.vertex import Walk
 
 DRIVERS = ("auto", "sweep", "replay")
-ATTACH = ("none",)
+ATTACH = ("delta", "all", "none")
 UNBOUNDED = 0xFFFFFFFF
 
 
@@ -55,7 +54,7 @@ def _make_class() -> type:
                 raise PathreplayError(f"pathreplay: rr_depth = {rr_depth}: use a depth >= 1")
             super().__init__(props)
             self.hide_emitters = props.get("hide_emitters", False)
-            self.attach = _choice(props, "attach", "none", ATTACH)
+            self.attach = _choice(props, "attach", "delta", ATTACH)
             driver = _choice(props, "driver", "auto", DRIVERS)
             if driver == "sweep" and self.max_depth > MAX_DEPTH:
                 depth = "-1 (unbounded)" if max_depth == -1 else max_depth
@@ -78,10 +77,9 @@ def _make_class() -> type:
             **_: Any,
         ) -> tuple[Any, Any, list[Any], Any]:
             """Radiance, its tangent, or nothing (after back-propagating ``δL``): see Mitsuba's ADIntegrator."""
-            walk = Walk(scene, self._options(scene), self.skip_area_emitters)
-            ray = dr.detach(ray)
+            walk = self._walk(scene)
             if mode == dr.ADMode.Primal:
-                L, valid = primal(walk, sampler, ray, active)
+                L, valid = primal(walk, sampler, dr.detach(ray), active)
                 return L, valid, [], None
             if mode == dr.ADMode.Forward:
                 tangent, valid = forward(walk, sampler, ray, active)
@@ -90,13 +88,17 @@ def _make_class() -> type:
             drive(walk, sampler, ray, δL, active)
             return mi.Spectrum(0), mi.Bool(True), [], None
 
-        def _options(self, scene: Any) -> Options:
-            return Options(
+        def _walk(self, scene: Any) -> Walk:
+            bsdfs = scene_bsdfs(scene)
+            return Walk(
+                scene=scene,
                 attach=self.attach,
                 hide_emitters=self.hide_emitters,
                 max_depth=self.max_depth,
                 rr_depth=self.rr_depth,
-                lobes=delta_lobes(scene),
+                lobes=delta_lobes(bsdfs),
+                attachable=attachable_bsdfs(bsdfs) if self.attach == "all" else None,
+                skip_area_emitters=self.skip_area_emitters,
             )
 
         def to_string(self) -> str:

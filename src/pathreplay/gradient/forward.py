@@ -7,62 +7,57 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.path import Walk, first_arrival, next_arrival, sustain, survival
+from ..transport.motion import path_moves
+from ..transport.path import first_arrival, next_arrival, sustain, survival
 from ..transport.step import surface_step
-from ..transport.vertex import Numbers
+from ..transport.vertex import Numbers, Walk
+from .adjoint import RayDerivative, Replayed, forward_step, tangents
 
 
 @dr.syntax
 def forward(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
     """Tangent of the radiance along camera rays: ``(δL, valid)``, a Spectrum and a Bool per ray.
 
-    The parameters must carry their tangents already (propagate to them before the call). Nothing is divided, so a
-    weight that is exactly zero keeps its derivative: δβ_{i+1} = δβ_i w_i + β_i δw_i.
-    Visibility and, with ``attach='none'``, all motion are not differentiated.
+    The parameters must carry their tangents already (propagate to them before the call); ``ray`` may be attached to
+    the camera. Nothing is divided, so a weight that is exactly zero keeps its derivative:
+    δβ_{i+1} = δβ_i w_i + β_i δw_i. Visibility is not differentiated and, with ``attach='none'``, nothing that moves.
     """
-    scene, options = walk.scene, walk.options
+    with dr.resume_grad():
+        δo, δd = tangents(ray.o, ray.d)
+    δ = RayDerivative(mi.Point3f(δo), mi.Vector3f(δd), mi.Float(0))  # tangent of the arrival
+
     δL = mi.Spectrum(0)  # tangent of the radiance
     β = mi.Spectrum(1)  # throughput
     δβ = mi.Spectrum(0)  # its tangent
     β_alive = mi.Spectrum(1)  # throughput with one zero weight left out: what keeps the path going
     η = mi.Float(1)  # relative index of refraction since the camera
     depth = mi.UInt32(0)  # index of the vertex
-    active = mi.Bool(active) & (options.max_depth > 0)
-    valid = mi.Bool(walk.environment_is_opaque) & active
+    active = mi.Bool(active) & (walk.max_depth > 0)
+    valid = mi.Bool(walk.background_is_opaque) & active
     at = first_arrival(walk, ray, active)
+    attached = path_moves(walk, at)
+    at.ray = dr.detach(at.ray)
 
-    while dr.hint(active, max_iterations=options.max_depth, exclude=[walk, scene, options], label="pathreplay: forward"):
+    while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk, attached], label="pathreplay: forward"):
         u = Numbers.draw(sampler)
-        go_on = depth + 1 < options.max_depth
-        step = surface_step(scene, at, u, go_on, options, active)
+        step = surface_step(walk, at, u, depth + 1 < walk.max_depth, active)
 
-        with dr.resume_grad():
-            held = surface_step(scene, at, u, go_on, options, active, step.kept)
-            δe, δw = tangents(held.e, held.w)
-
-        δL += δβ * dr.detach(held.e) + β * δe
-        δβ = δβ * dr.detach(held.w) + β * δw
         β_alive = sustain(β_alive, β, step)
-        β *= dr.detach(held.w)
-        η *= step.eta
-        valid |= active & step.surface & ~step.null
+        η *= step.kept.eta
+        valid |= active & step.surface & ~step.kept.null
+        rr_weight, survives = survival(β_alive, η, depth, u.roulette, walk)
+        go_on = step.active & survives & (dr.max(β_alive) != 0)
+        at_next = next_arrival(walk, step, go_on)
 
-        rr_weight, survives = survival(β_alive, η, depth, u.roulette, options)
-        active = step.active & survives & (dr.max(β_alive) != 0)
-        β *= rr_weight
-        δβ *= rr_weight
+        replayed = Replayed(at, u, step.kept, go_on, at_next.hit, rr_weight)
+        step, δe, δw, δ = forward_step(walk, replayed, attached, δ, active)
+        δL += δβ * dr.detach(step.e) + β * δe
+        δβ = (δβ * dr.detach(step.w) + β * δw) * rr_weight
+        β *= dr.detach(step.w) * rr_weight
         β_alive *= rr_weight
 
-        at = next_arrival(scene, step, active)
+        active = go_on
+        at = at_next
         depth += 1
 
     return δL, valid
-
-
-def tangents(*values: Any) -> list[Any]:
-    """Forward-propagate from the parameters to all values at once; zero for those that no parameter reaches."""
-    attached = [value for value in values if dr.grad_enabled(value)]
-    if not attached:
-        return [dr.zeros(type(value)) for value in values]
-    dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
-    return [dr.grad(value) for value in values]

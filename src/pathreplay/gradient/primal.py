@@ -7,9 +7,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.path import Walk, first_arrival, next_arrival, survival
+from ..transport.path import first_arrival, next_arrival, survival
 from ..transport.step import surface_step
-from ..transport.vertex import Numbers
+from ..transport.vertex import Numbers, Walk
 
 
 @dr.syntax
@@ -18,29 +18,28 @@ def primal(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
 
     ``valid`` is Mitsuba's alpha: the path met a surface that does not merely let it pass. Nothing is differentiated.
     """
-    scene, options = walk.scene, walk.options
     L = mi.Spectrum(0)  # radiance so far
     β = mi.Spectrum(1)  # throughput
     η = mi.Float(1)  # relative index of refraction since the camera
     depth = mi.UInt32(0)  # index of the vertex
-    active = mi.Bool(active) & (options.max_depth > 0)
-    valid = mi.Bool(walk.environment_is_opaque) & active
+    active = mi.Bool(active) & (walk.max_depth > 0)
+    valid = mi.Bool(walk.background_is_opaque) & active
     at = first_arrival(walk, ray, active)
 
-    while dr.hint(active, max_iterations=options.max_depth, exclude=[walk, scene, options], label="pathreplay: primal"):
+    while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk], label="pathreplay: primal"):
         u = Numbers.draw(sampler)
-        step = surface_step(scene, at, u, depth + 1 < options.max_depth, options, active)
+        step = surface_step(walk, at, u, depth + 1 < walk.max_depth, active)
 
         L += β * step.e
         β *= step.w
-        η *= step.eta
-        valid |= active & step.surface & ~step.null
+        η *= step.kept.eta
+        valid |= active & step.surface & ~step.kept.null
 
-        rr_weight, survives = survival(β, η, depth, u.roulette, options)
+        rr_weight, survives = survival(β, η, depth, u.roulette, walk)
         active = step.active & survives & (dr.max(β) != 0)
         β *= rr_weight
 
-        at = next_arrival(scene, step, active)
+        at = next_arrival(walk, step, active)
         depth += 1
 
     return L, valid

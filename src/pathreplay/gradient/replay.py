@@ -11,11 +11,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.path import Walk, first_arrival, next_arrival, survival
+from ..transport.path import first_arrival, next_arrival, survival
 from ..transport.step import surface_step
-from ..transport.vertex import Numbers, reciprocal
+from ..transport.vertex import Numbers, Walk, reciprocal
+from .adjoint import backward
 from .primal import primal
-from .sweep import backward
+
 
 
 @dr.syntax
@@ -26,31 +27,30 @@ def replay(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
     derivative of w_i. So where w_i is exactly zero its derivative is lost (the sweep driver keeps it); visibility and
     all motion are not differentiated.
     """
-    scene, options = walk.scene, walk.options
     L, _ = primal(walk, sampler.clone(), ray, active)  # β_i L_i, peeled on the way
 
     β = mi.Spectrum(1)  # throughput
     η = mi.Float(1)  # relative index of refraction since the camera
     depth = mi.UInt32(0)  # index of the vertex
-    active = mi.Bool(active) & (options.max_depth > 0)
+    active = mi.Bool(active) & (walk.max_depth > 0)
     at = first_arrival(walk, ray, active)
 
-    while dr.hint(active, max_iterations=options.max_depth, exclude=[walk, scene, options], label="pathreplay: replay"):
+    while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk], label="pathreplay: replay"):
         u = Numbers.draw(sampler)
-        go_on = depth + 1 < options.max_depth
-        step = surface_step(scene, at, u, go_on, options, active)
+        go_on = depth + 1 < walk.max_depth
+        step = surface_step(walk, at, u, go_on, active)
         L -= β * step.e
 
         with dr.resume_grad():
-            held = surface_step(scene, at, u, go_on, options, active, step.kept)
+            held = surface_step(walk, at, u, go_on, active, step.kept)
             Lo = β * held.e + L * held.w * dr.detach(reciprocal(held.w))
-            backward(δL * Lo)
+            backward(dr.sum(δL * Lo))
 
         β *= step.w
-        η *= step.eta
-        rr_weight, survives = survival(β, η, depth, u.roulette, options)
+        η *= step.kept.eta
+        rr_weight, survives = survival(β, η, depth, u.roulette, walk)
         active = step.active & survives & (dr.max(β) != 0)
         β *= rr_weight
 
-        at = next_arrival(scene, step, active)
+        at = next_arrival(walk, step, active)
         depth += 1

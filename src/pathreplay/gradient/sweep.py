@@ -14,9 +14,11 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..transport.path import Walk, first_arrival, next_arrival, sustain, survival
+from ..transport.motion import path_moves
+from ..transport.path import first_arrival, next_arrival, sustain, survival
 from ..transport.step import surface_step
-from ..transport.vertex import Arrival, Kept, Numbers, Options, Step
+from ..transport.vertex import Arrival, Kept, Numbers, Step, Walk
+from .adjoint import RayDerivative, Replayed, backward, backward_step
 
 # Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x about 100 bytes are 3.3 MB, and a
 # thread's stack is 8 MB. Beyond the stack the process would die without a word.
@@ -28,7 +30,7 @@ LOBE_SHIFT = 8
 
 
 @cache
-def _record_type(variant: str, with_lobes: bool) -> type:
+def _record_type(variant: str, resamples: bool) -> type:
     fields = {
         "o": mi.Point3f,  # ray
         "d": mi.Vector3f,
@@ -44,13 +46,12 @@ def _record_type(variant: str, with_lobes: bool) -> type:
         "light": mi.Point2f,  # random numbers
         "flags": mi.UInt32,
     }
-    if with_lobes:
+    if resamples:
         fields |= {"lobe": mi.Float, "direction": mi.Point2f}
     return make_dataclass("Record", list(fields.items()))
 
 
-def _write(at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: Any, options: Options) -> Any:
-    with_lobes = options.lobes > 0
+def _write(at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: Any, walk: Walk) -> Any:
     flags = dr.select(at.hit.valid, mi.UInt32(HIT), 0)
     flags |= dr.select(at.delta, mi.UInt32(DELTA), 0)
     flags |= dr.select(step.kept.lit, mi.UInt32(LIT), 0)
@@ -70,9 +71,9 @@ def _write(at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: Any, options
         "light": u.light,
         "flags": flags,
     }
-    if with_lobes:
+    if walk.resamples:
         fields |= {"lobe": u.lobe, "direction": u.direction}
-    return _record_type(mi.variant(), with_lobes)(**fields)
+    return _record_type(mi.variant(), walk.resamples)(**fields)
 
 
 def _read_arrival(record: Any, ray0: Any, camera: Any) -> Arrival:
@@ -88,92 +89,87 @@ def _read_arrival(record: Any, ray0: Any, camera: Any) -> Arrival:
     return Arrival(ray=ray, hit=hit, pdf=record.pdf, delta=(record.flags & DELTA) != 0, camera=camera)
 
 
-def _read_numbers(record: Any, with_lobes: bool) -> Numbers:
-    lobe = record.lobe if with_lobes else mi.Float(0)
-    direction = record.direction if with_lobes else mi.Point2f(0)
+def _read_numbers(record: Any, walk: Walk) -> Numbers:
+    lobe = record.lobe if walk.resamples else mi.Float(0)
+    direction = record.direction if walk.resamples else mi.Point2f(0)
     return Numbers(light=record.light, lobe=lobe, direction=direction, roulette=mi.Float(0))
+
+
+def _read_continuation(record: Any, onward: Arrival) -> Kept:
+    return Kept(
+        d=onward.ray.d,
+        pdf=onward.pdf,
+        delta=onward.delta,
+        lobe=record.flags >> LOBE_SHIFT,
+        lit=(record.flags & LIT) != 0,
+    )
 
 
 @dr.syntax
 def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> Any:
     """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters; returns L (Spectrum per ray).
 
-    Not differentiated: visibility and, with ``attach='none'``, all motion. A weight that is exactly zero keeps its
-    derivative. Raises PathreplayError when ``max_depth`` is above `MAX_DEPTH`.
+    ``ray`` may be attached to the camera. A weight that is exactly zero keeps its derivative. Not differentiated:
+    visibility and, with ``attach='none'``, everything that moves.
+    Raises PathreplayError when ``max_depth`` is above `MAX_DEPTH`, or when no parameter reaches the paths.
     """
-    scene, options = walk.scene, walk.options
-    with_lobes = options.lobes > 0
-    if dr.hint(options.max_depth > MAX_DEPTH, mode="scalar"):
+    if dr.hint(walk.max_depth > MAX_DEPTH, mode="scalar"):
         raise PathreplayError(
-            f"max_depth = {options.max_depth} is more than the sweep driver can hold ({MAX_DEPTH}): "
+            f"max_depth = {walk.max_depth} is more than the sweep driver can hold ({MAX_DEPTH}): "
             "use driver = 'replay', which has no limit"
         )
 
     # ------------------ First pass: record the path -----------------
 
-    tape = dr.alloc_local(_record_type(mi.variant(), with_lobes), max(options.max_depth, 1))
+    tape = dr.alloc_local(_record_type(mi.variant(), walk.resamples), max(walk.max_depth, 1))
     β = mi.Spectrum(1)  # throughput
     β_alive = mi.Spectrum(1)  # throughput with one zero weight left out: what keeps the path going
     η = mi.Float(1)  # relative index of refraction since the camera
     depth = mi.UInt32(0)  # index of the vertex
-    active = mi.Bool(active) & (options.max_depth > 0)
+    active = mi.Bool(active) & (walk.max_depth > 0)
     at = first_arrival(walk, ray, active)
+    attached = path_moves(walk, at)
+    at.ray = dr.detach(at.ray)
+    camera_ray = dr.detach(ray)
 
-    while dr.hint(active, max_iterations=options.max_depth, exclude=[walk, scene, options], label="pathreplay: record"):
+    while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk], label="pathreplay: record"):
         u = Numbers.draw(sampler)
-        step = surface_step(scene, at, u, depth + 1 < options.max_depth, options, active)
+        step = surface_step(walk, at, u, depth + 1 < walk.max_depth, active)
 
-        β_next = β * step.w
         β_alive = sustain(β_alive, β, step)
-        η *= step.eta
-        rr_weight, survives = survival(β_alive, η, depth, u.roulette, options)
-        tape[depth] = _write(at, u, step, β, rr_weight, options)
+        η *= step.kept.eta
+        rr_weight, survives = survival(β_alive, η, depth, u.roulette, walk)
+        tape[depth] = _write(at, u, step, β, rr_weight, walk)
 
         active = step.active & survives & (dr.max(β_alive) != 0)
-        β = β_next * rr_weight
+        β *= step.w * rr_weight
         β_alive *= rr_weight
-        at = next_arrival(scene, step, active)
+        at = next_arrival(walk, step, active)
         depth += 1
 
     # ------------ Second pass: from the last vertex back ------------
 
-    last = mi.UInt32(depth)  # number of vertices
+    last = depth - 1  # index of the last vertex
     L = mi.Spectrum(0)  # radiance along the ray that leaves the vertex
-    d_next = mi.Vector3f(0, 0, 1)  # that ray, as vertex i + 1 recorded it
-    pdf_next = mi.Float(0)
-    delta_next = mi.Bool(False)
+    q = RayDerivative.zero()  # adjoint of that ray
 
-    while dr.hint(depth > 0, exclude=[walk, scene, options], label="pathreplay: sweep"):
-        has_next = depth < last
+    while dr.hint(depth > 0, exclude=[walk, ray, camera_ray], label="pathreplay: sweep"):
         depth -= 1
         record = tape[depth]
-        at = _read_arrival(record, ray, depth == 0)
-        kept = Kept(
-            d=d_next,
-            pdf=pdf_next,
-            delta=delta_next,
-            lobe=record.flags >> LOBE_SHIFT,
-            lit=(record.flags & LIT) != 0,
+        onward = _read_arrival(tape[dr.minimum(depth + 1, last)], camera_ray, mi.Bool(False))
+        replayed = Replayed(
+            at=_read_arrival(record, camera_ray, depth == 0),
+            u=_read_numbers(record, walk),
+            kept=_read_continuation(record, onward),
+            go_on=depth < last,
+            hit_next=onward.hit,
+            rr_weight=record.rr_weight,
         )
-        with dr.resume_grad():
-            step = surface_step(scene, at, _read_numbers(record, with_lobes), has_next, options, mi.Bool(True), kept)
-            Lo = step.e + step.w * record.rr_weight * L
-            backward(δL * record.β * Lo)
+        L, q = backward_step(walk, replayed, attached, δL * record.β, L, q, mi.Bool(True))
 
-        L = dr.detach(Lo)
-        d_next, pdf_next, delta_next = at.ray.d, at.pdf, at.delta
+    # ----------------------- Back to the camera ----------------------
 
+    with dr.resume_grad():
+        if dr.hint(attached and dr.grad_enabled(ray.o, ray.d), mode="scalar"):
+            backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
     return L
-
-
-def backward(contribution: Any) -> None:
-    """Back-propagate from a contribution to the image.
-
-    Raises PathreplayError when no parameter with gradients reaches it: the gradient would silently be zero.
-    """
-    if not dr.grad_enabled(contribution):
-        raise PathreplayError(
-            "no parameter with gradients reaches the light paths: with attach = 'none' only materials, textures and "
-            "lights are differentiated, and some values have no derivative at all (see mi.traverse(scene))"
-        )
-    dr.backward_from(contribution)

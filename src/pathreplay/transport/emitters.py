@@ -10,13 +10,14 @@ import mitsuba as mi
 from .vertex import Arrival, mis_weight, reciprocal
 
 
-def emission(scene: Any, at: Arrival, si: Any, active: Any) -> Any:
+def emission(scene: Any, at: Arrival, si: Any, attached: bool, active: Any) -> Any:
     """Radiance emitted towards the ray's origin by what the ray hit (the environment on a miss), MIS weighted.
 
-    Returns a Spectrum, differentiable in the emitter's radiance. The MIS weight is not differentiated: where the
-    path is held fixed, it is a weighting that sums to one whatever the parameters do.
+    Returns a Spectrum, differentiable in the emitter's radiance and, if ``attached``, in the ray, the hit point and
+    the density ``at.pdf``. A path that is held fixed needs no derivative of its MIS weights: they sum to one whatever
+    the parameters do.
     """
-    with dr.suspend_grad():
+    with dr.suspend_grad(when=not attached):
         origin = dr.zeros(mi.Interaction3f)
         origin.p, origin.time, origin.wavelengths = at.ray.o, at.ray.time, at.ray.wavelengths
         ds = mi.DirectionSample3f(scene, si=si, ref=origin)
@@ -24,15 +25,25 @@ def emission(scene: Any, at: Arrival, si: Any, active: Any) -> Any:
     return mis * ds.emitter.eval(si, active)
 
 
-def draw_emitter(scene: Any, si: Any, u: Any, shadow_ray: bool, active: Any) -> tuple[Any, Any]:
-    """Sample a direction towards an emitter: the DirectionSample3f and Le/p (Spectrum).
+def draw_emitter(scene: Any, si: Any, u: Any, active: Any) -> tuple[Any, Any]:
+    """Sample a direction towards an emitter, and look whether it is lit: the DirectionSample3f and Le/p (Spectrum).
 
-    With ``shadow_ray``, an occluded sample comes back with density and weight zero.
+    An occluded sample comes back with density and weight zero. Nothing is differentiated.
     """
     with dr.suspend_grad():
-        return scene.sample_emitter_direction(si, u, shadow_ray, active)
+        return scene.sample_emitter_direction(si, u, True, active)
 
 
-def emitted_towards(scene: Any, si: Any, ds: Any, active: Any) -> Any:
-    """Le/p of an emitter sample that is held fixed: a Spectrum, differentiable in the emitter's radiance."""
-    return scene.eval_emitter_direction(si, ds, active) * dr.detach(reciprocal(ds.pdf))
+def redraw_emitter(scene: Any, si: Any, u: Any, light: Any, attached: bool, lit: Any) -> tuple[Any, Any]:
+    """The emitter sample of a first walk once more, differentiable: the DirectionSample3f and Le/p (Spectrum).
+
+    ``light`` is the sample itself, if it is still at hand, else None. If ``attached``, the point on the emitter stays
+    the same in the emitter's own coordinates, so that it moves with the emitter, and everything follows; else it is
+    fixed in space and only the emitted radiance is differentiated. Visibility never is.
+    """
+    if attached:
+        return scene.sample_emitter_direction(si, u, False, lit)
+    if light is None:
+        with dr.suspend_grad():
+            light, _ = scene.sample_emitter_direction(si, u, False, lit)
+    return light, scene.eval_emitter_direction(si, light, lit) * dr.detach(reciprocal(light.pdf))

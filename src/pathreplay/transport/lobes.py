@@ -1,4 +1,9 @@
-"""The weight of a continuation that is held fixed, and its derivative: smooth lobes by f/p, delta lobes by component."""
+"""Scattering that follows a choice already made: the weight of the continuation, its direction, and their derivatives.
+
+A smooth lobe is differentiated as f/p at a held place: either the point where the continuation hit the next surface,
+which moves with that surface, or, where nothing was hit, the direction. A delta lobe is differentiated through its
+direction. With ``attach='all'`` so are the smooth lobes of BSDFs for which that is right.
+"""
 
 from __future__ import annotations
 
@@ -7,38 +12,81 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .vertex import Kept, Numbers, Options, reciprocal
+from .vertex import Kept, Numbers, Walk, reciprocal
 
-# Share by which the weight of a lobe sampled alone may differ from the weight that was drawn and still be the same
-# lobe: float32 rounding is far below it, BSDFs that do not support restricted sampling (`mask`) are far above.
+# Share by which the weight of a lobe sampled alone may differ from the weight that was drawn and still belong to the
+# same lobe: float32 rounding is far below it, BSDFs without support for restricted sampling (`mask`) far above.
 SAME_LOBE = 1e-3
 
 
-def held_weight(bsdf: Any, ctx: Any, si: Any, u: Numbers, kept: Kept, options: Options, active: Any) -> Any:
-    """Weight w of the kept continuation, differentiable in the BSDF.
+def scatter(
+    walk: Walk, bsdf: Any, si: Any, u: Numbers, kept: Kept, attached: bool, hit_next: Any, active: Any
+) -> tuple[Any, Any, Any]:
+    """Weight w (Spectrum), world direction and density (Float) of the kept continuation, differentiably.
 
-    Smooth lobes: w = f(wo)/p with the density p held fixed (the direction is held fixed, so its density is a
-    constant). Delta lobes: see `delta_weight`. Returns a Spectrum.
+    Not differentiated: the choice among lobes and, unless ``attached``, direction and density.
     """
+    ctx = mi.BSDFContext()
     smooth = active & ~kept.delta
-    f = bsdf.eval(ctx, si, si.to_local(kept.d), smooth)
-    w = f * dr.detach(reciprocal(kept.pdf))
-    if options.lobes == 0:
-        return w
-    delta = active & kept.delta
-    return dr.select(delta, delta_weight(bsdf, ctx, si, u, kept, options, delta), w)
+    d, J = kept.d, mi.Float(1)
+    if attached:
+        d, J = held_at_hit(si, kept.d, hit_next, smooth)
+
+    if walk.resamples:
+        sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
+        if attached:
+            follows = active & kept.delta
+            if walk.attach == "all":
+                free = smooth & dr.gather(mi.Bool, walk.attachable, dr.reinterpret_array(mi.UInt32, bsdf))
+                follows |= free
+            d = dr.select(follows, dr.replace_grad(kept.d, si.to_world(sample.wo)), d)
+            J = dr.select(follows, 1, J)
+
+    wo = si.to_local(d)
+    if attached:
+        f, pdf = bsdf.eval_pdf(ctx, si, wo, smooth)
+        pdf = dr.replace_grad(kept.pdf, dr.select(smooth, pdf, 0))
+    else:
+        f, pdf = bsdf.eval(ctx, si, wo, smooth), kept.pdf
+    w = f * J * dr.detach(reciprocal(kept.pdf))
+
+    if attached and walk.attach == "all":
+        w = dr.select(free, f * reciprocal(pdf), w)
+    if walk.lobes > 0:
+        delta = active & kept.delta
+        w = dr.select(delta, _delta_weight(walk, bsdf, si, u, kept, w_sample, delta), w)
+    return w, d, pdf
 
 
-def delta_weight(bsdf: Any, ctx: Any, si: Any, u: Numbers, kept: Kept, options: Options, active: Any) -> Any:
-    """Weight of a sampled delta lobe with the derivative of  (weight of the lobe alone) / (probability of its choice).
+def held_at_hit(si: Any, d: Any, hit: Any, active: Any) -> tuple[Any, Any]:
+    """Direction towards the point that a ray from ``si`` along ``d`` hit, and the density of that point's place.
+
+    The point stays where it is on its surface and moves with it. J = |(∂p/∂u x ∂p/∂v) · d| / dist² is the solid angle
+    that a piece of the surface takes up, relative to its present value: 1, with the derivative of log J. Holding the
+    point and not the direction keeps edges of emitters and seams between materials where they are in the integrand;
+    held directions would see them move, and that boundary term would be missing. Rays that left the scene hold ``d``.
+    """
+    found = active & hit.is_valid()
+    ray = dr.detach(si.spawn_ray(d))
+    y = hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, found)
+    x = si.spawn_ray(dr.detach(d)).o
+    towards = y.p - x
+    dist2 = dr.squared_norm(towards)
+    facing = dr.abs(dr.dot(dr.cross(y.dp_du, y.dp_dv), towards)) * dr.rcp(dist2 * dr.sqrt(dist2))
+    ok = found & (facing > 0)
+    J = dr.select(ok, dr.replace_grad(mi.Float(1), facing * dr.detach(reciprocal(facing))), 1)
+    return dr.select(ok, dr.replace_grad(d, towards * dr.rsqrt(dist2)), d), J
+
+
+def _delta_weight(walk: Walk, bsdf: Any, si: Any, u: Numbers, kept: Kept, w: Any, active: Any) -> Any:
+    """Weight of a sampled delta lobe, with the derivative of (weight of the lobe alone) / (probability of its choice).
 
     A BSDF that picks among lobes returns weights in which the choice has cancelled, and with it, in some plugins,
-    the derivative of Fresnel's term (``thindielectric``). So the lobe is sampled once more by itself, through
-    ``BSDFContext.component``, and divided by the probability with which it was picked. Where a plugin does not
-    support that (the two weights disagree) the plugin's own derivative stays.
+    the derivative of Fresnel's term (``thindielectric``, ``plastic``). So the lobe is sampled once more by itself,
+    through ``BSDFContext.component``, and divided by the probability with which it was picked. Where a plugin does
+    not support that (the two weights disagree) its own derivative stays.
     """
-    sample, w = bsdf.sample(ctx, si, u.lobe, u.direction, active)
-    for k in range(options.lobes):
+    for k in range(walk.lobes):
         alone = mi.BSDFContext()
         alone.component = k
         picked = active & (kept.lobe == k)

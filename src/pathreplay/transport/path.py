@@ -2,38 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from .vertex import Arrival, Options, Step, reciprocal
+from .vertex import Arrival, Step, Walk, reciprocal
 
 # Russian roulette ends at least one path in twenty, so that a path between mirrors comes to an end.
 MAX_SURVIVAL = 0.95
-
-
-@dataclass(frozen=True)
-class Walk:
-    """The scene that is walked through, and how."""
-
-    scene: Any  # mi.Scene
-    options: Options
-    skip_area_emitters: Callable[..., Any]  # Mitsuba's, an integrator's method
-
-    @property
-    def environment_is_opaque(self) -> bool:
-        """Whether a camera ray that hits nothing counts as covered in the alpha channel."""
-        return not self.options.hide_emitters and self.scene.environment() is not None
 
 
 def first_arrival(walk: Walk, ray: Any, active: Any) -> Arrival:
     """The first vertex along camera rays. With ``hide_emitters``, area emitters are passed through."""
     ray = mi.Ray3f(ray)
     hit = walk.scene.ray_intersect_preliminary(ray, coherent=True, reorder=False, active=active)
-    if walk.options.hide_emitters:
+    if walk.hide_emitters:
         passed = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, passed)
         onward = si.spawn_ray(ray.d)
@@ -43,14 +27,14 @@ def first_arrival(walk: Walk, ray: Any, active: Any) -> Arrival:
     return Arrival(ray=ray, hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
 
 
-def survival(β: Any, η: Any, depth: Any, u: Any, options: Options) -> tuple[Any, Any]:
+def survival(β: Any, η: Any, depth: Any, u: Any, walk: Walk) -> tuple[Any, Any]:
     """Russian roulette: 1 / (survival probability) (Float) and whether the path survives (Bool). Detached.
 
     The probability is min(max β · η², 0.95) from ``rr_depth`` on and one before; η² takes the compression of solid
     angle out of the radiance throughput.
     """
     probability = dr.minimum(dr.max(β) * dr.square(η), MAX_SURVIVAL)
-    plays = depth >= options.rr_depth
+    plays = depth >= walk.rr_depth
     return dr.select(plays, reciprocal(probability), 1), ~plays | (u < probability)
 
 
@@ -66,7 +50,7 @@ def sustain(β_alive: Any, β: Any, step: Step) -> Any:
     return β_alive * dr.select((w == 0) & (β != 0), stand_in, w)
 
 
-def next_arrival(scene: Any, step: Step, active: Any) -> Arrival:
+def next_arrival(walk: Walk, step: Step, active: Any) -> Arrival:
     """Follow the continuation of a step to the next vertex."""
-    hit = scene.ray_intersect_preliminary(step.ray_next, coherent=False, reorder=False, active=active)
+    hit = walk.scene.ray_intersect_preliminary(step.ray_next, coherent=False, reorder=False, active=active)
     return Arrival(ray=step.ray_next, hit=hit, pdf=step.kept.pdf, delta=step.kept.delta, camera=mi.Bool(False))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,19 +11,34 @@ import mitsuba as mi
 
 
 @dataclass(frozen=True)
-class Options:
-    """What is the same at every vertex: Python values, fixed when the kernel is traced.
+class Walk:
+    """The scene that is walked through and how: Python values, fixed when the kernel is traced.
 
-    ``attach`` says what the path follows when parameters move (``none``: nothing). ``hide_emitters`` leaves out
-    emitters that the camera sees directly. ``max_depth`` and ``rr_depth`` are Mitsuba's; an unbounded depth is
-    2^32 - 1. ``lobes`` is the number of BSDF components that may hold a delta lobe, 0 when the scene has none.
+    ``attach`` says what the path follows when parameters move: ``none`` nothing, ``delta`` directions sampled from
+    delta lobes and hit points, ``all`` directions of the BSDFs marked in ``attachable``, too. ``hide_emitters`` leaves
+    out emitters that the camera sees directly. ``max_depth`` and ``rr_depth`` are Mitsuba's; an unbounded depth is
+    2^32 - 1. ``lobes`` is one more than the largest component index at which a BSDF of the scene has a delta lobe,
+    0 when none has.
     """
 
+    scene: Any  # mi.Scene
     attach: str
     hide_emitters: bool
     max_depth: int
     rr_depth: int
     lobes: int
+    attachable: Any  # Bool by BSDF registry index: its smooth lobes may be sampled attached
+    skip_area_emitters: Callable[..., Any]  # Mitsuba's, an integrator's method
+
+    @property
+    def resamples(self) -> bool:
+        """Whether a later pass samples BSDFs once more, with the random numbers of the first walk."""
+        return self.lobes > 0 or self.attach == "all"
+
+    @property
+    def background_is_opaque(self) -> bool:
+        """Whether a camera ray that hits nothing counts as covered in the alpha channel."""
+        return not self.hide_emitters and self.scene.environment() is not None
 
 
 @dataclass
@@ -60,7 +76,10 @@ class Kept:
     delta: Any  # Bool: a delta lobe was sampled
     lobe: Any  # UInt32: the BSDF component that was sampled
     lit: Any  # Bool: an emitter sample was taken, and nothing is in its way
-    light: Any = None  # DirectionSample3f of that sample, where it need not be drawn again
+    # Only the first walk needs these; they are None in a record that is read back.
+    light: Any = None  # DirectionSample3f of the emitter sample
+    null: Any = None  # Bool: the lobe passes straight through
+    eta: Any = None  # Float: relative index of refraction that it crosses
 
 
 @dataclass
@@ -70,10 +89,9 @@ class Step:
     e: Any  # Spectrum: emission (MIS weighted) + next-event estimate
     w: Any  # Spectrum: f/p or lobe weight, before Russian roulette
     ray_next: Any  # Ray3f
+    pdf: Any  # Float: density of the continuation, for the next vertex
     kept: Kept
-    eta: Any  # Float: relative index of refraction that the continuation crosses
     surface: Any  # Bool: the ray hit something
-    null: Any  # Bool: the sampled lobe passes straight through
     active: Any  # Bool: there is a continuation
 
 

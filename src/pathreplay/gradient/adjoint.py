@@ -1,0 +1,111 @@
+"""Reverse and forward differentiation of a single step: the only places where a driver calls automatic differentiation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import PathreplayError
+from ..transport.step import surface_step
+from ..transport.vertex import Arrival, Kept, Numbers, Step, Walk
+
+
+@dataclass
+class RayDerivative:
+    """Derivative of an arrival: the adjoint q in reverse mode, the tangent in forward mode."""
+
+    o: Any  # Point3f
+    d: Any  # Vector3f
+    pdf: Any  # Float
+
+    @staticmethod
+    def zero() -> RayDerivative:
+        return RayDerivative(mi.Point3f(0), mi.Vector3f(0), mi.Float(0))
+
+
+@dataclass
+class Replayed:
+    """What a later pass knows about a vertex and its continuation."""
+
+    at: Arrival
+    u: Numbers
+    kept: Kept
+    go_on: Any  # Bool: there is a next vertex
+    hit_next: Any  # PreliminaryIntersection3f of the next vertex
+    rr_weight: Any  # Float: 1 / survival probability
+
+
+def _attached_arrival(at: Arrival) -> Arrival:
+    """A copy of an arrival whose ray and density are AD variables of their own."""
+    ray = mi.Ray3f(at.ray)
+    ray.o, ray.d, pdf = mi.Point3f(dr.detach(ray.o)), mi.Vector3f(dr.detach(ray.d)), mi.Float(dr.detach(at.pdf))
+    dr.enable_grad(ray.o, ray.d, pdf)
+    return Arrival(ray=ray, hit=at.hit, pdf=pdf, delta=at.delta, camera=at.camera)
+
+
+def _step(walk: Walk, v: Replayed, at: Arrival, attached: bool, active: Any) -> Step:
+    return surface_step(walk, at, v.u, v.go_on, active, v.kept, attached, v.hit_next)
+
+
+def backward_step(
+    walk: Walk, v: Replayed, attached: bool, adjoint: Any, L: Any, q: RayDerivative, active: Any
+) -> tuple[Any, RayDerivative]:
+    """Back-propagate  adjoint·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters, and give L_i and q_i.
+
+    ``adjoint`` is δL β_i, ``L`` is L_{i+1} (Spectrum). Where not ``attached``, q stays zero and costs nothing.
+    """
+    with dr.resume_grad():
+        at = _attached_arrival(v.at) if attached else v.at
+        step = _step(walk, v, at, attached, active)
+        Li = step.e + step.w * (v.rr_weight * L)
+        target = dr.sum(adjoint * Li)
+        if attached:
+            along = dr.dot(q.o, step.ray_next.o) + dr.dot(q.d, step.ray_next.d) + q.pdf * step.pdf
+            target += dr.select(v.go_on, along, 0)
+        backward(target)
+        if attached:
+            q = RayDerivative(dr.grad(at.ray.o), dr.grad(at.ray.d), dr.grad(at.pdf))
+    return dr.detach(Li), q
+
+
+def forward_step(
+    walk: Walk, v: Replayed, attached: bool, tangent: RayDerivative, active: Any
+) -> tuple[Step, Any, Any, RayDerivative]:
+    """The step, the tangents of e_i and w_i (Spectrum), and that of the next arrival."""
+    with dr.resume_grad():
+        at = v.at
+        if attached:
+            at = _attached_arrival(at)
+            dr.set_grad(at.ray.o, tangent.o)
+            dr.set_grad(at.ray.d, tangent.d)
+            dr.set_grad(at.pdf, tangent.pdf)
+        step = _step(walk, v, at, attached, active)
+        δe, δw, δo, δd, δpdf = tangents(step.e, step.w, step.ray_next.o, step.ray_next.d, step.pdf)
+    return step, δe, δw, RayDerivative(δo, δd, δpdf)
+
+
+def tangents(*values: Any) -> list[Any]:
+    """Forward-propagate from the parameters to all values at once; zero for those that no parameter reaches."""
+    attached = [value for value in values if dr.grad_enabled(value)]
+    if not attached:
+        return [dr.zeros(type(value)) for value in values]
+    # Interior gradients must survive: some of the values are computed from others.
+    dr.forward_to(*attached, flags=dr.ADFlag.ClearEdges)
+    return [dr.grad(value) for value in values]
+
+
+def backward(target: Any) -> None:
+    """Back-propagate from a scalar per path.
+
+    Raises PathreplayError when no parameter with gradients reaches it: the gradient would silently be zero.
+    """
+    if not dr.grad_enabled(target):
+        raise PathreplayError(
+            "no parameter with gradients reaches the light paths: check that the key is differentiable "
+            "(mi.traverse(scene)), that params.update() was called after dr.enable_grad, and that attach is not "
+            "'none' if it moves something"
+        )
+    dr.backward_from(target)
