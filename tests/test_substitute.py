@@ -13,6 +13,7 @@ SMOOTH = {"dielectric": "smoothdielectric"}
 SCENE = """<scene version="3.0.0">
     <default name="index" value="1.3"/>
     <include filename="materials.xml"/>
+    <integrator type="path" id="path"/>
     <sensor type="perspective" id="eye">
         <transform name="to_world"><lookat origin="0,0,6" target="0,0,0" up="0,1,0"/></transform>
         <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film>
