@@ -68,7 +68,7 @@ class View:
         """The weights w / n as a tensor like the image, and the scale Σ |w_k I_k| / n of the objective."""
         image = self.render(plain, seed, spp)
         if loss is None:
-            w = _smooth_weights(image.shape, _has_alpha(self.sensor))
+            w = smooth_weights(image.shape, _has_alpha(self.sensor))
         else:
             dr.enable_grad(image)
             value = loss(image)
@@ -117,7 +117,7 @@ def _has_alpha(sensor: Any) -> bool:
     return bool(mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha))
 
 
-def _smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
+def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
     """w / n with w = 1 + cos(2π (0.7 x + 0.4 y + c/3)) / 2 for pixel (x, y) in [0, 1]² and channel c.
 
     Positive and smooth, since random signs would cost resolution as in a direction; a wave across the image

@@ -54,8 +54,10 @@ def integrator_under_test(spec: Any, scene: Any, max_depth: int | None = None) -
     name, or chosen by None, gets the path limits of the scene's own integrator; ``max_depth`` overrides them.
 
     Raises:
-        PathreplayError: Mitsuba cannot make it, or ``max_depth`` is given along with a finished integrator.
+        PathreplayError: Mitsuba cannot make it, or ``max_depth`` makes no sense or is given along with a finished one.
     """
+    if max_depth is not None and max_depth < 1 and max_depth != -1:
+        raise PathreplayError(f"max_depth is {max_depth}; give a path length of at least 1, or -1 for no bound")
     own = scene.integrator()
     if spec is None and max_depth is None and isinstance(own, mi.CppADIntegrator):
         return own
@@ -112,7 +114,9 @@ def _load(description: dict[str, Any]) -> Any:
     try:
         integrator = mi.load_dict(description)
     except Exception as error:  # Mitsuba raises RuntimeError, plugins in Python whatever they like
-        raise PathreplayError(f"Integrator '{description.get('type')}' cannot be made: {one_line(error)}") from error
+        # Mitsuba writes the whole traceback of a Python plugin into its message; its last line says what is wrong.
+        told = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else one_line(error)
+        raise PathreplayError(f"Integrator '{description.get('type')}' cannot be made: {told}") from error
     if not isinstance(integrator, mi.Integrator):
         raise PathreplayError(f"'{description.get('type')}' is no integrator but a {type(integrator).__name__}")
     return integrator

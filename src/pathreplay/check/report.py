@@ -12,6 +12,7 @@ from typing import Any
 
 import mitsuba as mi
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
@@ -32,9 +33,10 @@ def check_all(scene: Any, patterns: Sequence[str], **options: Any) -> list[Gradi
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     results = []
     # Standard error, and gone when done: what is printed or piped is the result alone.
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         for i, key in enumerate(keys):
-            task = bar.add_task(Text(f"{key} ({i + 1}/{len(keys)})").plain, total=None)
+            task = bar.add_task(escape(f"{key} ({i + 1}/{len(keys)})"), total=None)
 
             def progress(done: int, total: int, task: Any = task) -> None:
                 bar.update(task, completed=done, total=total)

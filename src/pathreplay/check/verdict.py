@@ -68,11 +68,12 @@ def judge(
     *passes*; if not, it passes as *zero* where both means are within 4 σ of zero and 4 σ is negligible; if not, nothing
     was resolved and it is *inconclusive*.
     """
-    reference = (4 * half_step - full_step) / 3
-    g, g_se = _mean(gradient)
-    r, r_se = _mean(reference)
-    # D(h/2) is off by a third of what halving changed; that it is a bound for the better combination makes it safe.
-    change, change_se = _mean((half_step - full_step) / 3)
+    with np.errstate(invalid="ignore"):  # infinite samples are looked for below
+        reference = (4 * half_step - full_step) / 3
+        # D(h/2) is off by a third of what halving changed; that it bounds the better combination keeps us safe.
+        change, change_se = _mean((half_step - full_step) / 3)
+        g, g_se = _mean(gradient)
+        r, r_se = _mean(reference)
     truncation = math.sqrt(max(0.0, change**2 - change_se**2))
     scale = max(abs(g), abs(r))
     known = Judgement(g, g_se, r, r_se, math.hypot(truncation, rounding), math.nan, math.inf, "inconclusive", "")
@@ -89,7 +90,7 @@ def judge(
     if abs(z) >= Z_LIMIT:
         verdict, reason = "fail", _disagreement(g, r)
     elif resolution <= RESOLUTION:
-        verdict, reason = "pass", f"agrees; an error above {Z_LIMIT * resolution:.1%} would have shown"
+        verdict, reason = "pass", f"agrees; an error above {100 * Z_LIMIT * resolution:.2g} % would have shown"
     elif scale <= Z_LIMIT * σ <= negligible or scale == σ == 0:
         verdict, reason = "zero", f"both are zero to within {Z_LIMIT * σ:.1g}, which is nothing against the image"
     else:
@@ -100,8 +101,7 @@ def judge(
 def _mean(samples: np.ndarray) -> tuple[float, float]:
     """Mean and its standard error."""
     samples = np.asarray(samples, np.float64)
-    with np.errstate(invalid="ignore"):  # infinite samples: the caller looks for them and says so
-        return float(samples.mean()), float(samples.std(ddof=1) / math.sqrt(samples.size))
+    return float(samples.mean()), float(samples.std(ddof=1) / math.sqrt(samples.size))
 
 
 def _deviate(difference: float, σ: float, *parts: tuple[float, int]) -> float:
@@ -129,7 +129,8 @@ def _unresolved(resolution: float, step_error: float, σ: float) -> str:
         return "the finite differences depend on the step; change --step"
     if not math.isfinite(resolution):
         return "nothing was resolved; use more --spp or --seeds"
-    factor = (resolution / RESOLUTION) ** 2
+    # Twice what the noise asks for: both the noise and the size of the gradient are themselves uncertain.
+    factor = 2 * (resolution / RESOLUTION) ** 2
     if factor > 1000:
         return "the noise hides everything; use another direction or objective, or very many more samples"
-    return f"the noise hides it; use about {max(2, math.ceil(factor))} times the --seeds or --spp"
+    return f"the noise hides it; use about {math.ceil(factor)} times the --seeds or --spp"
