@@ -121,6 +121,10 @@ def _unknown(spec: str, path: Path) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """A Mitsuba or Dr.Jit error as one readable line, without its C++ source position."""
-    text = " ".join(str(error).split())
-    return re.sub(r"\[[A-Za-z_]+\.cpp:\d+\] ", "", text)
+    """A Mitsuba or Dr.Jit error as one readable line: without C++ source positions, without a plugin's traceback."""
+    text = str(error)
+    if "PathreplayError: " in text:  # raised by a plugin of ours: it already is what the user should read
+        return " ".join(text.rsplit("PathreplayError: ", 1)[1].split())
+    text = re.sub(r"Traceback \(most recent call last\):\n(?:[ ]+.*\n)*", "", text)
+    text = re.sub(r"\[[A-Za-z_]+\.cpp:\d+\] ", "", text)
+    return " ".join(re.sub(r'(At|While loading) dictionary node "root": ', "", text).split())

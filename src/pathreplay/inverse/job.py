@@ -17,7 +17,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes, read_image
-from pathreplay.inverse.loop import ctrl_c_stops, iterate, make_adam, render_views
+from pathreplay.inverse.loop import ctrl_c_stops, iterate, make_adam, put_values, render_views
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
 from pathreplay.inverse.report import Outcome, Recovered, ViewPictures, report_files
@@ -45,7 +45,8 @@ class RunResult:
         """A few lines for the terminal: loss, errors, where the report is, how to go on."""
         lines = []
         if self.history:
-            lines.append(f"loss {self.history[0].loss:.4g} -> {self.history[-1].loss:.4g} in {self.iterations} iterations")
+            first, last = self.history[0].loss, self.history[-1].loss
+            lines.append(f"loss {first:.4g} -> {last:.4g} in {self.iterations} iterations")
         lines += [f"{key}: root mean square error {error:.4g}" for key, error in self.errors.items()]
         lines.append(f"report: {self.report}")
         if self.stopped:
@@ -82,13 +83,15 @@ def optimize(
         adam = make_adam(problem)
         history: list[checkpoint.Entry] = []
         if start.folder is None:
+            put_values(problem, adam)
             before = render_views(problem, start.config)
             folder = create_run_folder(start.output, start.config, start.source, start.base)
             folder.write(_first_files(problem, before, adam))
         else:
             folder = start.folder
             _, history = checkpoint.restore(folder.path / CHECKPOINT, adam)
-            if len(history) >= start.config.iterations:
+            # All iterations but no report: the disk was full at the end. Then only the end is done again.
+            if len(history) >= start.config.iterations and (folder.path / "report.html").exists():
                 raise PathreplayError(
                     f"Run {folder.path} has all its {len(history)} iterations; raise 'iterations' in its config"
                 )

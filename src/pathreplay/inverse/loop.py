@@ -64,6 +64,13 @@ def make_adam(problem: Problem) -> Adam:
     return adam
 
 
+def put_values(problem: Problem, adam: Adam) -> None:
+    """Give the scene the values that Adam holds."""
+    for variable in problem.variables:
+        problem.params[variable.key] = adam[variable.key]
+    problem.params.update()
+
+
 def iterate(
     problem: Problem,
     config: Config,
@@ -83,7 +90,7 @@ def iterate(
     """
     for i in range(len(history), config.iterations):
         begin = time.perf_counter()
-        _put(problem, adam)
+        put_values(problem, adam)
         loss = _loss(problem, config, i)
         dr.backward(loss)
         norms, dropped = _gradients(adam)
@@ -100,7 +107,7 @@ def iterate(
         after(entry)
         if stop.wanted():
             break
-    _put(problem, adam)
+    put_values(problem, adam)
 
 
 def render_views(problem: Problem, config: Config) -> dict[str, Image]:
@@ -135,12 +142,6 @@ def _loss(problem: Problem, config: Config, iteration: int) -> mi.Float:
         )
         total += problem.loss(image, mi.TensorXf(view.target)).array / len(problem.views)
     return total
-
-
-def _put(problem: Problem, adam: Adam) -> None:
-    for variable in problem.variables:
-        problem.params[variable.key] = adam[variable.key]
-    problem.params.update()
 
 
 def _gradients(adam: Adam) -> tuple[dict[str, float], int]:

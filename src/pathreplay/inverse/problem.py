@@ -96,6 +96,8 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     elif targets is None:
         targets = _target_files(config.target.images, scene, sensors, base)
 
+    if missing := set(sensors) - set(targets):
+        raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
     variables = tuple(
         Variable(key, entry.lower, entry.upper, entry.learning_rate or config.learning_rate, start[key], truth.get(key))
         for key, entry in keys.items()

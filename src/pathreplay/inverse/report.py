@@ -171,7 +171,7 @@ def summary(outcome: Outcome) -> bytes:
     """One PNG with everything side by side: a row per view (target, start, result, difference), a row per texture."""
     rows = [(v.name, v.pictures(), v.exposure) for v in outcome.views[:SUMMARY_ROWS]]
     rows += [(r.key, r.textures(), 1.0) for r in [r for r in outcome.recovered if r.textures()][:SUMMARY_ROWS]]
-    figure = Figure(figsize=(8.4, 2.25 * len(rows)), layout="constrained", dpi=100)
+    figure = Figure(figsize=(8.4, 2.25 * len(rows)), layout="constrained", dpi=90)
     grid = figure.subplots(len(rows), 4, squeeze=False)
     for line, (name, pictures, exposure) in zip(grid, rows, strict=True):
         for axes in line:

@@ -1,0 +1,179 @@
+"""Bad input to ``pathreplay optimize``: one line that names thing, value and way out; status 2; nothing written."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathreplay import backend, cli
+
+SCENE = """<scene version="3.0.0">
+  <sensor type="perspective" id="eye">
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="4"/>
+    <string name="pixel_format" value="rgb"/></film></sensor>
+  <bsdf type="diffuse" id="paint"><texture type="bitmap" name="reflectance">
+    <string name="filename" value="texture.exr"/><boolean name="raw" value="true"/></texture></bsdf>
+  <bsdf type="dielectric" id="glass"/>
+  <shape type="sphere" id="ball"><ref id="paint"/></shape>
+  <shape type="sphere" id="bubble"><point name="center" x="3" y="0" z="0"/><ref id="glass"/></shape>
+  <emitter type="constant" id="sky"><rgb name="radiance" value="1"/></emitter>
+</scene>"""
+
+CONFIG = """scene = "ball.xml"
+iterations = 1
+spp = 1
+picture_spp = 1
+integrator = { type = "prb", max_depth = 3 }
+parameters = [ { key = "paint.reflectance.data", lower = 0, upper = 1 } ]
+target = { images = ["target.exr"] }
+"""
+
+
+@pytest.fixture
+def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a job that works."""
+    backend.set_variant("llvm_ad_rgb")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ball.xml").write_text(SCENE)
+    write_image(tmp_path / "texture.exr", np.full((2, 2, 3), 0.5))
+    write_image(tmp_path / "target.exr", np.full((4, 6, 3), 0.5))
+    (tmp_path / "job.toml").write_text(CONFIG)
+    return tmp_path
+
+
+def write_image(path: Path, pixels: np.ndarray) -> None:
+    from pathreplay.inverse.images import exr_bytes
+
+    path.write_bytes(exr_bytes(pixels.astype(np.float32)))
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    """Exit status of the command line as the user would see it."""
+    monkeypatch.setattr(sys, "argv", ["pathreplay", "optimize", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    return int(ended.value.code or 0)
+
+
+def test_a_good_job_ends_with_0_and_says_where_the_report_is(
+    room: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(monkeypatch, "job.toml", "--quiet") == 0
+    assert "report: runs/job/report.html" in capsys.readouterr().out
+    assert (room / "runs/job/report.html").is_file()
+
+
+def replace(old: str, new: str) -> Callable[[Path], None]:
+    def change(room: Path) -> None:
+        text = (room / "job.toml").read_text()
+        assert old in text
+        (room / "job.toml").write_text(text.replace(old, new))
+
+    return change
+
+
+def spoil(file: str, value: float) -> Callable[[Path], None]:
+    def change(room: Path) -> None:
+        pixels = np.full((2, 2, 3) if file == "texture.exr" else (4, 6, 3), 0.5)
+        pixels[1, 0, 2] = value
+        write_image(room / file, pixels)
+
+    return change
+
+
+def small_target(room: Path) -> None:
+    write_image(room / "target.exr", np.full((3, 5, 3), 0.5))
+
+
+KEY = '"paint.reflectance.data"'
+BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
+    "key does not exist": (replace(KEY, '"paint.reflectance.dat"'), ["reflectance.dat'", "paint.reflectance.data"]),
+    "glob matches nothing": (replace(KEY, '"pant.*.data"'), ["pant.*.data"]),
+    "key without derivative": (replace(KEY, '"glass.eta"'), ["glass.eta", "smoothdielectric"]),
+    "a matrix": (replace(KEY, '"ball.to_world"'), ["ball.to_world"]),
+    "key named twice": (
+        replace(f"[ {{ key = {KEY}", f'[ {{ key = "paint.*.data" }}, {{ key = {KEY}'),
+        ["named twice", "paint.*.data"],
+    ),
+    "missing target": (replace("target.exr", "targt.exr"), ["targt.exr", "does not exist"]),
+    "target is no image": (replace("target.exr", "ball.xml"), ["ball.xml cannot be read"]),
+    "wrong-sized target": (small_target, ["target.exr", "5 x 3", "6 x 4"]),
+    "too many targets": (replace('["target.exr"]', '["target.exr", "target.exr"]'), ["2 target images for 1 sensors"]),
+    "NaN in the target": (spoil("target.exr", np.nan), ["target.exr", "NaN", "(1, 0, 2)"]),
+    "infinity in the target": (spoil("target.exr", np.inf), ["target.exr", "inf", "(1, 0, 2)"]),
+    "NaN in the scene": (spoil("texture.exr", np.nan), ["paint.reflectance.data", "nan", "(1, 0, 2)"]),
+    "infinity in the scene": (spoil("texture.exr", np.inf), ["paint.reflectance.data", "inf", "(1, 0, 2)"]),
+    "upper below lower": (replace("upper = 1", "upper = -1"), ["paint.reflectance.data", "-1", "lower bound 0"]),
+    "start beyond a bound": (replace("upper = 1", "upper = 0.25"), ["starts at 0.5", "upper bound 0.25"]),
+    "zero spp": (replace("spp = 1\np", "spp = 0\np"), ["'spp' is 0", "job.toml"]),
+    "no iterations": (replace("iterations = 1", "iterations = 0"), ["'iterations' is 0", "job.toml"]),
+    "unknown config key": (replace("spp = 1\np", "ssp = 1\np"), ["job.toml", "'ssp'", "'spp'"]),
+    "not TOML": (replace("spp = 1\np", "spp = \np"), ["job.toml", "not valid TOML"]),
+    "unknown variant": (replace("spp = 1\np", 'variant = "llvm_ad_rbg"\np'), ["llvm_ad_rbg", "llvm_ad_rgb"]),
+    "variant without derivatives": (
+        replace("spp = 1\np", 'variant = "scalar_rgb"\np'),
+        ["scalar_rgb", "no derivatives"],
+    ),
+    "unknown loss": (replace("spp = 1\np", 'loss = "l3"\np'), ["l3", "l2"]),
+    "unknown scene": (replace("ball.xml", "bal.xml"), ["bal.xml", "ball.xml"]),
+    "unknown integrator": (replace('"prb"', '"prbb"'), ["prbb"]),
+    "unknown integrator option": (replace("max_depth", "max_dept"), ["max_dept"]),
+    "integrator without gradients": (replace('"prb"', '"path"'), ["'path' computes no gradients", "pathreplay"]),
+    "depth beyond the sweep": (
+        replace('{ type = "prb", max_depth = 3 }', '{ type = "pathreplay", max_depth = 100000, driver = "sweep" }'),
+        ["100000", "replay"],
+    ),
+    "unknown sensor": (replace("spp = 1\np", 'sensors = ["ear"]\np'), ["'ear'", "eye"]),
+    "missing image of a value": (
+        replace('{ images = ["target.exr"] }', '{ values = { "paint.reflectance.data" = "photo.jpg" } }'),
+        ["photo.jpg", "does not exist"],
+    ),
+    "value for an unknown key": (
+        replace('{ images = ["target.exr"] }', '{ values = { "pain.reflectance.data" = 0.1 } }'),
+        ["pain.reflectance.data", "paint.reflectance.data"],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_gets_one_line_and_status_2(
+    case: str, room: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change, words = BAD[case]
+    change(room)
+    files = set(room.rglob("*"))
+    assert command(monkeypatch, "job.toml", "--quiet") == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    line = err.strip()
+    assert "\n" not in line and "Traceback" not in line
+    assert all(word in line for word in words), line
+    assert set(room.rglob("*")) == files
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["config file", "--resume"]),
+        (["jb.toml"], ["No config file jb.toml", "job.toml"]),
+        (["job.toml", "--resume", "."], ["leave CONFIG"]),
+        (["--resume", "."], ["no run folder"]),
+        (["job.toml", "--output", "/proc/none/run"], ["/proc/none/run", "--output"]),
+    ],
+)
+def test_bad_arguments_get_one_line_and_status_2(
+    arguments: list[str],
+    words: list[str],
+    room: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert command(monkeypatch, *arguments, "--quiet") == 2
+    line = capsys.readouterr().err.strip()
+    assert "\n" not in line
+    assert all(word in line for word in words), line
