@@ -12,7 +12,7 @@ from .gradient.forward import forward
 from .gradient.primal import primal
 from .gradient.replay import replay
 from .gradient.sweep import MAX_DEPTH, sweep
-from .transport.traits import attachable_bsdfs, delta_lobes, scene_bsdfs
+from .transport.traits import Traits, scene_traits
 from .transport.vertex import Walk
 
 DRIVERS = ("auto", "sweep", "replay")
@@ -65,6 +65,7 @@ def _make_class() -> type:
             if driver == "auto":
                 driver = "sweep" if self.max_depth <= MAX_DEPTH else "replay"
             self.driver = driver
+            self.told = False  # the log line about BSDFs that stay detached
 
         def sample(
             self,
@@ -89,17 +90,29 @@ def _make_class() -> type:
             return mi.Spectrum(0), mi.Bool(True), [], None
 
         def _walk(self, scene: Any) -> Walk:
-            bsdfs = scene_bsdfs(scene)
+            traits = scene_traits(scene)
+            if self.attach == "all":
+                self._tell_attachable(traits)
             return Walk(
                 scene=scene,
+                traits=traits,
                 attach=self.attach,
                 hide_emitters=self.hide_emitters,
                 max_depth=self.max_depth,
                 rr_depth=self.rr_depth,
-                lobes=delta_lobes(bsdfs),
-                attachable=attachable_bsdfs(bsdfs) if self.attach == "all" else None,
                 skip_area_emitters=self.skip_area_emitters,
             )
+
+        def _tell_attachable(self, traits: Traits) -> None:
+            if traits.attachable is None:
+                raise PathreplayError(
+                    "pathreplay: attach = 'all', but no BSDF of the scene can be sampled attached (diffuse, "
+                    "roughconductor, roughdielectric, normal and bump maps over them can): use attach = 'delta'"
+                )
+            if traits.detached_names and not self.told:
+                names = ", ".join(traits.detached_names)
+                mi.Log(mi.LogLevel.Warn, f"pathreplay: attach = 'all' keeps the directions of {names} fixed")
+                self.told = True
 
         def to_string(self) -> str:
             depth = -1 if self.max_depth == UNBOUNDED else self.max_depth

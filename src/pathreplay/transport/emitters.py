@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .vertex import Arrival, mis_weight, reciprocal
+from .vertex import Arrival, Walk, mis_weight, reciprocal
 
 
 def emission(scene: Any, at: Arrival, si: Any, attached: bool, active: Any) -> Any:
@@ -34,16 +34,34 @@ def draw_emitter(scene: Any, si: Any, u: Any, active: Any) -> tuple[Any, Any]:
         return scene.sample_emitter_direction(si, u, True, active)
 
 
-def redraw_emitter(scene: Any, si: Any, u: Any, light: Any, attached: bool, lit: Any) -> tuple[Any, Any]:
+def redraw_emitter(walk: Walk, si: Any, u: Any, light: Any, attached: bool, lit: Any) -> tuple[Any, Any]:
     """The emitter sample of a first walk once more, differentiable: the DirectionSample3f and Le/p (Spectrum).
 
     ``light`` is the sample itself, if it is still at hand, else None. If ``attached``, the point on the emitter stays
     the same in the emitter's own coordinates, so that it moves with the emitter, and everything follows; else it is
     fixed in space and only the emitted radiance is differentiated. Visibility never is.
     """
+    scene = walk.scene
     if attached:
-        return scene.sample_emitter_direction(si, u, False, lit)
+        light, Le = scene.sample_emitter_direction(si, u, False, lit)
+        if walk.traits.lights_deform:
+            Le *= _mesh_growth(scene, si, light, lit)
+        return light, Le
     if light is None:
         with dr.suspend_grad():
             light, _ = scene.sample_emitter_direction(si, u, False, lit)
     return light, scene.eval_emitter_direction(si, light, lit) * dr.detach(reciprocal(light.pdf))
+
+
+def _mesh_growth(scene: Any, si: Any, light: Any, lit: Any) -> Any:
+    """Area of the emitting triangle relative to its present one: 1, with the derivative of log area.
+
+    Mitsuba samples a mesh with the areas that its triangles had, and does not differentiate them.
+    """
+    ray = dr.detach(si.spawn_ray_to(light.p))
+    ray.maxt = dr.largest(mi.Float)
+    hit = scene.ray_intersect_preliminary(ray, active=lit)
+    on_mesh = lit & hit.is_valid() & hit.shape.is_mesh()
+    y = hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, on_mesh)
+    area = dr.norm(dr.cross(y.dp_du, y.dp_dv))
+    return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)

@@ -36,8 +36,11 @@ def scatter(
         sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
         if attached:
             follows = active & kept.delta
+            free = mi.Bool(False)  # smooth lobes that are sampled attached
             if walk.attach == "all":
-                free = smooth & dr.gather(mi.Bool, walk.attachable, dr.reinterpret_array(mi.UInt32, bsdf))
+                index = dr.reinterpret_array(mi.UInt32, bsdf)
+                table = walk.traits.attachable
+                free = smooth & dr.gather(mi.Bool, table, index, smooth & (index < dr.width(table)))
                 follows |= free
             d = dr.select(follows, dr.replace_grad(kept.d, si.to_world(sample.wo)), d)
             J = dr.select(follows, 1, J)
@@ -50,9 +53,9 @@ def scatter(
         f, pdf = bsdf.eval(ctx, si, wo, smooth), kept.pdf
     w = f * J * dr.detach(reciprocal(kept.pdf))
 
-    if attached and walk.attach == "all":
-        w = dr.select(free, f * reciprocal(pdf), w)
-    if walk.lobes > 0:
+    if attached and walk.resamples:
+        w = dr.select(free, w_sample, w)
+    if walk.traits.lobes > 0:
         delta = active & kept.delta
         w = dr.select(delta, _delta_weight(walk, bsdf, si, u, kept, w_sample, delta), w)
     return w, d, pdf
@@ -86,7 +89,7 @@ def _delta_weight(walk: Walk, bsdf: Any, si: Any, u: Numbers, kept: Kept, w: Any
     through ``BSDFContext.component``, and divided by the probability with which it was picked. Where a plugin does
     not support that (the two weights disagree) its own derivative stays.
     """
-    for k in range(walk.lobes):
+    for k in range(walk.traits.lobes):
         alone = mi.BSDFContext()
         alone.component = k
         picked = active & (kept.lobe == k)

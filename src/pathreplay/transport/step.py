@@ -67,7 +67,7 @@ def surface_step(
         d, pdf = kept.d, kept.pdf
     else:
         lit = kept.lit
-        light, Le = redraw_emitter(walk.scene, si, u.light, kept.light, attached, lit)
+        light, Le = redraw_emitter(walk, si, u.light, kept.light, attached, lit)
         f, pdf_light = bsdf.eval_pdf(ctx, si, si.to_local(light.d), lit)
         w, d, pdf = scatter(walk, bsdf, si, u, kept, attached, hit_next, go_on)
 

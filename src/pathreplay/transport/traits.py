@@ -1,14 +1,49 @@
-"""Facts about a scene that are found on the host, before a kernel is traced: which lobes its BSDFs have."""
+"""Facts about a scene that are found on the host, before a kernel is traced: its lobes, and lights that change shape."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
+# Sampling is a smooth function of the random numbers, and no choice among lobes depends on a parameter.
+ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
+FRAMES = frozenset({"NormalMap", "BumpMap", "TwoSidedBRDF"})
 
-def scene_bsdfs(scene: Any) -> list[Any]:
-    """All BSDFs that the scene's shapes use, those nested in other BSDFs and in instanced shapes included."""
+
+@dataclass(frozen=True)
+class Traits:
+    """What the drivers want to know about a scene.
+
+    ``lobes`` is one more than the largest component index at which a BSDF has a delta lobe, 0 if none has.
+    ``attachable`` tells, by BSDF registry index (Bool), where smooth lobes may be sampled attached; None if nowhere.
+    ``detached_names`` are the classes of the BSDFs with smooth lobes where they may not. ``lights_deform`` says that
+    an emitting mesh has vertex positions with gradients.
+    """
+
+    lobes: int
+    attachable: Any
+    detached_names: tuple[str, ...]
+    lights_deform: bool
+
+
+def scene_traits(scene: Any) -> Traits:
+    """Look at all BSDFs and meshes of a scene, those nested in other BSDFs and in instanced shapes included."""
+    nodes = _nodes(scene)
+    bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
+    attachable = [bsdf for bsdf in bsdfs if _is_attachable(bsdf)]
+    others = {b.class_name() for b in bsdfs if b not in attachable and mi.has_flag(b.flags(), mi.BSDFFlags.Smooth)}
+    return Traits(
+        lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs), default=0),
+        attachable=_mask_by_index(attachable) if attachable else None,
+        detached_names=tuple(sorted(others)),
+        lights_deform=any(_deforms(node) for node in nodes if isinstance(node, mi.Mesh) and node.is_emitter()),
+    )
+
+
+def _nodes(root: Any) -> set[Any]:
     seen: set[Any] = set()
 
     class Collector(mi.TraversalCallback):  # type: ignore[misc, name-defined]
@@ -17,26 +52,31 @@ def scene_bsdfs(scene: Any) -> list[Any]:
                 seen.add(value)
                 value.traverse(Collector())  # one callback per node: Mitsuba forbids re-entry
 
-    scene.traverse(Collector())
-    return [node for node in seen if isinstance(node, mi.BSDF)]
+    root.traverse(Collector())
+    return seen
 
 
-def delta_lobes(bsdfs: list[Any]) -> int:
-    """One more than the largest component index at which one of the BSDFs has a delta lobe; 0 if none has."""
-    count = 0
-    for bsdf in bsdfs:
-        for k in range(bsdf.component_count()):
-            if mi.has_flag(bsdf.flags(k), mi.BSDFFlags.Delta):
-                count = max(count, k + 1)
-    return count
+def _delta_lobes(bsdf: Any) -> int:
+    delta = [k for k in range(bsdf.component_count()) if mi.has_flag(bsdf.flags(k), mi.BSDFFlags.Delta)]
+    return max(delta) + 1 if delta else 0
 
 
-def attachable_bsdfs(bsdfs: list[Any]) -> Any:
-    """Which smooth lobes may be sampled attached: Bool by BSDF registry index.
+def _is_attachable(bsdf: Any) -> bool:
+    name = bsdf.class_name()
+    if name in FRAMES:
+        return all(_is_attachable(nested) for nested in _nodes(bsdf) if isinstance(nested, mi.BSDF))
+    return name in ATTACHABLE
 
-    Right where sampling is a smooth function of the random numbers and the choice among lobes does not depend on a
-    parameter: `diffuse`, `roughconductor`, `roughdielectric`, and normal or bump maps over them.
-    """
-    allowed = [bsdf for bsdf in bsdfs if _is_attachable(bsdf)]
-    index = dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(allowed))
-    return index
+
+def _mask_by_index(bsdfs: list[Any]) -> Any:
+    index = [dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0] for bsdf in bsdfs]
+    mask = [False] * (max(index) + 1)
+    for i in index:
+        mask[i] = True
+    return mi.Bool(mask)
+
+
+def _deforms(mesh: Any) -> bool:
+    params = mi.traverse(mesh)
+    with dr.resume_grad():
+        return "vertex_positions" in params and bool(dr.grad_enabled(params["vertex_positions"]))

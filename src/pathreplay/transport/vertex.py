@@ -9,31 +9,31 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .traits import Traits
+
 
 @dataclass(frozen=True)
 class Walk:
     """The scene that is walked through and how: Python values, fixed when the kernel is traced.
 
-    ``attach`` says what the path follows when parameters move: ``none`` nothing, ``delta`` directions sampled from
-    delta lobes and hit points, ``all`` directions of the BSDFs marked in ``attachable``, too. ``hide_emitters`` leaves
-    out emitters that the camera sees directly. ``max_depth`` and ``rr_depth`` are Mitsuba's; an unbounded depth is
-    2^32 - 1. ``lobes`` is one more than the largest component index at which a BSDF of the scene has a delta lobe,
-    0 when none has.
+    ``attach`` says what the path follows when parameters move: ``none`` nothing, ``delta`` hit points and directions
+    sampled from delta lobes, ``all`` also directions from the BSDFs marked in ``traits.attachable``. ``hide_emitters``
+    leaves out emitters that the camera sees directly. ``max_depth`` and ``rr_depth`` are Mitsuba's; an unbounded depth
+    is 2^32 - 1.
     """
 
     scene: Any  # mi.Scene
+    traits: Traits
     attach: str
     hide_emitters: bool
     max_depth: int
     rr_depth: int
-    lobes: int
-    attachable: Any  # Bool by BSDF registry index: its smooth lobes may be sampled attached
     skip_area_emitters: Callable[..., Any]  # Mitsuba's, an integrator's method
 
     @property
     def resamples(self) -> bool:
         """Whether a later pass samples BSDFs once more, with the random numbers of the first walk."""
-        return self.lobes > 0 or self.attach == "all"
+        return self.traits.lobes > 0 or self.attach == "all"
 
     @property
     def background_is_opaque(self) -> bool:
