@@ -20,11 +20,16 @@ help:
 # The stamp depends on what decides the versions, so that nothing is installed twice. An interrupted set-up has no stamp and
 # is gone on with; a .venv whose Python has vanished is made anew.
 $(READY): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || { \
-	  echo "make: error: $(PYTHON) is $$($(PYTHON) --version 2>&1), Python 3.10 or newer is needed: make PYTHON=python3.12 ..." >&2; \
+	@command -v $(PYTHON) >/dev/null || { \
+	  echo "make: error: there is no $(PYTHON): install Python 3.10 or newer, or name it: make PYTHON=python3.12 ..." >&2; \
+	  exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
+	  echo "make: error: $(PYTHON) is $$($(PYTHON) --version 2>&1), Python 3.10 or newer is needed:" \
+	    "make PYTHON=python3.12 ..." >&2; \
 	  exit 2; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
-	  echo "make: error: $(PYTHON) cannot make virtual environments: install its venv package (Debian: apt install python3-venv)" >&2; \
+	  echo "make: error: $(PYTHON) cannot make virtual environments: install its venv package" \
+	    "(Debian: apt install python3-venv)" >&2; \
 	  exit 2; }
 	@echo "make: setting up $(VENV) (once; about a minute)"
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV)

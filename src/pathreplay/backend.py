@@ -195,7 +195,9 @@ def set_variant(name: str | None = None) -> str:
         ensure_llvm()
     try:
         mi.set_variant(name)
-    except ImportError as error:
+    except ImportError as error:  # Mitsuba's way to say that a back end is off
+        if (error.name or "").startswith("pathreplay"):
+            raise  # a module of ours is missing: nothing that the user can mend
         reason = " ".join(str(error).split())
         raise PathreplayError(f"variant {name} does not run here ({reason}): see `pathreplay doctor`") from error
     return name

@@ -122,7 +122,7 @@ def _versions() -> tuple[str, str, list[str], list[str]]:
         reason = " ".join(str(error).split())
         way_out = "install Mitsuba: pip install 'mitsuba>=3.9.1,<3.10'"
         return f"cannot be imported ({reason})", "unknown", [], [way_out]
-    return str(mi.__version__), str(dr.__version__), list(mi.variants()), []  # type: ignore[attr-defined]
+    return str(mi.__version__), str(dr.__version__), list(mi.variants()), []
 
 
 def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[VariantVerdict]:
