@@ -35,8 +35,7 @@ def forward(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
     active = mi.Bool(active) & (walk.max_depth > 0)
     valid = mi.Bool(walk.background_is_opaque) & active
     at = first_arrival(walk, ray, active)
-    attached = path_moves(walk, at)
-    at.ray = dr.detach(at.ray)
+    attached = path_moves(walk, ray, at)
 
     while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk, attached], label="pathreplay: forward"):
         u = Numbers.draw(sampler)

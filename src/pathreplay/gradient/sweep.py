@@ -128,8 +128,7 @@ def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> Any:
     depth = mi.UInt32(0)  # index of the vertex
     active = mi.Bool(active) & (walk.max_depth > 0)
     at = first_arrival(walk, ray, active)
-    attached = path_moves(walk, at)
-    at.ray = dr.detach(at.ray)
+    attached = path_moves(walk, ray, at)
     camera_ray = dr.detach(ray)
 
     while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk], label="pathreplay: record"):

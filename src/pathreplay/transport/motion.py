@@ -10,17 +10,17 @@ import mitsuba as mi
 from .vertex import Arrival, Walk
 
 
-def path_moves(walk: Walk, at: Arrival) -> bool:
+def path_moves(walk: Walk, ray: Any, at: Arrival) -> bool:
     """Whether hit points, sampled directions or emitter samples depend on parameters with gradients.
 
-    ``at`` is the first arrival along the camera rays, attached to them. Looks at the four places where motion can
+    ``ray`` are the camera rays, attached to the camera, and ``at`` is the first arrival along them. Looks at the four places where motion can
     enter: the camera ray, the shapes, the BSDFs whose directions are followed, and the emitters. Nothing is evaluated.
     """
     if walk.attach == "none":
         return False
     with dr.resume_grad():
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All)
-        moving = [at.ray.o, at.ray.d, si.p, si.n, si.sh_frame.n, si.uv, si.dp_du, si.dp_dv]
+        moving = [ray.o, ray.d, si.p, si.n, si.sh_frame.n, si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
         if walk.resamples:
             sample, _ = still.bsdf().sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))

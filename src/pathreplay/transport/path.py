@@ -14,8 +14,8 @@ MAX_SURVIVAL = 0.95
 
 
 def first_arrival(walk: Walk, ray: Any, active: Any) -> Arrival:
-    """The first vertex along camera rays. With ``hide_emitters``, area emitters are passed through."""
-    ray = mi.Ray3f(ray)
+    """The first vertex along camera rays, detached from them. With ``hide_emitters``, area emitters are passed through."""
+    ray = mi.Ray3f(dr.detach(ray))
     hit = walk.scene.ray_intersect_preliminary(ray, coherent=True, reorder=False, active=active)
     if walk.hide_emitters:
         passed = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
