@@ -1,7 +1,8 @@
 """Sets the variant that the tests run in, before any of them builds a scene.
 
 Every test runs in `llvm_ad_rgb`; what needs another variant, or a Python that has not imported us yet, starts one
-of its own with `run_python`.
+of its own with `run_python`. (Setting a second variant runs Mitsuba's Python modules once more: its stock integrators
+are then no longer instances of the classes that those modules show.)
 """
 
 from __future__ import annotations
@@ -9,11 +10,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 
-from pathreplay.backend import set_variant
+from pathreplay.backend import set_variant  # before mitsuba: points Dr.Jit at a libLLVM
+
+import mitsuba as mi  # isort: skip
 
 VARIANT = "llvm_ad_rgb"
 #: Far above what any of these takes (a few seconds): a hanging process must not hang the tests.
@@ -26,9 +29,10 @@ def pytest_configure() -> None:
 
 
 @pytest.fixture(autouse=True)
-def _variant() -> None:
-    """Give every test the variant back, whatever the one before it has set."""
-    set_variant(VARIANT)
+def _variant() -> Iterator[None]:
+    """Hold every test to leaving the variant as it found it."""
+    yield
+    assert mi.variant() == VARIANT, "a test that needs another variant runs in a Python of its own (run_python)"
 
 
 @pytest.fixture

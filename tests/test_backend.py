@@ -116,15 +116,22 @@ def test_find_llvm_names_what_it_tried_and_the_way_out(monkeypatch: pytest.Monke
 # ---------------------------------------------------------------------------------------------------------- variants
 
 
-def test_set_variant_keeps_an_active_variant_that_can_differentiate() -> None:
-    mi.set_variant("llvm_ad_spectral")
-    assert backend.set_variant() == "llvm_ad_spectral" == mi.variant()
-
-
-def test_set_variant_replaces_one_that_cannot() -> None:
-    mi.set_variant("scalar_rgb")
-    assert backend.set_variant() in ("llvm_ad_rgb", "cuda_ad_rgb")
-    assert "_ad_" in mi.variant()
+@pytest.mark.parametrize(
+    ("active", "expected"),
+    [(None, "{default}"), ("llvm_ad_spectral", "llvm_ad_spectral"), ("scalar_rgb", "{default}")],
+    ids=["none", "kept", "replaced"],
+)
+def test_set_variant_keeps_what_can_differentiate_and_replaces_what_cannot(run_python, active, expected) -> None:
+    code = f"""
+import pathreplay, drjit as dr, mitsuba as mi
+from pathreplay.backend import set_variant
+if {active!r}:
+    mi.set_variant({active!r})
+default = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
+assert set_variant() == mi.variant() == {expected!r}.format(default=default), mi.variant()
+"""
+    done = run_python(code, env={"DRJIT_LIBLLVM_PATH": GOOD})
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
