@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -36,17 +37,18 @@ def _variant() -> Iterator[None]:
 
 
 @pytest.fixture
-def run_python() -> Callable[..., subprocess.CompletedProcess[str]]:
+def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
     """Run code in a fresh Python: `run_python(code, env={"NAME": "value" or None}, args=[...])`.
 
-    DRJIT_LIBLLVM_PATH, which this process has set for itself, is not handed on. None in `env` removes a variable.
+    DRJIT_LIBLLVM_PATH, which this process has set for itself, is not handed on; Dr.Jit's cache, which it looks for in
+    the home folder and complains if there is none, is in `tmp_path`. None in `env` removes a variable.
     """
 
     def run(
         code: str, env: dict[str, str | None] | None = None, args: tuple[str, ...] = ()
     ) -> subprocess.CompletedProcess[str]:
         environment = dict(os.environ)
-        for name, value in {"DRJIT_LIBLLVM_PATH": None, **(env or {})}.items():
+        for name, value in {"DRJIT_LIBLLVM_PATH": None, "DRJIT_CACHE_DIR": str(tmp_path), **(env or {})}.items():
             if value is None:
                 environment.pop(name, None)
             else:
@@ -62,3 +64,15 @@ def run_python() -> Callable[..., subprocess.CompletedProcess[str]]:
         )
 
     return run
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print the table of truth cells that were measured, and the cells that are left out, with the reason."""
+    from test_truth_materials import EXCLUSIONS
+    from truth import ROWS, table
+
+    if ROWS:
+        terminalreporter.section("gradients against finite differences")
+        terminalreporter.write_line(table())
+        for name, reason in EXCLUSIONS.items():
+            terminalreporter.write_line(f"left out: {name}: {reason}")
