@@ -138,4 +138,4 @@ def integrator_name(integrator: Any) -> str:
     # For Python plugins Mitsuba's class_name() is that of the C++ base.
     python = isinstance(integrator, mi.CppADIntegrator)
     name = type(integrator).__name__ if python else str(integrator.class_name())
-    return name.removesuffix("Integrator").lower()
+    return name.removesuffix("Integrator").replace("VolumetricPath", "Volpath").lower()
