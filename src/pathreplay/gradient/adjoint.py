@@ -1,4 +1,4 @@
-"""Reverse and forward differentiation of a single step: the only places where a driver calls automatic differentiation."""
+"""Reverse and forward differentiation of a single step: the only place where automatic differentiation is called."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from ..errors import PathreplayError
 from ..transport.motion import path_moves
-from ..transport.path import first_arrival, next_arrival, sustain, survival
+from ..transport.path import first_arrival, next_arrival, survival, sustain
 from ..transport.step import surface_step
 from ..transport.vertex import Arrival, Kept, Numbers, Step, Walk
 from .adjoint import RayDerivative, Replayed, backward, backward_step
@@ -25,7 +25,7 @@ from .adjoint import RayDerivative, Replayed, backward, backward_step
 MAX_DEPTH = 2048
 
 # Bits of Record.flags: Dr.Jit's local memory cannot hold Bool.
-HIT, DELTA, LIT = 1, 2, 4
+HIT, DELTA, LIT, BLACK = 1, 2, 4, 8
 LOBE_SHIFT = 8
 
 
@@ -55,6 +55,7 @@ def _write(at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: Any, walk: W
     flags = dr.select(at.hit.valid, mi.UInt32(HIT), 0)
     flags |= dr.select(at.delta, mi.UInt32(DELTA), 0)
     flags |= dr.select(step.kept.lit, mi.UInt32(LIT), 0)
+    flags |= dr.select(step.kept.black, mi.UInt32(BLACK), 0)
     flags |= step.kept.lobe << LOBE_SHIFT
     fields = {
         "o": at.ray.o,
@@ -100,6 +101,7 @@ def _read_continuation(record: Any, onward: Arrival) -> Kept:
         d=onward.ray.d,
         pdf=onward.pdf,
         delta=onward.delta,
+        black=(record.flags & BLACK) != 0,
         lobe=record.flags >> LOBE_SHIFT,
         lit=(record.flags & LIT) != 0,
     )

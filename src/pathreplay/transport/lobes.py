@@ -52,6 +52,9 @@ def scatter(
     else:
         f, pdf = bsdf.eval(ctx, si, wo, smooth), kept.pdf
     w = f * J * dr.detach(reciprocal(kept.pdf))
+    # A sample that failed (`roughdielectric` may reflect to the far side) has weight zero whatever f is there; a black
+    # BSDF has weight zero because f is, and keeps its derivative.
+    w = dr.select(kept.black & dr.any(dr.detach(f) != 0), 0, w)
 
     if attached and walk.resamples:
         w = dr.select(free, w_sample, w)

@@ -13,8 +13,9 @@ from .vertex import Arrival, Walk
 def path_moves(walk: Walk, ray: Any, at: Arrival) -> bool:
     """Whether hit points, sampled directions or emitter samples depend on parameters with gradients.
 
-    ``ray`` are the camera rays, attached to the camera, and ``at`` is the first arrival along them. Looks at the four places where motion can
-    enter: the camera ray, the shapes, the BSDFs whose directions are followed, and the emitters. Nothing is evaluated.
+    ``ray`` are the camera rays, attached to the camera, and ``at`` is the first arrival along them. Looks at the four
+    places where motion can enter: the camera ray, the shapes, the BSDFs whose directions are followed, and the
+    emitters. Nothing is evaluated.
     """
     if walk.attach == "none":
         return False

@@ -59,6 +59,7 @@ def surface_step(
             pdf=sample.pdf,
             delta=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta),
             null=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null),
+            black=dr.all(w == 0),
             lobe=sample.sampled_component,
             eta=sample.eta,
             lit=lit,

@@ -1,4 +1,4 @@
-"""Facts about a scene that are found on the host, before a kernel is traced: its lobes, and lights that change shape."""
+"""Facts about a scene, found on the host before a kernel is traced: its lobes, and lights that change shape."""
 
 from __future__ import annotations
 

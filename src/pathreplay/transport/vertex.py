@@ -74,6 +74,7 @@ class Kept:
     d: Any  # Vector3f: sampled direction, world space
     pdf: Any  # Float: its solid-angle density, or the probability of the delta lobe
     delta: Any  # Bool: a delta lobe was sampled
+    black: Any  # Bool: the weight of the continuation was zero in all channels
     lobe: Any  # UInt32: the BSDF component that was sampled
     lit: Any  # Bool: an emitter sample was taken, and nothing is in its way
     # Only the first walk needs these; they are None in a record that is read back.
