@@ -10,6 +10,7 @@ import mitsuba as mi
 from .errors import PathreplayError
 from .gradient.forward import forward
 from .gradient.primal import primal
+from .gradient.ray_jacobian import Recovery
 from .gradient.replay import replay
 from .gradient.sweep import MAX_DEPTH, sweep
 from .transport.traits import Traits, scene_traits
@@ -34,7 +35,8 @@ def _make_class() -> type:
         """Differentiable path tracer for surfaces.
 
         Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
-        (False), ``driver`` (``auto``, ``sweep``, ``replay``) and ``attach`` (``none``). ``auto`` sweeps unless
+        (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``) and ``noise`` (0.3; of
+        ray adjoints with the replay driver: see `Recovery`). ``auto`` sweeps unless
         ``max_depth`` is more than the sweep can hold. Forward mode is the same whatever the driver.
 
         Not differentiated: visibility; with ``attach='none'`` all motion of shapes, cameras and directions.
@@ -65,6 +67,10 @@ def _make_class() -> type:
             if driver == "auto":
                 driver = "sweep" if self.max_depth <= MAX_DEPTH else "replay"
             self.driver = driver
+            noise = props.get("noise", Recovery.noise)
+            if noise < 0:
+                raise PathreplayError(f"pathreplay: noise = {noise}: use a standard deviation >= 0 (0 = off)")
+            self.recovery = Recovery(noise=noise)
             self.told = False  # the log line about BSDFs that stay detached
 
         def sample(
@@ -85,8 +91,10 @@ def _make_class() -> type:
             if mode == dr.ADMode.Forward:
                 tangent, valid = forward(walk, sampler, ray, active)
                 return tangent, valid, [], None
-            drive = sweep if self.driver == "sweep" else replay
-            drive(walk, sampler, ray, δL, active)
+            if self.driver == "sweep":
+                sweep(walk, sampler, ray, δL, active)
+            else:
+                replay(walk, sampler, ray, δL, active, self.recovery)
             return mi.Spectrum(0), mi.Bool(True), [], None
 
         def _walk(self, scene: Any) -> Walk:

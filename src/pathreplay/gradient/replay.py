@@ -2,30 +2,67 @@
 
 This is path replay backpropagation (Vicini, Speierer, Jakob 2021): the first pass keeps one number, L_0; the second
 recovers what lies beyond each vertex from what has been met so far. Memory does not depend on the depth at all.
+Where the path moves with the parameters, `replay_attached` peels the adjoint of the ray as well.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.motion import path_moves
 from ..transport.path import first_arrival, next_arrival, survival
 from ..transport.step import surface_step
 from ..transport.vertex import Numbers, Walk, reciprocal
 from .adjoint import backward
 from .primal import primal
+from .ray_jacobian import Recovery, has_smooth_lobes
+from .replay_attached import replay_attached
 
+
+def replay(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, recovery: Recovery) -> None:
+    """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
+
+    ``ray`` may be attached to the camera. ``recovery`` says how ray adjoints are found where the path moves; it is
+    then that a warning tells, once, of smooth lobes, and how many paths lost a part of their gradient because it was
+    not finite. Not differentiated: visibility, weights that are exactly zero (the sweep driver keeps their
+    derivatives) and, with ``attach='none'``, all motion.
+    """
+    active = mi.Bool(active) & (walk.max_depth > 0)
+    if not path_moves(walk, ray, first_arrival(walk, ray, active)):
+        _replay_still(walk, sampler, ray, δL, active)
+        return
+    if has_smooth_lobes(walk):
+        _warn_of_smooth_lobes()
+    lost = replay_attached(walk, sampler, ray, δL, active, recovery)
+    share = dr.count(lost)[0] / max(dr.width(lost), 1)
+    if share > 0:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"pathreplay: {share:.2%} of the paths had ray adjoints that were not finite; they were left out",
+        )
+
+
+@cache
+def _warn_of_smooth_lobes() -> None:
+    """Said once per process: the driver is at the edge of what it can do."""
+    mi.Log(
+        mi.LogLevel.Warn,
+        "pathreplay: driver = 'replay' follows moving paths over smooth BSDFs, where the Jacobian of the ray is "
+        "singular: noise makes the gradient unbiased, but it gets worse with every such bounce. "
+        "driver = 'sweep' has no such limit, and is faster",
+    )
 
 
 @dr.syntax
-def replay(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
-    """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
+def _replay_still(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
+    """Replay a path that does not move.
 
     Peels β_{i+1} L_{i+1} = β_i L_i - β_i e_i and differentiates it as (β_i L_{i+1}) w_i through the relative
-    derivative of w_i. So where w_i is exactly zero its derivative is lost (the sweep driver keeps it); visibility and
-    all motion are not differentiated.
+    derivative of w_i.
     """
     L, _ = primal(walk, sampler.clone(), ray, active)  # β_i L_i, peeled on the way
 

@@ -1,0 +1,186 @@
+"""Rays in four local coordinates, and the 4x4 Jacobian by which a step maps one ray to the next.
+
+A ray has four degrees of freedom: its origin in the plane perpendicular to it, and its direction. Sliding the origin
+along the ray changes neither what is hit nor what follows, so in the six coordinates (o, d) the Jacobian is always
+singular. Two facts about an arrival go beyond the ray and matter at the next vertex alone, through the MIS weight of
+its emission: the density of the ray and the distance it came. They are differentiated there and then
+(`emission_slope`), so that they need no place in the matrix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.emitters import emission
+from ..transport.step import surface_step
+from ..transport.vertex import Arrival, Numbers, Walk, reciprocal
+from .adjoint import Replayed, tangents
+
+PLACES = ("everywhere", "smooth", "direction")
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """How ray adjoints are recovered: solve (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i.
+
+    ``noise`` is the standard deviation of ε_i, which is +noise or -noise with even odds: of all noise of mean zero and
+    that variance it stays furthest from zero, and so the matrix from being singular. 0 turns it off. ``place`` says
+    what X_i is: the identity at all vertices (``everywhere``, the seed algorithm), the identity where a smooth lobe
+    was sampled (``smooth``), or, there, the identity on directions and zero on origins (``direction``). ``double``
+    keeps the books in float64; local derivatives are float32 in any case.
+    """
+
+    noise: float = 0.3
+    place: str = "direction"
+    double: bool = True
+
+    def real(self, kind: type) -> Any:
+        """The array type in which the books are kept that belongs to a type of the variant."""
+        return dr.float64_array_t(kind) if self.double else kind
+
+
+@dataclass
+class RayFrame:
+    """Two axes perpendicular to a ray: its coordinates are (s·o/ℓ, t·o/ℓ, s·d, t·d), relative to the ray itself."""
+
+    s: Any  # Vector3f
+    t: Any  # Vector3f
+    scale: float  # ℓ, the unit of length
+
+    @staticmethod
+    def of(ray: Any, scale: float) -> RayFrame:
+        s, t = mi.coordinate_system(ray.d)
+        return RayFrame(s, t, scale)
+
+    def point(self, o: Any, x: list[Any]) -> Any:
+        return o + self.scale * (self.s * x[0] + self.t * x[1])
+
+    def direction(self, d: Any, x: list[Any]) -> Any:
+        return d + self.s * x[2] + self.t * x[3]
+
+    def coordinates(self, o: Any, d: Any) -> list[Any]:
+        inverse = 1 / self.scale
+        return [dr.dot(self.s, o) * inverse, dr.dot(self.t, o) * inverse, dr.dot(self.s, d), dr.dot(self.t, d)]
+
+
+@dataclass
+class Slope:
+    """Derivative of δL·β e of a vertex with respect to what its ray alone does not tell; Float each."""
+
+    pdf: Any  # by the density of the ray
+    slide: Any  # by the length that the origin slides forward along the ray
+
+    @staticmethod
+    def zero() -> Slope:
+        return Slope(mi.Float(0), mi.Float(0))
+
+
+@dataclass
+class Local:
+    """A step linearised in the four coordinates of its ray."""
+
+    A: Any  # Matrix4f: coordinates of the next ray by those of this ray
+    e: Any  # Vector4f: derivative of δL·β_i e_i + (slope of e_{i+1})·(pdf, slide)
+    log_w: list[Any]  # 4 x Spectrum: derivative of log w_i, by each coordinate; 0 where w_i is 0
+
+
+def has_smooth_lobes(walk: Walk) -> bool:
+    """Whether any BSDF of the scene has a lobe other than delta lobes."""
+    return bool(walk.traits.detached_names) or walk.traits.attachable is not None
+
+
+def length_scale(scene: Any) -> float:
+    """Half the diagonal of the scene: a unit of length in which offsets and angles are alike. 1 for an empty scene."""
+    extents = scene.bbox().extents()
+    diagonal = sum(float(x) ** 2 for x in extents) ** 0.5
+    return diagonal / 2 if 0 < diagonal < float("inf") else 1.0
+
+
+def emission_slope(walk: Walk, at: Arrival, weight: Any, active: Any) -> Slope:
+    """How weight·e (Spectrum weight, detached) changes with the density of an arrival and the distance it came."""
+    if not has_smooth_lobes(walk):
+        return Slope.zero()
+    slopes = []
+    for k in range(2):
+        pdf, slide = at.pdf, mi.Float(0)
+        if k == 0:
+            pdf = _unit_tangent(pdf)
+        else:
+            slide = _unit_tangent(slide)
+        with dr.resume_grad(slide if k else pdf):
+            ray = mi.Ray3f(at.ray)
+            si = at.hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            ray.o = ray.o + ray.d * slide
+            slid = Arrival(ray=ray, hit=at.hit, pdf=pdf, delta=at.delta, camera=at.camera)
+            e = dr.sum(weight * emission(walk.scene, slid, si, True, active))
+            slopes.append(dr.select(active, tangents(e)[0], 0))
+    return Slope(*slopes)
+
+
+def local_terms(
+    walk: Walk, v: Replayed, at: Arrival, weight: Any, slope: Slope, frame_next: RayFrame, active: Any
+) -> tuple[Any, Any, list[Any]]:
+    """The step at ``v`` with a differentiable arrival: what its adjoint is made of.
+
+    δL·β_i e_i + (slope of e_{i+1})·(pdf, slide) (Float), w_i/detach(w_i) (Spectrum, 0 where w_i is 0) and the four
+    coordinates of the next ray. ``weight`` is δL β_i (Spectrum), ``slope`` that of the next vertex.
+    """
+    step = surface_step(walk, at, v.u, v.go_on, active, v.kept, True, v.hit_next)
+    o, d = step.ray_next.o, step.ray_next.d
+    e = dr.sum(weight * step.e)
+    e += dr.select(v.go_on, slope.pdf * step.pdf + slope.slide * dr.dot(dr.detach(d), o), 0)
+    w = dr.select(v.go_on, step.w * dr.detach(reciprocal(step.w)), 0)
+    return e, w, frame_next.coordinates(o, d)
+
+
+def linearise(
+    walk: Walk, v: Replayed, weight: Any, slope: Slope, frame: RayFrame, frame_next: RayFrame, active: Any
+) -> Local:
+    """Differentiate `local_terms` by the four coordinates of the ray, and by nothing else.
+
+    Both passes call this very function, so that they see the same numbers to the last bit.
+    """
+    columns = []
+    for k in range(4):
+        # One graph per column: traversing one twice ends the process (Dr.Jit 1.5, virtual calls in a loop).
+        x = [mi.Float(0) for _ in range(4)]
+        x[k] = _unit_tangent(0)
+        with dr.resume_grad(x[k]):
+            ray = mi.Ray3f(v.at.ray)
+            ray.o, ray.d = frame.point(ray.o, x), frame.direction(ray.d, x)
+            at = Arrival(ray=ray, hit=v.at.hit, pdf=v.at.pdf, delta=v.at.delta, camera=v.at.camera)
+            e, w, x_next = local_terms(walk, v, at, weight, slope, frame_next, active)
+            columns.append(tangents(e, w, *x_next))
+    A = [columns[k][2 + j] for j in range(4) for k in range(4)]
+    return Local(A=mi.Matrix4f(*A), e=mi.Vector4f(*[c[0] for c in columns]), log_w=[c[1] for c in columns])
+
+
+def _unit_tangent(value: Any) -> Any:
+    """An AD variable (Float) of its own with tangent 1, also where gradients are suspended.
+
+    Resume gradients for it alone: a virtual call would push tangents from parameters, too, across the border of the
+    loop.
+    """
+    variable = mi.Float(dr.detach(value))
+    with dr.resume_grad():
+        dr.enable_grad(variable)
+        dr.set_grad(variable, 1)
+    return variable
+
+
+def random_sign(u: Numbers) -> Any:
+    """+1 or -1 (Float) with even odds: a hash of a vertex's numbers, so it repeats and takes none from the sampler."""
+    bits = [dr.reinterpret_array(mi.UInt32, x) for x in (u.light.x, u.roulette)]
+    return dr.select((mi.sample_tea_32(bits[0], bits[1], 4)[0] & 1) == 0, mi.Float(1), mi.Float(-1))
+
+
+def regularise(A: Any, ε: Any, place: str, smooth: Any) -> Any:
+    """A + ε X (4x4): X as `Recovery` says for ``place``, where ``smooth`` (Bool) is a vertex with a smooth lobe."""
+    origin = 0 if place == "direction" else 1
+    on = ε if place == "everywhere" else dr.select(smooth, ε, 0)
+    real = type(A)
+    return A + real(on * origin, 0, 0, 0, 0, on * origin, 0, 0, 0, 0, on, 0, 0, 0, 0, on)
