@@ -48,6 +48,8 @@ def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
     T = mi.ScalarTransform4f
     scene = cornell_box(resolution)
     overview = scene.pop("sensor")
+    # A texel is little wider than a pixel: a wider filter would blur neighbours into each other, slow to undo.
+    overview["film"]["rfilter"] = {"type": "box"}
     scene["overview"] = overview
     scene["closeup"] = {
         **overview,

@@ -78,7 +78,7 @@ def optimize(
     start = _resumed(Path(resume), config, output) if resume is not None else _fresh(config, output)
     variant = backend.set_variant(start.config.variant)
     with Progress(progress) as bar:
-        bar.say("loading the scene, preparing the targets")
+        bar.say("preparing")
         problem = build_problem(start.config, start.base, start.targets())
         adam = make_adam(problem)
         history: list[checkpoint.Entry] = []
@@ -105,7 +105,7 @@ def optimize(
 
         with ctrl_c_stops() as stop:
             iterate(problem, start.config, adam, history, stop, after)
-            bar.say("writing the pictures and the report")
+            bar.say("writing")
             return _finish(start, folder, problem, adam, history, before, variant)
 
 

@@ -171,15 +171,15 @@ def summary(outcome: Outcome) -> bytes:
     """One PNG with everything side by side: a row per view (target, start, result, difference), a row per texture."""
     rows = [(v.name, v.pictures(), v.exposure) for v in outcome.views[:SUMMARY_ROWS]]
     rows += [(r.key, r.textures(), 1.0) for r in [r for r in outcome.recovered if r.textures()][:SUMMARY_ROWS]]
-    figure = Figure(figsize=(8.4, 2.25 * len(rows)), layout="constrained", dpi=90)
+    figure = Figure(figsize=(8.4, 2.25 * len(rows)), layout="constrained", dpi=72)
     grid = figure.subplots(len(rows), 4, squeeze=False)
     for line, (name, pictures, exposure) in zip(grid, rows, strict=True):
         for axes in line:
             axes.axis("off")
-        for axes, (kind, image) in zip(line, pictures.items(), strict=False):
-            axes.imshow(_shown(image, exposure), interpolation="nearest", vmin=0, vmax=1, cmap="gray")
+        for column, (kind, image) in enumerate(pictures.items()):
+            line[column].imshow(_shown(image, exposure), interpolation="nearest", vmin=0, vmax=1, cmap="gray")
             label = f"{kind} ×{DIFFERENCE_GAIN:g}" if kind == "difference" else kind
-            axes.set_title(label if kind not in ("start",) or len(pictures) == 4 else f"{name}: {label}", fontsize=8)
+            line[column].set_title(label if column else f"{name}: {label}", fontsize=8)
     return _drawn(figure, "png")
 
 

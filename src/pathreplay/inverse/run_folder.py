@@ -51,17 +51,17 @@ class RunFolder:
 
     def _failure(self, error: OSError) -> str:
         if (self.path / CHECKPOINT).exists():
-            rescue = f"then continue with: pathreplay optimize --resume {self.path}"
+            rescue = f"then go on with: pathreplay optimize --resume {self.path}"
             for folder in self.path.iterdir():
                 if folder.is_dir():
                     with contextlib.suppress(OSError):
                         folder.rmdir()  # succeeds on an empty one only: what this failed write has made
         else:
             shutil.rmtree(self.path, ignore_errors=True)
-            rescue = "then start again; this run's folder was removed"
+            rescue = "or give --output elsewhere, then start again (this folder was removed)"
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return f"No space left on the disk for run folder {self.path}: free some space or give --output, {rescue}"
-        return f"Run folder {self.path} cannot be written ({error.strerror}): check its rights, {rescue}"
+            return f"No space left on the disk for run folder {self.path}: free some space, {rescue}"
+        return f"Run folder {self.path} cannot be written ({error.strerror}): mend that, {rescue}"
 
 
 def create_run_folder(output: Path, config: Config, source: Path | None, base: Path) -> RunFolder:
