@@ -224,7 +224,7 @@ def _drawn(figure: Figure, kind: str) -> bytes:
 
 
 def _with_palette(png: bytes) -> bytes:
-    """The PNG in 256 colours: fewer bytes for noisy pictures (the demo: 216 kB for 346 kB), fit for a README or a mail."""
+    """The PNG in 256 colours: fewer bytes for noisy pictures, fit for a README or a mail."""
     picture = PIL.Image.open(io.BytesIO(png)).convert("RGB")
     palette = picture.quantize(256)
     buffer = io.BytesIO()
