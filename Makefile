@@ -49,8 +49,9 @@ test: lint
 test-all: lint
 	$(BIN)/python -m pytest -q
 
+# TASKS='surface --quick' and the like: see benchmarks/__main__.py; without it all of them, in full.
 bench: $(READY)
-	$(BIN)/python -m benchmarks.surface
+	$(BIN)/python -m benchmarks $(TASKS)
 
 clean:
 	rm -rf $(VENV) .pytest_cache .ruff_cache .mypy_cache build src/*.egg-info

@@ -1,0 +1,56 @@
+"""Records of whole runs: made with the facts of the moment, kept as JSON under benchmarks/results/, read back."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from datetime import datetime, timezone
+from pathlib import Path
+
+from pydantic import TypeAdapter
+
+from .job import Record
+from .runner import ROOT, Measured
+
+RESULTS = ROOT / "benchmarks" / "results"
+_JSON = TypeAdapter(Record)
+
+
+def load_average() -> float:
+    """Processes that wanted a processor during the last minute, on average."""
+    return round(os.getloadavg()[0], 2)
+
+
+def _git(*arguments: str) -> str:
+    result = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True)
+    return result.stdout.strip() if result.returncode == 0 else ""
+
+
+def make_record(task: str, command: str, load_before: float, measured: Measured) -> Record:
+    """The record of a run that has just ended."""
+    modified = _git("status", "--porcelain", "--untracked-files=no", "--", "src", "benchmarks/*.py")
+    return Record(
+        task=task,
+        command=command,
+        date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        commit=_git("rev-parse", "--short=12", "HEAD") + ("+" if modified else ""),
+        load=(load_before, load_average()),
+        machines=tuple(measured.machines),
+        points=tuple(measured.points),
+    )
+
+
+def save(record: Record) -> Path:
+    """Write benchmarks/results/TASK.json, all at once."""
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / f"{record.task}.json"
+    draft = path.with_suffix(".json.tmp")
+    draft.write_bytes(_JSON.dump_json(record, indent=1) + b"\n")
+    draft.replace(path)
+    return path
+
+
+def load(task: str) -> Record | None:
+    """The saved record of a task, if there is one."""
+    path = RESULTS / f"{task}.json"
+    return _JSON.validate_json(path.read_bytes()) if path.exists() else None

@@ -1,0 +1,33 @@
+"""Fills docs/evidence.md: the tables between markers are made from the records under benchmarks/results/."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+
+from . import records
+from .job import Record
+from .runner import ROOT
+from .tables import footnote
+
+EVIDENCE = ROOT / "docs" / "evidence.md"
+MARKED = re.compile(r"(<!-- begin (?P<task>[\w-]+) -->\n).*?(<!-- end (?P=task) -->)", re.DOTALL)
+NOT_MEASURED = "*Not measured yet.*"
+
+
+def fill(tables: Mapping[str, Callable[[Record], str]]) -> list[str]:
+    """Rewrite the marked parts for which there is a table; returns the tasks that have no record yet."""
+    missing: list[str] = []
+
+    def replacement(match: re.Match[str]) -> str:
+        task = match["task"]
+        if task not in tables:
+            return match[0]
+        record = records.load(task)
+        if record is None:
+            missing.append(task)
+        text = NOT_MEASURED if record is None else f"{tables[task](record)}\n\n{footnote(record)}"
+        return f"{match[1]}{text}\n{match[3]}"
+
+    EVIDENCE.write_text(MARKED.sub(replacement, EVIDENCE.read_text()))
+    return missing

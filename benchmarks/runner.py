@@ -1,0 +1,146 @@
+"""Runs jobs in worker processes and gathers their samples; what goes wrong in a worker becomes a row."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from .job import Job, Machine, Point
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@dataclass
+class _Samples:
+    """What a worker has said about one method so far."""
+
+    seeds: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    squared_errors: list[float] = field(default_factory=list)
+    not_finite: list[int] = field(default_factory=list)
+    error: str | None = None
+
+    def add(self, seed: int, seconds: float, finite: bool) -> None:
+        """Take in one gradient pass."""
+        self.seeds.append(seed)
+        self.seconds.append(seconds)
+        self.not_finite += [] if finite else [seed]
+
+
+@dataclass
+class Measured:
+    """Points of all jobs that were run, and the distinct machines (they differ by thread count at most)."""
+
+    points: list[Point] = field(default_factory=list)
+    machines: list[Machine] = field(default_factory=list)
+
+
+def run_jobs(title: str, jobs: list[Job]) -> Measured:
+    """Run the jobs one after another, with a progress bar on stderr."""
+    measured = Measured()
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
+        bar = progress.add_task(title, total=sum(job.passes for job in jobs))
+        done = 0
+        for job in jobs:
+
+            def show(method: str, passes: int, job: Job = job, done: int = done) -> None:
+                text = f"{title}: {job.scene}, depth {job.max_depth}, {method}"
+                progress.update(bar, description=text, completed=done + min(passes, job.passes))
+
+            _run_job(job, measured, show)
+            done += job.passes
+        progress.update(bar, description=title, completed=done)
+    return measured
+
+
+def _run_job(job: Job, measured: Measured, show: Callable[[str, int], None]) -> None:
+    """Run a job, and once more without the method that killed its process, until all are told."""
+    methods = job.methods
+    while methods:
+        killer = _attempt(replace(job, methods=methods), measured, show)
+        methods = tuple(name for name in methods if name != killer) if killer else ()
+
+
+def _attempt(job: Job, measured: Measured, show: Callable[[str, int], None]) -> str | None:
+    """One worker process. Returns the method that killed it; the points of the others are then not kept."""
+    samples = {name: _Samples() for name in job.methods}
+    running, peak, passes = job.methods[0], None, 0
+    # An empty home has an empty kernel cache: compiling is in the peak memory of every job or, by chance, of some.
+    with tempfile.TemporaryDirectory() as home, tempfile.TemporaryFile("w+") as complaints:
+        command = [sys.executable, "-m", "benchmarks.worker", json.dumps(asdict(job))]
+        environment = os.environ | {"HOME": home}
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=complaints, text=True, cwd=ROOT, env=environment
+        ) as worker:
+            try:
+                for event in _events(worker):
+                    match event:
+                        case {"event": "machine", **facts}:
+                            machine = Machine(**facts)
+                            measured.machines += [machine] if machine not in measured.machines else []
+                        case {"event": "start", "method": running}:
+                            show(running, passes)
+                        case {"event": "sample", "method": method, "kept": kept} as sample:
+                            passes += 1
+                            if kept:
+                                samples[method].add(sample["seed"], sample["seconds"], sample["finite"])
+                        case {"event": "error", "method": method, "message": message}:
+                            samples[method].error = message
+                        case {"event": "errors", "method": method, "squared_errors": squared_errors}:
+                            samples[method].squared_errors = squared_errors
+                        case {"event": "peak", "mib": peak}:
+                            pass
+            except BaseException:
+                worker.kill()
+                raise
+        died = worker.returncode != 0
+        if died:
+            complaints.seek(0)
+            samples[running].error = _cause_of_death(worker.returncode, complaints.read())
+    alone = len(job.methods) == 1
+    for method, told in samples.items():
+        if not died or method == running:
+            measured.points.append(_point(job, method, told, peak if alone else None))
+    return running if died else None
+
+
+def _events(worker: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
+    assert worker.stdout is not None
+    for line in worker.stdout:
+        if line.startswith('{"event"'):
+            yield json.loads(line)
+
+
+def _cause_of_death(status: int, complaints: str) -> str:
+    if status < 0:
+        return f"died: {signal.Signals(-status).name}"
+    lines = [line for line in complaints.splitlines() if line.strip()]
+    return f"ended with status {status}: {lines[-1].strip()[:200] if lines else 'no message'}"
+
+
+def _point(job: Job, method: str, told: _Samples, peak: float | None) -> Point:
+    return Point(
+        scene=job.scene,
+        parameters=job.parameters,
+        method=method,
+        max_depth=job.max_depth,
+        paths=job.resolution**2 * job.spp,
+        seeds=tuple(told.seeds),
+        seconds=tuple(told.seconds),
+        squared_errors=tuple(told.squared_errors),
+        not_finite=tuple(told.not_finite),
+        peak_mib=peak,
+        error=told.error,
+    )

@@ -1,0 +1,61 @@
+"""Markdown tables from the points of a record."""
+
+from __future__ import annotations
+
+import statistics as st
+from collections.abc import Iterable, Sequence
+
+from .estimates import cost_ratio, time_ratio, variance_ratio
+from .job import Point, Record
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table: the first column to the left, the others to the right."""
+    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def median_seconds(point: Point) -> str:
+    return f"{st.median(point.seconds):.3f}"
+
+
+def method_cell(point: Point) -> str:
+    """Name of the method, and how often it failed without raising."""
+    broken = len(point.not_finite)
+    return point.method + (f" ({broken} of {len(point.seeds)} not finite)" if broken else "")
+
+
+def groups(points: Iterable[Point]) -> dict[tuple[object, ...], dict[str, Point]]:
+    """Points that were measured in turn: by scene, parameters, depth and paths, then by method."""
+    found: dict[tuple[object, ...], dict[str, Point]] = {}
+    for point in points:
+        group = (point.scene, point.parameters, point.max_depth, point.paths)
+        found.setdefault(group, {})[point.method] = point
+    return found
+
+
+def comparison(point: Point, rival: Point | None) -> list[str]:
+    """Cells: median seconds, then time, variance and time x variance relative to a rival."""
+    if point.error:
+        return [point.error, "", "", ""]
+    seconds = median_seconds(point)
+    if rival is None or rival.error or rival is point:
+        return [seconds, "1" if rival is point else "", *[("1" if rival is point else "")] * 2]
+    # Both have squared errors, or (a single round) neither.
+    times, errors = (point.seconds, rival.seconds), (point.squared_errors, rival.squared_errors)
+    if not all(errors):
+        return [seconds, str(time_ratio(*times)), "", ""]
+    return [seconds, str(time_ratio(*times)), str(variance_ratio(*errors)), str(cost_ratio(times, errors))]
+
+
+def footnote(record: Record) -> str:
+    """Where, when and with what the numbers were taken."""
+    machine = record.machines[0]
+    rounds = max((len(point.seconds) for point in record.points), default=0)
+    threads = " and ".join(str(m.threads) for m in record.machines)
+    return (
+        f"`{record.command}`, {record.date[:10]}, commit {record.commit}: {machine.processor}, "
+        f"{machine.processors} processors, {threads} threads, {machine.variant}, Mitsuba {machine.mitsuba}, "
+        f"Dr.Jit {machine.drjit}, libLLVM {machine.libllvm}, Python {machine.python}; {rounds} rounds; "
+        f"load average {record.load[0]:.1f} before, {record.load[1]:.1f} after."
+    )
