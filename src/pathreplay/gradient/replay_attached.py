@@ -81,7 +81,7 @@ def replay_attached(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, r
 
         L += Spectrum(β * e)
         lit = Spectrum(δL) * Spectrum(β * e)
-        q += J.T @ Vector(local.e) + Vector(*[dr.sum(lit * k) for k in κ])
+        q += Vector(J.T @ Vector(local.e)) + Vector(*[dr.sum(lit * k) for k in κ])
         κ = [κ[k] + sum(Spectrum(local.log_w[j]) * J[j, k] for j in range(4)) for k in range(4)]
         ε = recovery.noise * random_sign(v.u)
         J = regularise(Matrix(local.A), type(q.x)(ε), recovery.place, ~v.kept.delta) @ J
@@ -119,7 +119,7 @@ def replay_attached(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, r
         p = Vector(local.e) + Vector(*[dr.sum(Spectrum(δL) * L * Spectrum(k)) for k in local.log_w])
         ε = recovery.noise * random_sign(v.u)
         A = regularise(Matrix(local.A), type(q.x)(ε), recovery.place, ~v.kept.delta)
-        q = dr.select(v.go_on, dr.rcp(A.T) @ (q - p), 0)
+        q = dr.select(v.go_on, Vector(dr.rcp(A.T) @ (q - p)), 0)
         broken = ~dr.all(dr.isfinite(q))
         q = dr.select(broken, 0, q)
         lost |= broken
