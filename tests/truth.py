@@ -6,6 +6,7 @@ The parameter moves along one direction, value(t), and all gradients are dJ/dt a
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -32,6 +33,7 @@ class Case:
     seeds: int = 12
     options: dict = field(default_factory=dict)  # of the integrator
     drivers: tuple[str, ...] = ("sweep", "replay")
+    peer: bool = False  # measure Mitsuba's prb, too
     lanes: float | None = 1e-3  # largest relative L1 error lane by lane; None: random choices depend on the parameter
 
 
@@ -47,19 +49,23 @@ class Row:
     z: float
     lanes: float  # relative L1 error lane by lane; nan where not defined
     transpose: float  # |<W, Jv> - <J^T W, v>| / Σ|W·Jv|; nan where not defined
+    peer: float = np.nan  # Mitsuba's prb
 
 
 ROWS: list[Row] = []
+# Forward and reverse add up the same terms in another order; with more samples float32 rounding of the sums shows.
+SAME_SEED_SPP = 16
 
 
 def table() -> str:
     """All rows so far, as text."""
     lines = [f"{'cell':44s} {'driver':8s} {'gradient':>11s} {'fin. diff.':>11s} {'std. error':>10s} {'z':>6s} "
-             f"{'lanes':>8s} {'fwd=rev':>8s}"]  # fmt: skip
+             f"{'lanes':>8s} {'fwd=rev':>8s} {'prb':>9s}"]  # fmt: skip
     for r in ROWS:
         lines.append(
             f"{r.name:44s} {r.driver:8s} {r.gradient:+11.5f} {r.reference:+11.5f} {r.error:10.5f} {r.z:+6.2f} "
-            f"{_number(r.lanes)} {_number(r.transpose)}"
+            f"{_number(r.lanes)} {_number(r.transpose)} "
+            + (f"{r.peer:+9.5f}" if np.isfinite(r.peer) else f"{'-':>9s}")
         )
     return "\n".join(lines)
 
@@ -91,6 +97,22 @@ def random(scale: float = 1.0, planes: int | None = None, seed: int = 7) -> Move
 def translate(x: float, y: float, z: float) -> Move:
     """A transformation that is followed by a translation by t (x, y, z)."""
     return lambda value, t: mi.Transform4f().translate([x * t, y * t, z * t]) @ mi.Transform4f(value)
+
+
+def rotate(x: float, y: float, z: float) -> Move:
+    """A transformation that is followed by a rotation by t radians about the axis (x, y, z)."""
+    return lambda value, t: mi.Transform4f().rotate([x, y, z], dr.rad2deg(t)) @ mi.Transform4f(value)
+
+
+def tilt_vertices(scale: float = 0.3) -> Move:
+    """Flat vertex positions (x, y, z), moved by t · scale · (y, 0, x z): normals turn, front against back."""
+
+    def move(value: Any, t: Any) -> Any:
+        x, y, z = (dr.gather(mi.Float, value, dr.arange(mi.UInt32, dr.width(value) // 3) * 3 + k) for k in range(3))
+        moved = mi.Point3f(x + t * scale * y, y, z + t * scale * x * z)
+        return dr.ravel(moved)
+
+    return move
 
 
 def translate_vertices(x: float, y: float, z: float) -> Move:
@@ -126,20 +148,20 @@ class Bench:
         h = self.case.step
         return (self.image(integrator, seed, h) - self.image(integrator, seed, -h)) / (2 * h)
 
-    def forward(self, integrator: Any, seed: int) -> np.ndarray:
+    def forward(self, integrator: Any, seed: int, spp: int = 0) -> np.ndarray:
         t = dr.opaque(mi.Float, 0)
         dr.enable_grad(t)
         dr.set_grad(t, 1)
         self.put(t)
         dr.forward(t, dr.ADFlag.ClearEdges)
-        return np.array(integrator.render_forward(self.scene, self.params, seed=seed, spp=self.case.spp))
+        return np.array(integrator.render_forward(self.scene, self.params, seed=seed, spp=spp or self.case.spp))
 
-    def backward(self, integrator: Any, seed: int) -> float:
+    def backward(self, integrator: Any, seed: int, spp: int = 0) -> float:
         t = dr.opaque(mi.Float, 0)
         dr.enable_grad(t)
         self.put(t)
         weights = mi.TensorXf(self.weights)
-        integrator.render_backward(self.scene, self.params, weights, seed=seed, spp=self.case.spp)
+        integrator.render_backward(self.scene, self.params, weights, seed=seed, spp=spp or self.case.spp)
         value = self.params[self.case.key]
         dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
@@ -160,6 +182,7 @@ def measure(case: Case) -> list[Row]:
     Finite differences are of Mitsuba's `path`; lane by lane they are of our own primal image, without Russian
     roulette, whose probabilities move with the parameters.
     """
+    gc.collect()  # scenes of earlier cases would be traced, too
     bench = Bench(case)
     try:
         return _measure(case, bench)
@@ -173,12 +196,13 @@ def _measure(case: Case, bench: Bench) -> list[Row]:
     reference = np.array([bench.dot(bench.difference(path, 1000 + seed)) for seed in seeds])
 
     steady = bench.integrator(rr_depth=1000, **case.options)
-    tangent = bench.forward(steady, 1)
     lanes = np.nan
     if case.lanes is not None:
+        tangent = bench.forward(steady, 1)
         difference = bench.difference(steady, 1)
         lanes = float(np.abs(tangent - difference).sum() / np.abs(difference).sum())
 
+    peer = _peer(bench, seeds) if case.peer else np.nan
     rows = []
     for driver in ("forward", *case.drivers):
         props = {} if driver == "forward" else {"driver": driver}
@@ -189,12 +213,22 @@ def _measure(case: Case, bench: Bench) -> list[Row]:
         else:
             g = np.array([bench.backward(integrator, seed) for seed in seeds])
             same = bench.integrator(rr_depth=1000, driver=driver, **case.options)
-            transpose = abs(bench.dot(tangent) - bench.backward(same, 1)) / bench.dot(np.abs(tangent))
+            tangent = bench.forward(steady, 1, SAME_SEED_SPP)
+            transpose = abs(bench.dot(tangent) - bench.backward(same, 1, SAME_SEED_SPP)) / bench.dot(np.abs(tangent))
         error = float(np.sqrt((g.var(ddof=1) + reference.var(ddof=1)) / case.seeds))
         z = float((g.mean() - reference.mean()) / error)
-        rows.append(Row(case.name, driver, g.mean(), reference.mean(), error, z, lanes, transpose))
+        rows.append(Row(case.name, driver, g.mean(), reference.mean(), error, z, lanes, transpose, peer))
     ROWS.extend(rows)
     return rows
+
+
+def _peer(bench: Bench, seeds: range) -> float:
+    """Mean gradient by Mitsuba's prb; nan where it refuses."""
+    prb = bench.integrator("prb", rr_depth=3)
+    try:
+        return float(np.mean([bench.backward(prb, seed) for seed in seeds]))
+    except RuntimeError:
+        return np.nan
 
 
 # Beyond four standard errors an honest gradient falls once in ten thousand cells.
@@ -241,7 +275,7 @@ def camera(origin: tuple[float, float, float] = (0, 0, 5), fov: float = 10, targ
     }
 
 
-def environment(n: int = 64) -> dict:
+def environment(n: int = 1024) -> dict:
     """A smooth environment map: no edges, so that everything under it can be differentiated lane by lane."""
     y, x = np.mgrid[0 : n // 2, 0:n] / n * 2 * np.pi
     waves = [1 + 0.5 * np.sin(x) * np.sin(y), 1 + 0.5 * np.cos(x + 1) * np.sin(y), 1 + 0.3 * np.sin(2 * x) * np.sin(y)]

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.motion import path_moves
-from ..transport.path import first_arrival, next_arrival, sustain, survival
+from ..transport.path import first_arrival, next_arrival, survival, sustain
 from ..transport.step import surface_step
 from ..transport.vertex import Numbers, Walk
 from .adjoint import RayDerivative, Replayed, forward_step, tangents

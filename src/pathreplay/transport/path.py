@@ -14,7 +14,7 @@ MAX_SURVIVAL = 0.95
 
 
 def first_arrival(walk: Walk, ray: Any, active: Any) -> Arrival:
-    """The first vertex along camera rays, detached from them; ``hide_emitters`` lets them pass through area emitters."""
+    """The first vertex along camera rays, detached from them; ``hide_emitters`` makes area emitters transparent."""
     ray = mi.Ray3f(dr.detach(ray))
     hit = walk.scene.ray_intersect_preliminary(ray, coherent=True, reorder=False, active=active)
     if walk.hide_emitters:
