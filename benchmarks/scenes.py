@@ -97,7 +97,11 @@ def closed_box(resolution: int) -> SceneDict:
         "lamp": {
             "type": "rectangle",
             "to_world": T().translate([0, 0, 0.98]).rotate([1, 0, 0], 180).scale(0.2),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.999}},
+            # Two sides: the upper one of a diffuse lamp would absorb the paths that get above it.
+            "bsdf": {
+                "type": "twosided",
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.999}},
+            },
             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 1.0}},
         },
     }

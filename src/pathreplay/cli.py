@@ -8,6 +8,7 @@ modules are imported inside the commands, so that `pathreplay --help` answers at
 from __future__ import annotations
 
 import errno
+import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -105,6 +106,16 @@ def optimize(
 
     result = run_job(config, resume=resume, output=output, progress=not quiet)
     typer.echo(result.describe())
+
+
+# The options are those of `python -m benchmarks`, which prints its own help.
+@app.command(add_help_option=False, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def bench(context: typer.Context) -> None:
+    """Measure time, memory and variance next to Mitsuba's own integrators; needs a checkout."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / "benchmarks" / "__main__.py").is_file():
+        raise PathreplayError("the benchmarks are not installed: clone the repository and run make bench there")
+    raise typer.Exit(subprocess.run([sys.executable, "-m", "benchmarks", *context.args], cwd=root).returncode)
 
 
 def _fail(message: str) -> NoReturn:
