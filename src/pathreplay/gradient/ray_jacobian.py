@@ -20,9 +20,9 @@ from ..transport.step import surface_step
 from ..transport.vertex import Arrival, Numbers, Walk, reciprocal
 from .adjoint import Replayed, tangents
 
-# Noise is needed where the condition number of A (Frobenius) is above this. At held smooth lobes rounding to float32
-# alone makes it 1e6 and more; at mirrors, glass and attached rough metal it is below 1e3. float64 forgives 1e4.
-ILL_CONDITIONED = 1e4
+# Noise is needed where `independence` is below this. At held smooth lobes it would be zero but for float32 rounding,
+# which makes it 1e-7; at mirrors, glass and attached rough metal it is above 1e-3. float64 forgives 1e-4.
+ILL_CONDITIONED = 1e-4
 
 
 @dataclass(frozen=True)
@@ -181,22 +181,34 @@ def random_sign(u: Numbers) -> Any:
 
 
 def regularise(A: Any, ε: Any, place: str, smooth: Any) -> Any:
-    """A + ε X (4x4): X as `Recovery` says for ``place``; ``smooth`` (Bool) is a vertex where a smooth lobe was sampled."""
+    """A + ε X (4x4), X as `Recovery` says for ``place``; ``smooth`` (Bool): a smooth lobe was sampled."""
     if place == "everywhere":
         on, origin = ε, 1
     elif place == "smooth":
         on, origin = dr.select(smooth, ε, 0), 1
     else:
-        on, origin = dr.select(condition(A) <= ILL_CONDITIONED, 0, ε), 0
+        on, origin = dr.select(independence(A) >= ILL_CONDITIONED, 0, ε), 0
     return A + type(A)(on * origin, 0, 0, 0, 0, on * origin, 0, 0, 0, 0, on, 0, 0, 0, 0, on)
 
 
-def condition(A: Any) -> Any:
-    """Condition number |A| |A^-1| in the Frobenius norm (Float64); not a number or infinite where A is singular."""
-    A = dr.float64_array_t(mi.Matrix4f)(A)
-    A_inverse = dr.rcp(A)
-    return dr.sqrt(_squares(A) * _squares(A_inverse))
+def independence(A: Any) -> Any:
+    """How far the columns of a 4x4 matrix are from linear dependence (Float64): about 1 / its condition number.
+
+    The smallest part of a column that the columns before it do not span, relative to the Frobenius norm, by modified
+    Gram-Schmidt. (Cofactors, and so `dr.rcp`, cannot tell: of a matrix of rank two they are rounding alone.)
+    """
+    real = dr.float64_array_t(mi.Float)
+    columns = [[real(A[i, k]) for i in range(4)] for k in range(4)]
+    norm2 = sum(_dot(c, c) for c in columns)
+    smallest = real(1)
+    for k, a in enumerate(columns):
+        rest2 = _dot(a, a)
+        smallest = dr.minimum(smallest, dr.sqrt(rest2 / norm2))
+        for j in range(k + 1, 4):
+            share = dr.select(rest2 > 0, _dot(a, columns[j]) / rest2, 0)
+            columns[j] = [y - share * x for x, y in zip(a, columns[j], strict=True)]
+    return smallest
 
 
-def _squares(A: Any) -> Any:
-    return sum(dr.square(A[i, j]) for i in range(4) for j in range(4))
+def _dot(a: list[Any], b: list[Any]) -> Any:
+    return sum(x * y for x, y in zip(a, b, strict=True))

@@ -127,7 +127,9 @@ def replay_attached(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, r
         with dr.resume_grad():
             e, w, x_next = local_terms(walk, v, at, δL * β, slope, frame_next, active)
             q_next = mi.Vector4f(q)
-            backward(e + dr.sum(δL * mi.Spectrum(L) * w) + sum(q_next[k] * x_next[k] for k in range(4)))
+            target = e + dr.sum(δL * mi.Spectrum(L) * w) + sum(q_next[k] * x_next[k] for k in range(4))
+            if dr.hint(dr.grad_enabled(target), mode="scalar"):  # not so where the camera alone moves
+                backward(target)
 
         β, at, active = β_next, at_next, v.go_on
         depth += 1

@@ -1,0 +1,256 @@
+"""Attached path replay: the noise leaves the expected Jacobian product and the gradient alone; chains are exact."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from pathreplay.gradient import replay as replay_module
+from pathreplay.gradient.ray_jacobian import Recovery, independence, random_sign, regularise
+from pathreplay.transport.vertex import Numbers
+
+RESOLUTION = 8
+SPP = 16
+DIFFUSE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.7, 0.9]}}
+MIRROR = {"type": "conductor"}
+GLASS = {"type": "smoothdielectric", "int_ior": 1.5}
+ROUGH = {"type": "roughconductor", "alpha": 0.2}
+
+
+# ------------------------------------------------------ scenes -------------------------------------------------------
+
+
+def environment() -> dict[str, Any]:
+    y, x = np.mgrid[0:16, 0:32] * (np.pi / 16)
+    waves = [np.sin(x) * np.sin(y) / 2, np.cos(x + 1) * np.sin(y) / 2, np.sin(2 * x) * np.sin(y) / 3]
+    return {"type": "envmap", "bitmap": mi.Bitmap((1 + np.stack(waves, axis=-1)).astype(np.float32))}
+
+
+def scene_with(origin: list[float], target: list[float], **objects: Any) -> mi.Scene:
+    camera = {
+        "type": "perspective",
+        "fov": 20,
+        "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=target, up=[0, 0.1, 1]),
+        "film": {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}},
+    }
+    return mi.load_dict({"type": "scene", "camera": camera, **objects}, optimize=False)
+
+
+def panes(interfaces: int) -> mi.Scene:
+    """Tilted panes of glass behind one another: the path has as many delta vertices as ``max_depth`` lets it have."""
+    turn, T = mi.ScalarTransform4f().rotate, mi.ScalarTransform4f
+    place = [T().translate([0, 0, k / 4]) @ turn([1, k % 3, 0], 180 * (k % 2) + 3 + k) for k in range(interfaces)]
+    glass = {
+        f"pane{k}": {"type": "rectangle", "to_world": to @ T().scale(6), "bsdf": {"type": "ref", "id": "glass"}}
+        for k, to in enumerate(place)
+    }
+    return scene_with([0.3, -0.2, -5], [0.3, 0, 0], env=environment(), glass=GLASS, **glass, obj=_mirror_behind())
+
+
+def _mirror_behind() -> dict[str, Any]:
+    """A mirror ball behind the panes, so that the chain is long and passes a curved surface in its middle."""
+    return {"type": "sphere", "center": [0, 0, 9], "radius": 4, "bsdf": MIRROR}
+
+
+def valley(bsdf: dict[str, Any]) -> mi.Scene:
+    """Two balls and a floor that see one another."""
+    bsdf, material = {"type": "ref", "id": "material"}, bsdf
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(4), "bsdf": bsdf}
+    return scene_with(
+        [0, -6, 2],
+        [0, 0, 0.7],
+        env=environment(),
+        material=material,
+        floor=floor,
+        obj={"type": "sphere", "center": [-0.9, 0, 1], "radius": 0.9, "bsdf": bsdf},
+        other={"type": "sphere", "center": [1, 0.2, 1.1], "radius": 0.9, "bsdf": bsdf},
+    )
+
+
+def lit_room(bsdf: dict[str, Any]) -> mi.Scene:
+    """A ball and a floor under a near light: MIS weights depend on the density and on the distance of a ray."""
+    light = mi.ScalarTransform4f().translate([0.5, 0, 2.5]) @ mi.ScalarTransform4f().rotate([1, 0.2, 0], 170)
+    return scene_with(
+        [0, -5, 1.5],
+        [0, 0, 0.5],
+        floor={"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(3), "bsdf": bsdf},
+        obj={"type": "sphere", "center": [-0.3, 0, 0.8], "radius": 0.7, "bsdf": bsdf},
+        light={"type": "rectangle", "to_world": light, "emitter": {"type": "area", "radiance": 3.0}},
+    )
+
+
+# ----------------------------------------------------- gradients -----------------------------------------------------
+
+
+def gradient(
+    scene: mi.Scene,
+    driver: str,
+    depth: int,
+    key: str = "obj.to_world",
+    recovery: Recovery | None = None,
+    seed: int = 1,
+    attach: str = "delta",
+) -> np.ndarray:
+    """Derivative of a weighted image by three shifts and a turn of what ``key`` names."""
+    integrator = mi.load_dict(
+        {"type": "pathreplay", "max_depth": depth, "rr_depth": 1000, "driver": driver, "attach": attach}
+    )
+    if recovery is not None:
+        integrator.recovery = recovery
+    params = mi.traverse(scene)
+    still = mi.Transform4f(params[key])
+    by = [mi.Float(0) for _ in range(4)]
+    dr.enable_grad(*by)
+    moved = mi.Transform4f().translate(mi.Vector3f(*by[:3])) @ mi.Transform4f().rotate([0.3, 1, 0.2], by[3])
+    params[key] = moved @ still
+    params.update()
+    weights = np.random.default_rng(0).uniform(0.5, 1.5, (RESOLUTION, RESOLUTION, 3)).astype(np.float32)
+    image = mi.render(scene, params, integrator=integrator, spp=SPP, seed=seed + 1000, seed_grad=seed)
+    dr.backward(dr.sum(image * mi.TensorXf(weights), axis=None))
+    result = np.array([dr.grad(x)[0] for x in by], dtype=np.float64)
+    params[key] = still
+    params.update()
+    return result
+
+
+def error(found: np.ndarray, expected: np.ndarray) -> float:
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+
+
+def z_score(differences: np.ndarray) -> np.ndarray:
+    """Of the mean over the first axis; rounding (1e-6 of the largest) is added to the standard error."""
+    standard_error = differences.std(axis=0, ddof=1) / np.sqrt(len(differences))
+    return differences.mean(axis=0) / (standard_error + 1e-12)
+
+
+# --------------------------------------------- claim 1: the product survives -----------------------------------------
+
+CHAIN = [np.random.default_rng(k).normal(size=(4, 4)) for k in range(4)]
+CHAIN[1][:, 2:] = CHAIN[1][:, :2] @ [[0.5, 0.2], [-0.1, 0.7]]  # of rank two, as at a diffuse vertex
+CHAIN[3][2:] = 0.3 * CHAIN[3][:2]
+
+
+@pytest.mark.parametrize("place", ["everywhere", "smooth", "directions"])
+def test_noise_leaves_the_expected_product_of_jacobians_alone(place: str) -> None:
+    draws = 200_000
+    rng = mi.PCG32(size=draws)
+    real = dr.float64_array_t(mi.Matrix4f)
+    product = real(1)
+    expected = np.eye(4)
+    for k, A in enumerate(CHAIN):
+        numbers = [rng.next_float32() for _ in range(6)]
+        u = Numbers(mi.Point2f(*numbers[:2]), numbers[2], mi.Point2f(*numbers[3:5]), numbers[5])
+        product = regularise(real(A), 0.7 * random_sign(u), place, mi.Bool(k % 2 == 1)) @ product
+        expected = A @ expected
+    found = np.array([[np.array(product[i, j]) for j in range(4)] for i in range(4)])
+    spread = found.std(axis=-1)
+    assert spread.max() > 0.1  # there is noise
+    z = (found.mean(axis=-1) - expected) / (spread / np.sqrt(draws) + 1e-9)
+    assert np.abs(z).max() < 4.5, z  # 16 entries, three places: 4.5 standard errors happen once in 3000 runs
+
+
+def test_the_sign_repeats_and_has_mean_zero() -> None:
+    rng = mi.PCG32(size=100_000)
+    numbers = [rng.next_float32() for _ in range(6)]
+    u = Numbers(mi.Point2f(*numbers[:2]), numbers[2], mi.Point2f(*numbers[3:5]), numbers[5])
+    signs = np.array(random_sign(u))
+    assert np.array_equal(signs, np.array(random_sign(u)))
+    assert set(signs) == {-1.0, 1.0}
+    assert abs(signs.mean()) < 4 / np.sqrt(len(signs))
+
+
+def test_noise_only_where_the_matrix_is_ill_conditioned() -> None:
+    real = dr.float64_array_t(mi.Matrix4f)
+    well, singular = real(CHAIN[0]), real(CHAIN[1])
+    assert independence(well)[0] > 0.01
+    assert independence(singular)[0] < 1e-12
+    assert dr.allclose(regularise(well, mi.Float(0.5), "directions", mi.Bool(True)), well)
+    assert independence(regularise(singular, mi.Float(0.5), "directions", mi.Bool(False)))[0] > 1e-3
+
+
+# --------------------------------------------- claim 2: the gradient survives ----------------------------------------
+
+
+@pytest.mark.parametrize("key", ["obj.to_world", "pane0.to_world", "camera.to_world"])
+def test_a_chain_of_sixteen_delta_lobes_agrees_with_the_sweep(key: str) -> None:
+    scene = panes(12)
+    expected = gradient(scene, "sweep", 16, key)
+    assert error(gradient(scene, "replay", 16, key, Recovery(noise=0)), expected) < 1e-5
+    assert error(gradient(scene, "replay", 16, key, Recovery(noise=0, double=False)), expected) < 1e-5
+    # The chain is that long: without its last vertex the gradient is another.
+    assert error(gradient(scene, "sweep", 15, key), expected) > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("scene", "depth", "recovery"),
+    [
+        (lambda: panes(2), 6, Recovery(noise=0.2, place="everywhere")),
+        (lambda: valley(DIFFUSE), 3, Recovery(noise=0.5, place="smooth")),
+        (lambda: valley(DIFFUSE), 4, Recovery(noise=0.5)),
+        (lambda: valley(ROUGH), 4, Recovery(noise=0.5)),
+    ],
+    ids=["glass", "diffuse-identity", "diffuse", "rough-metal"],
+)
+def test_noise_leaves_the_gradient_unbiased(scene: Any, depth: int, recovery: Recovery) -> None:
+    scene = scene()
+    seeds = range(1, 17)
+    differences = np.array(
+        [
+            gradient(scene, "replay", depth, recovery=recovery, seed=k) - gradient(scene, "sweep", depth, seed=k)
+            for k in seeds
+        ]
+    )
+    assert np.abs(differences).max() > 1e-5  # the noise is there
+    assert np.abs(z_score(differences)).max() < 4.5, z_score(differences)
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "attach", "key"),
+    [
+        (DIFFUSE, "delta", "obj.to_world"),
+        (DIFFUSE, "delta", "camera.to_world"),
+        (ROUGH, "delta", "light.to_world"),
+        (ROUGH, "all", "obj.to_world"),
+    ],
+    ids=["diffuse", "diffuse-camera", "rough-metal-light", "rough-metal-all"],
+)
+def test_density_and_distance_reach_the_mis_weight_of_the_next_emission(attach: str, bsdf: Any, key: str) -> None:
+    scene = lit_room(bsdf)
+    found = gradient(scene, "replay", 4, key, Recovery(noise=1e-3), attach=attach)
+    assert error(found, gradient(scene, "sweep", 4, key, attach=attach)) < 1e-3
+
+
+def test_float64_books_reach_further_than_float32() -> None:
+    """What is left: rounding that the inverses magnify. With float32 it beats the gradient after a few bounces."""
+    scene = valley(DIFFUSE)
+    expected = gradient(scene, "sweep", 8)
+    by_double = {d: error(gradient(scene, "replay", 8, recovery=Recovery(double=d)), expected) for d in (True, False)}
+    assert by_double[True] < 0.01
+    assert by_double[False] > 10 * by_double[True]
+
+
+# ------------------------------------------------------ honesty ------------------------------------------------------
+
+
+def test_without_noise_the_gradient_stays_finite() -> None:
+    found = gradient(valley(DIFFUSE), "replay", 6, recovery=Recovery(noise=0))
+    assert np.isfinite(found).all()
+
+
+def test_smooth_lobes_on_moving_paths_are_warned_of_once(capfd: pytest.CaptureFixture[str]) -> None:
+    replay_module._warn_of_smooth_lobes.cache_clear()
+    scene = valley(DIFFUSE)
+    gradient(scene, "replay", 2)
+    gradient(scene, "replay", 2)
+    told = capfd.readouterr()
+    assert (told.out + told.err).count("driver = 'sweep' has no such limit") == 1
+
+
+def test_negative_noise_is_refused() -> None:
+    # Mitsuba's loader wraps what a plugin raises into an error of its own.
+    with pytest.raises(Exception, match=r"PathreplayError: pathreplay: noise = -0\.1: use a standard deviation >= 0"):
+        mi.load_dict({"type": "pathreplay", "noise": -0.1})
