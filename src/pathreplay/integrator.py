@@ -28,6 +28,14 @@ def _choice(props: Any, name: str, default: str, choices: tuple[str, ...]) -> st
     return str(value)
 
 
+def mendable(error: BaseException) -> BaseException:
+    """The PathreplayError that Dr.Jit wrapped in errors of its own on the way out of a loop; else the error itself."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, PathreplayError):
+        cause = cause.__cause__
+    return cause or error
+
+
 def _make_class() -> type:
     from mitsuba.ad.integrators.common import RBIntegrator
 
@@ -71,7 +79,8 @@ def _make_class() -> type:
             if noise < 0:
                 raise PathreplayError(f"pathreplay: noise = {noise}: use a standard deviation >= 0 (0 = off)")
             self.recovery = Recovery(noise=noise)
-            self.told = False  # the log line about BSDFs that stay detached
+            self.told: set[str] = set()  # what has been said in the log
+            self.lost: tuple[Any, int] | None = None  # number of paths with a lost part, of how many
 
         def sample(
             self,
@@ -88,22 +97,37 @@ def _make_class() -> type:
             if mode == dr.ADMode.Primal:
                 L, valid = primal(walk, sampler, dr.detach(ray), active)
                 return L, valid, [], None
+            if self.attach == "all":
+                self._tell_attachable(walk.traits)
             if mode == dr.ADMode.Forward:
                 tangent, valid = forward(walk, sampler, ray, active)
                 return tangent, valid, [], None
             if self.driver == "sweep":
-                sweep(walk, sampler, ray, δL, active)
+                lost = sweep(walk, sampler, ray, δL, active)
             else:
-                replay(walk, sampler, ray, δL, active, self.recovery)
+                lost = replay(walk, sampler, ray, δL, active, self.recovery)
+            if lost is not None:
+                self._tell_edges(walk.traits)
+                count = dr.zeros(mi.UInt32, 1)
+                dr.scatter_add(count, mi.UInt32(1), mi.UInt32(0), lost)  # evaluated together with the gradients
+                self.lost = count, dr.width(ray)
             return mi.Spectrum(0), mi.Bool(True), [], None
 
+        def render_backward(self, *args: Any, **kwargs: Any) -> None:
+            """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
+
+            Warns when a part of the gradient was not finite and had to be left out.
+            """
+            try:
+                super().render_backward(*args, **kwargs)
+            except RuntimeError as error:
+                raise mendable(error) from None
+            self._tell_lost()
+
         def _walk(self, scene: Any) -> Walk:
-            traits = scene_traits(scene)
-            if self.attach == "all":
-                self._tell_attachable(traits)
             return Walk(
                 scene=scene,
-                traits=traits,
+                traits=scene_traits(scene),
                 attach=self.attach,
                 hide_emitters=self.hide_emitters,
                 max_depth=self.max_depth,
@@ -117,10 +141,31 @@ def _make_class() -> type:
                     "pathreplay: attach = 'all', but no BSDF of the scene can be sampled attached (diffuse, "
                     "roughconductor, roughdielectric, normal and bump maps over them can): use attach = 'delta'"
                 )
-            if traits.detached_names and not self.told:
+            if traits.detached_names:
                 names = ", ".join(traits.detached_names)
-                mi.Log(mi.LogLevel.Warn, f"pathreplay: attach = 'all' keeps the directions of {names} fixed")
-                self.told = True
+                self._tell_once(f"attach = 'all' keeps the directions of {names} fixed")
+
+        def _tell_edges(self, traits: Traits) -> None:
+            if traits.lobes and traits.area_lights:
+                self._tell_once(
+                    "something moves in a scene with delta lobes and area lights: where the edge of a light or a "
+                    "silhouette is seen through glass or mirrors, its motion is missing from the gradient"
+                )
+
+        def _tell_once(self, message: str) -> None:
+            if message not in self.told:
+                self.told.add(message)
+                mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
+
+        def _tell_lost(self) -> None:
+            if self.lost is None:
+                return
+            (count, paths), self.lost = self.lost, None
+            if count[0] > 0:
+                mi.Log(
+                    mi.LogLevel.Warn,
+                    f"pathreplay: in {count[0] / paths:.2%} of the paths a ray adjoint was not finite and was left out",
+                )
 
         def to_string(self) -> str:
             depth = -1 if self.max_depth == UNBOUNDED else self.max_depth

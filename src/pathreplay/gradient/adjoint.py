@@ -25,6 +25,11 @@ class RayDerivative:
     def zero() -> RayDerivative:
         return RayDerivative(mi.Point3f(0), mi.Vector3f(0), mi.Float(0))
 
+    def finite_part(self) -> tuple[RayDerivative, Any]:
+        """The derivative where it is finite and zero elsewhere, and where that is (Bool)."""
+        ok = dr.all(dr.isfinite(self.o)) & dr.all(dr.isfinite(self.d)) & dr.isfinite(self.pdf)
+        return RayDerivative(dr.select(ok, self.o, 0), dr.select(ok, self.d, 0), dr.select(ok, self.pdf, 0)), ok
+
 
 @dataclass
 class Replayed:
@@ -52,11 +57,13 @@ def _step(walk: Walk, v: Replayed, at: Arrival, attached: bool, active: Any) -> 
 
 def backward_step(
     walk: Walk, v: Replayed, attached: bool, adjoint: Any, L: Any, q: RayDerivative, active: Any
-) -> tuple[Any, RayDerivative]:
-    """Back-propagate  adjoint·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters, and give L_i and q_i.
+) -> tuple[Any, RayDerivative, Any]:
+    """Back-propagate  adjoint·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters; gives L_i, q_i, and its loss.
 
-    ``adjoint`` is δL β_i, ``L`` is L_{i+1} (Spectrum). Where not ``attached``, q stays zero and costs nothing.
+    ``adjoint`` is δL β_i, ``L`` is L_{i+1} (Spectrum). Where not ``attached``, q stays zero and costs nothing. A q_i
+    that is not finite is dropped: the last result (Bool) tells where.
     """
+    lost = mi.Bool(False)
     with dr.resume_grad():
         at = _attached_arrival(v.at) if attached else v.at
         step = _step(walk, v, at, attached, active)
@@ -67,8 +74,9 @@ def backward_step(
             target += dr.select(v.go_on, along, 0)
         backward(target)
         if attached:
-            q = RayDerivative(dr.grad(at.ray.o), dr.grad(at.ray.d), dr.grad(at.pdf))
-    return dr.detach(Li), q
+            q, finite = RayDerivative(dr.grad(at.ray.o), dr.grad(at.ray.d), dr.grad(at.pdf)).finite_part()
+            lost = ~finite
+    return dr.detach(Li), q, lost
 
 
 def forward_step(

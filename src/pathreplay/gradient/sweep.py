@@ -109,10 +109,11 @@ def _read_continuation(record: Any, onward: Arrival) -> Kept:
 
 @dr.syntax
 def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> Any:
-    """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters; returns L (Spectrum per ray).
+    """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
 
-    ``ray`` may be attached to the camera. A weight that is exactly zero keeps its derivative. Not differentiated:
-    visibility and, with ``attach='none'``, everything that moves.
+    Returns, for every ray, whether a part of its adjoint was not finite and was lost (Bool); None where nothing moves,
+    so that there are no ray adjoints. ``ray`` may be attached to the camera. A weight that is exactly zero keeps its
+    derivative. Not differentiated: visibility and, with ``attach='none'``, everything that moves.
     Raises PathreplayError when ``max_depth`` is above `MAX_DEPTH`, or when no parameter reaches the paths.
     """
     if dr.hint(walk.max_depth > MAX_DEPTH, mode="scalar"):
@@ -153,6 +154,7 @@ def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> Any:
     last = depth - 1  # index of the last vertex
     L = mi.Spectrum(0)  # radiance along the ray that leaves the vertex
     q = RayDerivative.zero()  # adjoint of that ray
+    lost = mi.Bool(False)  # a part of the adjoint was not finite
 
     while dr.hint(depth > 0, exclude=[walk, ray, camera_ray], label="pathreplay: sweep"):
         depth -= 1
@@ -166,11 +168,12 @@ def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> Any:
             hit_next=onward.hit,
             rr_weight=record.rr_weight,
         )
-        L, q = backward_step(walk, replayed, attached, δL * record.β, L, q, mi.Bool(True))
+        L, q, lost_here = backward_step(walk, replayed, attached, δL * record.β, L, q, mi.Bool(True))
+        lost |= lost_here
 
     # ----------------------- Back to the camera ----------------------
 
     with dr.resume_grad():
         if dr.hint(attached and dr.grad_enabled(ray.o, ray.d), mode="scalar"):
             backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
-    return L
+    return lost if attached else None

@@ -47,7 +47,7 @@ def sustain(β_alive: Any, β: Any, step: Step) -> Any:
     w = dr.detach(step.w)
     w_max = dr.max(w)
     stand_in = dr.select(step.kept.pdf != 0, dr.select(w_max != 0, w_max, 1), 0)
-    return β_alive * dr.select((w == 0) & (β != 0), stand_in, w)
+    return β_alive * mi.Spectrum(dr.select((w == 0) & (β != 0), stand_in, w))
 
 
 def next_arrival(walk: Walk, step: Step, active: Any) -> Arrival:

@@ -20,13 +20,14 @@ class Traits:
     ``lobes`` is one more than the largest component index at which a BSDF has a delta lobe, 0 if none has.
     ``attachable`` tells, by BSDF registry index (Bool), where smooth lobes may be sampled attached; None if nowhere.
     ``detached_names`` are the classes of the BSDFs with smooth lobes where they may not. ``lights_deform`` says that
-    an emitting mesh has vertex positions with gradients.
+    an emitting mesh has vertex positions with gradients; ``area_lights`` that there are emitters with an edge.
     """
 
     lobes: int
     attachable: Any
     detached_names: tuple[str, ...]
     lights_deform: bool
+    area_lights: bool
 
 
 def scene_traits(scene: Any) -> Traits:
@@ -40,6 +41,7 @@ def scene_traits(scene: Any) -> Traits:
         attachable=_mask_by_index(attachable) if attachable else None,
         detached_names=tuple(sorted(others)),
         lights_deform=any(_deforms(node) for node in nodes if isinstance(node, mi.Mesh) and node.is_emitter()),
+        area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
     )
 
 

@@ -1,0 +1,234 @@
+"""The plugin as Mitsuba sees it: properties, refusals, warnings, threads, seeds, and equal images."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from pathreplay import PathreplayError
+from truth import bitmap, lit_room, noise, random, rgb, translate, under_sky
+
+DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}
+
+
+def plugin(**properties):
+    return mi.load_dict({"type": "pathreplay", **properties})
+
+
+@pytest.mark.parametrize(
+    ("properties", "words"),
+    [
+        ({"max_depth": -2}, ["max_depth = -2", "-1"]),
+        ({"rr_depth": 0}, ["rr_depth = 0"]),
+        ({"driver": "swep"}, ["driver = 'swep'", "'sweep'"]),
+        ({"attach": "some"}, ["attach = 'some'", "'delta'"]),
+        ({"driver": "sweep", "max_depth": 5000}, ["max_depth = 5000", "2048", "'replay'"]),
+        ({"driver": "sweep", "max_depth": -1}, ["unbounded", "'replay'"]),
+        ({"noise": -1.0}, ["noise = -1"]),
+    ],
+)
+def test_bad_properties_are_named_with_the_way_out(properties, words) -> None:
+    with pytest.raises(Exception) as error:  # Mitsuba wraps what a plugin raises
+        plugin(**properties)
+    assert all(word in str(error.value) for word in words), str(error.value)
+
+
+def test_auto_sweeps_where_the_record_fits() -> None:
+    assert plugin().driver == "sweep"
+    assert plugin(max_depth=2048).driver == "sweep"
+    assert plugin(max_depth=2049).driver == "replay"
+    assert plugin(max_depth=-1).driver == "replay"
+
+
+def lamp_in_view(shape: str, near_clip: float = 0.01) -> mi.Scene:
+    """A lamp between the camera and an object, two units before it."""
+    scene = lit_room(DIFFUSE, shape)
+    scene["camera"]["film"]["pixel_format"] = "rgba"
+    scene["camera"]["near_clip"] = near_clip
+    scene["light"]["to_world"] = mi.ScalarTransform4f().translate([0.5, 0, 2]).scale(0.3)
+    scene["light"]["bsdf"] = {"type": "diffuse"}
+    return mi.load_dict(scene)
+
+
+def means(scene: mi.Scene, **integrator) -> np.ndarray:
+    """Mean of each channel, for twelve seeds."""
+    integrator = mi.load_dict({"rr_depth": 2, **integrator})
+    images = [np.array(mi.render(scene, integrator=integrator, spp=64, seed=seed)) for seed in range(12)]
+    return np.stack(images).astype(np.float64).mean((1, 2))
+
+
+def assert_equal_means(a: np.ndarray, b: np.ndarray) -> None:
+    """The means over seeds agree within four standard errors."""
+    error = np.sqrt((a.var(0, ddof=1) + b.var(0, ddof=1)) / len(a)) + 1e-6
+    assert np.all(np.abs(a.mean(0) - b.mean(0)) < 4 * error), (a.mean(0), b.mean(0), error)
+
+
+@pytest.mark.parametrize("max_depth", [0, 1, 2, 5])
+@pytest.mark.parametrize("hide_emitters", [False, True])
+def test_images_are_those_of_path(max_depth: int, hide_emitters: bool) -> None:
+    """In colour and alpha, with a light in view."""
+    scene = lamp_in_view("cube")
+    ours = means(scene, type="pathreplay", max_depth=max_depth, hide_emitters=hide_emitters)
+    assert_equal_means(ours, means(scene, type="path", max_depth=max_depth, hide_emitters=hide_emitters))
+    assert (ours.mean() > 0) == (max_depth > 0)
+
+
+def test_a_sphere_behind_a_hidden_lamp_is_where_it_is() -> None:
+    """Mitsuba's path and prb misplace it: they lose the distance to the lamp. A camera beyond the lamp is right."""
+    ours = means(lamp_in_view("sphere"), type="pathreplay", hide_emitters=True)
+    assert_equal_means(ours, means(lamp_in_view("sphere", near_clip=3.05), type="path", hide_emitters=True))
+
+
+def _textured():
+    scene = mi.load_dict(lit_room({"type": "diffuse", "reflectance": bitmap(noise(16, 3, 0.2, 0.8))}))
+    params = mi.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("reflectance.data"))
+    return scene, params, key
+
+
+def _gradient(scene, params, key, integrator, seed=3):
+    dr.enable_grad(params[key])
+    params.update()
+    dr.set_grad(params[key], 0)
+    integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (16, 16, 3)), seed=seed, spp=64)
+    gradient = np.array(dr.grad(params[key]))
+    dr.disable_grad(params[key])
+    params.update()
+    return gradient
+
+
+# Sums of some thousand float32 terms in whatever order the threads come.
+ROUNDING = 1e-5
+
+
+@pytest.mark.parametrize("driver", ["sweep", "replay"])
+def test_one_thread_and_many_agree_and_a_seed_repeats(driver: str) -> None:
+    scene, params, key = _textured()
+    integrator = plugin(driver=driver)
+    many = _gradient(scene, params, key, integrator)
+    again = _gradient(scene, params, key, integrator)
+    other = _gradient(scene, params, key, integrator, seed=4)
+    threads = dr.thread_count()
+    try:
+        dr.set_thread_count(1)
+        one = _gradient(scene, params, key, integrator)
+    finally:
+        dr.set_thread_count(threads)
+    largest = np.abs(many).max()
+    assert np.abs(many - again).max() < ROUNDING * largest
+    assert np.abs(many - one).max() < ROUNDING * largest
+    assert np.abs(many - other).max() > 10 * ROUNDING * largest
+
+
+def test_render_and_dr_backward_and_forward() -> None:
+    """`mi.render` with `dr.backward` and `dr.forward` gives what the methods give."""
+    scene, params, key = _textured()
+    integrator = plugin()
+    direct = _gradient(scene, params, key, integrator, seed=5)
+    dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(scene, params, integrator=integrator, spp=64, seed=1, seed_grad=5)
+    dr.backward(dr.sum(image, axis=None))
+    assert np.allclose(np.array(dr.grad(params[key])), direct, rtol=1e-3, atol=ROUNDING * np.abs(direct).max())
+
+    value = mi.TensorXf(dr.detach(params[key]))
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    params[key] = random(1.0)(value, t)
+    params.update()
+    image = mi.render(scene, params, integrator=integrator, spp=64, seed=1, seed_grad=5)
+    dr.forward(t)
+    tangent = np.array(dr.grad(image)).sum()
+    assert tangent == pytest.approx((direct * np.array(random(1.0)(0 * value, 1.0))).sum(), rel=1e-3)
+    params[key] = value
+    params.update()
+
+
+def test_it_loads_from_xml() -> None:
+    scene = mi.load_string(
+        """<scene version="3.0.0"><integrator type="pathreplay"><integer name="max_depth" value="3"/>
+        <string name="driver" value="replay"/></integrator></scene>"""
+    )
+    assert scene.integrator().max_depth == 3
+    assert scene.integrator().driver == "replay"
+
+
+def test_a_gradient_that_nothing_reaches_is_an_error() -> None:
+    """With attach='none' a moving shape would silently get the gradient zero."""
+    scene = mi.load_dict(under_sky(DIFFUSE))
+    params = mi.traverse(scene)
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    still = mi.Transform4f(params["object.to_world"])
+    params["object.to_world"] = translate(1, 0, 0)(still, t)
+    params.update()
+    with pytest.raises(PathreplayError, match="attach"):
+        plugin(attach="none").render_backward(scene, params, dr.ones(mi.TensorXf, (16, 16, 3)), spp=4)
+    params["object.to_world"] = still  # Dr.Jit trips over attached parameters of scenes that are alive
+    params.update()
+
+
+def test_attach_all_is_refused_where_it_would_do_nothing() -> None:
+    scene = mi.load_dict(under_sky({"type": "principled"}))
+    with pytest.raises(PathreplayError, match="attach = 'delta'"):
+        plugin(attach="all").render_backward(scene, mi.traverse(scene), dr.ones(mi.TensorXf, (16, 16, 3)), spp=1)
+
+
+@pytest.mark.parametrize("sampler", ["independent", "stratified", "multijitter", "orthogonal", "ldsampler"])
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+def test_samplers_filters_and_crops(sampler: str, rfilter: str) -> None:
+    """Forward against reverse with every sampler, and a film with a filter that spreads and a crop window."""
+    description = lit_room(DIFFUSE)
+    description["camera"]["sampler"] = {"type": sampler}
+    description["camera"]["film"] |= {
+        "rfilter": {"type": rfilter}, "crop_width": 9, "crop_height": 7, "crop_offset_x": 3, "crop_offset_y": 4
+    }  # fmt: skip
+    scene = mi.load_dict(description, optimize=False)
+    params = mi.traverse(scene)
+    key, integrator = "object.bsdf.reflectance.value", plugin()
+    dr.enable_grad(params[key])
+    params.update()
+    dr.set_grad(params[key], 1)
+    weights = np.random.default_rng(1).uniform(0, 1, (7, 9, 3)).astype(np.float32)
+    tangent = float((np.array(integrator.render_forward(scene, params, seed=2, spp=16)) * weights).sum())
+    dr.set_grad(params[key], 0)
+    integrator.render_backward(scene, params, mi.TensorXf(weights), seed=2, spp=16)
+    adjoint = float(np.array(dr.grad(params[key])).sum())
+    dr.disable_grad(params[key])
+    params.update()
+    assert tangent == pytest.approx(adjoint, rel=1e-5)
+    assert tangent > 0
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_other_variants_agree_forward_and_reverse(variant: str, run_python) -> None:
+    code = f"""
+import pathreplay, mitsuba as mi, drjit as dr, numpy as np
+mi.set_variant({variant!r})
+scene = mi.load_dict(mi.cornell_box()); params = mi.traverse(scene)
+key = next(k for k in params.keys() if k.startswith("red.reflectance"))
+for driver in ("sweep", "replay"):
+    integrator = mi.load_dict({{"type": "pathreplay", "driver": driver}})
+    sensor = scene.sensors()[0]
+    dr.enable_grad(params[key]); params.update(); dr.set_grad(params[key], 1)
+    f = np.array(integrator.render_forward(scene, params, seed=1, spp=1)).sum()
+    dr.set_grad(params[key], 0)
+    shape = mi.render(scene, integrator=integrator, spp=1).shape
+    integrator.render_backward(scene, params, dr.ones(mi.TensorXf, shape), seed=1, spp=1)
+    b = np.array(dr.grad(params[key])).sum()
+    assert abs(f - b) < 1e-4 * abs(f) and f > 0, (f, b)
+print("agree")
+"""
+    result = run_python(code)
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert "agree" in result.stdout
+
+
+def test_polarised_variants_are_refused(run_python) -> None:
+    result = run_python(
+        "import pathreplay, mitsuba as mi\nmi.set_variant('llvm_ad_spectral_polarized')\n"
+        "mi.load_dict({'type': 'pathreplay'})"
+    )
+    assert "llvm_ad_spectral'" in result.stderr and "polarisation" in result.stderr
