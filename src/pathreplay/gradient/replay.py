@@ -23,27 +23,21 @@ from .ray_jacobian import Recovery, has_smooth_lobes
 from .replay_attached import replay_attached
 
 
-def replay(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, recovery: Recovery) -> None:
+def replay(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, recovery: Recovery) -> Any:
     """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
 
-    ``ray`` may be attached to the camera. ``recovery`` says how ray adjoints are found where the path moves; it is
-    then that a warning tells, once, of smooth lobes, and how many paths lost a part of their gradient because it was
-    not finite. Not differentiated: visibility, weights that are exactly zero (the sweep driver keeps their
-    derivatives) and, with ``attach='none'``, all motion.
+    Where the path moves, ``recovery`` says how ray adjoints are found, a warning tells, once, of smooth lobes, and the
+    result is, for every ray, whether a part of its gradient was lost because it was not finite (Bool); else it is None.
+    ``ray`` may be attached to the camera. Not differentiated: visibility, weights that are exactly zero (the sweep
+    driver keeps their derivatives) and, with ``attach='none'``, all motion.
     """
     active = mi.Bool(active) & (walk.max_depth > 0)
     if not path_moves(walk, ray, first_arrival(walk, ray, active)):
         _replay_still(walk, sampler, ray, δL, active)
-        return
+        return None
     if has_smooth_lobes(walk):
         _warn_of_smooth_lobes()
-    lost = replay_attached(walk, sampler, ray, δL, active, recovery)
-    share = dr.count(lost)[0] / max(dr.width(lost), 1)
-    if share > 0:
-        mi.Log(
-            mi.LogLevel.Warn,
-            f"pathreplay: {share:.2%} of the paths had ray adjoints that were not finite; they were left out",
-        )
+    return replay_attached(walk, sampler, ray, δL, active, recovery)
 
 
 @cache
