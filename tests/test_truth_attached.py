@@ -14,7 +14,7 @@ import pytest
 
 from pathreplay.bsdfs.smoothdielectric import _plugin_class
 from truth import (
-    Case,
+    Bench, Case,
     add,
     bitmap,
     camera,
@@ -66,15 +66,32 @@ def bumps(nested):
     return {"type": "bumpmap", "texture": bitmap(_waves(8, 1)[0][..., None]), "nested": nested, "scale": 0.3}
 
 
-def quad(bsdf, **props):
+def tilted():
+    return mi.ScalarTransform4f().rotate([1, 1, 0], 15).scale([2, 2, 1])
+
+
+def quad(bsdf):
     """A tilted rectangle that fills the picture, under the smooth environment map."""
-    to_world = mi.ScalarTransform4f().rotate([1, 1, 0], 15).scale([2, 2, 1])
-    return under_sky(bsdf, "rectangle", to_world=to_world, **props)
+    return under_sky(bsdf, "rectangle", to_world=tilted())
 
 
 def block(bsdf):
     """A mesh without vertex normals: a turned cube whose front face fills the picture."""
-    return under_sky(bsdf, "cube", to_world=mi.ScalarTransform4f().rotate([1, 1, 0], 15).scale([2, 2, 1]))
+    return under_sky(bsdf, "cube", to_world=tilted())
+
+
+def instanced(bsdf):
+    """The same block, as an instance."""
+    scene = block(bsdf)
+    scene["group"] = {"type": "shapegroup", "block": scene["object"]}
+    scene["object"] = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    return dict(sorted(scene.items(), key=lambda item: item[0] == "object"))  # a reference comes after its target
+
+
+def lens(bsdf):
+    scene = quad(bsdf)
+    scene["camera"] = {**scene["camera"], "type": "thinlens", "aperture_radius": 0.1, "focus_distance": 4.0}
+    return scene
 
 
 T, R = {"type": "one_lobe", "lobe": 1}, {"type": "one_lobe", "lobe": 0}
@@ -103,10 +120,19 @@ LANES = [
     Case("mirror ball moves", lambda: under_sky(MIRROR), WORLD, translate(0.5, 0.2, 1), **ONCE),
     Case("glass ball moves", lambda: under_sky(T), WORLD, translate(0.5, 0.2, 1), **ONCE),
     Case("mirror turns", lambda: quad(MIRROR), WORLD, rotate(1, 0.5, 0), **FINE),
+    Case("mirror disk turns", lambda: under_sky(MIRROR, "disk", to_world=tilted()), WORLD, rotate(1, 0.5, 0), **FINE),
+    Case("mirror cylinder moves", lambda: under_sky(MIRROR, "cylinder", p0=[-2, 0, 0], p1=[2, 0, 0], radius=1.0),
+         WORLD, translate(0.5, 0.2, 1), **{**FINE, "step": 8e-3}),
     Case("mirror mesh bends", lambda: block(MIRROR), VERTICES, tilt_vertices(), **ONCE),
+    Case("instanced mirror mesh bends", lambda: instanced(MIRROR), "group.block.vertex_positions", tilt_vertices(),
+         **ONCE),
     Case("glass mesh bends", lambda: block(T), VERTICES, tilt_vertices(), **ONCE),
     Case("rough metal alpha, all", lambda: quad(METAL), "object.bsdf.alpha.value", add(), options=ALL, **TINY),
     Case("camera moves, textured wall", lambda: quad({"type": "diffuse", "reflectance": bitmap(WALLPAPER)}),
+         "camera.to_world", translate(0.5, 0.2, 1), **FINE),
+    Case("field of view, textured wall", lambda: quad({"type": "diffuse", "reflectance": bitmap(WALLPAPER)}),
+         "camera.x_fov", add(10.0), **FINE),
+    Case("lens moves, textured wall", lambda: lens({"type": "diffuse", "reflectance": bitmap(WALLPAPER)}),
          "camera.to_world", translate(0.5, 0.2, 1), **FINE),
     Case("camera moves, mirror ball", lambda: under_sky(MIRROR), "camera.to_world", translate(0.5, 0.2, 1), **ONCE),
     Case("camera turns, mirror ball", lambda: under_sky(MIRROR), "camera.to_world", rotate(1, 0, 0), **FINE),
@@ -138,6 +164,13 @@ def textured_lamp():
 
 def plain_lamp(shape="rectangle"):
     return lamp_over_floor({"type": "area", "radiance": rgb(3, 2, 1)}, shape)
+
+
+def spot(kind, **props):
+    scene = plain_lamp()
+    aim = mi.ScalarTransform4f().look_at(origin=[0.5, 3, 1], target=[0, 0, 0], up=[0, 0, 1])
+    scene["light"] = {"type": kind, "to_world": aim, **props}
+    return scene
 
 
 def stretch_vertices(value, t):
@@ -184,6 +217,8 @@ CELLS = [
     Case("mesh lamp moves", lambda: plain_lamp("cube"), "light.vertex_positions", translate_vertices(0.5, 1, 0.2),
          **BOTH),
     Case("point light moves", point_lamp, "light.position", add([0.5, 1.0, 0.2]), **BOTH),
+    Case("spot moves", lambda: spot("spot", intensity=rgb(9, 6, 3), cutoff_angle=60.0), "light.to_world",
+         translate(0.5, 0.2, 1), **BOTH),
     Case("environment turns", lambda: under_sky(DIFFUSE), "sky.to_world", rotate(0.2, 1, 0), **{**BOTH, "spp": 512}),
     Case("GGX normal map by an area light", bumpy_room, NORMAL, random(1.0, 2),
          **{**BOTH, "spp": 1024, "depth": 3, "step": 3e-3}),
@@ -206,6 +241,16 @@ def test_lane_by_lane(case: Case) -> None:
 @pytest.mark.parametrize("case", _params(CELLS, QUICK_CELLS))
 def test_in_expectation(case: Case) -> None:
     hold(case)
+
+
+def test_the_sun_turns() -> None:
+    """Its light has no noise here, so that standard errors say nothing: lane by lane only."""
+    sun = Case("sun turns", lambda: spot("directional", irradiance=rgb(9, 6, 3)), "light.to_world", rotate(1, 0.5, 0))
+    bench = Bench(sun)
+    integrator = bench.integrator()
+    tangent, difference = bench.forward(integrator, 1), bench.difference(integrator, 1)
+    bench.release()
+    assert np.abs(tangent - difference).sum() < 1e-3 * np.abs(difference).sum()
 
 
 @pytest.mark.slow
