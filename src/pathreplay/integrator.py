@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .errors import PathreplayError
+from .gradient.adjoint import LostPaths
 from .gradient.forward import forward
 from .gradient.primal import primal
 from .gradient.ray_jacobian import Recovery
@@ -80,7 +81,7 @@ def _make_class() -> type:
                 raise PathreplayError(f"pathreplay: noise = {noise}: use a standard deviation >= 0 (0 = off)")
             self.recovery = Recovery(noise=noise)
             self.told: set[str] = set()  # what has been said in the log
-            self.lost: tuple[Any, int] | None = None  # number of paths with a lost part, of how many
+            self.lost: tuple[LostPaths, int] | None = None  # of how many paths
 
         def sample(
             self,
@@ -102,15 +103,14 @@ def _make_class() -> type:
             if mode == dr.ADMode.Forward:
                 tangent, valid = forward(walk, sampler, ray, active)
                 return tangent, valid, [], None
+            lost = LostPaths()
             if self.driver == "sweep":
-                lost = sweep(walk, sampler, ray, δL, active)
+                moves = sweep(walk, sampler, ray, δL, active, lost)
             else:
-                lost = replay(walk, sampler, ray, δL, active, self.recovery)
-            if lost is not None:
+                moves = replay(walk, sampler, ray, δL, active, lost, self.recovery)
+            if moves:
                 self._tell_edges(walk.traits)
-                count = dr.zeros(mi.UInt32, 1)
-                dr.scatter_add(count, mi.UInt32(1), mi.UInt32(0), lost)  # evaluated together with the gradients
-                self.lost = count, dr.width(ray)
+                self.lost = lost, dr.width(ray)
             return mi.Spectrum(0), mi.Bool(True), [], None
 
         def render_backward(self, *args: Any, **kwargs: Any) -> None:
@@ -160,12 +160,10 @@ def _make_class() -> type:
         def _tell_lost(self) -> None:
             if self.lost is None:
                 return
-            (count, paths), self.lost = self.lost, None
-            if count[0] > 0:
-                mi.Log(
-                    mi.LogLevel.Warn,
-                    f"pathreplay: in {count[0] / paths:.2%} of the paths a ray adjoint was not finite and was left out",
-                )
+            (lost, paths), self.lost = self.lost, None
+            if lost.count[0] > 0:
+                share = f"{lost.count[0] / paths:.2%}"
+                mi.Log(mi.LogLevel.Warn, f"pathreplay: {share} of the paths had a ray adjoint that was not finite")
 
         def to_string(self) -> str:
             depth = -1 if self.max_depth == UNBOUNDED else self.max_depth

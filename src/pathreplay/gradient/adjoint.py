@@ -31,6 +31,18 @@ class RayDerivative:
         return RayDerivative(dr.select(ok, self.o, 0), dr.select(ok, self.d, 0), dr.select(ok, self.pdf, 0)), ok
 
 
+class LostPaths:
+    """Counts the paths that lost a part of their gradient because it was not finite."""
+
+    def __init__(self) -> None:
+        self.count = dr.zeros(mi.UInt32, 1)
+
+    def add(self, lost: Any) -> None:
+        """Count lanes. Inside the loop, where it is a side effect like the gradients: a mask that leaves a loop and
+        is evaluated by itself would run the whole kernel once more."""
+        dr.scatter_add(self.count, mi.UInt32(1), mi.UInt32(0), lost)
+
+
 @dataclass
 class Replayed:
     """What a later pass knows about a vertex and its continuation."""

@@ -17,27 +17,31 @@ from ..transport.motion import path_moves
 from ..transport.path import first_arrival, next_arrival, survival
 from ..transport.step import surface_step
 from ..transport.vertex import Numbers, Walk, reciprocal
-from .adjoint import backward
+from .adjoint import LostPaths, backward
 from .primal import primal
 from .ray_jacobian import Recovery, has_smooth_lobes
 from .replay_attached import replay_attached
 
 
-def replay(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, recovery: Recovery) -> Any:
+def replay(
+    walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostPaths, recovery: Recovery
+) -> bool:
     """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
 
-    Where the path moves, ``recovery`` says how ray adjoints are found, a warning tells, once, of smooth lobes, and the
-    result is, for every ray, whether a part of its gradient was lost because it was not finite (Bool); else it is None.
-    ``ray`` may be attached to the camera. Not differentiated: visibility, weights that are exactly zero (the sweep
-    driver keeps their derivatives) and, with ``attach='none'``, all motion.
+    ``ray`` may be attached to the camera. Returns whether the path moves with the parameters; if so, ``recovery`` says
+    how ray adjoints are found, ``lost`` counts paths with one that was not finite, and a warning tells, once, of smooth
+    lobes. Not differentiated: visibility, weights that are exactly zero (the sweep driver keeps their derivatives) and,
+    with ``attach='none'``, everything that moves.
     """
     active = mi.Bool(active) & (walk.max_depth > 0)
-    if not path_moves(walk, ray, first_arrival(walk, ray, active)):
+    moves = path_moves(walk, ray, first_arrival(walk, ray, active))
+    if not moves:
         _replay_still(walk, sampler, ray, δL, active)
-        return None
-    if has_smooth_lobes(walk):
-        _warn_of_smooth_lobes()
-    return replay_attached(walk, sampler, ray, δL, active, recovery)
+    else:
+        if has_smooth_lobes(walk):
+            _warn_of_smooth_lobes()
+        replay_attached(walk, sampler, ray, δL, active, lost, recovery)
+    return moves
 
 
 @cache

@@ -19,7 +19,7 @@ import mitsuba as mi
 from ..transport.path import first_arrival, next_arrival, survival
 from ..transport.step import surface_step
 from ..transport.vertex import Arrival, Numbers, Walk
-from .adjoint import Replayed, backward
+from .adjoint import LostPaths, Replayed, backward
 from .ray_jacobian import (
     RayFrame,
     Recovery,
@@ -47,13 +47,14 @@ def _advance(
 
 
 @dr.syntax
-def replay_attached(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, recovery: Recovery) -> Any:
+def replay_attached(
+    walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostPaths, recovery: Recovery
+) -> None:
     """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters and the camera.
 
-    Returns, per ray, a Bool: q was not finite somewhere on its path, and what it had to tell was left out. Exact on
-    chains of delta lobes. Behind smooth lobes A_i has rank two: without noise q is lost there, with noise the result
-    is unbiased as long as rounding is not magnified beyond it. Not differentiated: visibility, and weights that are
-    exactly zero.
+    ``lost`` counts the paths on which a q was not finite, and what it had to tell was left out. Exact on chains of
+    delta lobes. Behind smooth lobes A_i has rank two: without noise q is lost there, with noise the result is unbiased
+    as long as rounding is not magnified beyond it. Not differentiated: visibility, and weights that are exactly zero.
     """
     Spectrum, Matrix = recovery.real(mi.Spectrum), recovery.real(mi.Matrix4f)
     Vector = recovery.real(mi.Vector4f)
@@ -91,8 +92,8 @@ def replay_attached(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, r
 
     # ----------------------- Back to the camera ----------------------
 
-    lost = ~dr.all(dr.isfinite(q))
-    q = dr.select(lost, 0, q)
+    overflow = ~dr.all(dr.isfinite(q))
+    q = dr.select(overflow, 0, q)
     with dr.resume_grad():
         if dr.hint(dr.grad_enabled(ray.o, ray.d), mode="scalar"):
             x = RayFrame.of(dr.detach(ray), scale).coordinates(ray.o, ray.d)
@@ -101,6 +102,7 @@ def replay_attached(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, r
 
     # --------- Second pass: peel L and q, feed the parameters --------
 
+    broken = mi.Bool(False)  # this path has been counted as lost
     β = mi.Spectrum(1)
     η = mi.Float(1)
     depth = mi.UInt32(0)
@@ -108,7 +110,7 @@ def replay_attached(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, r
     at = first_arrival(walk, ray, active)
 
     while dr.hint(
-        active, max_iterations=walk.max_depth, exclude=[walk, recovery, scale], label="pathreplay: attached replay"
+        active, max_iterations=walk.max_depth, exclude=[walk, recovery, scale, lost], label="pathreplay: replay"
     ):
         v, at_next, e, β_next, η = _advance(walk, sampler2, at, β, η, depth, active)
         slope = emission_slope(walk, at_next, δL * β_next, v.go_on)
@@ -120,9 +122,10 @@ def replay_attached(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, r
         ε = recovery.noise * random_sign(v.u)
         A = regularise(Matrix(local.A), type(q.x)(ε), recovery.place, ~v.kept.delta)
         q = dr.select(v.go_on, Vector(dr.rcp(A.T) @ (q - p)), 0)
-        broken = ~dr.all(dr.isfinite(q))
-        q = dr.select(broken, 0, q)
-        lost |= broken
+        breaks = overflow | ~dr.all(dr.isfinite(q))
+        q = dr.select(breaks, 0, q)
+        lost.add(breaks & ~broken)
+        broken |= breaks
 
         with dr.resume_grad():
             e, w, x_next = local_terms(walk, v, at, δL * β, slope, frame_next, active)
@@ -134,4 +137,3 @@ def replay_attached(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, r
         β, at, active = β_next, at_next, v.go_on
         depth += 1
 
-    return lost

@@ -18,7 +18,7 @@ from ..transport.motion import path_moves
 from ..transport.path import first_arrival, next_arrival, survival, sustain
 from ..transport.step import surface_step
 from ..transport.vertex import Arrival, Kept, Numbers, Step, Walk
-from .adjoint import RayDerivative, Replayed, backward, backward_step
+from .adjoint import LostPaths, RayDerivative, Replayed, backward, backward_step
 
 # Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x about 100 bytes are 3.3 MB, and a
 # thread's stack is 8 MB. Beyond the stack the process would die without a word.
@@ -108,12 +108,12 @@ def _read_continuation(record: Any, onward: Arrival) -> Kept:
 
 
 @dr.syntax
-def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> Any:
+def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostPaths) -> bool:
     """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
 
-    Returns, for every ray, whether a part of its adjoint was not finite and was lost (Bool); None where nothing moves,
-    so that there are no ray adjoints. ``ray`` may be attached to the camera. A weight that is exactly zero keeps its
-    derivative. Not differentiated: visibility and, with ``attach='none'``, everything that moves.
+    ``ray`` may be attached to the camera. Returns whether the path moves with the parameters; if so, ``lost`` counts
+    paths with an adjoint that was not finite. A weight that is exactly zero keeps its derivative. Not differentiated:
+    visibility and, with ``attach='none'``, everything that moves.
     Raises PathreplayError when ``max_depth`` is above `MAX_DEPTH`, or when no parameter reaches the paths.
     """
     if dr.hint(walk.max_depth > MAX_DEPTH, mode="scalar"):
@@ -154,9 +154,9 @@ def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> Any:
     last = depth - 1  # index of the last vertex
     L = mi.Spectrum(0)  # radiance along the ray that leaves the vertex
     q = RayDerivative.zero()  # adjoint of that ray
-    lost = mi.Bool(False)  # a part of the adjoint was not finite
+    broken = mi.Bool(False)  # a part of the adjoint was not finite
 
-    while dr.hint(depth > 0, exclude=[walk, ray, camera_ray], label="pathreplay: sweep"):
+    while dr.hint(depth > 0, exclude=[walk, ray, camera_ray, lost], label="pathreplay: sweep"):
         depth -= 1
         record = tape[depth]
         onward = _read_arrival(tape[dr.minimum(depth + 1, last)], camera_ray, mi.Bool(False))
@@ -168,12 +168,14 @@ def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> Any:
             hit_next=onward.hit,
             rr_weight=record.rr_weight,
         )
-        L, q, lost_here = backward_step(walk, replayed, attached, δL * record.β, L, q, mi.Bool(True))
-        lost |= lost_here
+        L, q, breaks = backward_step(walk, replayed, attached, δL * record.β, L, q, mi.Bool(True))
+        if dr.hint(attached, mode="scalar"):
+            lost.add(breaks & ~broken)
+            broken |= breaks
 
     # ----------------------- Back to the camera ----------------------
 
     with dr.resume_grad():
         if dr.hint(attached and dr.grad_enabled(ray.o, ray.d), mode="scalar"):
             backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
-    return lost if attached else None
+    return attached

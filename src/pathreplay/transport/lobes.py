@@ -77,11 +77,12 @@ def held_at_hit(si: Any, d: Any, hit: Any, active: Any) -> tuple[Any, Any]:
     y = hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, found)
     x = si.spawn_ray(dr.detach(d)).o
     towards = y.p - x
-    dist2 = dr.squared_norm(towards)
-    facing = dr.abs(dr.dot(dr.cross(y.dp_du, y.dp_dv), towards)) * dr.rcp(dist2 * dr.sqrt(dist2))
+    facing = dr.abs(dr.dot(dr.cross(y.dp_du, y.dp_dv), towards))
     ok = found & (facing > 0)
-    J = dr.select(ok, dr.replace_grad(mi.Float(1), facing * dr.detach(reciprocal(facing))), 1)
-    return dr.select(ok, dr.replace_grad(d, towards * dr.rsqrt(dist2)), d), J
+    dist2 = dr.select(ok, dr.squared_norm(towards), 1)
+    # In corners distances are tiny: the derivative of a logarithm holds where those of powers would overflow.
+    log_J = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)
+    return dr.select(ok, dr.replace_grad(d, towards * dr.rsqrt(dist2)), d), dr.replace_grad(mi.Float(1), log_J)
 
 
 def _delta_weight(walk: Walk, bsdf: Any, si: Any, u: Numbers, kept: Kept, w: Any, active: Any) -> Any:
