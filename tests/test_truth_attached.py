@@ -14,7 +14,8 @@ import pytest
 
 from pathreplay.bsdfs.smoothdielectric import _plugin_class
 from truth import (
-    Bench, Case,
+    Bench,
+    Case,
     add,
     bitmap,
     camera,
