@@ -77,13 +77,16 @@ def check(
     """Compare gradients with finite differences of Mitsuba's path tracer; exit status 1 if one does not pass."""
     from pathreplay import backend
     from pathreplay.check import report
-    from pathreplay.scenes import load_scene
+    from pathreplay.scenes import load_scene_for
 
     if json is not None:
         report.require_writable(json)
     backend.set_variant(variant)
+    loaded, notes = load_scene_for(scene, param)
+    for note in notes:
+        typer.echo(f"pathreplay: {note}", err=True)
     results = report.check_all(
-        load_scene(scene), param, integrator=integrator, seeds=seeds, spp=spp, fd_spp=fd_spp, step=step,
+        loaded, param, integrator=integrator, seeds=seeds, spp=spp, fd_spp=fd_spp, step=step,
         max_depth=max_depth, mode=mode, sensor=sensor, seed=seed,
     )  # fmt: skip
     report.print_checks(results)

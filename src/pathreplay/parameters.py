@@ -86,8 +86,8 @@ def owner_class(params: Any, key: str) -> str:
 # ------------------------------------------------------------------------------
 
 
-def require_differentiable(params: Any, key: str) -> None:
-    """Return quietly if Mitsuba can carry a derivative to ``key``.
+def require_differentiable(params: Any, key: str, integrator: Any = None) -> None:
+    """Return quietly if ``integrator`` (None: any of Mitsuba's) can carry a derivative to ``key``.
 
     Raises:
         PathreplayError: the key does not exist, is a plain number, holds integers, or is marked
@@ -95,13 +95,18 @@ def require_differentiable(params: Any, key: str) -> None:
     """
     if key not in params:
         raise PathreplayError(_no_match(list(params.keys()), key))
+    if carries_derivative(params, key, integrator):
+        return
     value = params[key]
     owner = owner_class(params, key)
-    if carries_derivative(params, key):
-        return
     known = _WAY_OUT.get((owner, key.rsplit(".", 1)[-1]))
     if known is not None:
         raise PathreplayError(f"Parameter '{key}' carries no derivative: {known}")
+    if needs_ray_adjoint(params, key):
+        raise PathreplayError(
+            f"Parameter '{key}' carries no derivative through this integrator: only 'pathreplay' differentiates "
+            "cameras and the motion of lights; use it, with attach = 'delta' (its default) or 'all'"
+        )
     if isinstance(value, (bool, int, float)):
         why = f"its {owner} keeps it as a plain number ({value!r})"
     elif not _is_float(value):
@@ -111,7 +116,7 @@ def require_differentiable(params: Any, key: str) -> None:
     raise PathreplayError(f"Parameter '{key}' carries no derivative: {why}; choose one that mi.traverse marks with ∂")
 
 
-def resolve_differentiable(params: Any, patterns: str | Iterable[str]) -> list[str]:
+def resolve_differentiable(params: Any, patterns: str | Iterable[str], integrator: Any = None) -> list[str]:
     """Like :func:`resolve_keys`, but a glob takes only those matches that carry a derivative.
 
     Raises:
@@ -120,25 +125,56 @@ def resolve_differentiable(params: Any, patterns: str | Iterable[str]) -> list[s
     found: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         matches = resolve_keys(params, pattern)
-        usable = [key for key in matches if carries_derivative(params, key)]
+        usable = [key for key in matches if carries_derivative(params, key, integrator)]
         if not usable:
-            require_differentiable(params, matches[0])
+            require_differentiable(params, matches[0], integrator)
         found.update(dict.fromkeys(usable))
     return list(found)
 
 
-def carries_derivative(params: Any, key: str) -> bool:
-    """Whether Mitsuba can carry a derivative to a parameter: Dr.Jit floats that it does not mark as excluded."""
-    return _is_float(params[key]) and not params.flags(key) & mi.ParamFlags.NonDifferentiable
+def carries_derivative(params: Any, key: str, integrator: Any = None) -> bool:
+    """Whether a derivative reaches a parameter: Dr.Jit floats that Mitsuba does not mark as excluded.
+
+    Of those that it does mark, ``pathreplay`` (unless ``attach`` is 'none') reaches cameras and the motion of lights.
+    """
+    if not _is_float(params[key]):
+        return False
+    if not params.flags(key) & mi.ParamFlags.NonDifferentiable:
+        return True
+    # By name: this room is below the integrators.
+    ours = type(integrator).__name__ == "PathReplayIntegrator" and integrator.attach != "none"
+    return ours and needs_ray_adjoint(params, key)
 
 
-def _is_transform(value: Any) -> bool:
+# Marked NonDifferentiable by Mitsuba, whose integrators drop their derivatives. Each is held to finite differences in
+# tests/test_parameters.py.
+_CAMERA = {
+    "to_world",
+    "x_fov",
+    "principal_point_offset_x",
+    "principal_point_offset_y",
+    "aperture_radius",
+    "focus_distance",
+}
+_LIGHT = {"to_world", "position"}
+
+
+def needs_ray_adjoint(params: Any, key: str) -> bool:
+    """Whether a parameter is one of a camera, or moves a light that is no shape: Mitsuba's integrators drop these."""
+    node, name = params.properties[key][2], key.rsplit(".", 1)[-1]
+    return _is_float(params[key]) and (
+        (isinstance(node, mi.Sensor) and name in _CAMERA) or (isinstance(node, mi.Emitter) and name in _LIGHT)
+    )
+
+
+def is_transform(value: Any) -> bool:
+    """Whether a value is a transform of Dr.Jit floats, such as a ``to_world``."""
     # Every Dr.Jit array answers to .matrix too. Scalar transforms (texture to_uv) hold no Dr.Jit array: no derivative.
     return not dr.is_array_v(value) and hasattr(value, "matrix") and dr.is_diff_v(value.matrix)
 
 
 def _is_float(value: Any) -> bool:
-    inner = value.matrix if _is_transform(value) else value
+    inner = value.matrix if is_transform(value) else value
     return bool(dr.is_array_v(inner) and dr.is_float_v(inner) and dr.is_diff_v(inner))
 
 
@@ -171,7 +207,7 @@ def require_finite(params: Any) -> None:
 
 def _flat(value: Any) -> Any:
     """All entries of a floating-point value as one flat Dr.Jit array, without derivatives."""
-    value = dr.detach(value.matrix if _is_transform(value) else value)
+    value = dr.detach(value.matrix if is_transform(value) else value)
     if dr.is_tensor_v(value):
         return value.array
     return dr.ravel(value) if dr.depth_v(value) > 1 else value
@@ -185,10 +221,12 @@ def _flat(value: Any) -> Any:
 def get_array(value: Any) -> np.ndarray:
     """A floating-point parameter value as a NumPy array of its own precision; a copy, without derivatives.
 
-    Shapes: ``Float`` (n,); ``Color3f`` and its kind (3,), or (3, n) where it holds n colours; ``TensorXf`` its own;
-    ``AffineTransform4f`` (4, 4).
+    Shapes: a plain number (1,); ``Float`` (n,); ``Color3f`` and its kind (3,), or (3, n) where it holds n colours;
+    ``TensorXf`` its own; ``AffineTransform4f`` (4, 4).
     """
-    if _is_transform(value):
+    if isinstance(value, float):
+        return np.array([value], np.float32)
+    if is_transform(value):
         value = value.matrix
     array = np.array(dr.detach(value))
     if not dr.is_tensor_v(value) and array.ndim > 1 and array.shape[-1] == 1:
@@ -207,7 +245,9 @@ def to_value(like: Any, array: Any) -> Any:
     if given.shape != expected.shape:
         raise PathreplayError(f"Value of shape {given.shape} given for a parameter of shape {expected.shape}")
     given = np.ascontiguousarray(given, dtype=expected.dtype)
-    if _is_transform(like):
+    if isinstance(like, float):
+        return float(given[0])
+    if is_transform(like):
         return type(like)(type(like.matrix)(given))
     if dr.is_tensor_v(like) or dr.depth_v(like) == 1 or dr.is_matrix_v(like):
         return type(like)(given)
@@ -237,7 +277,7 @@ def displaced(value: Any, direction: np.ndarray, t: Any) -> Any:
     ``direction`` has the shape of ``get_array(value)``. For transforms the sum is one of matrices, so ``direction``
     need not be invertible. Derivatives flow from ``t``.
     """
-    if _is_transform(value):
+    if is_transform(value):
         return type(value)(value.matrix + to_value(value.matrix, direction) * t)
     step = to_value(value, direction)
     if dr.is_tensor_v(value):

@@ -3,76 +3,19 @@
 from __future__ import annotations
 
 import difflib
+import gc
 import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
-import numpy as np
 
+from pathreplay import parameters as scene_parameters
+from pathreplay.bsdfs.substitute import load_dict_with, load_file_with
+from pathreplay.builtin_scenes import BUILTINS, SceneDict
 from pathreplay.errors import PathreplayError
-
-SceneDict = dict[str, Any]
-
-BUILTINS: dict[str, Callable[..., SceneDict]] = {}
-"""Built-in scenes: name -> function that returns a Mitsuba scene dictionary."""
-
-
-def builtin(name: str) -> Callable[[Callable[..., SceneDict]], Callable[..., SceneDict]]:
-    """Decorator that makes a function's scene dictionary known under ``name``."""
-
-    def register(make: Callable[..., SceneDict]) -> Callable[..., SceneDict]:
-        BUILTINS[name] = make
-        return make
-
-    return register
-
-
-@builtin("cornell-box")
-def cornell_box(resolution: int = 256) -> SceneDict:
-    """Mitsuba's own Cornell box: two white boxes, a red and a green wall, one area light."""
-    scene: SceneDict = mi.cornell_box()
-    scene["sensor"]["film"].update(width=resolution, height=resolution)
-    return scene
-
-
-@builtin("cornell-box-photo")
-def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
-    """The Cornell box with a grey picture (``texture`` x ``texture`` texels) as its back wall, seen by two sensors.
-
-    ``overview`` is the classical camera. ``closeup`` stands in the box, behind the two white boxes, which were moved
-    to the front so that it sees every texel of the wall. Key of the picture: ``back.bsdf.reflectance.data``.
-    """
-    T = mi.ScalarTransform4f
-    scene = cornell_box(resolution)
-    overview = scene.pop("sensor")
-    # A texel is little wider than a pixel: a wider filter would blur neighbours into each other, slow to undo.
-    overview["film"]["rfilter"] = {"type": "box"}
-    scene["overview"] = overview
-    scene["closeup"] = {
-        **overview,
-        # 1.3 from the wall, whose half side is 1: tan(fov / 2) = 1 / 1.3 and a margin of one per cent.
-        "to_world": T().look_at(origin=[0, 0, 0.3], target=[0, 0, -1], up=[0, 1, 0]),
-        "fov": 75.8,
-    }
-    scene["large-box"]["to_world"] = T().translate([-0.45, -0.65, 0.42]).rotate([0, 1, 0], 18).scale([0.26, 0.35, 0.26])
-    scene["small-box"]["to_world"] = T().translate([0.45, -0.78, 0.5]).rotate([0, 1, 0], -17).scale(0.22)
-    grey = mi.Bitmap(np.full((texture, texture, 3), 0.5, np.float32))
-    scene["back"]["bsdf"] = {
-        "type": "diffuse",
-        # raw: the texels are linear reflectances, which is what is optimised.
-        # to_uv turns v round: the first row of an image belongs at the top of the wall.
-        "reflectance": {
-            "type": "bitmap",
-            "bitmap": grey,
-            "raw": True,
-            "wrap_mode": "clamp",
-            "to_uv": T().translate([0, 1, 0]).scale([1, -1, 1]),
-        },
-    }
-    return scene
 
 
 def load_scene(spec: str | Path, base: Path | None = None, **parameters: Any) -> mi.Scene:
@@ -85,25 +28,71 @@ def load_scene(spec: str | Path, base: Path | None = None, **parameters: Any) ->
     Raises:
         PathreplayError: no such file or built-in, a wrong parameter, a file that Mitsuba cannot read, no variant.
     """
+    return load_scene_with(spec, {}, base, **parameters)[0]
+
+
+def load_scene_with(
+    spec: str | Path, plugins: Mapping[str, str], base: Path | None = None, **parameters: Any
+) -> tuple[mi.Scene, list[str]]:
+    """`load_scene` with plugins exchanged (old type -> new type), and one line for each that was: id and place."""
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
     if str(spec) in BUILTINS:
-        return _load_builtin(str(spec), parameters)
+        return load_dict_with(_builtin_dict(str(spec), parameters), plugins)
     path = Path(spec) if base is None else Path(base) / spec
     if not path.is_file():
         raise PathreplayError(_unknown(str(spec), path))
     arguments: dict[str, Any] = {name: str(value) for name, value in parameters.items()}
     try:
-        # optimize=False: merging equal objects would lose the names by which parameters are addressed.
-        scene = mi.load_file(str(path), optimize=False, **arguments)
+        # Equal objects are not merged: that would lose the names by which parameters are addressed.
+        scene, exchanged = load_file_with(path, plugins, **arguments)
     except (RuntimeError, ValueError, TypeError) as error:
         raise PathreplayError(f"Scene {path} cannot be loaded: {one_line(error)}") from error
     if not isinstance(scene, mi.Scene):
         raise PathreplayError(f"{path} describes no <scene> but a {type(scene).__name__}; wrap it in <scene>")
-    return scene
+    return scene, exchanged
 
 
-def _load_builtin(name: str, parameters: dict[str, Any]) -> mi.Scene:
+SMOOTH_GLASS = {"dielectric": "smoothdielectric"}
+"""Mitsuba's plugin with an index that carries no derivative -> ours with one that does."""
+
+
+def load_scene_for(
+    spec: str | Path, wanted: Iterable[str], base: Path | None = None, **parameters: Any
+) -> tuple[mi.Scene, tuple[str, ...]]:
+    """Load a scene in which the ``wanted`` keys and globs carry derivatives, as far as exchanging plugins brings it.
+
+    Where a pattern that ends in ``eta`` matches the index of a ``dielectric``, the scene is loaded once more with
+    `smoothdielectric` in the place of every ``dielectric``. Returns the scene and what is to be said about it, one line
+    each. Patterns that match nothing are left for others to complain about.
+
+    Raises:
+        PathreplayError: as `load_scene` does.
+    """
+    scene = load_scene(spec, base, **parameters)
+    params = mi.traverse(scene)
+    patterns = [pattern for pattern in wanted if pattern.rsplit(".", 1)[-1] == "eta"]
+    asked = [
+        key for key in _matches(params, patterns) if scene_parameters.owner_class(params, key) == "SmoothDielectric"
+    ]
+    if not asked:
+        return scene, ()
+    # Dr.Jit traces calls through every instance alive, so the first scene has to go before the second one comes.
+    del scene, params
+    gc.collect()
+    scene, exchanged = load_scene_with(spec, SMOOTH_GLASS, base, **parameters)
+    count = "one" if len(exchanged) == 1 else f"all {len(exchanged)}"
+    return scene, (f"replaced 'dielectric' by 'smoothdielectric' ({count} of them): its eta carries a derivative",)
+
+
+def _matches(params: Any, patterns: list[str]) -> list[str]:
+    try:
+        return scene_parameters.resolve_keys(params, patterns)
+    except PathreplayError:
+        return []
+
+
+def _builtin_dict(name: str, parameters: dict[str, Any]) -> SceneDict:
     make = BUILTINS[name]
     known = inspect.signature(make).parameters
     for key, value in parameters.items():
@@ -111,7 +100,7 @@ def _load_builtin(name: str, parameters: dict[str, Any]) -> mi.Scene:
             raise PathreplayError(f"Built-in scene '{name}' has no parameter '{key}'; it has: {', '.join(known)}")
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise PathreplayError(f"Parameter '{key}' of scene '{name}' is {value!r}; give a whole number above 0")
-    return mi.load_dict(make(**parameters), optimize=False)
+    return make(**parameters)
 
 
 def _unknown(spec: str, path: Path) -> str:

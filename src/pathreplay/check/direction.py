@@ -52,12 +52,21 @@ class Line:
     stencil: Stencil
 
 
-def choose_line(key: str, value: np.ndarray, direction: Any = None, step: float | None = None, seed: int = 0) -> Line:
+def choose_line(
+    key: str,
+    value: np.ndarray,
+    direction: Any = None,
+    step: float | None = None,
+    seed: int = 0,
+    *,
+    far: bool = False,
+) -> Line:
     """The line through ``value`` along ``direction``, or along a random direction whose largest entry is 1.
 
     The default step moves the entry that moves most by a hundredth of the parameter's size. Where a parameter that is
     nowhere negative would become so (a black texel), the differences are one-sided: a negative reflectance is no
-    harm to a linear texture, but a negative roughness or density is.
+    harm to a linear texture, but a negative roughness or density is. Transforms move by a random translation, those
+    of things infinitely ``far`` away (sun, sky), which no translation moves, turn about a random axis.
 
     Raises:
         PathreplayError: the direction has the wrong shape, is zero or is not finite; the step is not a positive number.
@@ -76,6 +85,9 @@ def choose_line(key: str, value: np.ndarray, direction: Any = None, step: float 
             raise PathreplayError(f"Direction for '{key}' is zero, NaN or infinite; give finite numbers, not all zero")
     elif value.size == 1:
         v, description = np.ones(value.shape), "scalar"
+    elif transform and far:
+        v, description = np.zeros(value.shape), f"random rotation, seed {seed}"
+        v[:3, :3] = np.cross(_random_entries((3,), seed), value[:3, :3], axisb=0, axisc=0)
     elif transform:
         v, description = np.zeros(value.shape), f"random translation, seed {seed}"
         v[:3, 3] = _random_entries((3,), seed)

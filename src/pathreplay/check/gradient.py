@@ -108,7 +108,7 @@ def check_gradient(
             reference seed costs four images, at ±h and ±h/2 with common random numbers.
         step: h; None for a hundredth of max(1, largest absolute entry).
         direction: array of the parameter's shape, taken as it is; None for 1 (scalars), a random translation
-            (``to_world``), or random positive entries, the largest being 1.
+            (``to_world``; a rotation for sun and sky), or random positive entries, the largest being 1.
         mode: 'backward' (``dr.backward`` through ``mi.render``) or 'forward' (``dr.forward``).
         loss: None for the mean of the image under smooth weights between 0.5 and 1.5 that differ by channel, so
             that errors of opposite sign in two places do not cancel. Otherwise a function from the image (TensorXf,
@@ -129,15 +129,16 @@ def check_gradient(
     """
     _require_arguments(scene, sensor, seeds, spp, fd_spp, mode)
     params = mi.traverse(scene)
-    require_differentiable(params, key)
+    tested = integrator_under_test(integrator, scene, max_depth)
+    require_differentiable(params, key, tested)
     require_finite(params)
     if get_array(params[key]).dtype == np.float16:
         raise PathreplayError(
             f"Parameter '{key}' is stored in half precision, too coarse for finite differences; give the texture the "
             "option format='variant'"
         )
-    line = choose_line(key, get_array(params[key]).astype(np.float64), direction, step, seed)
-    tested = integrator_under_test(integrator, scene, max_depth)
+    value = get_array(params[key]).astype(np.float64)
+    line = choose_line(key, value, direction, step, seed, far=_is_far(params.properties[key][2]))
     plain = reference_integrator(reference, scene, tested)
     fd_spp = spp if fd_spp is None else fd_spp
     # Distinct 32-bit words: seeds of the gradient's primal image, of its derivative, of the reference, of the weights.
@@ -155,8 +156,8 @@ def check_gradient(
 
     gradients = np.empty(seeds)
     values = np.empty((seeds, len(offsets)))
-    with alone(params, key) as value:
-        view = View(scene, params, key, value, line, scene.sensors()[sensor])
+    with alone(params, key) as held:
+        view = View(scene, params, key, held, line, scene.sensors()[sensor])
         weights, scale = view.weights(plain, loss, int(weight_seed), fd_spp)
         tick()
         for i in range(seeds):
@@ -169,7 +170,7 @@ def check_gradient(
 
     full, half = values @ line.stencil.full / line.step, values @ line.stencil.half / line.step
     # A rounding error of one half unit in the last place of every image, all of one sign, at worst.
-    unit = np.finfo(get_array(value).dtype).eps / 2
+    unit = np.finfo(get_array(held).dtype).eps / 2
     rounding = float(np.abs(np.subtract(np.multiply(4, line.stencil.half), line.stencil.full)).sum() / 3) * unit * scale
     result = judge(gradients, full, half, rounding=rounding / line.step, negligible=NEGLIGIBLE * scale / line.size)
     return GradientCheck(
@@ -188,6 +189,12 @@ def check_gradient(
         reference_samples=tuple(((4 * half - full) / 3).tolist()),
         **vars(result),
     )
+
+
+def _is_far(owner: Any) -> bool:
+    """Whether a light stands infinitely far away, where only its orientation counts."""
+    flags = mi.EmitterFlags.Infinite | mi.EmitterFlags.DeltaDirection
+    return isinstance(owner, mi.Emitter) and bool(mi.has_flag(owner.flags(), flags))
 
 
 def _require_arguments(scene: Any, sensor: int, seeds: int, spp: int, fd_spp: int | None, mode: str) -> None:

@@ -17,19 +17,23 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.text import Text
 
 from pathreplay.check.gradient import GradientCheck, check_gradient
+from pathreplay.check.reference import integrator_under_test
 from pathreplay.errors import PathreplayError
 from pathreplay.parameters import resolve_differentiable
 
 _STYLES = {"pass": "green", "zero": "green", "fail": "bold red", "inconclusive": "yellow"}
 
 
-def check_all(scene: Any, patterns: Sequence[str], **options: Any) -> list[GradientCheck]:
+def check_all(
+    scene: Any, patterns: Sequence[str], *, integrator: Any = None, max_depth: int | None = None, **options: Any
+) -> list[GradientCheck]:
     """``check_gradient(scene, key, **options)`` for every key that the patterns name, with a bar on standard error.
 
     Raises:
         PathreplayError: see :func:`check_gradient` and :func:`resolve_differentiable`.
     """
-    keys = resolve_differentiable(mi.traverse(scene), patterns)
+    tested = integrator_under_test(integrator, scene, max_depth)
+    keys = resolve_differentiable(mi.traverse(scene), patterns, tested)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     results = []
     # Standard error, and gone when done: what is printed or piped is the result alone.
@@ -41,7 +45,7 @@ def check_all(scene: Any, patterns: Sequence[str], **options: Any) -> list[Gradi
             def progress(done: int, total: int, task: Any = task) -> None:
                 bar.update(task, completed=done, total=total)
 
-            results.append(check_gradient(scene, key, progress=progress, **options))
+            results.append(check_gradient(scene, key, integrator=tested, progress=progress, **options))
             bar.remove_task(task)
     return results
 

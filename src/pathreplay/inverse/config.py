@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.pose import PARTS, PoseKind
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -36,14 +37,56 @@ Value = Finite | list[Finite] | str | Picture
 """A parameter's value: one number for every entry, a list such as a colour, or an image file for a texture."""
 
 
+Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class Displacement(_Table):
+    """Where a pose starts, from where the scene has it: scene units, and a rotation vector in degrees."""
+
+    translation: Vector | None = None
+    rotation: Vector | None = None
+
+
 class Parameter(_Table):
     """One scene parameter to recover, or several by a glob."""
 
     key: str
     lower: Finite | None = None
     upper: Finite | None = None
-    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    learning_rate: Positive | None = None
     initial: Value | None = None
+    pose: PoseKind | None = None
+    start: Displacement | None = None
+    pivot: Vector | None = None
+    distance: Positive | None = None
+    rotation_learning_rate: Positive | None = None
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Parameter:
+        posed = {"start", "pivot", "distance", "rotation_learning_rate"} & self.model_fields_set
+        if self.pose is None:
+            if posed:
+                raise ValueError(
+                    f"parameter '{self.key}': '{min(posed)}' belongs to a pose; "
+                    "add pose = 'translation', 'rotation' or 'rigid'"
+                )
+            return self
+        if plain := {"lower", "upper", "initial"} & self.model_fields_set:
+            raise ValueError(
+                f"parameter '{self.key}': '{min(plain)}' does not go with a pose; displace its start with 'start'"
+            )
+        parts = PARTS[self.pose]
+        given = [] if self.start is None else sorted(self.start.model_fields_set)
+        wrong = [f"start.{part}" for part in given if part not in parts]
+        if self.rotation_learning_rate is not None and "rotation" not in parts:
+            wrong.append("rotation_learning_rate")
+        if wrong:
+            raise ValueError(
+                f"parameter '{self.key}': '{wrong[0]}' is not part of pose = '{self.pose}'; take pose = 'rigid', or "
+                "leave it out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _ordered(self) -> Parameter:
@@ -163,8 +206,9 @@ def _first(error: ValidationError) -> str:
     if first["type"] == "extra_forbidden":
         key = str(first["loc"][-1])
         table = Config if len(first["loc"]) == 1 else _TABLES.get(str(first["loc"][0]), Config)
-        if first["loc"][-2:-1] == ("Picture",):
-            table = Picture
+        if len(first["loc"]) > 1:
+            inner: dict[str, type[BaseModel]] = {"Picture": Picture, "start": Displacement}
+            table = inner.get(str(first["loc"][-2]), table)
         close = difflib.get_close_matches(key, table.model_fields, n=1, cutoff=0.4)
         hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(table.model_fields)}"
         return f"unknown key '{where}'; {hint}"

@@ -17,13 +17,14 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes, read_image
-from pathreplay.inverse.loop import ctrl_c_stops, iterate, make_adam, put_values, render_views
+from pathreplay.inverse.loop import ctrl_c_stops, iterate, make_adam, put_values, render_views, scene_values
+from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
-from pathreplay.inverse.report import Outcome, Recovered, ViewPictures, report_files
+from pathreplay.inverse.report import Outcome, Recovered, RecoveredPose, ViewPictures, report_files
 from pathreplay.inverse.run_folder import CHECKPOINT, RunFolder, create_run_folder, default_output, open_run_folder
 from pathreplay.inverse.values import Array
-from pathreplay.parameters import get_array
+from pathreplay.parameters import get_array, to_value
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,9 @@ class RunResult:
     history: tuple[checkpoint.Entry, ...]
     parameters: dict[str, Array]
     errors: dict[str, float]
-    """Root mean square error of each parameter whose truth is known."""
+    """Root mean square error of each parameter whose truth is known; poses are told apart."""
+    poses: dict[str, PoseError]
+    """How far each pose whose truth is known is from it."""
 
     def describe(self) -> str:
         """A few lines for the terminal: loss, errors, where the report is, how to go on."""
@@ -47,7 +50,11 @@ class RunResult:
         if self.history:
             first, last = self.history[0].loss, self.history[-1].loss
             lines.append(f"loss {first:.4g} -> {last:.4g} in {self.iterations} iterations")
-        lines += [f"{key}: root mean square error {error:.4g}" for key, error in self.errors.items()]
+        for key, error in self.errors.items():
+            value = self.parameters[key]
+            found = f"{value.item():.5g}, " if value.size == 1 else ""
+            lines.append(f"{key}: {found}root mean square error {error:.4g}")
+        lines += [f"{key}: {error}" for key, error in self.poses.items()]
         lines.append(f"report: {self.report}")
         if self.stopped:
             lines.append(f"stopped early; go on with: pathreplay optimize --resume {shlex.quote(str(self.folder))}")
@@ -80,6 +87,8 @@ def optimize(
     with Progress(progress) as bar:
         bar.say("preparing")
         problem = build_problem(start.config, start.base, start.targets())
+        for note in problem.notes:
+            bar.note(note)
         adam = make_adam(problem)
         history: list[checkpoint.Entry] = []
         if start.folder is None:
@@ -158,16 +167,23 @@ def _finish(
 ) -> RunResult:
     config = start.config
     result = render_views(problem, config)
-    values = {key: get_array(value) for key, value in adam.items()}
+    # The variables (translations, rotation vectors) and what they make of the scene (transforms).
+    values = {key: get_array(value) for key, value in {**adam, **scene_values(problem, adam)}.items()}
     views = tuple(
         ViewPictures(v.name, v.target, before[v.name], result[v.name], exposure_for(v.target)) for v in problem.views
     )
-    recovered = tuple(Recovered(v.key, v.start, values[v.key], v.truth) for v in problem.variables)
-    outcome = Outcome(config, start.source, folder.path, views, recovered, tuple(history), variant)
+    poses = tuple(_recovered_pose(problem, pose, values) for pose in problem.poses)
+    parts = {name for pose in problem.poses for name in pose.parts().values()}
+    recovered = tuple(
+        Recovered(v.key, v.start, values[v.key], v.truth) for v in problem.variables if v.key not in parts
+    )
+    outcome = Outcome(
+        config, start.source, folder.path, views, recovered, poses, tuple(history), variant, problem.notes
+    )
     files = {
         CHECKPOINT: checkpoint.save(adam, len(history), history),
         "parameters.safetensors": safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in values.items()}),
-        "parameters.json": _parameters_json(recovered).encode(),
+        "parameters.json": _parameters_json(recovered, poses).encode(),
         "history.jsonl": "".join(json.dumps(asdict(entry)) + "\n" for entry in history).encode(),
     }
     for view in views:
@@ -186,10 +202,25 @@ def _finish(
         history=tuple(history),
         parameters=values,
         errors={item.key: error for item in recovered if (error := item.error()) is not None},
+        poses={item.pose.key: item.error for item in poses if item.error is not None},
     )
 
 
-def _parameters_json(recovered: tuple[Recovered, ...]) -> str:
+def _recovered_pose(problem: Problem, pose: Pose, values: dict[str, Array]) -> RecoveredPose:
+    variables = {variable.key: variable for variable in problem.variables}
+    names = pose.parts()
+    at_start = {name: to_value(variables[name].like, variables[name].start) for name in names.values()}
+    return RecoveredPose(
+        pose=pose,
+        start={part: variables[name].start for part, name in names.items()},
+        result={part: values[name] for part, name in names.items()},
+        value=values[pose.key],
+        error=pose.error(values[pose.key]),
+        error_at_start=pose.error(get_array(pose.value(at_start))),
+    )
+
+
+def _parameters_json(recovered: tuple[Recovered, ...], poses: tuple[RecoveredPose, ...]) -> str:
     """Small values in full, large ones by shape, mean and range (their numbers are in parameters.safetensors)."""
     table: dict[str, Any] = {}
     for item in recovered:
@@ -204,4 +235,6 @@ def _parameters_json(recovered: tuple[Recovered, ...]) -> str:
         if item.truth is not None:
             entry |= {"rmse": item.error(), "rmse_at_start": item.error_at_start()}
         table[item.key] = entry
+    for pose in poses:
+        table[pose.pose.key] = pose.as_dict()
     return json.dumps(table, indent=2) + "\n"

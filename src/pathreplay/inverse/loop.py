@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -60,15 +61,22 @@ def make_adam(problem: Problem) -> Adam:
     """Adam over the problem's variables at their start values."""
     adam = Adam(lr=1.0, beta_1=BETA_1, beta_2=BETA_2)
     for variable in problem.variables:
-        adam[variable.key] = to_value(problem.params[variable.key], variable.start)
+        adam[variable.key] = to_value(variable.like, variable.start)
     return adam
 
 
 def put_values(problem: Problem, adam: Adam) -> None:
     """Give the scene the values that Adam holds."""
-    for variable in problem.variables:
-        problem.params[variable.key] = adam[variable.key]
+    for key, value in scene_values(problem, adam).items():
+        problem.params[key] = value
     problem.params.update()
+
+
+def scene_values(problem: Problem, adam: Adam) -> dict[str, Any]:
+    """The scene's parameters, by key, for the variables that Adam holds; poses become transforms."""
+    names = {name for pose in problem.poses for name in pose.parts().values()}
+    plain = {variable.key: adam[variable.key] for variable in problem.variables if variable.key not in names}
+    return plain | {pose.key: pose.value(adam) for pose in problem.poses}
 
 
 def iterate(

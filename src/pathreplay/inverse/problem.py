@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,15 +17,21 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import Config, Parameter, Plugin
 from pathreplay.inverse.images import Image, find_image, read_image, with_channels
 from pathreplay.inverse.losses import Loss, find_loss
+from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.values import Array, make_value, require_finite_array
-from pathreplay.scenes import load_scene, one_line
+from pathreplay.scenes import load_scene, load_scene_for, one_line
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One scene parameter to recover: its key, bounds, learning rate, start value, and the truth where it is known."""
+    """What the optimiser moves: its name, bounds, learning rate, start value, and the truth where it is known.
+
+    The name is the key of a scene parameter, or that of a pose with ':translation' or ':rotation' behind it.
+    """
 
     key: str
+    like: Any
+    """A Dr.Jit value of its type and shape."""
     lower: float | None
     upper: float | None
     learning_rate: float
@@ -48,8 +56,11 @@ class Problem:
     params: mi.SceneParameters
     integrator: mi.Integrator
     variables: tuple[Variable, ...]
+    poses: tuple[Pose, ...]
     views: tuple[View, ...]
     loss: Loss
+    notes: tuple[str, ...]
+    """What was done to the scene that the user should know of."""
 
 
 # Streams of random numbers: pictures never share a seed with iterations, nor targets with renderings.
@@ -71,42 +82,41 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
         PathreplayError: whatever in the job cannot work, as one line.
     """
     loss = find_loss(config.loss)
-    scene = load_scene(config.scene, base, **config.scene_parameters)
+    wanted = [entry.key for entry in config.parameters]
+    scene, notes = load_scene_for(config.scene, wanted, base, **config.scene_parameters)
     params = mi.traverse(scene)
     parameters.require_finite(params)
     integrator = load_integrator(config.integrator)
-    # Imported late: it exists once a variant is set.
-    from mitsuba.ad.integrators.common import ADIntegrator
-
-    if not isinstance(integrator, ADIntegrator):
+    if not isinstance(integrator, mi.CppADIntegrator):
         raise PathreplayError(
             f"Integrator '{config.integrator.type}' computes no gradients; use 'pathreplay' or another AD integrator"
         )
-    keys = _keys(params, config.parameters)
+    keys = _keys(params, config.parameters, integrator)
     # Before any target is rendered: the cheap mistakes first.
-    start = {key: _start(params, key, entry, base) for key, entry in keys.items()}
+    unsolved, moved = _variables(params, keys, config, base)
     sensors = _sensors(scene, config.sensors)
 
     truth: dict[str, Array] = {}
     if config.target.images is None:
         target_scene = _target_scene(config, base)
-        truth = _truth(target_scene, keys, start)
+        truth = _truth(target_scene, params, keys)
         if targets is None:
             targets = _rendered_targets(config, target_scene, sensors)
+        # Dr.Jit traces calls through every instance alive: the target scene would be in all our kernels.
+        del target_scene
+        gc.collect()
     elif targets is None:
         targets = _target_files(config.target.images, scene, sensors, base)
 
     if missing := set(sensors) - set(targets):
         raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
-    variables = tuple(
-        Variable(key, entry.lower, entry.upper, entry.learning_rate or config.learning_rate, start[key], truth.get(key))
-        for key, entry in keys.items()
-    )
+    variables = tuple(replace(variable, truth=truth.get(variable.key)) for variable in unsolved)
+    poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in moved)
     # Traversed anew: an object from which values were read expects all its keys at the next update().
     params = mi.traverse(scene)
     params.keep(list(keys))
     views = tuple(View(name, index, targets[name]) for name, index in sensors.items())
-    return Problem(scene, params, integrator, variables, views, loss)
+    return Problem(scene, params, integrator, variables, poses, views, loss, notes)
 
 
 def load_integrator(plugin: Plugin) -> mi.Integrator:
@@ -117,7 +127,7 @@ def load_integrator(plugin: Plugin) -> mi.Integrator:
         raise PathreplayError(f"Integrator '{plugin.type}' cannot be made: {one_line(error)}") from None
 
 
-def _keys(params: mi.SceneParameters, entries: list[Parameter]) -> dict[str, Parameter]:
+def _keys(params: mi.SceneParameters, entries: list[Parameter], integrator: mi.Integrator) -> dict[str, Parameter]:
     keys: dict[str, Parameter] = {}
     for entry in entries:
         for key in parameters.resolve_keys(params, entry.key):
@@ -125,16 +135,42 @@ def _keys(params: mi.SceneParameters, entries: list[Parameter]) -> dict[str, Par
                 raise PathreplayError(
                     f"Parameter '{key}' is named twice, by '{keys[key].key}' and '{entry.key}'; remove one"
                 )
-            parameters.require_differentiable(params, key)
+            parameters.require_differentiable(params, key, integrator)
             keys[key] = entry
     return keys
+
+
+def _variables(
+    params: mi.SceneParameters, keys: dict[str, Parameter], config: Config, base: Path
+) -> tuple[list[Variable], list[Pose]]:
+    variables: list[Variable] = []
+    poses: list[Pose] = []
+    for key, entry in keys.items():
+        rate = entry.learning_rate or config.learning_rate
+        if entry.pose is None:
+            start = _start(params, key, entry, base)
+            variables.append(Variable(key, params[key], entry.lower, entry.upper, rate, start, None))
+            continue
+        pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
+        poses.append(pose)
+        for part, name in pose.parts().items():
+            given = getattr(entry.start, part, None) or [0.0, 0.0, 0.0]
+            start = np.array(given, np.float32)
+            if part == "rotation":
+                # Users write degrees. A learning rate without unit is taken in radians, fit for a scene of size 1.
+                start = np.radians(start)
+                degrees = entry.rotation_learning_rate
+                rate = rate if degrees is None else float(np.radians(degrees))
+            variables.append(Variable(name, mi.Vector3f(0), None, None, rate, start, None))
+    return variables, poses
 
 
 def _start(params: mi.SceneParameters, key: str, entry: Parameter, base: Path) -> Array:
     like = params[key]
     if not dr.is_array_v(like):
         raise PathreplayError(
-            f"Parameter '{key}' is a {type(like).__name__}; numbers, colours, textures and flat arrays can be optimised"
+            f"Parameter '{key}' is a matrix, whose 16 numbers do not stay a motion; give it "
+            "pose = 'translation', 'rotation' or 'rigid'"
         )
     start = parameters.get_array(like) if entry.initial is None else make_value(key, like, entry.initial, base)
     for bound, name, wrong in ((entry.lower, "lower", np.less), (entry.upper, "upper", np.greater)):
@@ -187,11 +223,11 @@ def _target_scene(config: Config, base: Path) -> mi.Scene:
     return scene
 
 
-def _truth(scene: mi.Scene, keys: dict[str, Parameter], start: dict[str, Array]) -> dict[str, Array]:
+def _truth(scene: mi.Scene, own: mi.SceneParameters, keys: dict[str, Parameter]) -> dict[str, Array]:
     """Values of the wanted parameters in the target scene, where it has them in the same shape."""
     params = mi.traverse(scene)
     found = {key: parameters.get_array(params[key]) for key in keys if key in params}
-    return {key: value for key, value in found.items() if value.shape == start[key].shape}
+    return {key: value for key, value in found.items() if value.shape == parameters.get_array(own[key]).shape}
 
 
 def _rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -> dict[str, Image]:

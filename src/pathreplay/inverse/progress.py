@@ -38,6 +38,10 @@ class Progress:
         """Name what is going on now."""
         self._bar.update(self._task, description=text)
 
+    def note(self, text: str) -> None:
+        """One line that stays, above the bar."""
+        self._bar.console.print(f"pathreplay: {text}", markup=False, highlight=False, soft_wrap=True)
+
     def start(self, done: int, total: int) -> None:
         """Begin to count iterations."""
         self._bar.reset(self._task, total=total, completed=done, description="optimizing", loss="")

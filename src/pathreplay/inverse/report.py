@@ -8,9 +8,10 @@ import os
 import platform
 import re
 import shlex
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -21,6 +22,7 @@ from matplotlib.figure import Figure
 from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.images import Image, difference, png_bytes
+from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.values import Array
 
 # Differences are shown brighter than the pictures: a converged one would be black otherwise.
@@ -91,6 +93,48 @@ class Recovered:
 
 
 @dataclass(frozen=True)
+class RecoveredPose:
+    """One pose: translation and rotation vector (radians) at the start and in the result, by part, and their errors."""
+
+    pose: Pose
+    start: dict[str, Array]
+    result: dict[str, Array]
+    value: Array
+    """The transform (4 x 4) or the vertices in the result."""
+    error: PoseError | None
+    error_at_start: PoseError | None
+
+    def rows(self) -> dict[str, str]:
+        """Readable rows: what was moved by how much, and how far it is from the truth."""
+        table: dict[str, str] = {}
+        for kind, parts in (("start", self.start), ("recovered", self.result)):
+            for part, array in parts.items():
+                unit = "°" if part == "rotation" else ""
+                numbers = np.degrees(array) if part == "rotation" else array
+                table[f"{kind}, {part}"] = ", ".join(f"{v:.4g}{unit}" for v in numbers)
+        if self.error is not None and self.error_at_start is not None:
+            table["error at the start"] = str(self.error_at_start)
+            table["error"] = str(self.error)
+        return table
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything for parameters.json; rotations in degrees."""
+        table: dict[str, Any] = {"pose": self.pose.kind, "pivot": list(self.pose.pivot)}
+        for kind, parts in (("start", self.start), ("result", self.result)):
+            table[kind] = {p: (np.degrees(a) if p == "rotation" else a).tolist() for p, a in parts.items()}
+        if self.value.shape == (4, 4):
+            table["value"] = self.value.tolist()
+            if self.pose.truth is not None:
+                table["truth"] = self.pose.truth.tolist()
+        for kind, error in (("error", self.error), ("error_at_start", self.error_at_start)):
+            if error is not None:
+                table[kind] = asdict(error)
+        if self.pose.distance is not None:
+            table["distance"] = self.pose.distance
+        return table
+
+
+@dataclass(frozen=True)
 class Outcome:
     """Everything that the report tells."""
 
@@ -99,8 +143,10 @@ class Outcome:
     folder: Path
     views: tuple[ViewPictures, ...]
     recovered: tuple[Recovered, ...]
+    poses: tuple[RecoveredPose, ...]
     history: tuple[Entry, ...]
     variant: str
+    notes: tuple[str, ...]
 
     def command(self) -> str:
         """The command line that makes this run again, or goes on with it where it was stopped."""

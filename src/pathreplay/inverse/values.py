@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import Picture, Value
 from pathreplay.inverse.images import find_image, read_image, resized, with_channels
-from pathreplay.parameters import get_array
+from pathreplay.parameters import get_array, is_transform
 
 Array = NDArray[np.float32]
 
@@ -25,6 +25,10 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
     Raises:
         PathreplayError: the value does not fit the parameter, or the image is missing, unreadable or not finite.
     """
+    if is_transform(like):
+        raise PathreplayError(
+            f"Value given for the matrix '{key}'; set it in the scene, and displace the start of a pose"
+        )
     current = get_array(like)
     if isinstance(value, (int, float)):
         return np.full_like(current, value)

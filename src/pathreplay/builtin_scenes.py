@@ -1,0 +1,202 @@
+"""Built-in scenes: small rooms for the examples and the tests, as Mitsuba dictionaries that functions return."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+SceneDict = dict[str, Any]
+
+BUILTINS: dict[str, Callable[..., SceneDict]] = {}
+"""Built-in scenes: name -> function that returns a Mitsuba scene dictionary."""
+
+
+def builtin(name: str) -> Callable[[Callable[..., SceneDict]], Callable[..., SceneDict]]:
+    """Decorator that makes a function's scene dictionary known under ``name``."""
+
+    def register(make: Callable[..., SceneDict]) -> Callable[..., SceneDict]:
+        BUILTINS[name] = make
+        return make
+
+    return register
+
+
+@builtin("cornell-box")
+def cornell_box(resolution: int = 256) -> SceneDict:
+    """Mitsuba's own Cornell box: two white boxes, a red and a green wall, one area light."""
+    scene: SceneDict = mi.cornell_box()
+    scene["sensor"]["film"].update(width=resolution, height=resolution)
+    return scene
+
+
+@builtin("cornell-box-photo")
+def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
+    """The Cornell box with a grey picture (``texture`` x ``texture`` texels) as its back wall, seen by two sensors.
+
+    ``overview`` is the classical camera. ``closeup`` stands in the box, behind the two white boxes, which were moved
+    to the front so that it sees every texel of the wall. Key of the picture: ``back.bsdf.reflectance.data``.
+    """
+    T = mi.ScalarTransform4f
+    scene = cornell_box(resolution)
+    overview = scene.pop("sensor")
+    # A texel is little wider than a pixel: a wider filter would blur neighbours into each other, slow to undo.
+    overview["film"]["rfilter"] = {"type": "box"}
+    scene["overview"] = overview
+    scene["closeup"] = {
+        **overview,
+        # 1.3 from the wall, whose half side is 1: tan(fov / 2) = 1 / 1.3 and a margin of one per cent.
+        "to_world": T().look_at(origin=[0, 0, 0.3], target=[0, 0, -1], up=[0, 1, 0]),
+        "fov": 75.8,
+    }
+    scene["large-box"]["to_world"] = T().translate([-0.45, -0.65, 0.42]).rotate([0, 1, 0], 18).scale([0.26, 0.35, 0.26])
+    scene["small-box"]["to_world"] = T().translate([0.45, -0.78, 0.5]).rotate([0, 1, 0], -17).scale(0.22)
+    grey = mi.Bitmap(np.full((texture, texture, 3), 0.5, np.float32))
+    scene["back"]["bsdf"] = {
+        "type": "diffuse",
+        # raw: the texels are linear reflectances, which is what is optimised.
+        # to_uv turns v round: the first row of an image belongs at the top of the wall.
+        "reflectance": {
+            "type": "bitmap",
+            "bitmap": grey,
+            "raw": True,
+            "wrap_mode": "clamp",
+            "to_uv": T().translate([0, 1, 0]).scale([1, -1, 1]),
+        },
+    }
+    return scene
+
+
+def _room(radius: float) -> SceneDict:
+    """A hollow ball of light around the origin, poles above and below, painted smoothly in all directions.
+
+    Smooth, so that a picture tells which way to move from far away; of finite size, so that it also tells where from.
+    Radiance towards direction d, colour c: 0.6 + 0.08 Σ_j cos(k_cj · d + φ_cj), waves of 30 to 90 degrees.
+    """
+    rows, columns = 64, 128
+    θ, φ = np.meshgrid(
+        np.pi * (np.arange(rows) + 0.5) / rows, 2 * np.pi * (np.arange(columns) + 0.5) / columns, indexing="ij"
+    )
+    d = np.stack([np.sin(θ) * np.cos(φ), np.sin(θ) * np.sin(φ), np.cos(θ)], axis=-1)
+    random = np.random.default_rng(7)  # any fixed pattern will do
+    k = random.normal(size=(3, 6, 3))
+    k *= random.uniform(4.0, 12.0, (3, 6, 1)) / np.linalg.norm(k, axis=-1, keepdims=True)
+    waves = np.cos(np.einsum("rcx,nwx->rcnw", d, k) + random.uniform(0, 2 * np.pi, (3, 6)))
+    radiance = (0.6 + 0.08 * waves.sum(axis=-1)).astype(np.float32)
+    return {
+        "type": "sphere",
+        "flip_normals": True,
+        "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(radius),
+        "bsdf": {"type": "diffuse", "reflectance": 0.0},
+        "emitter": {"type": "area", "radiance": {"type": "bitmap", "bitmap": mi.Bitmap(radiance), "raw": True}},
+    }
+
+
+def _camera(origin: list[float], target: list[float], fov: float, resolution: int) -> SceneDict:
+    return {
+        "type": "perspective",
+        "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=target, up=[0, 1, 0]),
+        "fov": fov,
+        "film": {
+            "type": "hdrfilm",
+            "width": resolution,
+            "height": resolution,
+            "pixel_format": "rgb",
+            "rfilter": {"type": "box"},
+        },
+    }
+
+
+@builtin("glass-pane")
+def glass_pane(resolution: int = 48, texture: int = 24) -> SceneDict:
+    """A thick pane of glass (index 1.5) whose front is uneven, in a painted room, seen by three sensors.
+
+    ``front`` looks through it straight, ``left`` and ``right`` at 50 degrees, where the thickness shifts what is seen
+    and the front mirrors more of the room: that tells the index from the slope of the surface. Keys: ``glass.eta`` and
+    ``front_face.bsdf.normalmap.data``, ``texture`` x ``texture`` normals (n + 1) / 2 over the middle of the pane.
+    """
+    T = mi.ScalarTransform4f
+    half, thick, distance = 2.4, 0.5, 2.9
+    angle = np.radians(50)
+    side = [float(distance * np.sin(angle)), 0.0, float(distance * np.cos(angle))]
+    # Sizes such that no path sees a rim: the pane is twice as wide as its uneven middle, which fills the pictures.
+    middle = T().translate([-0.5, -0.5, 0]).scale([2, 2, 1])
+    normals = {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(_bumps(texture)),
+        "raw": True,
+        "wrap_mode": "clamp",
+        "to_uv": middle,
+    }
+    return {
+        "type": "scene",
+        "front": _camera([0, 0, distance], [0, 0, 0], 42, resolution),
+        "left": _camera([-side[0], 0, side[2]], [0, 0, 0], 36, resolution),
+        "right": _camera(side, [0, 0, 0], 36, resolution),
+        "room": _room(4.0),
+        "glass": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
+        "front_face": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 0, thick / 2]).scale(half),
+            "bsdf": {"type": "normalmap", "normalmap": normals, "bsdf": {"type": "ref", "id": "glass"}},
+        },
+        "back_face": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 0, -thick / 2]).rotate([0, 1, 0], 180).scale(half),
+            "bsdf": {"type": "ref", "id": "glass"},
+        },
+    }
+
+
+def _bumps(size: int) -> np.ndarray:
+    """Normals of h(x, y) = 0.03 w (sin 7x cos 5y + cos(4x + 6y)), w = (1 - x²)(1 - y²), flat towards the rim."""
+    x, y = np.meshgrid((np.arange(size) + 0.5) / size * 2 - 1, (np.arange(size) + 0.5) / size * 2 - 1)
+
+    def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        window = np.square((1 - x * x) * (1 - y * y))
+        return 0.03 * window * (np.sin(7 * x) * np.cos(5 * y) + np.cos(4 * x + 6 * y))
+
+    ε = 1e-3
+    slope_x = (height(x + ε, y) - height(x - ε, y)) / (2 * ε)
+    slope_y = (height(x, y + ε) - height(x, y - ε)) / (2 * ε)
+    n = np.stack([-slope_x, -slope_y, np.ones_like(x)], axis=-1)
+    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    return ((n + 1) / 2).astype(np.float32)
+
+
+@builtin("mirror-camera")
+def mirror_camera(resolution: int = 48) -> SceneDict:
+    """An old, blotched mirror that hangs in a painted room, seen by a tripod that stays and a camera that is carried.
+
+    Both see the mirror with some of the room around it. The blotches tell where in its plane the mirror is. Keys:
+    ``camera.to_world`` and ``mirror.to_world``.
+    """
+    T = mi.ScalarTransform4f
+    return {
+        "type": "scene",
+        "camera": _camera([0.9, 0.4, 1.9], [-0.3, 0.0, -1.0], 75, resolution),
+        "tripod": _camera([-0.9, 0.3, 0.5], [-0.4, -0.1, -1.0], 60, resolution),
+        "room": _room(3.0),
+        "mirror": {
+            "type": "rectangle",
+            "to_world": T()
+            .translate([-0.4, -0.1, -1.0])
+            .rotate([0, 1, 0], 15)
+            .rotate([1, 0, 0], -8)
+            .scale([1.3, 1.1, 1]),
+            "bsdf": {
+                "type": "conductor",
+                "material": "none",
+                "specular_reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(_blotches(32)), "raw": True},
+            },
+        },
+    }
+
+
+def _blotches(size: int) -> np.ndarray:
+    """Reflectance 0.7 + 0.15 (cos 9x sin 7y + sin(5x - 8y)), less in blue."""
+    x, y = np.meshgrid((np.arange(size) + 0.5) / size * 2 - 1, (np.arange(size) + 0.5) / size * 2 - 1)
+    grey = 0.7 + 0.15 * (np.cos(9 * x) * np.sin(7 * y) + np.sin(5 * x - 8 * y))
+    return (grey[:, :, None] * np.array([1, 0.97, 0.9])).astype(np.float32)
