@@ -44,8 +44,8 @@ def _make_class() -> type:
         """Differentiable path tracer for surfaces.
 
         Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
-        (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``) and ``noise`` (0.3; of
-        ray adjoints with the replay driver: see `Recovery`). ``auto`` sweeps unless
+        (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``,
+        ``none``) and ``noise`` (0.01; of ray adjoints with the replay driver: see `Recovery`). ``auto`` sweeps unless
         ``max_depth`` is more than the sweep can hold. Forward mode is the same whatever the driver.
 
         Not differentiated: visibility; with ``attach='none'`` all motion of shapes, cameras and directions.
@@ -98,10 +98,20 @@ def _make_class() -> type:
             if mode == dr.ADMode.Primal:
                 L, valid = primal(walk, sampler, dr.detach(ray), active)
                 return L, valid, [], None
+            self._refuse_instances(walk.traits)
+            if walk.traits.masks_mirrors:
+                self._tell_once(
+                    "a mask lies over delta lobes, which Mitsuba cannot sample one by one there: derivatives by what "
+                    "decides among them (an index, or a reflectance of plastic) are wrong"
+                )
             if self.attach == "all":
                 self._tell_attachable(walk.traits)
             if mode == dr.ADMode.Forward:
-                tangent, valid = forward(walk, sampler, ray, active)
+                lost = LostPaths()
+                tangent, valid, moves = forward(walk, sampler, ray, active, lost)
+                if moves:
+                    self._tell_edges(walk.traits)
+                    self.lost = lost, dr.width(ray)
                 return tangent, valid, [], None
             lost = LostPaths()
             if self.driver == "sweep":
@@ -124,6 +134,21 @@ def _make_class() -> type:
                 raise mendable(error) from None
             self._tell_lost()
 
+        def render_forward(self, *args: Any, **kwargs: Any) -> Any:
+            """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
+
+            The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
+            from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
+            """
+            try:
+                tangent = super().render_forward(*args, **kwargs)
+            except RuntimeError as error:
+                raise mendable(error) from None
+            if self.lost is not None:
+                dr.eval(tangent)  # in one kernel with the count of lost paths
+            self._tell_lost()
+            return tangent
+
         def _walk(self, scene: Any) -> Walk:
             return Walk(
                 scene=scene,
@@ -134,6 +159,13 @@ def _make_class() -> type:
                 rr_depth=self.rr_depth,
                 skip_area_emitters=self.skip_area_emitters,
             )
+
+        def _refuse_instances(self, traits: Traits) -> None:
+            if traits.instances_move and self.attach != "none":
+                raise PathreplayError(
+                    "pathreplay: an instance's to_world has a gradient, but Mitsuba does not differentiate the normals "
+                    "of instances: move the vertex_positions of the shapes in its group, or use a shape of its own"
+                )
 
         def _tell_attachable(self, traits: Traits) -> None:
             if traits.attachable is None:

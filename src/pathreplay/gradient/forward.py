@@ -11,22 +11,24 @@ from ..transport.motion import path_moves
 from ..transport.path import first_arrival, next_arrival, survival, sustain
 from ..transport.step import surface_step
 from ..transport.vertex import Numbers, Walk
-from .adjoint import RayDerivative, Replayed, forward_step, tangents
+from .adjoint import LostPaths, RayDerivative, Replayed, forward_step, tangents
 
 
 @dr.syntax
-def forward(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
-    """Tangent of the radiance along camera rays: ``(δL, valid)``, a Spectrum and a Bool per ray.
+def forward(walk: Walk, sampler: Any, ray: Any, active: Any, lost: LostPaths) -> tuple[Any, Any, bool]:
+    """Tangent of the radiance along camera rays: ``(δL, valid, moves)``, a Spectrum and a Bool per ray, and a bool.
 
     The parameters must carry their tangents already (propagate to them before the call); ``ray`` may be attached to
     the camera. Nothing is divided, so a weight that is exactly zero keeps its derivative:
-    δβ_{i+1} = δβ_i w_i + β_i δw_i. Visibility is not differentiated and, with ``attach='none'``, nothing that moves.
+    δβ_{i+1} = δβ_i w_i + β_i δw_i. If the path ``moves`` with the parameters, ``lost`` counts paths with a tangent that
+    was not finite and was dropped. Visibility is not differentiated and, with ``attach='none'``, nothing that moves.
     """
     with dr.resume_grad():
         δo, δd = tangents(ray.o, ray.d)
     δ = RayDerivative(mi.Point3f(δo), mi.Vector3f(δd), mi.Float(0))  # tangent of the arrival
 
     δL = mi.Spectrum(0)  # tangent of the radiance
+    broken = mi.Bool(False)  # a tangent was not finite
     β = mi.Spectrum(1)  # throughput
     δβ = mi.Spectrum(0)  # its tangent
     β_alive = mi.Spectrum(1)  # throughput with one zero weight left out: what keeps the path going
@@ -37,7 +39,7 @@ def forward(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
     at = first_arrival(walk, ray, active)
     attached = path_moves(walk, ray, at)
 
-    while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk, attached], label="pathreplay: forward"):
+    while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk, attached, lost], label="pathreplay: forward"):
         u = Numbers.draw(sampler)
         step = surface_step(walk, at, u, depth + 1 < walk.max_depth, active)
 
@@ -50,6 +52,10 @@ def forward(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
 
         replayed = Replayed(at, u, step.kept, go_on, at_next.hit, rr_weight)
         step, δe, δw, δ = forward_step(walk, replayed, attached, δ, active)
+        if dr.hint(attached, mode="scalar"):
+            δ, finite = δ.finite_part()
+            lost.add(active & ~finite & ~broken)
+            broken |= ~finite
         δL += δβ * dr.detach(step.e) + β * δe
         δβ = (δβ * dr.detach(step.w) + β * δw) * rr_weight
         β *= dr.detach(step.w) * rr_weight
@@ -59,4 +65,4 @@ def forward(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
         at = at_next
         depth += 1
 
-    return δL, valid
+    return δL, valid, attached

@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .surface import held_point
 from .vertex import Arrival, Walk, mis_weight, reciprocal
 
 
@@ -61,7 +62,6 @@ def _mesh_growth(scene: Any, si: Any, light: Any, lit: Any) -> Any:
     ray = dr.detach(si.spawn_ray_to(light.p))
     ray.maxt = dr.largest(mi.Float)
     hit = scene.ray_intersect_preliminary(ray, active=lit)
-    on_mesh = lit & hit.is_valid() & hit.shape.is_mesh()
-    y = hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, on_mesh)
-    area = dr.norm(dr.cross(y.dp_du, y.dp_dv))
+    on_mesh = lit & hit.is_valid() & hit.shape.is_mesh() & (hit.shape.emitter() == light.emitter)
+    area = dr.norm(held_point(hit, ray, on_mesh)[1])
     return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)

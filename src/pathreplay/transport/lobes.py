@@ -12,10 +12,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .surface import held_point
 from .vertex import Kept, Numbers, Walk, reciprocal
 
-# Share by which the weight of a lobe sampled alone may differ from the weight that was drawn and still belong to the
-# same lobe: float32 rounding is far below it, BSDFs without support for restricted sampling (`mask`) far above.
+# Share by which the weight of a lobe sampled alone may differ from the weight that was drawn (and squared distance of
+# their directions) and still belong to the same lobe: float32 rounding is far below it, BSDFs without support for
+# restricted sampling (`mask`) far above.
 SAME_LOBE = 1e-3
 
 
@@ -67,17 +69,18 @@ def scatter(
 def held_at_hit(si: Any, d: Any, hit: Any, active: Any) -> tuple[Any, Any]:
     """Direction towards the point that a ray from ``si`` along ``d`` hit, and the density of that point's place.
 
-    The point stays where it is on its surface and moves with it. J = |(∂p/∂u x ∂p/∂v) · d| / dist² is the solid angle
-    that a piece of the surface takes up, relative to its present value: 1, with the derivative of log J. Holding the
-    point and not the direction keeps edges of emitters and seams between materials where they are in the integrand;
-    held directions would see them move, and that boundary term would be missing. Rays that left the scene hold ``d``.
+    The point stays where it is on its surface and moves with it. J = |A · d| / dist², with A the area element there, is
+    the solid angle that a piece of the surface takes up, relative to its present value: 1, with the derivative of
+    log J. Holding the point and not the direction keeps edges of emitters and seams between materials where they are
+    in the integrand; held directions would see them move, and that boundary term would be missing. Rays that left the
+    scene hold ``d``.
     """
     found = active & hit.is_valid()
     ray = dr.detach(si.spawn_ray(d))
-    y = hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, found)
+    y, A = held_point(hit, ray, found)
     x = si.spawn_ray(dr.detach(d)).o
-    towards = y.p - x
-    facing = dr.abs(dr.dot(dr.cross(y.dp_du, y.dp_dv), towards))
+    towards = y - x
+    facing = dr.abs(dr.dot(A, towards))
     ok = found & (facing > 0)
     dist2 = dr.select(ok, dr.squared_norm(towards), 1)
     # In corners distances are tiny: the derivative of a logarithm holds where those of powers would overflow.
@@ -91,14 +94,19 @@ def _delta_weight(walk: Walk, bsdf: Any, si: Any, u: Numbers, kept: Kept, w: Any
     A BSDF that picks among lobes returns weights in which the choice has cancelled, and with it, in some plugins,
     the derivative of Fresnel's term (``thindielectric``, ``plastic``). So the lobe is sampled once more by itself,
     through ``BSDFContext.component``, and divided by the probability with which it was picked. Where a plugin does
-    not support that (the two weights disagree) its own derivative stays.
+    not support that (weights or directions disagree) its own derivative stays.
     """
+    drawn = dr.detach(w)
+    missing = mi.Bool(active)
     for k in range(walk.traits.lobes):
         alone = mi.BSDFContext()
         alone.component = k
-        picked = active & (kept.lobe == k)
-        _, w_k = bsdf.sample(alone, si, u.lobe, u.direction, picked)
+        # The lobes of a surface's back are counted from zero, too, but asked for after those of the front.
+        picked = missing if walk.traits.two_sides else missing & (kept.lobe == k)
+        sample, w_k = bsdf.sample(alone, si, u.lobe, u.direction, picked)
         w_k *= dr.detach(reciprocal(kept.pdf))
-        same = picked & dr.all(dr.abs(dr.detach(w_k) - dr.detach(w)) <= SAME_LOBE * dr.abs(dr.detach(w)))
+        same = picked & (dr.squared_norm(dr.detach(sample.wo) - si.to_local(kept.d)) < SAME_LOBE)
+        same &= dr.all(dr.abs(dr.detach(w_k) - drawn) <= SAME_LOBE * dr.abs(drawn))
         w = dr.select(same, w_k, w)
+        missing &= ~same
     return w

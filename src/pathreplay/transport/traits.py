@@ -17,31 +17,47 @@ FRAMES = frozenset({"NormalMap", "BumpMap", "TwoSidedBRDF"})
 class Traits:
     """What the drivers want to know about a scene.
 
-    ``lobes`` is one more than the largest component index at which a BSDF has a delta lobe, 0 if none has.
-    ``attachable`` tells, by BSDF registry index (Bool), where smooth lobes may be sampled attached; None if nowhere.
-    ``detached_names`` are the classes of the BSDFs with smooth lobes where they may not. ``lights_deform`` says that
-    an emitting mesh has vertex positions with gradients; ``area_lights`` that there are emitters with an edge.
+    ``mirrors`` are the BSDFs with delta lobes, and ``lobes`` is one more than the largest component index of such a
+    lobe, 0 if there is none. ``attachables`` are the BSDFs whose smooth lobes may be sampled attached, and
+    ``attachable`` tells so by BSDF registry index (Bool; None if nowhere); ``detached_names`` are the classes of the
+    other BSDFs with smooth lobes. ``lights_deform`` says that an emitting mesh has vertex positions with gradients,
+    ``instances_move`` that an instance's ``to_world`` has, ``area_lights`` that there are emitters with an edge,
+    ``two_sides`` that a surface may have another BSDF on its back, ``masks_mirrors`` that a mask lies over delta lobes.
     """
 
+    mirrors: tuple[Any, ...]
     lobes: int
+    attachables: tuple[Any, ...]
     attachable: Any
     detached_names: tuple[str, ...]
     lights_deform: bool
+    instances_move: bool
     area_lights: bool
+    two_sides: bool
+    masks_mirrors: bool
 
 
 def scene_traits(scene: Any) -> Traits:
     """Look at all BSDFs and meshes of a scene, those nested in other BSDFs and in instanced shapes included."""
     nodes = _nodes(scene)
     bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
-    attachable = [bsdf for bsdf in bsdfs if _is_attachable(bsdf)]
+    shapes = [node for node in nodes if isinstance(node, mi.Shape)]
+    # A lamp for which the scene names no BSDF has a diffuse one all the same: nobody asked to have that attached.
+    of_lamps = {shape.bsdf() for shape in shapes if shape.is_emitter()}
+    seen = {shape.bsdf() for shape in shapes if not shape.is_emitter()}
+    attachable = [bsdf for bsdf in bsdfs if _is_attachable(bsdf) and bsdf not in of_lamps - seen]
     others = {b.class_name() for b in bsdfs if b not in attachable and mi.has_flag(b.flags(), mi.BSDFFlags.Smooth)}
     return Traits(
+        mirrors=tuple(bsdf for bsdf in bsdfs if _delta_lobes(bsdf)),
         lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs), default=0),
+        attachables=tuple(attachable),
         attachable=_mask_by_index(attachable) if attachable else None,
         detached_names=tuple(sorted(others)),
-        lights_deform=any(_deforms(node) for node in nodes if isinstance(node, mi.Mesh) and node.is_emitter()),
+        lights_deform=any(_has_gradient(s, "vertex_positions") for s in shapes if s.is_mesh() and s.is_emitter()),
+        instances_move=any(_has_gradient(s, "to_world") for s in shapes if s.class_name() == "Instance"),
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
+        two_sides=any(bsdf.class_name() == "TwoSidedBRDF" for bsdf in bsdfs),
+        masks_mirrors=any(bsdf.class_name() == "MaskBSDF" and _delta_lobes(_nested(bsdf)) for bsdf in bsdfs),
     )
 
 
@@ -56,6 +72,10 @@ def _nodes(root: Any) -> set[Any]:
 
     root.traverse(Collector())
     return seen
+
+
+def _nested(bsdf: Any) -> Any:
+    return next(node for node in _nodes(bsdf) if isinstance(node, mi.BSDF))
 
 
 def _delta_lobes(bsdf: Any) -> int:
@@ -78,7 +98,7 @@ def _mask_by_index(bsdfs: list[Any]) -> Any:
     return mi.Bool(mask)
 
 
-def _deforms(mesh: Any) -> bool:
-    params = mi.traverse(mesh)
+def _has_gradient(shape: Any, name: str) -> bool:
+    params = mi.traverse(shape)
     with dr.resume_grad():
-        return "vertex_positions" in params and bool(dr.grad_enabled(params["vertex_positions"]))
+        return name in params and bool(dr.grad_enabled(params[name]))
