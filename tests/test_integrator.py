@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -232,3 +234,103 @@ def test_polarised_variants_are_refused(run_python) -> None:
         "mi.load_dict({'type': 'pathreplay'})"
     )
     assert "llvm_ad_spectral'" in result.stderr and "polarisation" in result.stderr
+
+
+@pytest.fixture
+def log():
+    """What is written to Mitsuba's log during a test."""
+    lines = []
+
+    class Appender(mi.Appender):
+        def append(self, level, text):
+            lines.append(text)
+
+        def log_progress(self, *args):
+            pass
+
+    logger, appender = mi.logger(), Appender()
+    logger.add_appender(appender)
+    yield lines
+    logger.remove_appender(appender)
+
+
+def _differentiate(scene, key, integrator, forward=False):
+    params = mi.traverse(scene)
+    dr.enable_grad(params[key])
+    params.update()
+    if forward:
+        dr.set_grad(params[key], 1)
+        dr.enqueue(dr.ADMode.Forward, params[key])
+        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+        integrator.render_forward(scene, params, spp=1)
+    else:
+        integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (16, 16, 3)), spp=1)
+    dr.disable_grad(params[key])
+    params.update()
+
+
+@pytest.mark.parametrize("forward", [False, True])
+def test_edges_behind_mirrors_are_told_once(log, forward: bool) -> None:
+    scene = mi.load_dict(lit_room({"type": "conductor"}), optimize=False)
+    integrator = plugin()
+    for _ in range(2):
+        _differentiate(scene, "object.to_world", integrator, forward)
+    assert sum("edge of a light" in line for line in log) == 1
+
+
+def test_lost_adjoints_are_told_with_their_share(log, monkeypatch) -> None:
+    """A direction held at a hit that is made infinite: its adjoint cannot be finite."""
+    from pathreplay.transport import lobes
+
+    held = lobes.held_at_hit
+
+    def broken(*args):
+        d, J = held(*args)
+        return d, J * dr.replace_grad(mi.Float(1), dr.sum(d) * dr.opaque(mi.Float, np.inf))
+
+    monkeypatch.setattr(lobes, "held_at_hit", broken)
+    scene = mi.load_dict(lit_room(DIFFUSE), optimize=False)
+    _differentiate(scene, "object.to_world", plugin())
+    assert any("% of the paths had a ray adjoint that was not finite" in line for line in log)
+
+
+def test_bsdfs_that_stay_detached_are_named(log) -> None:
+    scene = lit_room({"type": "principled"})
+    _differentiate(mi.load_dict(scene, optimize=False), "floor.bsdf.reflectance.value", plugin(attach="all"))
+    assert any("keeps the directions of Principled fixed" in line for line in log)
+
+
+def test_a_default_bsdf_of_a_lamp_does_not_make_attach_all_do_something() -> None:
+    scene = lit_room({"type": "principled"})
+    scene["floor"]["bsdf"] = {"type": "principled"}
+    with pytest.raises(PathreplayError, match="attach = 'delta'"):
+        _differentiate(mi.load_dict(scene, optimize=False), "sky.radiance.value", plugin(attach="all"))
+
+
+def test_a_moving_instance_is_refused() -> None:
+    scene = under_sky({"type": "conductor"})
+    scene["group"] = {"type": "shapegroup", "ball": scene.pop("object")}
+    scene["object"] = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    with pytest.raises(PathreplayError, match="vertex_positions"):
+        _differentiate(mi.load_dict(scene, optimize=False), "object.to_world", plugin())
+
+
+def test_nothing_moves_when_only_a_smooth_lobe_changes() -> None:
+    """The roughness of one thing must not make the path move because another is a mirror."""
+    from pathreplay.transport.motion import path_moves
+    from pathreplay.transport.path import first_arrival
+
+    gc.collect()  # shapes of earlier scenes would be asked, too
+    description = lit_room({"type": "roughconductor", "alpha": 0.2})
+    description["mirror"] = {"type": "sphere", "center": [0, 0, -5], "bsdf": {"type": "conductor"}}
+    scene = mi.load_dict(description, optimize=False)
+    params = mi.traverse(scene)
+    ray, _ = scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
+    for key, moves in (("object.bsdf.alpha.value", False), ("object.to_world", True), ("sky.radiance.value", False)):
+        dr.enable_grad(params[key])
+        params.update()
+        walk = plugin()._walk(scene)
+        with dr.suspend_grad():
+            assert path_moves(walk, ray, first_arrival(walk, ray, mi.Bool(True))) == moves, key
+        dr.disable_grad(params[key])
+        params.update()

@@ -15,13 +15,25 @@ EXCLUSIONS = {
     "blend with a delta child": "its primal image is biased: the density that it returns mixes Dirac deltas and others",
     "mask opacity at exactly 0 or 1": "the lobe that would appear is never drawn",
     "plastic, diffuse reflectance exactly 0": "the diffuse lobe is then never drawn, so only its direct light counts",
+    "plastic specular reflectance, blend weight exactly 0": "likewise: the lobe or child is never drawn",
+    "mask over delta lobes that compete (plastic, glass)": "Mitsuba cannot sample them one by one there; warned",
+    "instance to_world": "Mitsuba does not differentiate the normals of instances; refused",
     "replay with a zero weight": "the seed algorithm divides by the weight; sweep and forward do not",
 }
 
 
 def cell(name: str, bsdf: dict, key: str, move=None, **options) -> Case:
     shape = options.pop("shape", "sphere")
-    return Case(name, lambda: lit_room(bsdf_copy(bsdf), shape), f"object.bsdf.{key}", move or add(), **options)
+    return Case(name, lambda: room(bsdf_copy(bsdf), shape), f"object.bsdf.{key}", move or add(), **options)
+
+
+def room(bsdf: dict, shape: str) -> dict:
+    """The lit room; ``back`` is a rectangle that is seen from behind."""
+    if shape != "back":
+        return lit_room(bsdf, shape)
+    scene = lit_room(bsdf, "rectangle")
+    scene["object"]["to_world"] = mi.ScalarTransform4f().rotate([0, 1, 0], 180)
+    return scene
 
 
 def bsdf_copy(bsdf):
@@ -84,6 +96,11 @@ CASES = [
     cell("thindielectric transmittance zero", {"type": "thindielectric", "specular_transmittance": rgb(0.5, 0.6, 0)},
          "specular_transmittance.value", add([0.0, 0.0, 1.0]), shape="rectangle", drivers=("sweep",)),
     cell("twosided diffuse", {"type": "twosided", "nested": DIFFUSE}, "brdf_0.reflectance.value", shape="rectangle"),
+    cell("twosided diffuse and plastic, from the back", {"type": "twosided", "a": DIFFUSE, "b": {"type": "plastic",
+         "diffuse_reflectance": rgb(0.3, 0.4, 0.5)}}, "brdf_1.diffuse_reflectance.value", shape="back", lanes=None,
+         step=3e-3),
+    cell("opaque mask over a mirror, its tint", {"type": "mask", "opacity": 1.0, "nested": {"type": "conductor",
+         "specular_reflectance": rgb(1, 1, 1)}}, "nested_bsdf.specular_reflectance.value"),
     cell("mask over diffuse, its reflectance", {"type": "mask", "opacity": 0.6, "nested": DIFFUSE},
          "nested_bsdf.reflectance.value"),
     cell("mask opacity", {"type": "mask", "opacity": 0.6, "nested": DIFFUSE}, "opacity.value", lanes=None, spp=256),

@@ -233,8 +233,8 @@ def _peer(bench: Bench, seeds: range) -> float:
 
 # Beyond four standard errors an honest gradient falls once in ten thousand cells.
 Z_MAX = 4.0
-# A gradient must be resolved to count: noise above this share of its size could hide an error of 100 %.
-RESOLVED = 0.25
+# A gradient must be resolved to count: a standard error of this share of it lets an error of four times that pass.
+RESOLVED = 0.1
 # Same seed, forward against reverse: float32 rounding of the sums, relative to the sum of magnitudes.
 TRANSPOSE_MAX = 1e-5
 

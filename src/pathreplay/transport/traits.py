@@ -46,13 +46,13 @@ def scene_traits(scene: Any) -> Traits:
     of_lamps = {shape.bsdf() for shape in shapes if shape.is_emitter()}
     seen = {shape.bsdf() for shape in shapes if not shape.is_emitter()}
     attachable = [bsdf for bsdf in bsdfs if _is_attachable(bsdf) and bsdf not in of_lamps - seen]
-    others = {b.class_name() for b in bsdfs if b not in attachable and mi.has_flag(b.flags(), mi.BSDFFlags.Smooth)}
+    others = [bsdf for bsdf in bsdfs if not _is_attachable(bsdf) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
     return Traits(
         mirrors=tuple(bsdf for bsdf in bsdfs if _delta_lobes(bsdf)),
         lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs), default=0),
         attachables=tuple(attachable),
         attachable=_mask_by_index(attachable) if attachable else None,
-        detached_names=tuple(sorted(others)),
+        detached_names=tuple(sorted({bsdf.class_name() for bsdf in others})),
         lights_deform=any(_has_gradient(s, "vertex_positions") for s in shapes if s.is_mesh() and s.is_emitter()),
         instances_move=any(_has_gradient(s, "to_world") for s in shapes if s.class_name() == "Instance"),
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
