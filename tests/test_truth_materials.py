@@ -65,7 +65,7 @@ CASES = [
          "specular_reflectance.value", drivers=("sweep",)),
     cell("roughconductor specular reflectance", {**ROUGH, "specular_reflectance": rgb(0.5, 0.6, 0.7)},
          "specular_reflectance.value"),
-    cell("roughconductor alpha", ROUGH, "alpha.value", lanes=None, spp=256),
+    cell("roughconductor alpha", ROUGH, "alpha.value", lanes=None, spp=1024),
     cell("roughconductor k", {"type": "roughconductor", "eta": 1.5, "k": 2.0, "alpha": 0.3}, "k.value"),
     cell("plastic diffuse reflectance", {"type": "plastic", "diffuse_reflectance": rgb(0.3, 0.4, 0.5)},
          "diffuse_reflectance.value", lanes=None, step=3e-3),
@@ -115,7 +115,7 @@ CASES = [
     cell("normal map over roughconductor", {"type": "normalmap", "normalmap": NORMALS, "nested": ROUGH},
          "normalmap.data", random(1.0, planes=2), lanes=None, spp=512),
     cell("bump map over diffuse", {"type": "bumpmap", "texture": texels(0.4, 0.6, 1), "nested": DIFFUSE, "scale": 0.2},
-         "nested_texture.data", random(0.3), lanes=None, spp=256),
+         "nested_texture.data", random(0.3), lanes=None, spp=1024),
 ]  # fmt: skip
 
 
