@@ -18,9 +18,9 @@ SCENE = """<scene version="3.0.0">
     <string name="pixel_format" value="rgb"/></film></sensor>
   <bsdf type="diffuse" id="paint"><texture type="bitmap" name="reflectance">
     <string name="filename" value="texture.exr"/><boolean name="raw" value="true"/></texture></bsdf>
-  <bsdf type="dielectric" id="glass"/>
+  <bsdf type="plastic" id="gloss"/>
   <shape type="sphere" id="ball"><ref id="paint"/></shape>
-  <shape type="sphere" id="bubble"><point name="center" x="3" y="0" z="0"/><ref id="glass"/></shape>
+  <shape type="sphere" id="bubble"><point name="center" x="3" y="0" z="0"/><ref id="gloss"/></shape>
   <emitter type="constant" id="sky"><rgb name="radiance" value="1"/></emitter>
 </scene>"""
 
@@ -94,8 +94,9 @@ KEY = '"paint.reflectance.data"'
 BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "key does not exist": (replace(KEY, '"paint.reflectance.dat"'), ["reflectance.dat'", "paint.reflectance.data"]),
     "glob matches nothing": (replace(KEY, '"pant.*.data"'), ["pant.*.data"]),
-    "key without derivative": (replace(KEY, '"glass.eta"'), ["glass.eta", "smoothdielectric"]),
-    "a matrix": (replace(KEY, '"ball.to_world"'), ["ball.to_world"]),
+    "key without derivative": (replace(KEY, '"gloss.eta"'), ["gloss.eta", "no replacement"]),
+    "a matrix": (replace(KEY, '"ball.to_world"'), ["ball.to_world", "pose"]),
+    "a camera with prb": (replace(KEY, '"eye.to_world"'), ["eye.to_world", "only 'pathreplay'"]),
     "key named twice": (
         replace(f"[ {{ key = {KEY}", f'[ {{ key = "paint.*.data" }}, {{ key = {KEY}'),
         ["named twice", "paint.*.data"],

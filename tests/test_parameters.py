@@ -101,7 +101,7 @@ def test_a_glob_keeps_what_has_a_derivative_and_an_exact_key_must(params: Any) -
         ("photo.faces", "UInt"),
         ("photo.bsdf.reflectance.to_uv", "ScalarAffineTransform3f"),
         ("sensor.far_clip", "plain number (10000.0)"),
-        ("sensor.to_world", "marks this parameter of PerspectiveCamera as not differentiable"),
+        ("sensor.to_world", "only 'pathreplay' differentiates cameras"),
         ("lamp.intensity.valve", "nearest: lamp.intensity.value"),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes import BUILTINS, load_scene
+from pathreplay.scenes import BUILTINS, load_scene, load_scene_for
 
 XML = """<scene version="3.0.0">
   <default name="res" value="8"/>
@@ -26,13 +26,22 @@ def variant() -> None:
     backend.set_variant("llvm_ad_rgb")
 
 
+CORNELL = {"red.reflectance.value", "green.reflectance.value", "light.emitter.radiance.value"}
+KEYS = {
+    "cornell-box": CORNELL,
+    "cornell-box-photo": CORNELL | {"back.bsdf.reflectance.data"},
+    "glass-pane": {"glass.eta", "front_face.bsdf.normalmap.data"},
+    "mirror-camera": {"camera.to_world", "mirror.to_world"},
+}
+
+
 @pytest.mark.parametrize("name", sorted(BUILTINS))
 def test_builtins_render_with_their_names(name: str) -> None:
     scene = load_scene(name, resolution=8)
     params = mi.traverse(scene)
-    assert {"red.reflectance.value", "green.reflectance.value", "light.emitter.radiance.value"} <= set(params.keys())
+    assert KEYS[name] <= set(params.keys())
     for sensor in range(len(scene.sensors())):
-        assert mi.render(scene, sensor=sensor, spp=4).shape == (8, 8, 3)
+        assert mi.render(scene, sensor=sensor, spp=4, integrator=mi.load_dict({"type": "path"})).shape == (8, 8, 3)
 
 
 def test_closeup_sees_every_texel() -> None:
@@ -86,3 +95,31 @@ def test_bad_scenes_get_one_line(case: str, tmp_path: Path) -> None:
         load_scene(spec, tmp_path, **arguments)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+GLASS = """<scene version="3.0.0">
+  <bsdf type="dielectric" id="glass"/><bsdf type="thindielectric" id="thin"/>
+  <shape type="sphere" id="one"><ref id="glass"/></shape>
+  <shape type="sphere"><bsdf type="dielectric"/></shape>
+  <shape type="sphere" id="three"><ref id="thin"/></shape>
+</scene>"""
+
+
+@pytest.mark.parametrize(("wanted", "replaced"), [
+    (["glass.eta"], True), (["*.eta"], True), (["thin.eta"], False), (["glass.*"], False), (["nothing.eta"], False),
+])  # fmt: skip
+def test_glass_is_replaced_only_for_its_index(wanted: list[str], replaced: bool, tmp_path: Path) -> None:
+    (tmp_path / "glass.xml").write_text(GLASS)
+    scene, notes = load_scene_for("glass.xml", wanted, tmp_path)
+    names = [type(shape.bsdf()).__name__ for shape in scene.shapes()]
+    assert names.count("SmoothDielectric") == (2 if replaced else 0)
+    assert isinstance(mi.traverse(scene)["glass.eta"], float) != replaced
+    assert len(notes) == replaced
+    if replaced:
+        assert "all 2" in notes[0] and "'smoothdielectric'" in notes[0] and "\n" not in notes[0]
+
+
+def test_glass_of_a_builtin_is_replaced_too() -> None:
+    scene, notes = load_scene_for("glass-pane", ["glass.eta"], resolution=8, texture=4)
+    assert "one of them" in notes[0]
+    assert mi.traverse(scene)["glass.eta"][0] == pytest.approx(1.5)

@@ -110,19 +110,20 @@ def _camera(origin: list[float], target: list[float], fov: float, resolution: in
 
 
 @builtin("glass-pane")
-def glass_pane(resolution: int = 48, texture: int = 24) -> SceneDict:
+def glass_pane(resolution: int = 48, texture: int = 16) -> SceneDict:
     """A thick pane of glass (index 1.5) whose front is uneven, in a painted room, seen by three sensors.
 
-    ``front`` looks through it straight, ``left`` and ``right`` at 50 degrees, where the thickness shifts what is seen
+    ``front`` looks through it straight, ``left`` and ``right`` at 55 degrees, where the thickness shifts what is seen
     and the front mirrors more of the room: that tells the index from the slope of the surface. Keys: ``glass.eta`` and
     ``front_face.bsdf.normalmap.data``, ``texture`` x ``texture`` normals (n + 1) / 2 over the middle of the pane.
     """
     T = mi.ScalarTransform4f
-    half, thick, distance = 2.4, 0.5, 2.9
-    angle = np.radians(50)
+    # So wide that no path sees the rim; its corners stay within the room.
+    half, thick, distance = [2.8, 2.0, 1.0], 0.6, 2.9
+    angle = np.radians(55)
     side = [float(distance * np.sin(angle)), 0.0, float(distance * np.cos(angle))]
-    # Sizes such that no path sees a rim: the pane is twice as wide as its uneven middle, which fills the pictures.
-    middle = T().translate([-0.5, -0.5, 0]).scale([2, 2, 1])
+    # The picture of the normals covers -0.8 to 0.8 in x and y; around it, in view too, its flat edge goes on.
+    middle = T().translate([0.5, 0.5, 0]).scale([half[0] / 0.8, half[1] / 0.8, 1]).translate([-0.5, -0.5, 0])
     normals = {
         "type": "bitmap",
         "bitmap": mi.Bitmap(_bumps(texture)),
@@ -132,9 +133,10 @@ def glass_pane(resolution: int = 48, texture: int = 24) -> SceneDict:
     }
     return {
         "type": "scene",
-        "front": _camera([0, 0, distance], [0, 0, 0], 42, resolution),
-        "left": _camera([-side[0], 0, side[2]], [0, 0, 0], 36, resolution),
-        "right": _camera(side, [0, 0, 0], 36, resolution),
+        "front": _camera([0, 0, distance], [0, 0, 0], 44, resolution),
+        "left": _camera([-side[0], 0, side[2]], [0, 0, 0], 40, resolution),
+        "right": _camera(side, [0, 0, 0], 40, resolution),
+        "integrator": {"type": "path", "max_depth": 5},
         "room": _room(4.0),
         "glass": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
         "front_face": {
@@ -151,12 +153,12 @@ def glass_pane(resolution: int = 48, texture: int = 24) -> SceneDict:
 
 
 def _bumps(size: int) -> np.ndarray:
-    """Normals of h(x, y) = 0.03 w (sin 7x cos 5y + cos(4x + 6y)), w = (1 - x²)(1 - y²), flat towards the rim."""
+    """Normals of h(x, y) = 0.03 w (sin 5x cos 4y + cos(3x + 5y)), w = (1 - x²)²(1 - y²)², flat towards the rim."""
     x, y = np.meshgrid((np.arange(size) + 0.5) / size * 2 - 1, (np.arange(size) + 0.5) / size * 2 - 1)
 
     def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         window = np.square((1 - x * x) * (1 - y * y))
-        return 0.03 * window * (np.sin(7 * x) * np.cos(5 * y) + np.cos(4 * x + 6 * y))
+        return 0.03 * window * (np.sin(5 * x) * np.cos(4 * y) + np.cos(3 * x + 5 * y))
 
     ε = 1e-3
     slope_x = (height(x + ε, y) - height(x - ε, y)) / (2 * ε)
@@ -178,6 +180,7 @@ def mirror_camera(resolution: int = 48) -> SceneDict:
         "type": "scene",
         "camera": _camera([0.9, 0.4, 1.9], [-0.3, 0.0, -1.0], 75, resolution),
         "tripod": _camera([-0.9, 0.3, 0.5], [-0.4, -0.1, -1.0], 60, resolution),
+        "integrator": {"type": "path", "max_depth": 3},
         "room": _room(3.0),
         "mirror": {
             "type": "rectangle",

@@ -147,7 +147,7 @@ def carries_derivative(params: Any, key: str, integrator: Any = None) -> bool:
 
 
 # Marked NonDifferentiable by Mitsuba, whose integrators drop their derivatives. Each is held to finite differences in
-# tests/test_parameters.py.
+# tests/test_cameras_and_lights.py.
 _CAMERA = {
     "to_world",
     "x_fov",

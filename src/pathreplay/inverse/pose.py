@@ -90,7 +90,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class PoseError:
-    """Between two poses of a thing: distance of its origins (a mesh: centres), also as a share of a length, and angle."""
+    """Between two poses of a thing: distance of its origins (a mesh: centres), also as a share of a length; angle."""
 
     position: float
     relative: float | None
