@@ -110,7 +110,7 @@ def _camera(origin: list[float], target: list[float], fov: float, resolution: in
 
 
 @builtin("glass-pane")
-def glass_pane(resolution: int = 48, texture: int = 16) -> SceneDict:
+def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
     """A thick pane of glass (index 1.5) whose front is uneven, in a painted room, seen by three sensors.
 
     ``front`` looks through it straight, ``left`` and ``right`` at 55 degrees, where the thickness shifts what is seen
