@@ -45,6 +45,12 @@ def texels(low, high, channels=3, n=4):
     return {"type": "bitmap", "raw": True, "data": lambda: bitmap(noise(n, channels, low, high))["data"]}
 
 
+def ramp(value, t):
+    """A bump map that gets a slope: all normals tilt the same way."""
+    slope = np.linspace(-1, 1, value.shape[1], dtype=np.float32)[None, :, None] * np.ones(value.shape, np.float32)
+    return value + t * mi.TensorXf(slope)
+
+
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.4, 0.3)}
 ROUGH = {"type": "roughconductor", "material": "Al", "alpha": 0.3}
 NORMALS = {"type": "bitmap", "raw": True, "data": lambda: bitmap(np.concatenate(
@@ -115,7 +121,7 @@ CASES = [
     cell("normal map over roughconductor", {"type": "normalmap", "normalmap": NORMALS, "nested": ROUGH},
          "normalmap.data", random(1.0, planes=2), lanes=None, spp=512),
     cell("bump map over diffuse", {"type": "bumpmap", "texture": texels(0.4, 0.6, 1), "nested": DIFFUSE, "scale": 0.2},
-         "nested_texture.data", random(0.3), lanes=None, spp=1024),
+         "nested_texture.data", ramp, lanes=None, spp=1024),
 ]  # fmt: skip
 
 
