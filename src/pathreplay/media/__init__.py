@@ -1,0 +1,1 @@
+"""Media that Mitsuba lacks, and volumes from files."""
