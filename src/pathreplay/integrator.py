@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
@@ -9,12 +11,14 @@ import mitsuba as mi
 
 from .errors import PathreplayError
 from .gradient.adjoint import LostPaths
+from .gradient.baseline import Baseline
 from .gradient.forward import forward
 from .gradient.primal import primal
 from .gradient.ray_jacobian import Recovery
 from .gradient.replay import replay
-from .gradient.sweep import MAX_DEPTH, sweep
-from .transport.traits import Traits, scene_traits
+from .gradient.sweep import MAX_DEPTH, deepest, sweep
+from .transport.media import scene_media
+from .transport.traits import Traits, nodes_of, scene_traits
 from .transport.vertex import Walk
 
 DRIVERS = ("auto", "sweep", "replay")
@@ -73,8 +77,6 @@ def _make_class() -> type:
                     f"pathreplay: max_depth = {depth} is more than the sweep driver can hold ({MAX_DEPTH}): "
                     "use driver = 'replay', which has no limit"
                 )
-            if driver == "auto":
-                driver = "sweep" if self.max_depth <= MAX_DEPTH else "replay"
             self.driver = driver
             noise = props.get("noise", Recovery.noise)
             if noise < 0:
@@ -82,6 +84,8 @@ def _make_class() -> type:
             self.recovery = Recovery(noise=noise)
             self.told: set[str] = set()  # what has been said in the log
             self.lost: tuple[LostPaths, int] | None = None  # of how many paths
+            self.sensor: Any = None  # that is rendered
+            self.baseline: tuple[int, Baseline] | None = None  # and the scene that it belongs to
 
         def sample(
             self,
@@ -114,8 +118,11 @@ def _make_class() -> type:
                     self.lost = lost, dr.width(ray)
                 return tangent, valid, [], None
             lost = LostPaths()
-            if self.driver == "sweep":
-                moves = sweep(walk, sampler, ray, δL, active, lost)
+            driver = self.driver
+            if driver == "auto":
+                driver = "sweep" if self.max_depth <= deepest(walk) else "replay"
+            if driver == "sweep":
+                moves = sweep(walk, sampler, ray, δL, active, lost, self.baseline and self.baseline[1])
             else:
                 moves = replay(walk, sampler, ray, δL, active, lost, self.recovery)
             if moves:
@@ -123,42 +130,71 @@ def _make_class() -> type:
                 self.lost = lost, dr.width(ray)
             return mi.Spectrum(0), mi.Bool(True), [], None
 
-        def render_backward(self, *args: Any, **kwargs: Any) -> None:
+        def render_backward(
+            self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, *args: Any, **kwargs: Any
+        ) -> None:
             """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
 
             Warns when a part of the gradient was not finite and had to be left out.
             """
-            try:
-                super().render_backward(*args, **kwargs)
-            except RuntimeError as error:
-                raise mendable(error) from None
+            with self._looking_through(scene, sensor):
+                super().render_backward(scene, params, grad_in, sensor, *args, **kwargs)
             self._tell_lost()
+            if self.baseline is not None:
+                self.baseline[1].absorb()
 
-        def render_forward(self, *args: Any, **kwargs: Any) -> Any:
+        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, *args: Any, **kwargs: Any) -> Any:
             """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
 
             The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
             from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
             """
-            try:
-                tangent = super().render_forward(*args, **kwargs)
-            except RuntimeError as error:
-                raise mendable(error) from None
+            with self._looking_through(scene, sensor):
+                tangent = super().render_forward(scene, params, sensor, *args, **kwargs)
             if self.lost is not None:
                 dr.eval(tangent)  # in one kernel with the count of lost paths
             self._tell_lost()
             return tangent
 
+        def render(self, scene: Any, sensor: Any = 0, *args: Any, **kwargs: Any) -> Any:
+            """Render an image: see Mitsuba's ADIntegrator."""
+            with self._looking_through(scene, sensor):
+                return super().render(scene, sensor, *args, **kwargs)
+
+        @contextmanager
+        def _looking_through(self, scene: Any, sensor: Any) -> Iterator[None]:
+            """Remember the sensor, which may be in a medium, and make errors plain."""
+            self.sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            try:
+                yield
+            except RuntimeError as error:
+                mended = mendable(error)
+                if mended is error:
+                    raise
+                raise mended from None
+            finally:
+                self.sensor = None
+
         def _walk(self, scene: Any) -> Walk:
+            nodes = nodes_of(scene)
+            media = scene_media(nodes, self.sensor)
             return Walk(
                 scene=scene,
-                traits=scene_traits(scene),
+                traits=scene_traits(nodes, scene, media is not None),
+                media=media,
+                baseline=None if media is None else self._baseline(scene).look,
                 attach=self.attach,
                 hide_emitters=self.hide_emitters,
                 max_depth=self.max_depth,
                 rr_depth=self.rr_depth,
                 skip_area_emitters=self.skip_area_emitters,
             )
+
+        def _baseline(self, scene: Any) -> Baseline:
+            """What was learned of this scene so far; another scene starts anew."""
+            if self.baseline is None or self.baseline[0] != scene.ptr:
+                self.baseline = scene.ptr, Baseline(scene.bbox())
+            return self.baseline[1]
 
         def _refuse_instances(self, traits: Traits) -> None:
             if traits.instances_move and self.attach != "none":

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..transport.step import surface_step
+from ..transport.path import repeat_step
 from ..transport.vertex import Arrival, Kept, Numbers, Step, Walk
 
 
@@ -60,11 +60,11 @@ def _attached_arrival(at: Arrival) -> Arrival:
     ray = mi.Ray3f(at.ray)
     ray.o, ray.d, pdf = mi.Point3f(dr.detach(ray.o)), mi.Vector3f(dr.detach(ray.d)), mi.Float(dr.detach(at.pdf))
     dr.enable_grad(ray.o, ray.d, pdf)
-    return Arrival(ray=ray, hit=at.hit, pdf=pdf, delta=at.delta, camera=at.camera)
+    return replace(at, ray=ray, pdf=pdf)
 
 
 def _step(walk: Walk, v: Replayed, at: Arrival, attached: bool, active: Any) -> Step:
-    return surface_step(walk, at, v.u, v.go_on, active, v.kept, attached, v.hit_next)
+    return repeat_step(walk, at, v.u, v.kept, v.go_on, active, attached, v.hit_next)
 
 
 def backward_step(

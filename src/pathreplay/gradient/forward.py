@@ -8,8 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.motion import path_moves
-from ..transport.path import first_arrival, next_arrival, survival, sustain
-from ..transport.step import surface_step
+from ..transport.path import count, first_arrival, next_arrival, survival, sustain, take_step
 from ..transport.vertex import Numbers, Walk
 from .adjoint import LostPaths, RayDerivative, Replayed, forward_step, tangents
 
@@ -33,24 +32,25 @@ def forward(walk: Walk, sampler: Any, ray: Any, active: Any, lost: LostPaths) ->
     δβ = mi.Spectrum(0)  # its tangent
     β_alive = mi.Spectrum(1)  # throughput with one zero weight left out: what keeps the path going
     η = mi.Float(1)  # relative index of refraction since the camera
-    depth = mi.UInt32(0)  # index of the vertex
+    depth = mi.UInt32(0)  # vertices before
     active = mi.Bool(active) & (walk.max_depth > 0)
     valid = mi.Bool(walk.background_is_opaque) & active
     at = first_arrival(walk, ray, active)
     attached = path_moves(walk, ray, at)
 
-    while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk, attached, lost], label="pathreplay: forward"):
+    while dr.hint(active, exclude=[walk, attached, lost], label="pathreplay: forward"):
         u = Numbers.draw(sampler)
-        step = surface_step(walk, at, u, depth + 1 < walk.max_depth, active)
+        step = take_step(walk, at, u, sampler, β_alive, depth + 1 < walk.max_depth, active)
 
         β_alive = sustain(β_alive, β, step)
         η *= step.kept.eta
-        valid |= active & step.surface & ~step.kept.null
-        rr_weight, survives = survival(β_alive, η, depth, u.roulette, walk)
+        valid |= active & step.met & ~step.kept.null
+        rr_weight, survives = survival(β_alive, η, depth, u.roulette, walk, step)
         go_on = step.active & survives & (dr.max(β_alive) != 0)
-        at_next = next_arrival(walk, step, go_on)
+        at_next = next_arrival(walk, at, step, go_on)
 
         replayed = Replayed(at, u, step.kept, go_on, at_next.hit, rr_weight)
+        depth += count(walk, step)
         step, δe, δw, δ = forward_step(walk, replayed, attached, δ, active)
         if dr.hint(attached, mode="scalar"):
             δ, finite = δ.finite_part()
@@ -63,6 +63,5 @@ def forward(walk: Walk, sampler: Any, ray: Any, active: Any, lost: LostPaths) ->
 
         active = go_on
         at = at_next
-        depth += 1
 
     return δL, valid, attached

@@ -7,8 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.path import first_arrival, next_arrival, survival
-from ..transport.step import surface_step
+from ..transport.path import count, first_arrival, next_arrival, survival, take_step
 from ..transport.vertex import Numbers, Walk
 
 
@@ -16,30 +15,30 @@ from ..transport.vertex import Numbers, Walk
 def primal(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
     """Estimate the radiance along camera rays: ``(L, valid)``, a Spectrum and a Bool per ray.
 
-    ``valid`` is Mitsuba's alpha: the path met a surface that does not merely let it pass. Nothing is differentiated.
+    ``valid`` is Mitsuba's alpha: the path met a particle, or a surface that does not merely let it pass. Nothing is differentiated.
     """
     L = mi.Spectrum(0)  # radiance so far
     β = mi.Spectrum(1)  # throughput
     η = mi.Float(1)  # relative index of refraction since the camera
-    depth = mi.UInt32(0)  # index of the vertex
+    depth = mi.UInt32(0)  # vertices before
     active = mi.Bool(active) & (walk.max_depth > 0)
     valid = mi.Bool(walk.background_is_opaque) & active
     at = first_arrival(walk, ray, active)
 
-    while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk], label="pathreplay: primal"):
+    while dr.hint(active, exclude=[walk], label="pathreplay: primal"):
         u = Numbers.draw(sampler)
-        step = surface_step(walk, at, u, depth + 1 < walk.max_depth, active)
+        step = take_step(walk, at, u, sampler, β, depth + 1 < walk.max_depth, active)
 
         L += β * step.e
         β *= step.w
         η *= step.kept.eta
-        valid |= active & step.surface & ~step.kept.null
+        valid |= active & step.met & ~step.kept.null
 
-        rr_weight, survives = survival(β, η, depth, u.roulette, walk)
+        rr_weight, survives = survival(β, η, depth, u.roulette, walk, step)
         active = step.active & survives & (dr.max(β) != 0)
         β *= rr_weight
 
-        at = next_arrival(walk, step, active)
-        depth += 1
+        at = next_arrival(walk, at, step, active)
+        depth += count(walk, step)
 
     return L, valid

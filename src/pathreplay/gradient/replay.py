@@ -14,8 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.motion import path_moves
-from ..transport.path import first_arrival, next_arrival, survival
-from ..transport.step import surface_step
+from ..transport.path import count, first_arrival, next_arrival, repeat_step, survival, take_step
 from ..transport.vertex import Numbers, Walk, reciprocal
 from .adjoint import LostPaths, backward
 from .primal import primal
@@ -66,26 +65,26 @@ def _replay_still(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> 
 
     β = mi.Spectrum(1)  # throughput
     η = mi.Float(1)  # relative index of refraction since the camera
-    depth = mi.UInt32(0)  # index of the vertex
+    depth = mi.UInt32(0)  # vertices before
     active = mi.Bool(active) & (walk.max_depth > 0)
     at = first_arrival(walk, ray, active)
 
-    while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk], label="pathreplay: replay"):
+    while dr.hint(active, exclude=[walk], label="pathreplay: replay"):
         u = Numbers.draw(sampler)
         go_on = depth + 1 < walk.max_depth
-        step = surface_step(walk, at, u, go_on, active)
+        step = take_step(walk, at, u, sampler, β, go_on, active)
         L -= β * step.e
 
         with dr.resume_grad():
-            held = surface_step(walk, at, u, go_on, active, step.kept)
+            held = repeat_step(walk, at, u, step.kept, step.active, active)
             Lo = β * held.e + L * held.w * dr.detach(reciprocal(held.w))
             backward(dr.sum(δL * Lo))
 
         β *= step.w
         η *= step.kept.eta
-        rr_weight, survives = survival(β, η, depth, u.roulette, walk)
+        rr_weight, survives = survival(β, η, depth, u.roulette, walk, step)
         active = step.active & survives & (dr.max(β) != 0)
         β *= rr_weight
 
-        at = next_arrival(walk, step, active)
-        depth += 1
+        at = next_arrival(walk, at, step, active)
+        depth += count(walk, step)

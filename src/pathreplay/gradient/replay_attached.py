@@ -40,9 +40,9 @@ def _advance(
     step = surface_step(walk, at, u, depth + 1 < walk.max_depth, active)
     β = β * step.w  # not in place: the caller still needs it
     η = η * step.kept.eta
-    rr_weight, survives = survival(β, η, depth, u.roulette, walk)
+    rr_weight, survives = survival(β, η, depth, u.roulette, walk, step)
     go_on = step.active & survives & (dr.max(β) != 0)
-    at_next = next_arrival(walk, step, go_on)
+    at_next = next_arrival(walk, at, step, go_on)
     return Replayed(at, u, step.kept, go_on, at_next.hit, rr_weight), at_next, step.e, β * rr_weight, η
 
 

@@ -21,18 +21,21 @@ def emission(scene: Any, at: Arrival, si: Any, attached: bool, active: Any) -> A
     with dr.suspend_grad(when=not attached):
         origin = dr.zeros(mi.Interaction3f)
         origin.p, origin.time, origin.wavelengths = at.ray.o, at.ray.time, at.ray.wavelengths
+        if at.behind is not None:
+            origin.p -= at.behind * at.ray.d
         ds = mi.DirectionSample3f(scene, si=si, ref=origin)
         mis = mis_weight(at.pdf, scene.pdf_emitter_direction(origin, ds, active & ~at.delta))
     return mis * ds.emitter.eval(si, active)
 
 
-def draw_emitter(scene: Any, si: Any, u: Any, active: Any) -> tuple[Any, Any]:
-    """Sample a direction towards an emitter, and look whether it is lit: the DirectionSample3f and Le/p (Spectrum).
+def draw_emitter(scene: Any, si: Any, u: Any, active: Any, visible: bool = True) -> tuple[Any, Any]:
+    """Sample a direction towards an emitter: the DirectionSample3f and Le/p (Spectrum).
 
-    An occluded sample comes back with density and weight zero. Nothing is differentiated.
+    If it must be ``visible``, an occluded sample comes back with density and weight zero; else nobody looks. Nothing is
+    differentiated.
     """
     with dr.suspend_grad():
-        return scene.sample_emitter_direction(si, u, True, active)
+        return scene.sample_emitter_direction(si, u, visible, active)
 
 
 def redraw_emitter(walk: Walk, si: Any, u: Any, light: Any, attached: bool, lit: Any) -> tuple[Any, Any]:

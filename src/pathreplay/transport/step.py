@@ -1,7 +1,7 @@
-"""The step: what one surface vertex adds, how it scatters, and the derivative of both.
+"""The step on surfaces: what one vertex adds, how it scatters, and the derivative of both.
 
-Every driver is built from this one function. It knows emission, next-event estimation, BSDF sampling and multiple
-importance sampling; loops, images and their gradients are its callers' business.
+It knows emission, next-event estimation, BSDF sampling and multiple importance sampling; loops, images and their
+gradients are its callers' business. Its sibling for scenes with media is `medium_step`.
 """
 
 from __future__ import annotations
@@ -75,4 +75,4 @@ def surface_step(
     mis = dr.select(light.delta, 1, mis_weight(light.pdf, pdf_light))
     e += dr.select(lit, f * Le * (mis if attached else dr.detach(mis)), 0)
 
-    return Step(e=e, w=w, ray_next=si.spawn_ray(d), pdf=pdf, kept=kept, surface=si.is_valid(), active=go_on)
+    return Step(e=e, w=w, ray_next=si.spawn_ray(d), pdf=pdf, kept=kept, met=si.is_valid(), active=go_on)

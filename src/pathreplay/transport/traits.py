@@ -37,10 +37,12 @@ class Traits:
     masks_mirrors: bool
 
 
-def scene_traits(scene: Any) -> Traits:
-    """Look at all BSDFs and meshes of a scene, those nested in other BSDFs and in instanced shapes included."""
-    nodes = _nodes(scene)
-    bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
+def scene_traits(nodes: set[Any], scene: Any, media: bool) -> Traits:
+    """Look at all BSDFs and meshes of a scene, those nested in other BSDFs and in instanced shapes included.
+
+    With media, null boundaries are not mirrors: the step sends light straight through them.
+    """
+    bsdfs = [node for node in nodes if isinstance(node, mi.BSDF) and not (media and node.class_name() == "Null")]
     shapes = [node for node in nodes if isinstance(node, mi.Shape)]
     # A lamp for which the scene names no BSDF has a diffuse one all the same: nobody asked to have that attached.
     of_lamps = {shape.bsdf() for shape in shapes if shape.is_emitter()}
@@ -61,7 +63,8 @@ def scene_traits(scene: Any) -> Traits:
     )
 
 
-def _nodes(root: Any) -> set[Any]:
+def nodes_of(root: Any) -> set[Any]:
+    """All objects of a scene, or below one of its objects."""
     seen: set[Any] = set()
 
     class Collector(mi.TraversalCallback):  # type: ignore[misc, name-defined]
@@ -75,7 +78,7 @@ def _nodes(root: Any) -> set[Any]:
 
 
 def _nested(bsdf: Any) -> Any:
-    return next(node for node in _nodes(bsdf) if isinstance(node, mi.BSDF))
+    return next(node for node in nodes_of(bsdf) if isinstance(node, mi.BSDF))
 
 
 def _delta_lobes(bsdf: Any) -> int:
@@ -86,7 +89,7 @@ def _delta_lobes(bsdf: Any) -> int:
 def _is_attachable(bsdf: Any) -> bool:
     name = bsdf.class_name()
     if name in FRAMES:
-        return all(_is_attachable(nested) for nested in _nodes(bsdf) if isinstance(nested, mi.BSDF))
+        return all(_is_attachable(nested) for nested in nodes_of(bsdf) if isinstance(nested, mi.BSDF))
     return name in ATTACHABLE
 
 

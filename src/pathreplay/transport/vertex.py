@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 
+from .media import Media
 from .traits import Traits
+
+if TYPE_CHECKING:
+    from .flight import Flight
+    from .shadow import Shadow
 
 
 @dataclass(frozen=True)
@@ -19,7 +24,10 @@ class Walk:
     ``attach`` says what the path follows when parameters move: ``none`` nothing, ``delta`` hit points and directions
     sampled from delta lobes, ``all`` also directions from the BSDFs marked in ``traits.attachable``. ``hide_emitters``
     leaves out emitters that the camera sees directly. ``max_depth`` and ``rr_depth`` are Mitsuba's; an unbounded depth
-    is 2^32 - 1.
+    is 2^32 - 1. ``media`` is None in a scene without media, which then walks as Mitsuba's `path` does; with media all
+    conventions are those of `volpath`: null boundaries are no vertices. ``baseline`` (MediumInteraction3f, extinction,
+    Bool) -> Spectrum guesses the radiance that arrives at a point of a medium from beyond (None: zero); a better guess
+    makes gradients less noisy, and none makes them wrong.
     """
 
     scene: Any  # mi.Scene
@@ -29,6 +37,8 @@ class Walk:
     max_depth: int
     rr_depth: int
     skip_area_emitters: Callable[..., Any]  # Mitsuba's, an integrator's method
+    media: Media | None = None
+    baseline: Callable[..., Any] | None = None
 
     @property
     def resamples(self) -> bool:
@@ -65,6 +75,9 @@ class Arrival:
     pdf: Any  # Float: solid-angle density of ray.d at the previous vertex
     delta: Any  # Bool: it was a delta lobe, or the camera
     camera: Any  # Bool: the previous vertex is the camera
+    # With media only, else None:
+    medium: Any = None  # MediumPtr: what the ray goes through
+    behind: Any = None  # Float: distance to the previous vertex behind the ray's origin, through null boundaries
 
 
 @dataclass
@@ -77,9 +90,12 @@ class Kept:
     black: Any  # Bool: the weight of the continuation was zero in all channels
     lobe: Any  # UInt32: the BSDF component that was sampled
     lit: Any  # Bool: an emitter sample was taken, and nothing is in its way
+    null: Any = None  # Bool: the lobe passes straight through (None in a record without media)
+    # With media only, else None:
+    flight: Flight | None = None  # on the way to the vertex
+    shadow: Shadow | None = None  # between the vertex and its emitter sample
     # Only the first walk needs these; they are None in a record that is read back.
     light: Any = None  # DirectionSample3f of the emitter sample
-    null: Any = None  # Bool: the lobe passes straight through
     eta: Any = None  # Float: relative index of refraction that it crosses
 
 
@@ -92,8 +108,9 @@ class Step:
     ray_next: Any  # Ray3f
     pdf: Any  # Float: density of the continuation, for the next vertex
     kept: Kept
-    surface: Any  # Bool: the ray hit something
+    met: Any  # Bool: the ray met something: a surface or, in a medium, a particle
     active: Any  # Bool: there is a continuation
+    medium: Any = None  # MediumPtr: what the continuation goes through (with media only, else None)
 
 
 def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:

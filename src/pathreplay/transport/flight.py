@@ -1,0 +1,181 @@
+"""Free flight through a medium: delta tracking to the next real collision, and what later passes make of it.
+
+Tentative collisions are drawn from a majorant; at each, chance decides whether it is real. Real ones end the flight, as
+does the surface that bounds the medium. Nothing in this walk is differentiated. The derivative is that of the integrand,
+transmittance times scattering coefficient, at the place that was found:
+
+    d log T = -∫ dσ_t ds,  estimated at one uniform point of the flight:  -(t - a) dσ_t(y).
+
+It divides by nothing that may be zero, so that it also holds where null collisions are never drawn (a constant grid).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .media import interaction, is_grid, majorant, span
+from .vertex import Arrival, Walk, reciprocal
+
+
+@dataclass
+class Flight:
+    """What a first walk found between two vertices."""
+
+    event: Any  # Bool: a real collision, before any surface
+    t: Any  # Float: distance to it
+    density: Any  # Float: probability density of a collision there, p σ̄; 1 if there was none
+    W: Any  # Spectrum: weight of the null collisions on the way; 1 where the medium is grey
+    along: Any  # Float: where on the flight its derivative is taken, in [0, 1)
+    # With emission only, else None:
+    t_emit: Any = None  # Float: distance of the tentative collision at which emission is differentiated
+    c_emit: Any = None  # Spectrum: weight of the emission there
+    # Only the first walk needs these; they are None in a record that is read back.
+    σ_s: Any = None  # Spectrum: scattering coefficient at the collision
+    E: Any = None  # Spectrum: emission gathered on the way
+
+
+@dr.syntax
+def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any) -> Flight:
+    """Sample the flight along ``at.ray``, in ``at.medium``, up to the surface ``at.hit``. Detached.
+
+    ``β`` (Spectrum) is the throughput: in chromatic media a collision is real with probability
+    p = Σ_k β_k σ_k / (σ̄ Σ_k β_k), the history of all channels.
+    """
+    media = walk.media
+    ray, medium = dr.detach(at.ray), at.medium
+    flying = active & (medium != None)  # noqa: E711 (an array of pointers)
+    reach = dr.select(at.hit.is_valid(), at.hit.t, dr.inf)
+    a, b = span(medium, ray, reach, flying)
+    flying &= a < b
+    σ_max = majorant(medium, ray, flying)
+
+    t = mi.Float(a)
+    event = mi.Bool(False)
+    density = mi.Float(1)
+    W = mi.Spectrum(1)
+    σ_s = mi.Spectrum(0)
+    E = mi.Spectrum(0)
+    t_emit, c_emit, count = mi.Float(0), mi.Spectrum(0), mi.Float(0)
+
+    while dr.hint(flying, exclude=[walk, at, media], label="pathreplay: flight"):
+        u = sampler.next_1d(flying)
+        σ_bar = mi.Float(σ_max)
+        step = dr.select(σ_bar > 0, -dr.log(1 - u) * dr.rcp(σ_bar), dr.inf)
+        for grid in media.grids:
+            mine = flying & is_grid(grid, medium)
+            onward = mi.Ray3f(ray.o + t * ray.d, ray.d, ray.time, ray.wavelengths)
+            onward.maxt = b - t
+            step_grid, σ_grid = grid.free_flight(onward, u, mine)
+            step = dr.select(mine, step_grid, step)
+            σ_bar = dr.select(mine, σ_grid, σ_bar)
+        t_next = t + step
+        inside = flying & (t_next < b)
+        mei = interaction(medium, ray, t_next)
+        σ_s_here, _, σ_t = medium.get_scattering_coefficients(mei, inside)
+        σ_s_here, σ_t = dr.detach(σ_s_here), dr.detach(σ_t)
+
+        if dr.hint(media.emissive, mode="scalar"):
+            for grid in media.grids:
+                if dr.hint(grid.emission is not None, mode="scalar"):
+                    glows = inside & is_grid(grid, medium)
+                    c = mi.Spectrum(W * dr.rcp(σ_bar))
+                    E = dr.select(glows, E + c * dr.detach(grid.emission_at(mei, glows)), E)
+                    count = dr.select(glows, count + 1, count)
+                    picked = glows & (sampler.next_1d(glows) * count < 1)
+                    t_emit = dr.select(picked, t_next, t_emit)
+                    c_emit = dr.select(picked, c, c_emit)
+
+        if dr.hint(media.chromatic, mode="scalar"):
+            βW = dr.abs(β * W)
+            total = dr.sum(βW)
+            p = dr.select(total > 0, dr.sum(βW * σ_t) / (σ_bar * total), dr.mean(σ_t) / σ_bar)
+        else:
+            p = σ_t[0] / σ_bar
+        p = dr.clip(p, 0, 1)
+        real = inside & (sampler.next_1d(inside) < p)
+        flying = inside & ~real
+        if dr.hint(media.chromatic, mode="scalar"):
+            W = dr.select(flying, W * (1 - σ_t / σ_bar) * reciprocal(1 - p), W)
+        event |= real
+        density = dr.select(real, p * σ_bar, density)
+        σ_s = dr.select(real, σ_s_here, σ_s)
+        t = dr.select(inside, t_next, t)
+
+    along = sampler.next_1d(active)
+    flight = Flight(event=event, t=t, density=density, W=W, along=along, σ_s=σ_s)
+    if dr.hint(media.emissive, mode="scalar"):
+        flight.t_emit, flight.c_emit, flight.E = t_emit, c_emit * count, E
+    return flight
+
+
+@dataclass
+class Flown:
+    """A flight once more, differentiable."""
+
+    mei: Any  # MediumInteraction3f of the collision
+    w: Any  # Spectrum: weight of what comes after, σ_s/density at a collision, times transmittance (1, relative)
+    e: Any  # Spectrum: emission on the way, and a control variate: value zero, derivative of mean zero
+
+
+def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: Any, attached: bool, active: Any) -> Flown:
+    """The kept flight, differentiable in the coefficients of the medium and, if ``attached``, in ray and ``reach``.
+
+    ``reach`` is the distance to the surface (infinity if there is none). A collision keeps its place relative to the
+    two ends of the medium on its ray, so that it moves with the ray and with the surface, and no derivative is lost
+    where the flight is cut off. With b any function of position and direction (`Walk.baseline`),
+
+        (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (the last term at a collision x only)
+
+    is the score of the sampling itself, times b: its mean is zero. It takes out the variance that comes from the
+    radiance being large and its change with the medium small.
+    """
+    medium, ray = at.medium, at.ray
+    in_medium = active & (medium != None)  # noqa: E711
+    event = in_medium & flight.event
+    with dr.suspend_grad(when=not attached):
+        a, b = span(medium, ray, reach, in_medium)
+        t, stretch = flight.t, mi.Float(1)
+        if attached:
+            a0, b0 = dr.detach(a), dr.detach(b)
+            held = event & dr.isfinite(b0) & (a0 < b0)
+            scale = dr.select(held, dr.rcp(b0 - a0), 0)
+            t = dr.select(held, dr.replace_grad(flight.t, a + (flight.t - a0) * scale * (b - a)), t)
+            stretch = dr.select(held, dr.replace_grad(stretch, (b - a) * scale), stretch)
+        end = dr.select(event, t, b)
+        mei = interaction(medium, ray, t)
+        through = in_medium & dr.isfinite(end)
+        length = dr.select(through, end - a, 0)
+        at_y = interaction(medium, ray, a + flight.along * length)
+
+    σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
+    _, _, σ_y = medium.get_scattering_coefficients(at_y, through)
+    w = dr.select(event, σ_s * stretch * dr.rcp(flight.density), 1) * flight.W
+    e = mi.Spectrum(0)
+    if dr.grad_enabled(σ_y, length):
+        log_T = dr.select(through, -length * σ_y, 0)
+        w *= dr.replace_grad(mi.Spectrum(1), log_T)
+        if walk.baseline is not None:
+            score = dr.select(through, length * σ_y * walk.baseline(at_y, σ_y, through), 0)
+            score -= dr.select(event, σ_t * dr.rcp(flight.density) * walk.baseline(mei, σ_t, event), 0)
+            e += score - dr.detach(score)
+
+    if walk.media.emissive:
+        for grid in walk.media.grids:
+            if grid.emission is not None:
+                glows = in_medium & is_grid(grid, medium) & (flight.t_emit > 0)
+                with dr.suspend_grad(when=not attached):
+                    t = a + (flight.t_emit - dr.detach(a)) * (b - a) / dr.detach(b - a) if attached else flight.t_emit
+                    length = dr.select(glows, t - a, 0)
+                    at_e = interaction(medium, ray, t)
+                    at_y = interaction(medium, ray, a + flight.along * length)
+                    J = (b - a) / dr.detach(b - a) if attached else mi.Float(1)
+                ε = grid.emission_at(at_e, glows) * flight.c_emit * J
+                if dr.grad_enabled(σ_y, length):
+                    _, _, σ_y = medium.get_scattering_coefficients(at_y, glows)
+                    ε *= dr.replace_grad(mi.Spectrum(1), -length * σ_y)
+                e += dr.select(glows, ε, 0)
+    return Flown(mei=mei, w=w, e=e)
