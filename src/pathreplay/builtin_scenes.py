@@ -203,3 +203,81 @@ def _blotches(size: int) -> np.ndarray:
     x, y = np.meshgrid((np.arange(size) + 0.5) / size * 2 - 1, (np.arange(size) + 0.5) / size * 2 - 1)
     grey = 0.7 + 0.15 * (np.cos(9 * x) * np.sin(7 * y) + np.sin(5 * x - 8 * y))
     return (grey[:, :, None] * np.array([1, 0.97, 0.9])).astype(np.float32)
+
+
+@builtin("cloud")
+def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
+    """A small cloud (``grid``³ voxels, albedo 0.95) under a sky with a sun, seen by ``views`` sensors around it.
+
+    The medium fills a cube of side 2 without surface of its own. Key of the density (extinction per length):
+    ``cloud.interior_medium.sigma_t.data``.
+    """
+    T = mi.ScalarTransform4f
+    scene: SceneDict = {
+        "type": "scene",
+        "integrator": {"type": "volpath", "max_depth": 64},
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(_sky(32))},
+        "cloud": {
+            "type": "cube",
+            "bsdf": {"type": "null"},
+            "interior": {
+                "type": "heterogeneous",
+                "albedo": 0.95,
+                "sigma_t": {
+                    "type": "gridvolume",
+                    "grid": mi.VolumeGrid(_cumulus(grid)),
+                    "to_world": T().translate([-1, -1, -1]).scale(2),
+                },
+            },
+        },
+    }
+    for view in range(views):
+        angle = 2 * np.pi * (view + 0.3) / views
+        # In turn from below, from the side and from above: what lies behind what shows only from different heights.
+        height = (-1.6, 0.3, 2.2)[view % 3]
+        origin = [float(4 * np.cos(angle)), height, float(4 * np.sin(angle))]
+        scene[f"view{view + 1}"] = _camera(origin, [0, -0.1, 0], 34, resolution)
+    return scene
+
+
+def _cumulus(size: int) -> np.ndarray:
+    """Extinction max(0, 8 b(y) Σ_i exp(-|x - c_i|² / r_i²) (0.75 + n(x)) - 1.5) at the voxel centres of [-1, 1]³.
+
+    Six balls, cut off below by b to a flat base; the noise n is a sum of 12 plane waves of wavelengths 0.5 to 1.2. The
+    shape is (z, y, x, 1).
+    """
+    centres = (np.arange(size) + 0.5) / size * 2 - 1
+    z, y, x = np.meshgrid(centres, centres, centres, indexing="ij")
+    balls = [
+        ((0.0, -0.05, 0.0), 0.46),
+        ((0.5, -0.2, 0.12), 0.36),
+        ((-0.5, -0.22, -0.1), 0.38),
+        ((0.12, 0.42, -0.14), 0.32),
+        ((-0.14, -0.15, 0.52), 0.34),
+        ((0.3, -0.2, -0.5), 0.3),
+    ]
+    shape = np.zeros_like(x)
+    for (cx, cy, cz), radius in balls:
+        shape += np.exp(-(np.square(x - cx) + np.square(y - cy) + np.square(z - cz)) / radius**2)
+    shape *= 1 / (1 + np.exp(-(y + 0.45) / 0.06))  # the flat base
+    random = np.random.default_rng(5)  # any fixed pattern will do
+    k = random.normal(size=(12, 3))
+    k *= (2 * np.pi / random.uniform(0.5, 1.2, (12, 1))) / np.linalg.norm(k, axis=1, keepdims=True)
+    phase = random.uniform(0, 2 * np.pi, 12)
+    waves = np.cos(np.einsum("azyx,na->nzyx", np.stack([x, y, z]), k) + phase[:, None, None, None])
+    noise = 0.1 * waves.sum(axis=0)
+    return np.maximum(0, 8 * shape * (0.75 + noise) - 1.5).astype(np.float32)[..., None]
+
+
+def _sky(rows: int) -> np.ndarray:
+    """Blue above, dim below, and a sun 50 degrees above the horizon, spread over 8 degrees so that it can be met."""
+    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
+    θ, φ = np.pi * v, 2 * np.pi * u
+    d = np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], axis=-1)  # Mitsuba's envmap
+    up = 0.5 + 0.5 * d[..., 1:2]
+    sky = up * np.array([0.2, 0.3, 0.5]) + (1 - up) * np.array([0.14, 0.12, 0.11])
+    # At the side of the cameras that look up from below, so that no picture shows it.
+    elevation, azimuth = np.radians(50), np.radians(108)
+    sun = np.array([np.cos(elevation) * np.cos(azimuth), np.sin(elevation), np.cos(elevation) * np.sin(azimuth)])
+    glow = np.exp((d @ sun - 1) / (1 - np.cos(np.radians(8))))[..., None]
+    return (sky + 30 * glow * np.array([1.0, 0.9, 0.75])).astype(np.float32)
