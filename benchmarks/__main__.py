@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from . import attached, depth, records, surface
+from . import attached, depth, events, media, records, supergrid, surface
 from .report import EVIDENCE, fill
 from .runner import ROOT, run_jobs
 from .tables import footnote
 
-TASKS = {task.TITLE: task for task in (surface, depth, attached)}
+TASKS = {task.TITLE: task for task in (surface, depth, attached, media, events, supergrid)}
 
 
 def main(

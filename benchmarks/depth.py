@@ -47,9 +47,9 @@ def table(record: Record) -> str:
     rows = []
     for depth in depths:
         row = [cells.get((depth, method)) for method in methods]
-        rows.append([str(depth), *map(_seconds, row), *map(_memory, row)])
+        rows.append([str(depth), *map(seconds_cell, row), *map(memory_cell, row)])
     rows.append(["exponent of time", *(_exponent(record, m) for m in methods), *[""] * len(methods)])
-    rows.append(["last / first", *[""] * len(methods), *(_memory_growth(record, m) for m in methods)])
+    rows.append(["last / first", *[""] * len(methods), *(memory_growth(record, m) for m in methods)])
     return markdown(header, rows)
 
 
@@ -58,27 +58,31 @@ def fastest(point: Point) -> float:
     return min(point.seconds)
 
 
-def _seconds(point: Point | None) -> str:
+def seconds_cell(point: Point | None) -> str:
+    """Seconds of the fastest round, or why there are none."""
     if point is None:
         return ""
     return point.error or f"{fastest(point):.4f}"
 
 
-def _memory(point: Point | None) -> str:
+def memory_cell(point: Point | None) -> str:
+    """Peak MiB of the process."""
     return "" if point is None or point.peak_mib is None else f"{point.peak_mib:.0f}"
 
 
-def _alive(record: Record, method: str) -> list[Point]:
+def alive(record: Record, method: str) -> list[Point]:
+    """Points of the method, by increasing depth, that came to an end."""
     return [point for point in record.points if point.method == method and not point.error]
 
 
 def _exponent(record: Record, method: str) -> str:
-    points = _alive(record, method)
+    points = alive(record, method)
     if len(points) < 5:
         return "too few depths"
     return str(growth([point.max_depth for point in points], [fastest(point) for point in points]))
 
 
-def _memory_growth(record: Record, method: str) -> str:
-    peaks = [point.peak_mib for point in _alive(record, method) if point.peak_mib is not None]
+def memory_growth(record: Record, method: str) -> str:
+    """Peak memory at the largest depth over that at the smallest."""
+    peaks = [point.peak_mib for point in alive(record, method) if point.peak_mib is not None]
     return f"{peaks[-1] / peaks[0]:.3f}" if peaks else ""

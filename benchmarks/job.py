@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 #: Integrators by the name that the tables give them.
 METHODS: dict[str, dict[str, Any]] = {
     "prb": {"type": "prb"},
     "sweep": {"type": "pathreplay", "driver": "sweep"},
     "replay": {"type": "pathreplay", "driver": "replay"},
+    "volpath": {"type": "volpath"},
+    "prbvolpath": {"type": "prbvolpath"},
+    "score": {"type": "pathreplay", "volume_gradient": "score"},
+    "branch": {"type": "pathreplay", "volume_gradient": "score", "branch": True},
+    "listing": {"type": "pathreplay", "volume_gradient": "listing"},
 }
 
 
@@ -17,7 +22,8 @@ METHODS: dict[str, dict[str, Any]] = {
 class Job:
     """Gradient passes of some methods on one scene, in turn (A B C A B C ...), in one process.
 
-    Round k of every method has the seed k. ``warm_up`` rounds before the first compile the kernels and are not kept.
+    Round k of every method has the seed k. ``warm_up`` rounds before the first compile the kernels and are not kept;
+    after them all integrators are made anew: what a method learns from its passes it learns in rounds that are kept.
     """
 
     scene: str
@@ -30,6 +36,13 @@ class Job:
     rounds: int
     warm_up: int = 2
     threads: int = 0  # 0 = all processors
+    # A gradient pass, or a primal one with the noise of the image, or the mean number of real events a path.
+    measure: Literal["gradient", "image", "events"] = "gradient"
+    # Adjoint image: one everywhere, or a smooth wave (both over the number of entries).
+    weights: Literal["even", "wave"] = "even"
+    # Announce new parameters before each pass, as an optimiser does: majorants are then made anew; this is timed.
+    update: bool = False
+    reference: str | None = None  # the method whose mean tells how far the means of the others are off
 
     @property
     def passes(self) -> int:
@@ -54,6 +67,13 @@ class Point:
     not_finite: tuple[int, ...]  # seeds with which a gradient had infinite or NaN entries
     peak_mib: float | None  # largest resident size of the process, if the method had one to itself
     error: str | None = None
+    # Of each seed, as squared_errors, but of the gradient of a grid along smooth directions, the first to be optimised.
+    smooth_errors: tuple[float, ...] = ()
+    # Of each seed, with d = gradient - reference of that seed: mean over entries of d · (mean of d over other seeds).
+    # Their mean estimates the squared bias without bias. Empty if there is no reference.
+    bias_products: tuple[float, ...] = ()
+    measure: str = "gradient"
+    mean: float | None = None  # of what was measured, over entries and seeds
 
 
 @dataclass(frozen=True)

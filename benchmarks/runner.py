@@ -27,7 +27,7 @@ class _Samples:
 
     seeds: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
-    squared_errors: list[float] = field(default_factory=list)
+    errors: dict[str, Any] = field(default_factory=dict)  # as `spread` gives them
     not_finite: list[int] = field(default_factory=list)
     error: str | None = None
 
@@ -98,8 +98,8 @@ def _attempt(job: Job, measured: Measured, show: Callable[[str, int], None]) -> 
                                 samples[method].add(sample["seed"], sample["seconds"], sample["finite"])
                         case {"event": "error", "method": method, "message": message}:
                             samples[method].error = message
-                        case {"event": "errors", "method": method, "squared_errors": squared_errors}:
-                            samples[method].squared_errors = squared_errors
+                        case {"event": "errors", "method": method, **errors}:
+                            samples[method].errors = errors
                         case {"event": "peak", "mib": peak}:
                             pass
             except BaseException:
@@ -139,8 +139,12 @@ def _point(job: Job, method: str, told: _Samples, peak: float | None) -> Point:
         paths=job.resolution**2 * job.spp,
         seeds=tuple(told.seeds),
         seconds=tuple(told.seconds),
-        squared_errors=tuple(told.squared_errors),
+        squared_errors=tuple(told.errors.get("squared_errors", ())),
         not_finite=tuple(told.not_finite),
         peak_mib=peak,
         error=told.error,
+        smooth_errors=tuple(told.errors.get("smooth_errors", ())),
+        bias_products=tuple(told.errors.get("bias_products", ())),
+        measure=job.measure,
+        mean=told.errors.get("mean"),
     )

@@ -8,6 +8,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from .media_scenes import MEDIA_SCENES
+
 SceneDict = dict[str, Any]
 
 
@@ -112,5 +114,5 @@ SCENES: dict[str, Callable[[int], SceneDict]] = {
     "glossy-environment": glossy_environment,
     "glass-and-diffuse": glass_and_diffuse,
     "closed-box": closed_box,
-}
+} | MEDIA_SCENES
 """Scene by name: resolution -> dictionary for mi.load_dict (with optimize=False, to keep the keys)."""

@@ -21,6 +21,7 @@ from typing import Any
 from pathreplay import __version__, backend
 
 from .job import METHODS, Job, Machine
+from .spread import spread
 
 PIXEL_CHANNELS = 3
 
@@ -61,27 +62,38 @@ def peak_mib() -> float:
     return peak / (1024 if sys.platform != "darwin" else 1024**2)
 
 
-class GradientPass:
-    """A scene with gradients enabled: each call times one gradient pass of the mean of the image."""
+class Pass:
+    """A scene, ready for gradients: each call times one gradient pass of the weighted image, or one primal pass."""
 
     def __init__(self, job: Job) -> None:
         import drjit as dr
         import mitsuba as mi
+        import numpy as np
 
+        from pathreplay.check.objective import smooth_weights
+
+        from . import counting
         from .scenes import SCENES
 
         self.job = job
+        self.counter: Any = counting.register()
         self.scene = mi.load_dict(SCENES[job.scene](job.resolution), optimize=False)
         self.params = mi.traverse(self.scene)
         for key in job.parameters:
             dr.enable_grad(self.params[key])
         self.params.update()
         shape = (job.resolution, job.resolution, PIXEL_CHANNELS)
-        self.adjoint = dr.full(mi.TensorXf, 1 / (shape[0] * shape[1] * shape[2]), shape)
+        even = dr.full(mi.TensorXf, 1 / (shape[0] * shape[1] * shape[2]), shape)
+        wave = smooth_weights(shape, alpha=False).astype(np.float32)
+        self.adjoint = even if job.weights == "even" else mi.TensorXf(wave)
+        self.grid = getattr(self.params[job.parameters[0]], "shape", ()) if len(job.parameters) == 1 else ()
         self.integrators: dict[str, Any] = {}
 
     def __call__(self, method: str, seed: int) -> tuple[float, Any]:
-        """Seconds, and the gradients of all parameters as one flat array. Raises what the method raises."""
+        """Seconds, and the gradients of all parameters (or image, or event count) as one flat array.
+
+        Raises what the method raises.
+        """
         import drjit as dr
         import mitsuba as mi
         import numpy as np
@@ -91,20 +103,30 @@ class GradientPass:
             self.integrators[method] = mi.load_dict(METHODS[method] | depths)
         for key in self.job.parameters:
             dr.clear_grad(self.params[key])
+        self.counter.count = dr.zeros(mi.UInt32, 1)
         gc.collect()  # not in the middle of the measurement
         dr.sync_thread()
         start = time.perf_counter()
-        self.integrators[method].render_backward(self.scene, self.params, self.adjoint, seed=seed, spp=self.job.spp)
-        gradients = [dr.grad(self.params[key]) for key in self.job.parameters]
-        dr.eval(gradients)  # render_backward has only recorded the kernel
+        if self.job.update:
+            for key in self.job.parameters:
+                self.params.set_dirty(key)
+            self.params.update()
+        if self.job.measure != "gradient":
+            results = [self.integrators[method].render(self.scene, seed=seed, spp=self.job.spp)]
+        else:
+            self.integrators[method].render_backward(self.scene, self.params, self.adjoint, seed=seed, spp=self.job.spp)
+            results = [dr.grad(self.params[key]) for key in self.job.parameters]
+        dr.eval(results)  # so far the kernel has only been recorded
         dr.sync_thread()
         seconds = time.perf_counter() - start
-        flat = [np.ravel(np.array(getattr(gradient, "matrix", gradient))) for gradient in gradients]
+        if self.job.measure == "events":
+            return seconds, np.array(self.counter.count) / (self.job.resolution**2 * self.job.spp)
+        flat = [np.ravel(np.array(getattr(result, "matrix", result))) for result in results]
         return seconds, np.concatenate(flat)
 
 
 def run(job: Job) -> None:
-    """Run a job; events are `machine`, `start`, `sample`, `error`, `errors` (squared ones), `peak`."""
+    """Run a job; events are `machine`, `start`, `sample`, `error`, `errors` (see `spread`), `peak`."""
     variant = backend.set_variant(None)
 
     import drjit as dr
@@ -115,26 +137,27 @@ def run(job: Job) -> None:
     if job.threads:
         dr.set_thread_count(job.threads)
     _say("machine", **asdict(_machine(variant)))
-    gradient_pass = GradientPass(job)
-    gradients: dict[str, list[Any]] = {name: [] for name in job.methods}
+    one_pass = Pass(job)
+    kept: dict[str, list[Any]] = {name: [] for name in job.methods}
     for k in range(-job.warm_up, job.rounds):
-        for method in list(gradients):
+        if k == 0:
+            one_pass.integrators.clear()
+        for method in list(kept):
             _say("start", method=method)
             try:
-                seconds, gradient = gradient_pass(method, seed=k % 2**32)
+                seconds, result = one_pass(method, seed=k % 2**32)
             except Exception as error:
                 _say("error", method=method, message=one_line(error)[:200])
-                del gradients[method]
+                del kept[method]
                 continue
-            finite = bool(np.isfinite(gradient).all())
+            finite = bool(np.isfinite(result).all())
             _say("sample", method=method, seed=k, seconds=seconds, finite=finite, kept=k >= 0)
             if k >= 0:
-                gradients[method].append(gradient)
-    for method, rows in gradients.items():
+                kept[method].append(result)
+    reference = kept.get(job.reference or "")
+    for method, rows in kept.items():
         if len(rows) > 1 and np.isfinite(rows).all():
-            deviations = np.stack(rows) - np.mean(rows, axis=0)
-            squared = np.mean(deviations**2, axis=1) * len(rows) / (len(rows) - 1)
-            _say("errors", method=method, squared_errors=squared.tolist())
+            _say("errors", method=method, **spread(rows, reference, one_pass.grid))
     _say("peak", mib=peak_mib())
 
 

@@ -1,0 +1,84 @@
+"""Task `media`: time x variance of gradients of media, in turn with `prbvolpath`; learning is paid for."""
+
+from __future__ import annotations
+
+from .estimates import bias_share, efficiency, time_ratio, variance_ratio
+from .job import Job, Point, Record
+from .media_scenes import ALBEDO, ASYMMETRY, DENSITY, EXTINCTION
+from .tables import groups, markdown, median_seconds, method_cell
+
+TITLE = "media"
+RIVAL = "prbvolpath"
+METHODS = (RIVAL, "score", "branch", "listing")
+# Unbiased in every scene, those with empty voxels too: so the tests say.
+REFERENCE = "branch"
+
+#: Scene, parameter, max_depth, rr_depth. The dense core has no Russian roulette: its paths are the longest there are.
+ROWS = (
+    ("cloud", DENSITY, 64, 5),
+    ("dense-core", DENSITY, 96, 97),
+    ("room-with-cloud", DENSITY, 32, 5),
+    ("cloud-of-albedos", ALBEDO, 64, 5),
+    ("cloud", ASYMMETRY, 64, 5),
+    ("dark-cloud", DENSITY, 64, 5),
+    ("homogeneous", EXTINCTION, 64, 5),
+)
+WHAT = {DENSITY: "density", ALBEDO: "albedo", ASYMMETRY: "g", EXTINCTION: "sigma_t"}
+
+
+def jobs(quick: bool) -> list[Job]:
+    """One job for each row. Fifty rounds are a short optimisation: learning costs a longer one less."""
+    return [
+        Job(
+            scene=scene,
+            parameters=(parameter,),
+            methods=METHODS,
+            max_depth=max_depth,
+            rr_depth=rr_depth,
+            resolution=32,
+            spp=16,
+            rounds=6 if quick else 50,
+            # Of kernels only, since what was learned is dropped; several, since a method may have two: with and without
+            # something learned.
+            warm_up=3,
+            weights="wave",
+            update=True,
+            reference=REFERENCE,
+        )
+        for scene, parameter, max_depth, rr_depth in ROWS
+    ]
+
+
+def table(record: Record) -> str:
+    """Each method next to `prbvolpath`, with 95 % intervals."""
+    header = ["scene", "gradient of", "method", "seconds (median)", "time ratio", "variance ratio"]
+    header += ["along waves", "efficiency", "bias² / variance"]
+    rows = [
+        [point.scene, WHAT[point.parameters[0]], method_cell(point), *_cells(point, methods.get(RIVAL))]
+        for methods in groups(record.points).values()
+        for point in methods.values()
+    ]
+    return markdown(header, rows)
+
+
+def _cells(point: Point, rival: Point | None) -> list[str]:
+    if point.error:
+        return [point.error, *[""] * 5]
+    cells = [median_seconds(point)]
+    if rival is None or rival.error:
+        cells += [""] * 4
+    elif rival is point:
+        cells += ["1", "1", "1" if point.smooth_errors else "", "1"]
+    elif not (point.squared_errors and rival.squared_errors):
+        cells += [str(time_ratio(point.seconds, rival.seconds)), "", "", ""]
+    else:
+        times, errors = (point.seconds, rival.seconds), (point.squared_errors, rival.squared_errors)
+        smooth = point.smooth_errors and rival.smooth_errors
+        cells += [
+            str(time_ratio(*times)),
+            str(variance_ratio(*errors)),
+            str(variance_ratio(point.smooth_errors, rival.smooth_errors)) if smooth else "",
+            str(efficiency(times, errors)),
+        ]
+    told = point.bias_products and point.method != REFERENCE
+    return [*cells, str(bias_share(point.bias_products, point.squared_errors)) if told else ""]

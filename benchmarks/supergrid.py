@@ -1,0 +1,80 @@
+"""Task `supergrid`: what a coarse grid of local majorants saves on a sparse 64³ grid, and costs on a uniform one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .estimates import unpaired_ratio
+from .job import Job, Point, Record
+from .media_scenes import DENSITY
+from .tables import markdown, median_seconds
+
+TITLE = "supergrid"
+WITHOUT = "one majorant"
+GRIDS = {"sparse": ("supergrid", "auto"), "uniform": ("supergrid", "auto")}
+# A process has one medium only, since a virtual call traces every medium that there is: so the processes take turns.
+TURNS = 3
+
+
+def jobs(quick: bool) -> list[Job]:
+    """Image and gradient for each grid and choice of majorants; every process comes TURNS times, in turn."""
+    return [
+        Job(
+            scene=f"{grid}, {choice}",
+            parameters=(DENSITY,),
+            methods=("score",),
+            max_depth=32,
+            rr_depth=5,
+            resolution=32 if quick else 64,
+            spp=16,
+            rounds=4 if quick else 10,
+            warm_up=3,
+            measure=measure,
+            weights="wave",
+            update=True,
+        )
+        for grid, choices in GRIDS.items()
+        for measure in ("image", "gradient")
+        for _ in range(1 if quick else TURNS)
+        for choice in (WITHOUT, *choices)
+    ]
+
+
+def table(record: Record) -> str:
+    """Speed and noise relative to one majorant for the whole grid."""
+    found = _pooled(record)
+    rows = []
+    for (scene, measure), point in found.items():
+        grid, choice = scene.split(", ")
+        rows.append([grid, measure, choice, *_cells(point, found.get((f"{grid}, {WITHOUT}", measure)))])
+    return markdown(["grid", "pass", "majorants", "seconds (median)", "speed-up", "variance ratio"], rows)
+
+
+def _pooled(record: Record) -> dict[tuple[str, str], Point]:
+    """One point for each scene and measure: the seconds of all turns. Their errors are the same, as are the seeds."""
+    found: dict[tuple[str, str], Point] = {}
+    for point in record.points:
+        key = (point.scene, point.measure)
+        if key not in found:
+            found[key] = point
+            continue
+        so_far = found[key]
+        found[key] = replace(
+            so_far,
+            seconds=so_far.seconds + point.seconds,
+            error=so_far.error or point.error,
+        )
+    return found
+
+
+def _cells(point: Point, rival: Point | None) -> list[str]:
+    if point.error:
+        return [point.error, "", ""]
+    if rival is None or rival.error:
+        return [median_seconds(point), "", ""]
+    if rival is point:
+        return [median_seconds(point), "1", "1"]
+    variance = unpaired_ratio(point.squared_errors, rival.squared_errors, np.mean)
+    return [median_seconds(point), str(unpaired_ratio(rival.seconds, point.seconds, np.median)), str(variance)]
