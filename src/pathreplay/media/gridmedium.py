@@ -1,0 +1,212 @@
+"""`gridmedium`: Mitsuba's `heterogeneous` with a differentiable scale, emission, and majorants that follow the grid.
+
+With V, A and Q the volumes `sigma_t`, `albedo` and `emission`, and s the `scale`,
+
+    σ_t = s V(x),   σ_s = A(x) σ_t,   emitted radiance per unit length = Q(x)   (Q is not scaled) .
+
+Mitsuba's own integrators see one majorant for the whole medium and no emission. Ours calls `free_flight` (local
+majorants), `transmittance` (residual ratio tracking) and `emission_at`.
+
+Differentiated: the coefficients and the emission, by V, A, Q, s and the position. *Not* differentiated: majorants,
+free-flight distances and the estimate of transmittance (all detached), the bounding box and `to_world` of the volumes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import PathreplayError
+from . import cellwalk
+from .supergrid import Bounds, all_bounds, cheapest, constant_bounds, find_lattice, mean_chord, voxel_bounds
+
+
+def register() -> None:
+    """Registers `gridmedium` for the variant that is active now. Doing so again is harmless.
+
+    Mitsuba's base class is another one in every variant, hence so is the plugin's: call this once per variant.
+
+    Raises RuntimeError (Mitsuba's) when no variant is set.
+    """
+    mi.register_medium("gridmedium", _plugin_class())
+
+
+def _plugin_class() -> type:
+    """Builds the plugin's class on the medium base class of the variant that is active now."""
+
+    class GridMedium(mi.Medium):
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            kind = self.phase_function().class_name()
+            if mi.has_flag(self.phase_function().flags(), mi.PhaseFunctionFlags.Microflake):
+                raise PathreplayError(
+                    f"gridmedium: with the phase function {kind} the density depends on the "
+                    "direction, and majorants do not follow that; use Mitsuba's heterogeneous"
+                )
+            self.sigma_t = _volume(props, "sigma_t", 1.0)
+            self.albedo = _volume(props, "albedo", 0.75)
+            self.emission = _volume(props, "emission", None)
+            self.scale = mi.Float(_number(props, "scale", 1.0))
+            self.supergrid = _choice(props)
+            self.m_is_homogeneous = False
+            self.parameters_changed([])
+            lowest = dr.min(self.levels[-1].lowest)[0]
+            if lowest < 0:
+                raise PathreplayError(f"gridmedium: sigma_t is {lowest:g} somewhere; give densities of at least 0")
+
+        # ------------------------------------------------ parameters ------------------------------------------------
+
+        def traverse(self, cb: Any) -> None:
+            cb.put("scale", self.scale, mi.ParamFlags.Differentiable)
+            cb.put("albedo", self.albedo, mi.ParamFlags.Differentiable)
+            cb.put("sigma_t", self.sigma_t, mi.ParamFlags.Differentiable)
+            if self.emission is not None:
+                cb.put("emission", self.emission, mi.ParamFlags.Differentiable)
+            cb.put("phase_function", self.phase_function(), mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys: list[str]) -> None:
+            if keys and "sigma_t" not in keys and "scale" not in keys:
+                return
+            dr.make_opaque(self.scale)  # a literal would be compiled into the kernel, anew after every update
+            with dr.suspend_grad():
+                if not keys or "sigma_t" in keys:
+                    self.box = self.sigma_t.bbox()
+                    self.is_chromatic, self.levels = _look(self.sigma_t, self.supergrid is True)
+                    self.m_has_spectral_extinction = self.is_chromatic
+                self._choose_cells()
+
+        def _choose_cells(self) -> None:
+            """Tables of majorants and of control densities for the present scale, each with the cells that pay."""
+            scale = dr.detach(self.scale)
+            majorants = [(cellwalk.majorants(level, scale),) for level in self.levels]
+            self.flight_cells = self._cheapest_cells(majorants)
+            self.shadow_cells = self._cheapest_cells([cellwalk.control(level, scale) for level in self.levels])
+            self.majorant = mi.Float(majorants[-1][0])
+            dr.make_opaque(self.majorant)
+
+        def _cheapest_cells(self, values: list[tuple[Any, ...]]) -> cellwalk.Cells:
+            """Of the numbers by cell, one tuple per level and the rate of collisions last, those that pay."""
+            rates = [dr.mean(numbers[-1]) for numbers in values]
+            dr.eval(values, rates)
+            last = len(values) - 1
+            first = last if self.supergrid is False else 0
+            last = max(last - 1, 0) if self.supergrid is True else last
+            allowed = slice(first, last + 1)
+            collisions = [float(rate[0]) for rate in rates[allowed]]
+            chosen = first + cheapest(self.levels[allowed], collisions, mean_chord(self.box))
+            return cellwalk.make_cells(self.levels[chosen], list(values[chosen]))
+
+        @property
+        def uses_supergrid(self) -> bool:
+            """Whether free flights walk through cells with majorants of their own."""
+            return not self.flight_cells.is_single
+
+        def to_string(self) -> str:
+            lines = [f"sigma_t = {self.sigma_t}", f"albedo = {self.albedo}", f"emission = {self.emission}"]
+            cells = " x ".join(str(n - 2) for n in self.flight_cells.shape)
+            lines += [f"scale = {self.scale}", f"cells = {cells}"]
+            return "GridMedium[\n  " + ",\n".join(lines).replace("\n", "\n  ") + "\n]"
+
+        # -------------------------------------- what Mitsuba's integrators call --------------------------------------
+
+        def get_majorant(self, mei: Any, active: Any = True) -> Any:
+            return mi.UnpolarizedSpectrum(self.majorant)
+
+        def get_scattering_coefficients(self, mei: Any, active: Any = True) -> tuple[Any, Any, Any]:
+            σ_t = self.scale * self.sigma_t.eval(mei, active)
+            return σ_t * self.albedo.eval(mei, active), self.majorant - σ_t, σ_t
+
+        def intersect_aabb(self, ray: Any) -> tuple[Any, Any, Any]:
+            return self.box.ray_intersect(ray)
+
+        # -------------------------------------------- what our own calls ---------------------------------------------
+
+        def free_flight(self, ray: Any, u: Any, active: Any = True) -> tuple[Any, Any]:
+            """Distance to the next tentative collision and the local majorant there (Floats). Detached.
+
+            The distance t solves ∫_0^t m ds = -log(1 - u) with m the local majorant, at least σ_t in all channels and
+            0 outside of the medium's bounding box. It is infinite, and the majorant 0, if there is no such t below
+            ray.maxt. ``u`` lies in [0, 1).
+            """
+            with dr.suspend_grad():
+                return cellwalk.free_flight(self.flight_cells, self.box, dr.detach(ray), dr.detach(u), active)
+
+        def transmittance(self, ray: Any, sampler: Any, active: Any = True) -> Any:
+            """Unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) by channel (UnpolarizedSpectrum). Detached."""
+            with dr.suspend_grad():
+                ray, scale = dr.detach(ray), dr.detach(self.scale)
+
+                def density(t: Any, active: Any) -> Any:
+                    at = dr.zeros(mi.Interaction3f)
+                    at.p, at.time, at.wavelengths = ray(t), ray.time, ray.wavelengths
+                    return scale * dr.detach(self.sigma_t.eval(at, active))
+
+                return cellwalk.transmittance(self.shadow_cells, self.box, ray, density, sampler, active)
+
+        def emission_at(self, mei: Any, active: Any = True) -> Any:
+            """Radiance emitted per unit length at an interaction (UnpolarizedSpectrum); 0 without emission."""
+            return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, active)
+
+    return GridMedium
+
+
+# ---------------------------------------------- reading the properties ----------------------------------------------
+
+
+def _volume(props: Any, name: str, default: float | None) -> Any:
+    """The volume of that name; textures, colours and numbers become a `constvolume`. None without and no default."""
+    if name not in props and default is None:
+        return None
+    value = props[name] if name in props else default
+    if isinstance(value, mi.Volume):
+        return value
+    if isinstance(value, (str, bool)) or (isinstance(value, mi.Object) and not isinstance(value, mi.Texture)):
+        raise PathreplayError(f"gridmedium: {name} is {value!r:.40}; give a volume, a colour or a number")
+    constant = mi.Properties("constvolume")
+    constant["value"] = value
+    return mi.PluginManager.instance().create_object(constant)
+
+
+def _number(props: Any, name: str, default: float) -> float:
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < float("inf"):
+        raise PathreplayError(f"gridmedium: {name} is {value}; give a finite number, at least 0")
+    return float(value)
+
+
+def _choice(props: Any) -> bool | str:
+    value = props.get("supergrid", "auto")
+    if value != "auto" and not isinstance(value, bool):
+        raise PathreplayError(f"gridmedium: supergrid is {value!r}; use true, false or 'auto'")
+    return value
+
+
+# ----------------------------------------------- looking at the density -----------------------------------------------
+
+
+def _look(volume: Any, needs_grid: bool) -> tuple[bool, list[Bounds]]:
+    """Whether the volume differs between channels, and its bounds by cell, from fine to a single cell."""
+    params = mi.traverse(volume)
+    values = [dr.detach(params[key]) for key in params.keys()]
+    if volume.class_name() == "GridVolume":
+        channels = values[0].shape[-1]
+        if channels not in (1, 3, 4):
+            raise PathreplayError(f"gridmedium: sigma_t has {channels} channels; give a grid with 1 or 3")
+        lattice = find_lattice(volume, values[0].shape)
+        if lattice is not None:
+            return channels > 1 and not mi.is_monochromatic, all_bounds(voxel_bounds(lattice, values[0]))
+    if needs_grid:
+        raise PathreplayError(
+            f"gridmedium: sigma_t ({volume.class_name()}) shows no voxels; give a gridvolume, or leave supergrid "
+            "at 'auto'"
+        )
+    grey = all(dr.is_diff_v(value) and not dr.is_vector_v(value) and dr.width(value) == 1 for value in values)
+    lowest = 0.0
+    highest = float(volume.max())
+    if volume.class_name() == "ConstVolume" and not mi.is_spectral:
+        here = dr.detach(volume.eval(dr.zeros(mi.Interaction3f)))
+        lowest, highest = float(dr.min(here)[0]), float(dr.max(here)[0])
+    grey = mi.is_monochromatic or (bool(values) and grey)
+    return not grey, [constant_bounds(volume, lowest, (lowest + highest) / 2, highest)]

@@ -1,0 +1,239 @@
+"""Bounds of a volume's values in coarse cells, and the choice of the cells that make delta tracking cheapest.
+
+`voxel_bounds` finds for every cell of BASE³ voxels the lowest, mean and highest value that an interpolated lookup in
+it can give; `coarser` merges 2 x 2 x 2 cells; `cheapest` picks a size between those and one cell for everything.
+
+The bounds hold for both filters and all wrap modes of `gridvolume`, which cannot be asked for them: a cell counts the
+voxels next to it, and beyond the faces of the grid whatever any wrap mode puts there. They therefore also hold at
+least half a voxel beyond the faces of the cell, so that rounding in a walk from cell to cell does no harm.
+
+Nothing here is differentiated.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+#: Voxels along the side of the smallest cell. Cells of 2 halve the tentative collisions at best and double the steps.
+BASE = 4
+#: Cost of a step from cell to cell over that of a tentative collision (0.7 ms to 2.1 ms for 2^18 rays on two cores).
+STEP_COST = 1 / 3
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Where the voxels of a volume lie in the world.
+
+    Voxel i of an axis covers [i, i + 1] in voxel space; its value belongs to the middle. ``to_voxel`` (3 x 4) maps the
+    world there. ``size`` and ``channels`` are those of the data. ``low`` and ``high`` (voxels, per axis x, y, z) cover
+    the volume's bounding box, which is larger than the grid where that is turned against the axes of the world.
+    """
+
+    to_voxel: NDArray[np.float64]
+    size: tuple[int, int, int]
+    channels: int
+    low: tuple[int, int, int]
+    high: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Lowest, mean and highest value in cells of ``side``³ voxels, x running fastest (Float, one entry per cell).
+
+    ``to_cell`` (3 x 4) maps the world to cell space, where cell i of an axis covers [i, i + 1]; ``shape`` counts the
+    cells along x, y, z. Of several channels they are the lowest, the mean and the highest.
+    """
+
+    to_cell: NDArray[np.float64]
+    shape: tuple[int, int, int]
+    lowest: Any
+    mean: Any
+    highest: Any
+
+    @property
+    def faces_per_length(self) -> float:
+        """Cell faces crossed per unit length by a ray of random direction (its |d_k| has the mean 1/2)."""
+        return float(np.linalg.norm(self.to_cell[:, :3], axis=1).sum() / 2)
+
+    @property
+    def is_single(self) -> bool:
+        return self.shape == (1, 1, 1)
+
+
+# ----------------------------------------------- where the voxels are -----------------------------------------------
+
+
+def find_lattice(volume: Any, shape: tuple[int, ...]) -> Lattice | None:
+    """The lattice of a `gridvolume` with data of that shape (z, y, x, channels), or None if it cannot be made out.
+
+    Mitsuba keeps the volume's `to_world` to itself; it is read from what the volume prints, the translation from the
+    bounding box, which has all digits.
+    """
+    row = r"\[" + ", ".join([r"([-+.\de]+)"] * 4) + r"\]"
+    printed = re.search(r"to_local = Transform\[\s*matrix=\[" + r",\s*".join([row] * 3), repr(volume))
+    if printed is None:
+        return None
+    to_local = np.array(printed.groups(), dtype=np.float64).reshape(3, 4)[:, :3]
+    to_local[np.abs(to_local) < 1e-6 * np.abs(to_local).max(axis=1, keepdims=True)] = 0  # rounding of a rotation
+    if np.linalg.matrix_rank(to_local) < 3:
+        return None
+    linear = np.linalg.inv(to_local)  # its columns are the edges of the grid in the world
+    box = volume.bbox()
+    low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
+    corner = low - np.minimum(linear, 0).sum(axis=1)
+    extent = high - low
+    if not np.allclose(corner + np.maximum(linear, 0).sum(axis=1), high, atol=1e-4 * np.abs(extent).max()):
+        return None
+
+    size = (int(shape[2]), int(shape[1]), int(shape[0]))
+    to_voxel = np.concatenate([to_local, -(to_local @ corner)[:, None]], axis=1) * np.array(size)[:, None]
+    corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1)
+    reached = to_voxel[:, :3] @ corners + to_voxel[:, 3:]
+    # A hundredth of a voxel is rounding, and there are bounds for half a voxel beyond the range.
+    first = np.floor(reached.min(axis=1) + 0.01).astype(int)
+    last = np.ceil(reached.max(axis=1) - 0.01).astype(int)
+    return Lattice(to_voxel, size, int(shape[3]), tuple(first.tolist()), tuple(np.maximum(last, first + 1).tolist()))
+
+
+# -------------------------------------------------- bounds by cell --------------------------------------------------
+
+
+def constant_bounds(volume: Any, lowest: float, mean: float, highest: float) -> Bounds:
+    """One cell for a volume of which no more is known than its extreme values."""
+    box = volume.bbox()
+    low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
+    scale = 1 / np.maximum(high - low, 1e-30)
+    to_cell = np.concatenate([np.diag(scale), (-low * scale)[:, None]], axis=1)
+    return Bounds(to_cell, (1, 1, 1), mi.Float(lowest), mi.Float(mean), mi.Float(highest))
+
+
+def voxel_bounds(lattice: Lattice, data: Any) -> Bounds:
+    """Bounds of the values ``data`` (TensorXf, z y x channels) in cells of BASE³ voxels."""
+    values, size = dr.detach(data).array, lattice.size
+    lowest, mean, highest = _channels(values, lattice.channels)
+    shape = tuple(-(-(h - l) // BASE) for l, h in zip(lattice.low, lattice.high, strict=True))
+    counts = list(size)
+    for axis in range(3):
+        low, high = lattice.low[axis], lattice.high[axis]
+        near, inside = _support(low, high, size[axis]), _support(low, high, size[axis], neighbours=False)
+        lowest = _pool(lowest, counts, axis, near, dr.fmin)
+        highest = _pool(highest, counts, axis, near, dr.fmax)
+        mean = _pool(mean, counts, axis, inside, lambda a, b: a + b) / inside.shape[1]
+        counts[axis] = near.shape[0]
+        dr.eval(lowest, mean, highest)
+    to_cell = lattice.to_voxel.copy()
+    to_cell[:, 3] -= lattice.low
+    return Bounds(to_cell / BASE, (shape[0], shape[1], shape[2]), lowest, mean, highest)
+
+
+def coarser(bounds: Bounds) -> Bounds:
+    """The same bounds for cells twice as large along every axis."""
+    lowest, mean, highest = bounds.lowest, bounds.mean, bounds.highest
+    counts = list(bounds.shape)
+    for axis in range(3):
+        n = counts[axis]
+        pairs = np.minimum(np.arange(0, n, 2)[:, None] + [0, 1], n - 1)
+        lowest = _pool(lowest, counts, axis, pairs, dr.fmin)
+        highest = _pool(highest, counts, axis, pairs, dr.fmax)
+        mean = _pool(mean, counts, axis, pairs, lambda a, b: a + b) / 2
+        counts[axis] = len(pairs)
+    return replace(
+        bounds,
+        to_cell=bounds.to_cell / 2,
+        shape=(counts[0], counts[1], counts[2]),
+        lowest=lowest,
+        mean=mean,
+        highest=highest,
+    )
+
+
+def all_bounds(bounds: Bounds) -> list[Bounds]:
+    """These bounds and ever coarser ones, down to a single cell."""
+    found = [bounds]
+    while not found[-1].is_single:
+        found.append(coarser(found[-1]))
+    dr.eval([(b.lowest, b.mean, b.highest) for b in found])
+    return found
+
+
+def _channels(values: Any, channels: int) -> tuple[Any, Any, Any]:
+    """Lowest, mean and highest of the channels of every voxel."""
+    if channels == 1:
+        return values, values, values
+    index = dr.arange(mi.UInt32, dr.width(values) // channels) * channels
+    each = [dr.gather(mi.Float, values, index + k) for k in range(channels)]
+    if channels == 4:
+        # Coefficients of a spectrum between 0 and 1, and its factor; of the spectrum no more is known.
+        return dr.fmin(each[3], 0), mi.Float(each[3] * 0), each[3]
+    lowest, total, highest = each[0], each[0], each[0]
+    for value in each[1:]:
+        lowest, total, highest = dr.fmin(lowest, value), total + value, dr.fmax(highest, value)
+    return lowest, total / channels, highest
+
+
+def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np.int64]:
+    """Per cell of the range low..high of an axis with n voxels: the voxels that lookups in it may use (cells x voxels).
+
+    With trilinear interpolation those are its own and one more on either side. Outside of the grid they are the
+    last voxel (clamp), that of the other end (repeat), or the mirror image. Short rows repeat their first entry.
+    """
+    rows = []
+    for start in range(low, high, BASE):
+        stop = min(start + BASE, high)
+        beyond = 1 if neighbours else 0
+        used: list[int] = []
+        for i in range(start - beyond, stop + beyond):
+            clamped, repeated, mirrored = min(max(i, 0), n - 1), i % n, i % (2 * n)
+            used.append(clamped)
+            if neighbours and clamped != i:
+                used += [repeated, min(mirrored, 2 * n - 1 - mirrored)]
+        rows.append(list(dict.fromkeys(used)) if neighbours else used)
+    longest = max(map(len, rows))
+    return np.array([(row * longest)[:longest] for row in rows])
+
+
+def _pool(values: Any, counts: list[int], axis: int, table: NDArray[np.int64], merge: Callable[[Any, Any], Any]) -> Any:
+    """Merge along one axis of a flat array (x runs fastest, ``counts`` entries along x, y, z) as the table says."""
+    inner = int(np.prod(counts[:axis]))
+    cells, length = table.shape
+    sources = mi.UInt32(table.T.ravel().astype(np.uint32))
+    i = dr.arange(mi.UInt32, int(np.prod(counts)) // counts[axis] * cells)
+    before, rest = i % inner, i // inner
+    cell, after = rest % cells, rest // cells
+    offset = before + after * (inner * counts[axis])
+    merged = None
+    for k in range(length):
+        source = dr.gather(mi.UInt32, sources, cell + k * cells)
+        value = dr.gather(mi.Float, values, offset + source * inner)
+        merged = value if merged is None else merge(merged, value)
+    return merged
+
+
+# ------------------------------------------------ the choice of cells ------------------------------------------------
+
+
+def cheapest(levels: list[Bounds], rates: list[float], chord: float) -> int:
+    """Index of the level whose cells make a ray through the volume cheapest.
+
+    The cost is that of the tentative collisions, ``rates[i]`` per unit length on average, and of the steps from cell
+    to cell, over the mean length ``chord`` of a ray in the volume. A single cell needs no steps.
+    """
+    costs = [
+        rate * chord + (0 if level.is_single else STEP_COST * (1 + level.faces_per_length * chord))
+        for level, rate in zip(levels, rates, strict=True)
+    ]
+    return int(np.argmin(costs))
+
+
+def mean_chord(box: Any) -> float:
+    """Mean length of a random line in a box: four times the volume over the surface (Cauchy)."""
+    x, y, z = (float(e) for e in box.extents())
+    return 0.0 if x * y * z == 0 else 2 * x * y * z / (x * y + y * z + z * x)
