@@ -23,7 +23,8 @@ class Job:
     """Gradient passes of some methods on one scene, in turn (A B C A B C ...), in one process.
 
     Round k of every method has the seed k. ``warm_up`` rounds before the first compile the kernels and are not kept;
-    after them all integrators are made anew: what a method learns from its passes it learns in rounds that are kept.
+    after them all integrators are made anew, and again every ``restart`` rounds: what a method learns from its passes
+    it learns in rounds that are kept.
     """
 
     scene: str
@@ -35,6 +36,7 @@ class Job:
     spp: int
     rounds: int
     warm_up: int = 2
+    restart: int = 0  # make all integrators anew every so many rounds; 0 = never
     threads: int = 0  # 0 = all processors
     # A gradient pass, or a primal one with the noise of the image, or the mean number of real events a path.
     measure: Literal["gradient", "image", "events"] = "gradient"

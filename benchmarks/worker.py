@@ -140,7 +140,7 @@ def run(job: Job) -> None:
     one_pass = Pass(job)
     kept: dict[str, list[Any]] = {name: [] for name in job.methods}
     for k in range(-job.warm_up, job.rounds):
-        if k == 0:
+        if k == 0 or (k > 0 and job.restart and k % job.restart == 0):
             one_pass.integrators.clear()
         for method in list(kept):
             _say("start", method=method)
