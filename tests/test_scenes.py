@@ -31,6 +31,7 @@ KEYS = {
     "cornell-box": CORNELL,
     "cornell-box-photo": CORNELL | {"back.bsdf.reflectance.data"},
     "glass-pane": {"glass.eta", "front_face.bsdf.normalmap.data"},
+    "cloud": {"cloud.interior_medium.sigma_t.data"},
     "mirror-camera": {"camera.to_world", "mirror.to_world"},
 }
 
@@ -41,7 +42,7 @@ def test_builtins_render_with_their_names(name: str) -> None:
     params = mi.traverse(scene)
     assert KEYS[name] <= set(params.keys())
     for sensor in range(len(scene.sensors())):
-        assert mi.render(scene, sensor=sensor, spp=4, integrator=mi.load_dict({"type": "path"})).shape == (8, 8, 3)
+        assert mi.render(scene, sensor=sensor, spp=4, integrator=mi.load_dict({"type": "volpath"})).shape == (8, 8, 3)
 
 
 def test_closeup_sees_every_texel() -> None:

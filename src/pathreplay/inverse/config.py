@@ -56,6 +56,8 @@ class Parameter(_Table):
     upper: Finite | None = None
     learning_rate: Positive | None = None
     initial: Value | None = None
+    resolutions: Annotated[list[Count], Field(min_length=1)] | None = None
+    refine_at: list[Count] | None = None
     pose: PoseKind | None = None
     start: Displacement | None = None
     pivot: Vector | None = None
@@ -72,7 +74,7 @@ class Parameter(_Table):
                     "add pose = 'translation', 'rotation' or 'rigid'"
                 )
             return self
-        if plain := {"lower", "upper", "initial"} & self.model_fields_set:
+        if plain := {"lower", "upper", "initial", "resolutions", "refine_at"} & self.model_fields_set:
             raise ValueError(
                 f"parameter '{self.key}': '{min(plain)}' does not go with a pose; displace its start with 'start'"
             )
@@ -86,6 +88,18 @@ class Parameter(_Table):
                 f"parameter '{self.key}': '{wrong[0]}' is not part of pose = '{self.pose}'; take pose = 'rigid', or "
                 "leave it out"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _coarse_to_fine(self) -> Parameter:
+        sizes, begins = self.resolutions or [], self.refine_at or []
+        if len(begins) != max(0, len(sizes) - 1):
+            raise ValueError(
+                f"parameter '{self.key}': {len(sizes)} resolutions and {len(begins)} entries in refine_at; give the "
+                "iteration at which each resolution after the first begins"
+            )
+        if sorted(set(begins)) != begins:
+            raise ValueError(f"parameter '{self.key}': refine_at {begins} does not increase; put it in order")
         return self
 
     @model_validator(mode="after")
@@ -144,6 +158,7 @@ class Config(_Table):
     sensors: list[int | str] | None = None
     variant: str | None = None
     integrator: Plugin = Plugin(type="pathreplay")
+    rival: Plugin | None = None
     parameters: Annotated[list[Parameter], Field(min_length=1)]
     target: Target
     loss: str = "l2"
@@ -155,6 +170,16 @@ class Config(_Table):
     learning_rate_decay: Annotated[float, Field(gt=0, le=1)] = 0.1
     checkpoint_every: Count = 25
     output: str | None = None
+
+    @model_validator(mode="after")
+    def _refined_in_time(self) -> Config:
+        for entry in self.parameters:
+            if entry.refine_at and entry.refine_at[-1] >= self.iterations:
+                raise ValueError(
+                    f"parameter '{entry.key}': refine_at {entry.refine_at[-1]} is not before the end of the "
+                    f"{self.iterations} iterations; refine earlier, or raise 'iterations'"
+                )
+        return self
 
 
 def load_config(path: Path) -> Config:

@@ -17,13 +17,15 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes, read_image
-from pathreplay.inverse.loop import ctrl_c_stops, iterate, make_adam, put_values, render_views, scene_values
+from pathreplay.inverse.loop import Pace, ctrl_c_stops, iterate, make_adam, put_values, render_views, scene_values
 from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
 from pathreplay.inverse.report import Outcome, Recovered, RecoveredPose, ViewPictures, report_files
+from pathreplay.inverse.rival import Rival, run_rival
 from pathreplay.inverse.run_folder import CHECKPOINT, RunFolder, create_run_folder, default_output, open_run_folder
 from pathreplay.inverse.values import Array
+from pathreplay.media.volume_files import vol_bytes
 from pathreplay.parameters import get_array, to_value
 
 
@@ -98,7 +100,8 @@ def optimize(
             folder.write(_first_files(problem, before, adam))
         else:
             folder = start.folder
-            _, history = checkpoint.restore(folder.path / CHECKPOINT, adam)
+            refined = [v.key for v in problem.variables if v.levels is not None]
+            _, history = checkpoint.restore(folder.path / CHECKPOINT, adam, refined)
             # All iterations but no report: the disk was full at the end. Then only the end is done again.
             if len(history) >= start.config.iterations and (folder.path / "report.html").exists():
                 raise PathreplayError(
@@ -113,9 +116,14 @@ def optimize(
                 folder.write({CHECKPOINT: checkpoint.save(adam, len(history), history)})
 
         with ctrl_c_stops() as stop:
-            iterate(problem, start.config, adam, history, stop, after)
+            iterate(problem, start.config, adam, history, stop, Pace(start.config.iterations), after)
+            result = render_views(problem, start.config)
+            rival = None
+            if problem.rival is not None and len(history) == start.config.iterations:
+                folder.write({CHECKPOINT: checkpoint.save(adam, len(history), history)})
+                rival = run_rival(problem, start.config, sum(entry.seconds for entry in history), stop, bar)
             bar.say("writing")
-            return _finish(start, folder, problem, adam, history, before, variant)
+            return _finish(start, folder, problem, adam, history, before, result, rival, variant)
 
 
 @dataclass(frozen=True)
@@ -163,28 +171,37 @@ def _finish(
     adam: Adam,
     history: list[checkpoint.Entry],
     before: dict[str, Image],
+    result: dict[str, Image],
+    rival: Rival | None,
     variant: str,
 ) -> RunResult:
     config = start.config
-    result = render_views(problem, config)
+    theirs = rival.values if rival else {}
     # The variables (translations, rotation vectors) and what they make of the scene (transforms).
     values = {key: get_array(value) for key, value in {**adam, **scene_values(problem, adam)}.items()}
     views = tuple(
-        ViewPictures(v.name, v.target, before[v.name], result[v.name], exposure_for(v.target)) for v in problem.views
-    )
+        ViewPictures(
+            v.name, v.target, before[v.name], result[v.name], exposure_for(v.target),
+            rival.pictures[v.name] if rival else None,
+        )
+        for v in problem.views
+    )  # fmt: skip
     poses = tuple(_recovered_pose(problem, pose, values) for pose in problem.poses)
     parts = {name for pose in problem.poses for name in pose.parts().values()}
     recovered = tuple(
-        Recovered(v.key, v.start, values[v.key], v.truth) for v in problem.variables if v.key not in parts
+        Recovered(v.key, v.start, values[v.key], v.truth, theirs.get(v.key))
+        for v in problem.variables
+        if v.key not in parts
     )
     outcome = Outcome(
-        config, start.source, folder.path, views, recovered, poses, tuple(history), variant, problem.notes
+        config, start.source, folder.path, views, recovered, poses, tuple(history), variant, problem.notes, rival
     )
     files = {
         CHECKPOINT: checkpoint.save(adam, len(history), history),
         "parameters.safetensors": safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in values.items()}),
         "parameters.json": _parameters_json(recovered, poses).encode(),
         "history.jsonl": "".join(json.dumps(asdict(entry)) + "\n" for entry in history).encode(),
+        **(rival.files() if rival else {}),
     }
     for view in views:
         files[f"images/result-{view.name}.exr"] = exr_bytes(view.result)
@@ -193,6 +210,10 @@ def _finish(
     for item in recovered:
         for kind, image in item.textures().items():
             files[f"images/texture-{kind}-{item.file_name()}.png"] = png_bytes(image)
+        for kind, image in item.volumes().items():
+            files[f"images/volume-{kind}-{item.file_name()}.png"] = png_bytes(image)
+        if item.result.ndim == 4:
+            files[f"volumes/{item.file_name()}.vol"] = vol_bytes(item.result)
     folder.write({**files, **report_files(outcome)})
     return RunResult(
         folder=folder.path,

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import FrameType
 from typing import Any
 
@@ -19,12 +19,32 @@ from drjit.opt import Adam
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.config import Config
+from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
-from pathreplay.inverse.problem import ITERATION, PICTURE, Problem, seeds
+from pathreplay.inverse.problem import ITERATION, JUDGEMENT, PICTURE, Problem, seeds
 from pathreplay.parameters import get_array, to_value
 
 # Adam's second moment remembers about 1 / (1 - beta_2) steps. Its usual 0.999 outlasts a whole run of a few hundred.
 BETA_1, BETA_2 = 0.9, 0.99
+
+# How often the pictures are judged in a run with a rival: enough for a curve, at a few per cent of its time.
+JUDGEMENTS = 10
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How far a run is, counted in iterations; a rival's by the share that has passed of the ``seconds`` it may take.
+
+    Learning rates and resolutions follow this position, so a rival goes through the same schedule in the same time.
+    """
+
+    iterations: int
+    seconds: float | None = None
+
+    def position(self, history: list[Entry]) -> float:
+        if self.seconds is None:
+            return float(len(history))
+        return self.iterations * sum(entry.seconds for entry in history) / self.seconds
 
 
 @dataclass(frozen=True)
@@ -85,19 +105,23 @@ def iterate(
     adam: Adam,
     history: list[Entry],
     stop: Stop,
+    pace: Pace,
     after: Callable[[Entry], None],
 ) -> None:
-    """Take steps from ``len(history)`` to ``config.iterations``; ``after`` is called at the end of each.
+    """Take steps until ``pace`` is at ``config.iterations``; ``after`` is called at the end of each.
 
     One step: render every view with seeds of its own, back-propagate the mean of the views' losses, step Adam with the
-    learning rate lr·decay^(i / iterations), project every variable into its bounds. What is differentiated is decided
-    by the integrator; targets, bounds and the seeds' choice of paths are not.
+    learning rate lr·decay^(i / iterations), project every variable into its bounds. A grid whose next resolution is
+    due is interpolated before the step, and Adam starts anew on it. What is differentiated is decided by the
+    integrator; targets, bounds and the seeds' choice of paths are not.
 
     Raises:
         PathreplayError: the loss is no longer finite.
     """
-    for i in range(len(history), config.iterations):
+    while (position := pace.position(history)) < config.iterations:
+        i = len(history)
         begin = time.perf_counter()
+        _refine(problem, adam, position)
         put_values(problem, adam)
         loss = _loss(problem, config, i)
         dr.backward(loss)
@@ -107,12 +131,14 @@ def iterate(
             raise PathreplayError(
                 f"The loss is {value} at iteration {i}; lower the learning rates, or bound the parameters that ran away"
             )
-        _set_rates(problem, config, adam, i)
+        _set_rates(problem, config, adam, position)
         adam.step()
         _project(problem, adam)
-        entry = Entry(i, value, time.perf_counter() - begin, norms, dropped)
-        history.append(entry)
-        after(entry)
+        history.append(Entry(i, value, time.perf_counter() - begin, norms, dropped, errors(problem, adam)))
+        if problem.rival is not None and _due(position, pace.position(history), config.iterations):
+            put_values(problem, adam)
+            history[-1] = replace(history[-1], picture_error=judged(problem, config, i))
+        after(history[-1])
         if stop.wanted():
             break
     put_values(problem, adam)
@@ -133,6 +159,46 @@ def render_views(problem: Problem, config: Config) -> dict[str, Image]:
             )
         pictures[view.name] = np.array(image, dtype=np.float32)
     return pictures
+
+
+def errors(problem: Problem, adam: Adam) -> dict[str, float]:
+    """Root mean square error of each variable whose truth is known."""
+    return {v.key: rmse(get_array(adam[v.key]), v.truth) for v in problem.variables if v.truth is not None}
+
+
+def judged(problem: Problem, config: Config, iteration: int) -> float:
+    """Root mean square error of the pictures of the scene as it is now, without the noise of rendering them.
+
+    With two independent renderings A and B of a view, E[(A - T)(B - T)] = (I - T)², where a square would add the
+    variance; the mean over pixels and views is taken before the root (negative ones count as zero). The noise of the
+    targets stays in.
+    """
+    total = 0.0
+    for view in problem.views:
+        gaps = []
+        for seed in seeds(config.seed, JUDGEMENT, iteration, view.sensor):
+            with dr.suspend_grad():
+                image = mi.render(
+                    problem.scene, sensor=view.sensor, integrator=problem.judge, spp=config.spp, seed=mi.UInt32(seed)
+                )
+            gaps.append(np.array(image, dtype=np.float64) - view.target)
+        total += float(np.mean(gaps[0] * gaps[1])) / len(problem.views)
+    return float(np.sqrt(max(total, 0.0)))
+
+
+def _due(before: float, now: float, iterations: int) -> bool:
+    """Whether a judgement is due: in the first step of a run, and in those that cross a tenth of it."""
+    return before == 0 or int(JUDGEMENTS * before / iterations) < int(JUDGEMENTS * now / iterations)
+
+
+def _refine(problem: Problem, adam: Adam, position: float) -> None:
+    for variable in problem.variables:
+        if variable.levels is None:
+            continue
+        value, shape = adam[variable.key], variable.levels.shape_at(position)
+        if tuple(value.shape) != shape:
+            # Of another shape: Adam forgets its moments, which belong to cells of another size.
+            adam[variable.key] = type(value)(resampled(get_array(value), shape))
 
 
 def _loss(problem: Problem, config: Config, iteration: int) -> mi.Float:
@@ -167,8 +233,8 @@ def _gradients(adam: Adam) -> tuple[dict[str, float], int]:
     return norms, dropped
 
 
-def _set_rates(problem: Problem, config: Config, adam: Adam, iteration: int) -> None:
-    decay = config.learning_rate_decay ** (iteration / config.iterations)
+def _set_rates(problem: Problem, config: Config, adam: Adam, position: float) -> None:
+    decay = config.learning_rate_decay ** (position / config.iterations)
     # Opaque: as a literal the changing rate would be compiled into the kernel anew in every iteration.
     adam.set_learning_rate({v.key: dr.opaque(mi.Float, v.learning_rate * decay) for v in problem.variables})
 

@@ -15,6 +15,7 @@ import numpy as np
 from pathreplay import parameters
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import Config, Parameter, Plugin
+from pathreplay.inverse.grids import Levels, comparable, make_levels, resampled
 from pathreplay.inverse.images import Image, find_image, read_image, with_channels
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
@@ -37,6 +38,9 @@ class Variable:
     learning_rate: float
     start: Array
     truth: Array | None
+    """In the shape of ``start``, or for a grid in another resolution."""
+    levels: Levels | None = None
+    """Of a grid that is refined on the way."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,10 @@ class Problem:
     scene: mi.Scene
     params: mi.SceneParameters
     integrator: mi.Integrator
+    rival: mi.Integrator | None
+    """Solves the same problem in the same time, for comparison."""
+    judge: mi.Integrator
+    """Renders the pictures by which both are compared: the one that made the targets, where it is known."""
     variables: tuple[Variable, ...]
     poses: tuple[Pose, ...]
     views: tuple[View, ...]
@@ -64,7 +72,7 @@ class Problem:
 
 
 # Streams of random numbers: pictures never share a seed with iterations, nor targets with renderings.
-ITERATION, TARGET, PICTURE = 0, 1, 2
+ITERATION, TARGET, PICTURE, JUDGEMENT = 0, 1, 2, 3
 
 
 def seeds(seed: int, stream: int, index: int, view: int) -> tuple[int, int]:
@@ -86,12 +94,12 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     scene, notes = load_scene_for(config.scene, wanted, base, **config.scene_parameters)
     params = mi.traverse(scene)
     parameters.require_finite(params)
-    integrator = load_integrator(config.integrator)
-    if not isinstance(integrator, mi.CppADIntegrator):
-        raise PathreplayError(
-            f"Integrator '{config.integrator.type}' computes no gradients; use 'pathreplay' or another AD integrator"
-        )
+    integrator = _gradient_integrator(config.integrator)
     keys = _keys(params, config.parameters, integrator)
+    rival = None if config.rival is None else _gradient_integrator(config.rival)
+    if rival is not None:
+        _keys(params, config.parameters, rival)
+    judge = integrator if config.target.images is not None else load_integrator(config.target.integrator)
     # Before any target is rendered: the cheap mistakes first.
     unsolved, moved = _variables(params, keys, config, base)
     sensors = _sensors(scene, config.sensors)
@@ -116,7 +124,16 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     params = mi.traverse(scene)
     params.keep(list(keys))
     views = tuple(View(name, index, targets[name]) for name, index in sensors.items())
-    return Problem(scene, params, integrator, variables, poses, views, loss, notes)
+    return Problem(scene, params, integrator, rival, judge, variables, poses, views, loss, notes)
+
+
+def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
+    integrator = load_integrator(plugin)
+    if not isinstance(integrator, mi.CppADIntegrator):
+        raise PathreplayError(
+            f"Integrator '{plugin.type}' computes no gradients; use 'pathreplay' or another AD integrator"
+        )
+    return integrator
 
 
 def load_integrator(plugin: Plugin) -> mi.Integrator:
@@ -149,7 +166,11 @@ def _variables(
         rate = entry.learning_rate or config.learning_rate
         if entry.pose is None:
             start = _start(params, key, entry, base)
-            variables.append(Variable(key, params[key], entry.lower, entry.upper, rate, start, None))
+            like, levels = params[key], _levels(key, entry, start)
+            if levels is not None:
+                start = resampled(start, levels.shapes[0])
+                like = type(like)(start)
+            variables.append(Variable(key, like, entry.lower, entry.upper, rate, start, None, levels))
             continue
         pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
         poses.append(pose)
@@ -163,6 +184,16 @@ def _variables(
                 rate = rate if degrees is None else float(np.radians(degrees))
             variables.append(Variable(name, mi.Vector3f(0), None, None, rate, start, None))
     return variables, poses
+
+
+def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:
+    if entry.resolutions is None:
+        return None
+    if start.ndim < 3:
+        raise PathreplayError(
+            f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'resolutions' out"
+        )
+    return make_levels(start.shape, entry.resolutions, entry.refine_at or [])
 
 
 def _start(params: mi.SceneParameters, key: str, entry: Parameter, base: Path) -> Array:
@@ -224,10 +255,11 @@ def _target_scene(config: Config, base: Path) -> mi.Scene:
 
 
 def _truth(scene: mi.Scene, own: mi.SceneParameters, keys: dict[str, Parameter]) -> dict[str, Array]:
-    """Values of the wanted parameters in the target scene, where it has them in the same shape."""
+    """Values of the wanted parameters in the target scene, where it has them in the same shape or as such a grid."""
     params = mi.traverse(scene)
     found = {key: parameters.get_array(params[key]) for key in keys if key in params}
-    return {key: value for key, value in found.items() if value.shape == parameters.get_array(own[key]).shape}
+    shapes = {key: parameters.get_array(own[key]).shape for key in found}
+    return {key: value for key, value in found.items() if comparable(value.shape, shapes[key])}
 
 
 def _rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -> dict[str, Image]:

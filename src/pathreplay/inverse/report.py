@@ -16,13 +16,15 @@ from typing import Any
 import jinja2
 import numpy as np
 import PIL.Image
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.config import Config
+from pathreplay.inverse.figures import comparison_figure, drawn, loss_figure
+from pathreplay.inverse.grids import matched, rmse, slices
 from pathreplay.inverse.images import Image, difference, png_bytes
 from pathreplay.inverse.pose import Pose, PoseError
+from pathreplay.inverse.rival import Rival
 from pathreplay.inverse.values import Array
 
 # Differences are shown brighter than the pictures: a converged one would be black otherwise.
@@ -31,35 +33,38 @@ DIFFERENCE_GAIN = 4.0
 
 @dataclass(frozen=True)
 class ViewPictures:
-    """One view: target, start and result (linear), and the exposure under which all of them are shown."""
+    """One view: target, start, result and rival's result (linear), and the exposure under which all are shown."""
 
     name: str
     target: Image
     start: Image
     result: Image
     exposure: float
+    rival: Image | None = None
 
     def pictures(self) -> dict[str, Image]:
         """The pictures to show; the difference is result - target, red above and blue below, DIFFERENCE_GAIN times."""
         gap = difference(self.result, self.target) * DIFFERENCE_GAIN
-        return {"target": self.target, "start": self.start, "result": self.result, "difference": gap}
+        found = {"target": self.target, "start": self.start, "result": self.result, "difference": gap}
+        return found if self.rival is None else {**found, "rival": self.rival}
 
     def error(self) -> float:
         """Root mean square difference of result and target; includes the noise of both."""
-        return _rmse(self.result, self.target)
+        return rmse(self.result, self.target)
 
     def error_at_start(self) -> float:
-        return _rmse(self.start, self.target)
+        return rmse(self.start, self.target)
 
 
 @dataclass(frozen=True)
 class Recovered:
-    """One parameter: start, result, and truth where it is known."""
+    """One parameter: start, result, truth where it is known, and the rival's result where there was one."""
 
     key: str
     start: Array
     result: Array
     truth: Array | None
+    rival: Array | None = None
 
     def textures(self) -> dict[str, Image]:
         """Start, result and truth as images; empty for what is no texture of one to four channels."""
@@ -67,6 +72,19 @@ class Recovered:
             return {}
         images = {"start": self.start, "result": self.result}
         return images if self.truth is None else {**images, "truth": self.truth}
+
+    def volumes(self) -> dict[str, Image]:
+        """Middle slices of start, result, rival's result and truth, white at the largest value of the last of them.
+
+        Empty for what is no volume (z, y, x, one to four channels). All are shown in the finest resolution.
+        """
+        if self.result.ndim != 4 or self.result.shape[3] > 4:
+            return {}
+        kinds = {"start": self.start, "result": self.result, "rival": self.rival, "truth": self.truth}
+        given = {kind: volume for kind, volume in kinds.items() if volume is not None}
+        finest = max(given.values(), key=lambda volume: volume.size)
+        white = float((self.result if self.truth is None else self.truth).max()) or 1.0
+        return {kind: slices(matched(volume, finest)) / white for kind, volume in given.items()}
 
     def numbers(self) -> dict[str, list[float]]:
         """Start, result and truth as numbers; empty for what has more of them than one reads (over 16)."""
@@ -77,16 +95,19 @@ class Recovered:
 
     def error(self) -> float | None:
         """Root mean square error against the truth."""
-        return None if self.truth is None else _rmse(self.result, self.truth)
+        return None if self.truth is None else rmse(self.result, self.truth)
 
     def error_at_start(self) -> float | None:
-        return None if self.truth is None else _rmse(self.start, self.truth)
+        return None if self.truth is None else rmse(self.start, self.truth)
 
     def relative_error(self) -> float | None:
         """|result - truth| / |truth| (L2 norms); None where the truth is unknown or zero."""
         if self.truth is None or not self.truth.any():
             return None
-        return float(np.linalg.norm(self.result - self.truth) / np.linalg.norm(self.truth))
+        return float(np.linalg.norm(matched(self.result, self.truth) - self.truth) / np.linalg.norm(self.truth))
+
+    def rival_error(self) -> float | None:
+        return None if self.truth is None or self.rival is None else rmse(self.rival, self.truth)
 
     def file_name(self) -> str:
         return re.sub(r"[^\w.-]", "_", self.key)
@@ -135,6 +156,25 @@ class RecoveredPose:
 
 
 @dataclass(frozen=True)
+class Contestant:
+    """One of two integrators that had the same time: iterations, seconds, and the errors that they ended with."""
+
+    name: str
+    history: tuple[Entry, ...]
+    picture_error: float
+    """Root mean square over all views, noise taken out, at the last judgement; NaN where none was made."""
+    errors: dict[str, float]
+
+    def seconds(self) -> float:
+        return sum(entry.seconds for entry in self.history)
+
+
+def _contestant(name: str, history: tuple[Entry, ...], errors: dict[str, float]) -> Contestant:
+    judged = [entry.picture_error for entry in history if entry.picture_error is not None]
+    return Contestant(name, history, judged[-1] if judged else float("nan"), errors)
+
+
+@dataclass(frozen=True)
 class Outcome:
     """Everything that the report tells."""
 
@@ -147,6 +187,7 @@ class Outcome:
     history: tuple[Entry, ...]
     variant: str
     notes: tuple[str, ...]
+    rival: Rival | None = None
 
     def command(self) -> str:
         """The command line that makes this run again, or goes on with it where it was stopped."""
@@ -161,11 +202,34 @@ class Outcome:
     def dropped(self) -> int:
         return sum(entry.dropped for entry in self.history)
 
+    def judge(self) -> str:
+        """Type of the integrator that renders the pictures by which two runs are compared."""
+        target = self.config.target
+        return self.config.integrator.type if target.images is not None else target.integrator.type
+
+    def comparison(self) -> list[Contestant]:
+        """The job and its rival in numbers; empty where there was none."""
+        if self.rival is None or self.config.rival is None:
+            return []
+        known = [item for item in self.recovered if item.truth is not None]
+        ours = {item.key: item.error() or 0.0 for item in known}
+        theirs = {item.key: item.rival_error() or 0.0 for item in known}
+        return [
+            _contestant(self.config.integrator.type, self.history, ours),
+            _contestant(self.config.rival.type, self.rival.history, theirs),
+        ]
+
 
 def report_files(outcome: Outcome) -> dict[str, bytes]:
-    """report.html, the loss curve (SVG, PNG) and summary.png, as file name -> content."""
-    curve = loss_figure(outcome.history)
-    svg = _drawn(curve, "svg")
+    """report.html, the curves (SVG, PNG) and summary.png, as file name -> content."""
+    curves = {"loss": loss_figure(outcome.history)}
+    runs = outcome.comparison()
+    if runs:
+        # A run against itself with other options has one name twice.
+        names = [run.name if run.name != runs[0].name or run is runs[0] else f"{run.name} (rival)" for run in runs]
+        histories = {name: run.history for name, run in zip(names, runs, strict=True)}
+        curves["comparison"] = comparison_figure(histories, list(runs[0].errors))
+    drawings = {f"{name}.{kind}": drawn(curve, kind) for name, curve in curves.items() for kind in ("svg", "png")}
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pathreplay.inverse", "."),
         autoescape=True,
@@ -177,37 +241,13 @@ def report_files(outcome: Outcome) -> dict[str, bytes]:
     html = environment.get_template("report.html.j2").render(
         outcome=outcome,
         data_uri=_data_uri,
-        loss_svg=_uri("image/svg+xml", svg),
+        curves={name: _uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves},
+        runs=runs,
+        judge=outcome.judge(),
         gain=DIFFERENCE_GAIN,
         versions=versions(outcome.variant),
     )
-    return {
-        "report.html": html.encode(),
-        "loss.svg": svg,
-        "loss.png": _drawn(curve, "png"),
-        "summary.png": summary(outcome),
-    }
-
-
-def loss_figure(history: tuple[Entry, ...]) -> Figure:
-    """Loss against iteration, logarithmic, in grey and one colour that read on light and dark ground alike."""
-    figure = Figure(figsize=(7, 2.6), layout="constrained")
-    axes = figure.add_subplot()
-    axes.plot([entry.iteration for entry in history], [entry.loss for entry in history], color="#3b82f6", linewidth=1.5)
-    if any(entry.loss > 0 for entry in history):
-        axes.set_yscale("log")
-    axes.set_xlabel("iteration")
-    axes.set_ylabel("loss")
-    grey = "#808080"
-    axes.grid(True, color=grey, alpha=0.25, linewidth=0.5)
-    axes.tick_params(which="both", colors=grey)
-    for part in (axes.xaxis.label, axes.yaxis.label):
-        part.set_color(grey)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(grey)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    return figure
+    return {"report.html": html.encode(), **drawings, "summary.png": summary(outcome)}
 
 
 # At most so many views and textures in summary.png: it is an overview, the report has them all.
@@ -215,19 +255,28 @@ SUMMARY_ROWS = 3
 
 
 def summary(outcome: Outcome) -> bytes:
-    """One PNG with everything side by side: a row per view (target, start, result, difference), a row per texture."""
+    """One PNG with everything side by side: a row per view (target, start, result, difference), texture and volume."""
     rows = [(v.name, v.pictures(), v.exposure) for v in outcome.views[:SUMMARY_ROWS]]
-    rows += [(r.key, r.textures(), 1.0) for r in [r for r in outcome.recovered if r.textures()][:SUMMARY_ROWS]]
-    figure = Figure(figsize=(8.4, 2.25 * len(rows)), layout="constrained", dpi=100)
-    grid = figure.subplots(len(rows), 4, squeeze=False)
+    shown = [(r.key, r.textures() or r.volumes()) for r in outcome.recovered]
+    rows += [(key, images, 1.0) for key, images in [row for row in shown if row[1]][:SUMMARY_ROWS]]
+    columns = max(len(images) for _, images, _ in rows)
+    # As high as its picture, which is 2.1 wide, and 0.2 for the title.
+    heights = [0.2 + 2.1 * image.shape[0] / image.shape[1] for _, images, _ in rows for image in [images["start"]]]
+    figure = Figure(figsize=(2.1 * columns, sum(heights)), layout="constrained", dpi=100)
+    grid = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
     for line, (name, pictures, exposure) in zip(grid, rows, strict=True):
         for axes in line:
             axes.axis("off")
         for column, (kind, image) in enumerate(pictures.items()):
             line[column].imshow(_shown(image, exposure), interpolation="nearest", vmin=0, vmax=1, cmap="gray")
             label = f"{kind} ×{DIFFERENCE_GAIN:g}" if kind == "difference" else kind
-            line[column].set_title(label if column else f"{name}: {label}", fontsize=8)
-    return _with_palette(_drawn(figure, "png"))
+            line[column].set_title(label if column else f"{_short(name)}: {label}", fontsize=8)
+    return _with_palette(drawn(figure, "png"))
+
+
+def _short(name: str) -> str:
+    """What of a name fits over a picture: of a long key the end."""
+    return name if len(name) <= 28 else f"…{name[-27:]}"
 
 
 def versions(variant: str) -> dict[str, str]:
@@ -254,19 +303,6 @@ def _shown(image: Image, exposure: float) -> Image:
     linear = np.clip(image[:, :, :3] * exposure, 0, 1)
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
     return encoded[:, :, 0] if image.shape[2] < 3 else encoded
-
-
-def _rmse(a: Array, b: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(a.astype(np.float64) - b))))
-
-
-def _drawn(figure: Figure, kind: str) -> bytes:
-    FigureCanvasAgg(figure)
-    buffer = io.BytesIO()
-    # No date in the file: the same run gives the same bytes.
-    metadata = {"Date": None} if kind == "svg" else None
-    figure.savefig(buffer, format=kind, transparent=kind == "svg", metadata=metadata)
-    return buffer.getvalue()
 
 
 def _with_palette(png: bytes) -> bytes:

@@ -1,0 +1,80 @@
+"""Grids of values, textures and volumes alike: the same function at another resolution, coarse to fine, and slices.
+
+A grid has one or more spatial axes and, last, its channels: (y, x, channels) or (z, y, x, channels).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pathreplay.inverse.images import Image
+from pathreplay.inverse.values import Array
+
+
+@dataclass(frozen=True)
+class Levels:
+    """The resolutions that a grid goes through: shape ``shapes[j]`` from iteration ``begins[j]`` on."""
+
+    shapes: tuple[tuple[int, ...], ...]
+    begins: tuple[int, ...]
+
+    def shape_at(self, position: float) -> tuple[int, ...]:
+        """The shape that the grid should have at a position in the run, counted in iterations."""
+        return max((b, s) for b, s in zip(self.begins, self.shapes, strict=True) if b <= position)[1]
+
+
+def make_levels(shape: Sequence[int], longest: Sequence[int], refine_at: Sequence[int]) -> Levels:
+    """Levels of a grid of that shape: its longest axis gets ``longest[j]`` entries, the others in proportion."""
+    *axes, channels = shape
+    shapes = [(*(max(1, round(n * size / max(axes))) for n in axes), channels) for size in longest]
+    return Levels(tuple(shapes), (0, *refine_at))
+
+
+def resampled(grid: Array, shape: Sequence[int]) -> Array:
+    """The grid in another ``shape`` (same channels): linear between the centres of its cells, constant beyond them.
+
+    That is how Mitsuba looks grids and textures up, so a doubled resolution changes the function by no more than the
+    bends between the old centres. It keeps bounds. Where entries get fewer than half, some are passed over.
+    """
+    for axis, size in enumerate(shape[:-1]):
+        have = grid.shape[axis]
+        if size == have:
+            continue
+        at = np.clip((np.arange(size) + 0.5) * (have / size) - 0.5, 0, have - 1)
+        low = np.minimum(at.astype(np.intp), max(have - 2, 0))
+        share = (at - low).reshape(-1, *[1] * (grid.ndim - axis - 1))
+        upper = np.take(grid, np.minimum(low + 1, have - 1), axis)
+        grid = np.take(grid, low, axis) * (1 - share) + upper * share
+    return np.ascontiguousarray(grid, np.float32)
+
+
+def comparable(shape: Sequence[int], other: Sequence[int]) -> bool:
+    """Whether two arrays are the same quantity: of one shape, or grids of as many axes and channels."""
+    same_kind = len(shape) == len(other) and len(shape) >= 3 and shape[-1] == other[-1]
+    return same_kind or tuple(shape) == tuple(other)
+
+
+def matched(grid: Array, other: Array) -> Array:
+    """``grid`` in the shape of ``other``, to which it is `comparable`."""
+    return grid if grid.shape == other.shape else resampled(grid, other.shape)
+
+
+def rmse(value: Array, truth: Array) -> float:
+    """Root mean square error; grids of different resolutions are compared at that of the truth."""
+    return float(np.sqrt(np.mean(np.square(matched(value, truth).astype(np.float64) - truth))))
+
+
+def slices(volume: Array) -> Image:
+    """The middle slices of a volume (z, y, x, channels), side by side: seen along z, along y and along x.
+
+    Up is y in the first and the last and z in the second one.
+    """
+    z, y, x = (n // 2 for n in volume.shape[:3])
+    cuts = [volume[z, ::-1], volume[::-1, y], volume[:, ::-1, x].swapaxes(0, 1)]
+    height = max(cut.shape[0] for cut in cuts)
+    gap = np.zeros((height, 1, volume.shape[3]), np.float32)
+    padded = [np.pad(cut, ((0, height - cut.shape[0]), (0, 0), (0, 0))) for cut in cuts]
+    return np.concatenate([padded[0], gap, padded[1], gap, padded[2]], axis=1)[..., :3].astype(np.float32)
