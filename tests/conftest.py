@@ -67,10 +67,15 @@ def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print the table of truth cells that were measured, and the cells that are left out, with the reason."""
+    """Print what was measured: pictures, gradients, and the cells that are left out, with the reason."""
+    from test_primal_media import PRIMALS
+    from test_primal_media import table as pictures
     from test_truth_materials import EXCLUSIONS
     from truth import ROWS, table
 
+    if PRIMALS:
+        terminalreporter.section("pictures against volpath, in standard errors")
+        terminalreporter.write_line(pictures())
     if ROWS:
         terminalreporter.section("gradients against finite differences")
         terminalreporter.write_line(table())

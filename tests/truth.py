@@ -18,6 +18,12 @@ import numpy as np
 RES = 16
 Move = Callable[[Any, Any], Any]  # (value at 0, t) -> value at t
 
+# A finite difference Σ c f(o h) / h, as {o: c}. The wide ones, of third and fourth order, let h be a large share of the
+# parameter: delta tracking decides anew at every h, so that its noise does not shrink with h as a smooth path's does.
+CENTRAL = {-1: -0.5, 1: 0.5}
+WIDE = {-2: 1 / 12, -1: -8 / 12, 1: 8 / 12, 2: -1 / 12}
+UPWARD = {0: -11 / 6, 1: 3.0, 2: -1.5, 3: 1 / 3}  # where the parameter ends at its value
+
 
 @dataclass(frozen=True)
 class Case:
@@ -28,12 +34,16 @@ class Case:
     key: str
     move: Move
     depth: int = 4
+    rr_depth: int = 3
     step: float = 1e-2  # of t, for finite differences
     spp: int = 64
     seeds: int = 12
     options: dict = field(default_factory=dict)  # of the integrator
     drivers: tuple[str, ...] = ("sweep", "replay")
-    peer: bool = False  # measure Mitsuba's prb, too
+    peer: bool = False  # measure Mitsuba's prb (prbvolpath beside volpath), too
+    reference: str = "path"  # the plugin whose images are differenced
+    reference_spp: int = 0  # of the reference; 0: spp
+    stencil: dict[int, float] = field(default_factory=lambda: CENTRAL)
     lanes: float | None = 1e-3  # largest relative L1 error lane by lane; None: random choices depend on the parameter
 
 
@@ -139,14 +149,15 @@ class Bench:
         self.params[self.case.key] = self.case.move(self.value, t)
         self.params.update()
 
-    def image(self, integrator: Any, seed: int, t: float = 0.0) -> np.ndarray:
+    def image(self, integrator: Any, seed: int, t: float = 0.0, spp: int = 0) -> np.ndarray:
         self.put(dr.opaque(mi.Float, t))
-        return np.array(mi.render(self.scene, integrator=integrator, seed=seed, spp=self.case.spp)).astype(np.float64)
+        image = mi.render(self.scene, integrator=integrator, seed=seed, spp=spp or self.case.spp)
+        return np.array(image).astype(np.float64)
 
-    def difference(self, integrator: Any, seed: int) -> np.ndarray:
-        """Central difference of the image with common random numbers."""
+    def difference(self, integrator: Any, seed: int, spp: int = 0, stencil: dict[int, float] = CENTRAL) -> np.ndarray:
+        """Finite difference of the image with common random numbers."""
         h = self.case.step
-        return (self.image(integrator, seed, h) - self.image(integrator, seed, -h)) / (2 * h)
+        return sum(c * self.image(integrator, seed, o * h, spp) for o, c in stencil.items()) / h
 
     def forward(self, integrator: Any, seed: int, spp: int = 0) -> np.ndarray:
         t = dr.opaque(mi.Float, 0)
@@ -179,7 +190,7 @@ class Bench:
 def measure(case: Case) -> list[Row]:
     """Level 1 to 3 for all drivers of a case; the rows are kept for the table.
 
-    Finite differences are of Mitsuba's `path`; lane by lane they are of our own primal image, without Russian
+    Finite differences are of the case's reference; lane by lane they are of our own primal image, without Russian
     roulette, whose probabilities move with the parameters.
     """
     gc.collect()  # scenes of earlier cases would be traced, too
@@ -191,9 +202,10 @@ def measure(case: Case) -> list[Row]:
 
 
 def _measure(case: Case, bench: Bench) -> list[Row]:
-    path = bench.integrator("path", rr_depth=3)
+    plain = bench.integrator(case.reference, rr_depth=case.rr_depth)
     seeds = range(1, case.seeds + 1)
-    reference = np.array([bench.dot(bench.difference(path, 1000 + seed)) for seed in seeds])
+    wide = {"spp": case.reference_spp, "stencil": case.stencil}
+    reference = np.array([bench.dot(bench.difference(plain, 1000 + seed, **wide)) for seed in seeds])
 
     steady = bench.integrator(rr_depth=1000, **case.options)
     lanes = np.nan
@@ -206,7 +218,7 @@ def _measure(case: Case, bench: Bench) -> list[Row]:
     rows = []
     for driver in ("forward", *case.drivers):
         props = {} if driver == "forward" else {"driver": driver}
-        integrator = bench.integrator(rr_depth=3, **props, **case.options)
+        integrator = bench.integrator(rr_depth=case.rr_depth, **props, **case.options)
         if driver == "forward":
             g = np.array([bench.dot(bench.forward(integrator, seed)) for seed in seeds])
             transpose = np.nan
@@ -223,8 +235,8 @@ def _measure(case: Case, bench: Bench) -> list[Row]:
 
 
 def _peer(bench: Bench, seeds: range) -> float:
-    """Mean gradient by Mitsuba's prb; nan where it refuses."""
-    prb = bench.integrator("prb", rr_depth=3)
+    """Mean gradient by Mitsuba's prb or prbvolpath; nan where it refuses."""
+    prb = bench.integrator("prb" if bench.case.reference == "path" else "prbvolpath", rr_depth=bench.case.rr_depth)
     try:
         return float(np.mean([bench.backward(prb, seed) for seed in seeds]))
     except RuntimeError:

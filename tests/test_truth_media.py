@@ -1,0 +1,206 @@
+"""Media: gradients of density, albedo, phase functions and of what surrounds them, against finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from media_scenes import (
+    FORWARD,
+    behind_glass,
+    checkers,
+    cloud,
+    constant,
+    grid,
+    heterogeneous,
+    homogeneous,
+    in_the_mirror,
+    inside,
+    lit_floor,
+    nested,
+    overlapping,
+    smooth,
+    sunlit,
+)
+from truth import UPWARD, WIDE, Case, Move, add, hold, random, rgb, translate
+
+MEDIUM = "object.interior_medium."
+DENSITY, ALBEDO, G = MEDIUM + "sigma_t.data", MEDIUM + "albedo.data", MEDIUM + "phase_function.g"
+
+
+def where(mask: np.ndarray, scale: float = 1.0) -> Move:
+    """tensor + t · (random positive numbers up to ``scale``) where the mask is one."""
+    direction = np.random.default_rng(7).uniform(0.2 * scale, scale, mask.shape).astype(np.float32) * mask
+    return lambda value, t: value + t * mi.TensorXf(direction.astype(np.float32))
+
+
+def cell(name: str, scene: Callable[[], dict], key: str, move: Move, **options: Any) -> Case:
+    common = {
+        "reference": "volpath",
+        "stencil": WIDE,
+        "step": 0.15,
+        "depth": 8,
+        "spp": 256,
+        "reference_spp": 512,
+        "lanes": None,
+        "peer": True,
+    }
+    return Case(name, scene, key, move, **{**common, **options})
+
+
+def smooth_cloud(**props: Any) -> dict:
+    return cloud(heterogeneous(smooth(0.4, 2.0), smooth(0.3, 0.9), **props))
+
+
+def glowing(emission: float = 1.0) -> dict:
+    """A cloud under the sky that emits, too; volpath knows no emission."""
+    return smooth_cloud(plugin="gridmedium", emission=grid(emission * smooth(0.1, 0.6, 3)))
+
+
+def rainbow() -> dict:
+    return homogeneous(rgb(0.7, 0.5, 0.35), rgb(0.8, 0.6, 0.4), scale=2.0)
+
+
+def dense() -> dict:
+    """From the middle, light has been scattered some hundred times when it leaves: τ = 12, and τ²/2 + τ times."""
+    return heterogeneous(smooth(8.0, 16.0), constant(0.99))
+
+
+def uniform(**props: Any) -> dict:
+    return heterogeneous(constant(1.2), constant(0.6), **props)
+
+
+GLASS = {"type": "smoothdielectric"}
+ROUGH = {"type": "roughdielectric", "alpha": 0.3}
+ETA = "object.bsdf.eta"
+LISTING = {"options": {"volume_gradient": "listing"}}
+DENSE = {"depth": 512, "rr_depth": 1000, "spp": 32, "reference_spp": 12, "step": 0.4}
+UP = {"stencil": UPWARD, "step": 0.1}
+
+GRIDS = [
+    cell("smooth density", smooth_cloud, DENSITY, random(1.0)),
+    cell("constant density", lambda: cloud(uniform()), DENSITY, random(1.0)),
+    cell("binary density, full voxels", lambda: cloud(heterogeneous(checkers(), constant(0.6), scale=2.0)), DENSITY,
+         where(checkers())),
+    cell("binary density, empty voxels", lambda: cloud(heterogeneous(checkers(), constant(0.6), scale=2.0)), DENSITY,
+         where(1 - checkers()), **UP),
+    cell("albedo", smooth_cloud, ALBEDO, random(0.5)),
+    cell("black albedo", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.0))), ALBEDO, random(1.0), **UP),
+    cell("black albedo, density", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.0))), DENSITY, random(1.0)),
+    cell("one black channel of the albedo", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant((0.8, 0.5, 0.0)))),
+         ALBEDO, where(constant((0.0, 0.0, 1.0))), **UP),
+    cell("chromatic density", lambda: cloud(heterogeneous(smooth(0.4, 2.0, 3), smooth(0.3, 0.9, 3))), DENSITY,
+         random(1.0)),
+    cell("chromatic albedo", lambda: cloud(heterogeneous(smooth(0.4, 2.0, 3), smooth(0.3, 0.9, 3))), ALBEDO,
+         random(0.5)),
+    cell("phase g", lambda: sunlit(heterogeneous(smooth(0.4, 2.0), smooth(0.3, 0.9), FORWARD)), G, add()),
+    cell("dense, high albedo, density", lambda: inside(dense()), "fog.sigma_t.data", random(4.0), **DENSE),
+    cell("dense, high albedo, albedo", lambda: inside(dense()), "fog.albedo.data", random(0.01), **DENSE),
+]  # fmt: skip
+
+HOMOGENEOUS = [
+    cell("homogeneous density", lambda: cloud(homogeneous(1.0)), MEDIUM + "sigma_t.value.value", add()),
+    cell("homogeneous albedo", lambda: cloud(homogeneous(1.0)), MEDIUM + "albedo.value.value", add()),
+    cell("homogeneous chromatic density", lambda: cloud(rainbow()), MEDIUM + "sigma_t.value.value",
+         add([0.5, 0.4, 0.3])),
+    cell("homogeneous chromatic albedo", lambda: cloud(rainbow()), MEDIUM + "albedo.value.value",
+         add([1.0, 0.8, 0.6]), step=0.1),
+    cell("homogeneous black albedo", lambda: cloud(homogeneous(1.0, 0.0)), MEDIUM + "albedo.value.value", add(), **UP),
+    cell("homogeneous phase g", lambda: sunlit(homogeneous(1.0, 0.8, FORWARD)), G, add()),
+]  # fmt: skip
+
+PLACES = [
+    cell("fog on a lit floor, density", lambda: lit_floor(heterogeneous(smooth(0.4, 2.0), constant(0.4))), DENSITY,
+         random(1.0)),
+    cell("fog on a lit floor, albedo", lambda: lit_floor(heterogeneous(smooth(0.4, 2.0), constant(0.4))), ALBEDO,
+         random(0.5)),
+    cell("floor beside fog", lambda: lit_floor(heterogeneous(smooth(0.4, 2.0), constant(0.4))),
+         "floor.bsdf.reflectance.value", add()),
+    cell("light above fog", lambda: lit_floor(heterogeneous(smooth(0.4, 2.0), constant(0.4))),
+         "light.emitter.radiance.value", add()),
+    cell("sky around fog", smooth_cloud, "sky.data", random(1.0)),
+    cell("sensor inside, density", lambda: inside(heterogeneous(smooth(0.4, 2.0), constant(0.8))), "fog.sigma_t.data",
+         random(1.0)),
+    cell("sensor inside, homogeneous density", lambda: inside(homogeneous(1.0)), "fog.sigma_t.value.value", add()),
+    cell("in glass, density", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", GLASS), DENSITY,
+         random(1.0)),
+    cell("in glass, albedo", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", GLASS), ALBEDO,
+         random(0.5)),
+    cell("in glass, index", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", GLASS), ETA, add(),
+         step=0.08),
+    cell("in glass, index, homogeneous", lambda: cloud(homogeneous(1.0), "sphere", GLASS), ETA, add(), step=0.08),
+    cell("in rough glass, density", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", ROUGH),
+         DENSITY, random(1.0)),
+    cell("in rough glass, homogeneous density", lambda: cloud(homogeneous(1.0), "sphere", ROUGH),
+         MEDIUM + "sigma_t.value.value", add()),
+    cell("behind a pane, its index", lambda: behind_glass(GLASS, uniform()), "pane.bsdf.eta", add(), step=0.08),
+    cell("in a mirror, its index", lambda: in_the_mirror(GLASS, uniform()), "pane.bsdf.eta", add(), step=0.08),
+    cell("moving camera", smooth_cloud, "camera.to_world", translate(0.5, 0.2, 1), step=0.12),
+    cell("nested, outer density", lambda: nested(heterogeneous(smooth(0.4, 2.0)), homogeneous(2.0)),
+         "outer.sigma_t.data", random(1.0)),
+    cell("nested, inner density", lambda: nested(heterogeneous(smooth(0.4, 2.0)), homogeneous(2.0)),
+         "inner.sigma_t.value.value", add()),
+    cell("overlapping, density", lambda: overlapping(homogeneous(1.0), homogeneous(2.0)), MEDIUM +
+         "sigma_t.value.value", add()),
+]  # fmt: skip
+
+PLUGIN = {"plugin": "gridmedium"}
+EMISSION = [
+    cell("gridmedium density", lambda: smooth_cloud(**PLUGIN), DENSITY, random(1.0)),
+    cell("gridmedium albedo", lambda: smooth_cloud(**PLUGIN), ALBEDO, random(0.5)),
+    cell("gridmedium scale", lambda: smooth_cloud(**PLUGIN), MEDIUM + "scale", add()),
+    cell("gridmedium emission", glowing, MEDIUM + "emission.data", random(1.0), reference="pathreplay"),
+    cell("gridmedium emission zero", lambda: glowing(0.0), MEDIUM + "emission.data", random(1.0),
+         reference="pathreplay"),
+    cell("gridmedium density, glowing", lambda: glowing(3.0), DENSITY, random(1.0), reference="pathreplay"),
+    cell("gridmedium scale, glowing", lambda: glowing(3.0), MEDIUM + "scale", add(), reference="pathreplay"),
+    cell("gridmedium albedo, glowing", lambda: glowing(3.0), ALBEDO, random(0.5), reference="pathreplay"),
+]  # fmt: skip
+
+SEED = [
+    cell("listing, smooth density", smooth_cloud, DENSITY, random(1.0), **LISTING),
+    cell("listing, albedo", smooth_cloud, ALBEDO, random(0.5), **LISTING),
+    cell("listing, phase g", lambda: sunlit(heterogeneous(smooth(0.4, 2.0), smooth(0.3, 0.9), FORWARD)), G, add(),
+         **LISTING),
+]  # fmt: skip
+
+CASES = GRIDS + HOMOGENEOUS + PLACES + EMISSION + SEED
+
+QUICK = {
+    "constant density", "binary density, full voxels", "binary density, empty voxels", "black albedo",
+    "chromatic density", "phase g", "homogeneous chromatic density", "fog on a lit floor, density",
+    "sensor inside, density", "in glass, index, homogeneous", "gridmedium scale", "gridmedium emission",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, id=c.name, marks=() if c.name in QUICK else pytest.mark.slow) for c in CASES]
+)
+def test_gradient_against_finite_differences(case: Case) -> None:
+    hold(case)
+
+
+SPECTRAL = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from pathreplay.backend import set_variant
+set_variant("llvm_ad_spectral")
+import test_truth_media, truth
+try:
+    truth.hold(next(c for c in test_truth_media.CASES if c.name == sys.argv[2]))
+finally:
+    print(truth.table())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["smooth density", "homogeneous chromatic density", "homogeneous chromatic albedo"])
+def test_spectral_variant(run_python: Callable[..., Any], name: str) -> None:
+    done = run_python(SPECTRAL, args=(str(Path(__file__).parent), name))
+    print(done.stdout)
+    assert done.returncode == 0, done.stdout + done.stderr
