@@ -8,6 +8,7 @@ that is no less probable than a normal deviate of `Z_MAX`, for pixels and for bl
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -312,6 +313,7 @@ QUICK = {
     "spec", [pytest.param(p, id=p.name, marks=() if p.name in QUICK else pytest.mark.slow) for p in PICTURES]
 )
 def test_picture_against_volpath(spec: Picture) -> None:
+    gc.collect()  # of scenes that go while a kernel is traced, Dr.Jit loses count, and aborts
     scene = spec.load()
     theirs = pictures(spec.reference(), "volpath", 1000, **spec.options)
     ours = compare(pictures(scene, "pathreplay", 1, **spec.options), theirs)
