@@ -13,24 +13,27 @@ from .errors import PathreplayError
 from .gradient.adjoint import LostPaths
 from .gradient.baseline import Baseline
 from .gradient.forward import forward
+from .gradient.listing import listing
 from .gradient.primal import primal
 from .gradient.ray_jacobian import Recovery
 from .gradient.replay import replay
 from .gradient.sweep import MAX_DEPTH, deepest, sweep
-from .transport.media import scene_media
+from .transport.media import has_empty_voxels, scene_media
 from .transport.traits import Traits, nodes_of, scene_traits
 from .transport.vertex import Walk
 
 DRIVERS = ("auto", "sweep", "replay")
 ATTACH = ("delta", "all", "none")
+VOLUME_GRADIENTS = ("score", "listing")
+BRANCH = ("auto", True, False)
 UNBOUNDED = 0xFFFFFFFF
 
 
-def _choice(props: Any, name: str, default: str, choices: tuple[str, ...]) -> str:
+def _choice(props: Any, name: str, default: Any, choices: tuple[Any, ...]) -> Any:
     value = props.get(name, default)
     if value not in choices:
         raise PathreplayError(f"pathreplay: {name} = {value!r} is unknown: use one of {', '.join(map(repr, choices))}")
-    return str(value)
+    return value
 
 
 def mendable(error: BaseException) -> BaseException:
@@ -45,14 +48,21 @@ def _make_class() -> type:
     from mitsuba.ad.integrators.common import RBIntegrator
 
     class PathReplayIntegrator(RBIntegrator):  # type: ignore[misc]
-        """Differentiable path tracer for surfaces.
+        """Differentiable path tracer for surfaces and media.
 
         Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
         (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``,
-        ``none``) and ``noise`` (0.01; of ray adjoints with the replay driver: see `Recovery`). ``auto`` sweeps unless
-        ``max_depth`` is more than the sweep can hold. Forward mode is the same whatever the driver.
+        ``none``), ``noise`` (0.01; of ray adjoints with the replay driver: see `Recovery`), ``volume_gradient``
+        (``score``, ``listing``) and ``branch`` (``auto``, True, False). ``auto`` drivers sweep unless ``max_depth`` is
+        more than the sweep can hold. Forward mode is the same whatever the driver.
 
-        Not differentiated: visibility; with ``attach='none'`` all motion of shapes, cameras and directions.
+        ``volume_gradient='score'`` differentiates media where paths went, less a baseline that is learned from earlier
+        gradient passes of this integrator (with other seeds); ``listing`` is delta tracking as first published.
+        ``branch`` walks one more path from where a medium is empty; ``auto`` does so where a grid with gradients has
+        voxels without extinction.
+
+        Not differentiated: visibility; with ``attach='none'`` all motion of shapes, cameras and directions; by
+        extinction where it is zero if ``branch`` is off; with the replay driver, by weights that are exactly zero.
         Raises PathreplayError for unknown or unusable properties and in polarised variants.
         """
 
@@ -77,7 +87,12 @@ def _make_class() -> type:
                     f"pathreplay: max_depth = {depth} is more than the sweep driver can hold ({MAX_DEPTH}): "
                     "use driver = 'replay', which has no limit"
                 )
+            self.auto = driver == "auto"
+            if self.auto:
+                driver = "sweep" if self.max_depth <= MAX_DEPTH else "replay"
             self.driver = driver
+            self.volume_gradient = _choice(props, "volume_gradient", "score", VOLUME_GRADIENTS)
+            self.branch = _choice(props, "branch", "auto", BRANCH)
             noise = props.get("noise", Recovery.noise)
             if noise < 0:
                 raise PathreplayError(f"pathreplay: noise = {noise}: use a standard deviation >= 0 (0 = off)")
@@ -86,6 +101,9 @@ def _make_class() -> type:
             self.lost: tuple[LostPaths, int] | None = None  # of how many paths
             self.sensor: Any = None  # that is rendered
             self.baseline: tuple[int, Baseline] | None = None  # and the scene that it belongs to
+            self.learner: Baseline | None = None  # the same, in a pass that it may learn from
+            self.seed: Any = None  # of the pass, with what else tells passes apart
+            self.seeds: set[Any] = set()  # of the passes that it has learned from
 
         def sample(
             self,
@@ -98,7 +116,7 @@ def _make_class() -> type:
             **_: Any,
         ) -> tuple[Any, Any, list[Any], Any]:
             """Radiance, its tangent, or nothing (after back-propagating ``δL``): see Mitsuba's ADIntegrator."""
-            walk = self._walk(scene)
+            walk = self._walk(scene, mode != dr.ADMode.Primal)
             if mode == dr.ADMode.Primal:
                 L, valid = primal(walk, sampler, dr.detach(ray), active)
                 return L, valid, [], None
@@ -119,10 +137,16 @@ def _make_class() -> type:
                 return tangent, valid, [], None
             lost = LostPaths()
             driver = self.driver
-            if driver == "auto":
-                driver = "sweep" if self.max_depth <= deepest(walk) else "replay"
-            if driver == "sweep":
-                moves = sweep(walk, sampler, ray, δL, active, lost, self.baseline and self.baseline[1])
+            if self.auto and self.max_depth > deepest(walk):
+                driver = "replay"
+            moves = False
+            if walk.media is not None and self.volume_gradient == "listing":
+                listing(walk, sampler, ray, δL, active)
+            elif driver == "sweep":
+                if walk.baseline is not None and self.baseline is not None:
+                    self.learner = self.baseline[1]
+                    self.seeds.add(self.seed)
+                moves = sweep(walk, sampler, ray, δL, active, lost, self.learner)
             else:
                 moves = replay(walk, sampler, ray, δL, active, lost, self.recovery)
             if moves:
@@ -131,40 +155,50 @@ def _make_class() -> type:
             return mi.Spectrum(0), mi.Bool(True), [], None
 
         def render_backward(
-            self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, *args: Any, **kwargs: Any
+            self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
         ) -> None:
             """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
 
             Warns when a part of the gradient was not finite and had to be left out.
             """
-            with self._looking_through(scene, sensor):
-                super().render_backward(scene, params, grad_in, sensor, *args, **kwargs)
+            with self._looking_through(scene, sensor, seed, spp):
+                super().render_backward(scene, params, grad_in, sensor, seed, spp)
             self._tell_lost()
-            if self.baseline is not None:
-                self.baseline[1].absorb()
+            if self.learner is not None:
+                self.learner.absorb()
+                self.learner = None
 
-        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, *args: Any, **kwargs: Any) -> Any:
+        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
 
             The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
             from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
             """
-            with self._looking_through(scene, sensor):
-                tangent = super().render_forward(scene, params, sensor, *args, **kwargs)
+            with self._looking_through(scene, sensor, seed, spp):
+                tangent = super().render_forward(scene, params, sensor, seed, spp)
             if self.lost is not None:
                 dr.eval(tangent)  # in one kernel with the count of lost paths
             self._tell_lost()
             return tangent
 
-        def render(self, scene: Any, sensor: Any = 0, *args: Any, **kwargs: Any) -> Any:
+        def render(
+            self,
+            scene: Any,
+            sensor: Any = 0,
+            seed: Any = 0,
+            spp: int = 0,
+            develop: bool = True,
+            evaluate: bool = True,
+        ) -> Any:
             """Render an image: see Mitsuba's ADIntegrator."""
-            with self._looking_through(scene, sensor):
-                return super().render(scene, sensor, *args, **kwargs)
+            with self._looking_through(scene, sensor, seed, spp):
+                return super().render(scene, sensor, seed, spp, develop, evaluate)
 
         @contextmanager
-        def _looking_through(self, scene: Any, sensor: Any) -> Iterator[None]:
-            """Remember the sensor, which may be in a medium, and make errors plain."""
+        def _looking_through(self, scene: Any, sensor: Any, seed: Any, spp: int) -> Iterator[None]:
+            """Remember the sensor, which may be in a medium, and what tells passes apart; make errors plain."""
             self.sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            self.seed = (seed if isinstance(seed, int) else int(seed[0]), spp, self.sensor.ptr)
             try:
                 yield
             except RuntimeError as error:
@@ -175,14 +209,15 @@ def _make_class() -> type:
             finally:
                 self.sensor = None
 
-        def _walk(self, scene: Any) -> Walk:
+        def _walk(self, scene: Any, differentiate: bool) -> Walk:
             nodes = nodes_of(scene)
             media = scene_media(nodes, self.sensor)
             return Walk(
                 scene=scene,
                 traits=scene_traits(nodes, scene, media is not None),
                 media=media,
-                baseline=None if media is None else self._baseline(scene).look,
+                baseline=None if media is None else self._baseline(scene),
+                branch=media is not None and differentiate and self._branches(nodes),
                 attach=self.attach,
                 hide_emitters=self.hide_emitters,
                 max_depth=self.max_depth,
@@ -190,11 +225,21 @@ def _make_class() -> type:
                 skip_area_emitters=self.skip_area_emitters,
             )
 
-        def _baseline(self, scene: Any) -> Baseline:
-            """What was learned of this scene so far; another scene starts anew."""
+        def _baseline(self, scene: Any) -> Any:
+            """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
             if self.baseline is None or self.baseline[0] != scene.ptr:
                 self.baseline = scene.ptr, Baseline(scene.bbox())
-            return self.baseline[1]
+                self.seeds.clear()
+            if self.seed in self.seeds:
+                self._tell_once(
+                    f"seed {self.seed[0]} was used before: a pass cannot serve as baseline for itself, so that this "
+                    "one goes without; give every pass a seed of its own"
+                )
+                return None
+            return self.baseline[1].look
+
+        def _branches(self, nodes: set[Any]) -> bool:
+            return has_empty_voxels(nodes) if self.branch == "auto" else self.branch
 
         def _refuse_instances(self, traits: Traits) -> None:
             if traits.instances_move and self.attach != "none":

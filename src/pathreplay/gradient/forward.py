@@ -11,6 +11,7 @@ from ..transport.motion import path_moves
 from ..transport.path import count, first_arrival, next_arrival, survival, sustain, take_step
 from ..transport.vertex import Numbers, Walk
 from .adjoint import LostPaths, RayDerivative, Replayed, forward_step, tangents
+from .branch import Branch, branch_term
 
 
 @dr.syntax
@@ -37,6 +38,7 @@ def forward(walk: Walk, sampler: Any, ray: Any, active: Any, lost: LostPaths) ->
     valid = mi.Bool(walk.background_is_opaque) & active
     at = first_arrival(walk, ray, active)
     attached = path_moves(walk, ray, at)
+    branch = Branch.none()
 
     while dr.hint(active, exclude=[walk, attached, lost], label="pathreplay: forward"):
         u = Numbers.draw(sampler)
@@ -49,6 +51,8 @@ def forward(walk: Walk, sampler: Any, ray: Any, active: Any, lost: LostPaths) ->
         go_on = step.active & survives & (dr.max(β_alive) != 0)
         at_next = next_arrival(walk, at, step, go_on)
 
+        if dr.hint(walk.branch, mode="scalar"):
+            branch = branch.offer(at, step, β, depth, η, active)
         replayed = Replayed(at, u, step.kept, go_on, at_next.hit, rr_weight)
         depth += count(walk, step)
         step, δe, δw, δ = forward_step(walk, replayed, attached, δ, active)
@@ -64,4 +68,7 @@ def forward(walk: Walk, sampler: Any, ray: Any, active: Any, lost: LostPaths) ->
         active = go_on
         at = at_next
 
+    if dr.hint(walk.branch, mode="scalar"):
+        with dr.resume_grad():
+            δL += tangents(branch_term(walk, branch, sampler, dr.detach(ray)))[0]
     return δL, valid, attached

@@ -8,22 +8,31 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.path import count, first_arrival, next_arrival, survival, take_step
-from ..transport.vertex import Numbers, Walk
+from ..transport.vertex import Arrival, Numbers, Walk
 
 
-@dr.syntax
 def primal(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
     """Estimate the radiance along camera rays: ``(L, valid)``, a Spectrum and a Bool per ray.
 
-    ``valid`` is Mitsuba's alpha: the path met a particle, or a surface that does not merely let it pass. Nothing is differentiated.
+    ``valid`` is Mitsuba's alpha: the path met a particle, or a surface that does not merely let it pass. Nothing is
+    differentiated.
+    """
+    active = mi.Bool(active) & (walk.max_depth > 0)
+    at = first_arrival(walk, ray, active)
+    L, valid = walk_on(walk, sampler, at, mi.UInt32(0), mi.Float(1), active)
+    return L, valid | (walk.background_is_opaque & active)
+
+
+@dr.syntax
+def walk_on(walk: Walk, sampler: Any, at: Arrival, depth: Any, η: Any, active: Any) -> tuple[Any, Any]:
+    """Radiance (Spectrum) that arrives along ``at.ray``, and whether anything was met, from a vertex of a path on.
+
+    ``depth`` (UInt32) are the vertices before, and ``η`` the relative index of refraction since the camera.
     """
     L = mi.Spectrum(0)  # radiance so far
     β = mi.Spectrum(1)  # throughput
-    η = mi.Float(1)  # relative index of refraction since the camera
-    depth = mi.UInt32(0)  # vertices before
-    active = mi.Bool(active) & (walk.max_depth > 0)
-    valid = mi.Bool(walk.background_is_opaque) & active
-    at = first_arrival(walk, ray, active)
+    depth, η = mi.UInt32(depth), mi.Float(η)
+    active, valid = mi.Bool(active), mi.Bool(False)
 
     while dr.hint(active, exclude=[walk], label="pathreplay: primal"):
         u = Numbers.draw(sampler)

@@ -23,12 +23,14 @@ def record_type(walk: Walk) -> type:
     media = walk.media
     return _record_type(
         mi.variant(), walk.resamples or media is not None, media is not None, bool(media and media.chromatic),
-        bool(media and media.emissive), bool(media and media.passes),
+        bool(media and media.emissive), bool(media and media.passes), walk.branch,
     )  # fmt: skip
 
 
 @cache
-def _record_type(variant: str, resamples: bool, media: bool, chromatic: bool, emissive: bool, passes: bool) -> type:
+def _record_type(
+    variant: str, resamples: bool, media: bool, chromatic: bool, emissive: bool, passes: bool, branch: bool
+) -> type:
     fields = {
         "o": mi.Point3f,  # ray
         "d": mi.Vector3f,
@@ -64,6 +66,8 @@ def _record_type(variant: str, resamples: bool, media: bool, chromatic: bool, em
         fields |= {"t_emit": mi.Float, "c_emit": mi.Spectrum}
     if passes:
         fields |= {"chance": mi.Float}  # density of the continuation, also where it passes straight through
+    if branch:
+        fields |= {"p": mi.Float}
     return make_dataclass("Record", list(fields.items()))
 
 
@@ -110,6 +114,7 @@ def record(walk: Walk, at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: 
             "t_emit": flight.t_emit,
             "c_emit": flight.c_emit,
             "chance": kept.pdf,
+            "p": flight.p,
         }
     names = Record.__dataclass_fields__  # type: ignore[attr-defined]
     return Record(**{name: value for name, value in fields.items() if name in names})
@@ -165,6 +170,7 @@ def continuation_of(walk: Walk, read: Any, onward: Arrival) -> Kept:
         density=read.density,
         W=read.W if walk.media.chromatic else mi.Spectrum(1),
         along=read.along,
+        p=read.p if walk.branch else None,
     )
     if walk.media.emissive:
         kept.flight.t_emit, kept.flight.c_emit = read.t_emit, read.c_emit

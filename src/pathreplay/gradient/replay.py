@@ -13,18 +13,19 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import PathreplayError
 from ..transport.motion import path_moves
 from ..transport.path import count, first_arrival, next_arrival, repeat_step, survival, take_step
 from ..transport.vertex import Numbers, Walk, reciprocal
 from .adjoint import LostPaths, backward
+from .branch import Branch, branch_term
 from .primal import primal
 from .ray_jacobian import Recovery, has_smooth_lobes
 from .replay_attached import replay_attached
+from .sweep import MAX_DEPTH_MEDIA
 
 
-def replay(
-    walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostPaths, recovery: Recovery
-) -> bool:
+def replay(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostPaths, recovery: Recovery) -> bool:
     """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
 
     ``ray`` may be attached to the camera. Returns whether the path moves with the parameters; if so, ``recovery`` says
@@ -36,6 +37,11 @@ def replay(
     moves = path_moves(walk, ray, first_arrival(walk, ray, active))
     if not moves:
         _replay_still(walk, sampler, ray, δL, active)
+    elif walk.media is not None:
+        raise PathreplayError(
+            "driver = 'replay' cannot follow paths that move through media: use driver = 'sweep', "
+            f"with max_depth of at most {MAX_DEPTH_MEDIA}"
+        )
     else:
         if has_smooth_lobes(walk):
             _warn_of_smooth_lobes()
@@ -68,12 +74,15 @@ def _replay_still(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> 
     depth = mi.UInt32(0)  # vertices before
     active = mi.Bool(active) & (walk.max_depth > 0)
     at = first_arrival(walk, ray, active)
+    branch = Branch.none()
 
     while dr.hint(active, exclude=[walk], label="pathreplay: replay"):
         u = Numbers.draw(sampler)
         go_on = depth + 1 < walk.max_depth
         step = take_step(walk, at, u, sampler, β, go_on, active)
         L -= β * step.e
+        if dr.hint(walk.branch, mode="scalar"):
+            branch = branch.offer(at, step, β, depth, η, active)
 
         with dr.resume_grad():
             held = repeat_step(walk, at, u, step.kept, step.active, active)
@@ -88,3 +97,9 @@ def _replay_still(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> 
 
         at = next_arrival(walk, at, step, active)
         depth += count(walk, step)
+
+    if dr.hint(walk.branch, mode="scalar"):
+        with dr.resume_grad():
+            term = branch_term(walk, branch, sampler, dr.detach(ray))
+            if dr.hint(dr.grad_enabled(term), mode="scalar"):
+                backward(dr.sum(δL * term))

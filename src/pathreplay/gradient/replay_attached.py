@@ -136,4 +136,3 @@ def replay_attached(
 
         β, at, active = β_next, at_next, v.go_on
         depth += 1
-

@@ -17,6 +17,7 @@ from ..transport.path import count, first_arrival, next_arrival, survival, susta
 from ..transport.vertex import Numbers, Walk
 from .adjoint import LostPaths, RayDerivative, Replayed, backward, backward_step
 from .baseline import Baseline
+from .branch import Branch, branch_term
 from .record import arrival_of, continuation_of, numbers_of, record, record_type
 
 # Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x about 100 bytes are 3.3 MB, and a
@@ -33,7 +34,7 @@ def deepest(walk: Walk) -> int:
 
 
 def _records(walk: Walk) -> int:
-    """How many vertices the record has room for: with media also for two null boundaries at each, as convex ones need."""
+    """How many vertices the record has room for: with media also two null boundaries at each, as convex ones need."""
     if walk.media is None:
         return max(walk.max_depth, 1)
     return min(3 * walk.max_depth + 8, MAX_RECORDS_MEDIA)
@@ -46,9 +47,9 @@ def sweep(
     """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
 
     ``ray`` may be attached to the camera. Returns whether the path moves with the parameters; if so, ``lost`` counts
-    paths with an adjoint that was not finite; with media also those that crossed so many null boundaries that they had to
-    end. ``baseline`` learns from this pass, for later ones. A weight that is exactly zero keeps its derivative. Not differentiated:
-    visibility and, with ``attach='none'``, everything that moves.
+    paths with an adjoint that was not finite, and those that crossed so many null boundaries between media that they
+    had to end. ``baseline`` learns from this pass, for later ones. A weight that is exactly zero keeps its derivative.
+    Not differentiated: visibility and, with ``attach='none'``, everything that moves.
     Raises PathreplayError when ``max_depth`` is above `MAX_DEPTH`, or when no parameter reaches the paths.
     """
     if dr.hint(walk.max_depth > deepest(walk), mode="scalar"):
@@ -70,6 +71,7 @@ def sweep(
     at = first_arrival(walk, ray, active)
     attached = path_moves(walk, ray, at)
     camera_ray = dr.detach(ray)
+    branch = Branch.none()
 
     while dr.hint(active, exclude=[walk], label="pathreplay: record"):
         u = Numbers.draw(sampler)
@@ -79,6 +81,8 @@ def sweep(
         η *= step.kept.eta
         rr_weight, survives = survival(β_alive, η, depth, u.roulette, walk, step)
         tape[records] = record(walk, at, u, step, β, rr_weight)
+        if dr.hint(walk.branch, mode="scalar"):
+            branch = branch.offer(at, step, β, depth, η, active)
 
         active = step.active & survives & (dr.max(β_alive) != 0)
         β *= step.w * rr_weight
@@ -116,6 +120,14 @@ def sweep(
         if dr.hint(attached, mode="scalar"):
             lost.add(breaks & ~broken)
             broken |= breaks
+
+    # ---------------------- The path that branched --------------------
+
+    if dr.hint(walk.branch, mode="scalar"):
+        with dr.resume_grad():
+            term = branch_term(walk, branch, sampler, camera_ray)
+            if dr.hint(dr.grad_enabled(term), mode="scalar"):
+                backward(dr.sum(δL * term))
 
     # ----------------------- Back to the camera ----------------------
 

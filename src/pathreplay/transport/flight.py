@@ -1,8 +1,8 @@
 """Free flight through a medium: delta tracking to the next real collision, and what later passes make of it.
 
-Tentative collisions are drawn from a majorant; at each, chance decides whether it is real. Real ones end the flight, as
-does the surface that bounds the medium. Nothing in this walk is differentiated. The derivative is that of the integrand,
-transmittance times scattering coefficient, at the place that was found:
+Tentative collisions are drawn from a majorant; at each, chance decides whether it is real. Real ones end the flight,
+as does the surface that bounds the medium. This walk is not differentiated. The derivative is that of the integrand,
+transmittance times scattering coefficient, where it was found:
 
     d log T = -∫ dσ_t ds,  estimated at one uniform point of the flight:  -(t - a) dσ_t(y).
 
@@ -11,6 +11,7 @@ It divides by nothing that may be zero, so that it also holds where null collisi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,20 +31,47 @@ class Flight:
     density: Any  # Float: probability density of a collision there, p σ̄; 1 if there was none
     W: Any  # Spectrum: weight of the null collisions on the way; 1 where the medium is grey
     along: Any  # Float: where on the flight its derivative is taken, in [0, 1)
-    # With emission only, else None:
+    p: Any = None  # Float: probability that the collision was real (if the walk branches, else None)
+    # Of walks with emission only, else None:
     t_emit: Any = None  # Float: distance of the tentative collision at which emission is differentiated
     c_emit: Any = None  # Spectrum: weight of the emission there
     # Only the first walk needs these; they are None in a record that is read back.
     σ_s: Any = None  # Spectrum: scattering coefficient at the collision
     E: Any = None  # Spectrum: emission gathered on the way
+    null: NullCollision | None = None  # one of those on the way, if the walk branches
+
+
+@dataclass
+class NullCollision:
+    """A null collision, kept with a probability proportional to ``mass``: see `branch_weight`."""
+
+    t: Any  # Float: distance
+    ω: Any  # Spectrum: weight of the collision itself, over the probability that it was kept
+    mass: Any  # Float: of all null collisions on the way
+    pick: Any  # Float: a random number, to choose among flights
+
+
+# How much a null collision counts against a real one for the derivative of a collision, at equal probability. Small
+# values leave real collisions alone where there are some; it does not matter where there are none.
+BRANCHING = 0.1
+
+
+def branch_weight(p: Any) -> Any:
+    """1 / (p + c (1 - p)), where p is the probability of a real collision (Float).
+
+    The derivative of a collision, dσ_s L_s, is needed also where σ_s is zero and collisions are never real. Real ones
+    estimate it with p / (p + c (1 - p)) of their weight, and null ones with c (1 - p) / (p + c (1 - p)): together all.
+    """
+    return dr.rcp(p + BRANCHING * (1 - p))
 
 
 @dr.syntax
-def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any) -> Flight:
+def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any, visit: Callable[..., None] | None = None) -> Flight:
     """Sample the flight along ``at.ray``, in ``at.medium``, up to the surface ``at.hit``. Detached.
 
     ``β`` (Spectrum) is the throughput: in chromatic media a collision is real with probability
-    p = Σ_k β_k σ_k / (σ̄ Σ_k β_k), the history of all channels.
+    p = Σ_k β_k σ_k / (σ̄ Σ_k β_k), the history of all channels. ``visit`` is called at every collision, with its
+    MediumInteraction3f, the majorant (Float), and whether it is null and whether it is real (Bool).
     """
     media = walk.media
     ray, medium = dr.detach(at.ray), at.medium
@@ -56,12 +84,14 @@ def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any) -> Flight:
     t = mi.Float(a)
     event = mi.Bool(False)
     density = mi.Float(1)
+    p_real = mi.Float(1)
     W = mi.Spectrum(1)
     σ_s = mi.Spectrum(0)
     E = mi.Spectrum(0)
     t_emit, c_emit, count = mi.Float(0), mi.Spectrum(0), mi.Float(0)
+    t_null, ω_null, mass = mi.Float(0), mi.Spectrum(0), mi.Float(0)
 
-    while dr.hint(flying, exclude=[walk, at, media], label="pathreplay: flight"):
+    while dr.hint(flying, exclude=[walk, at, media, visit], label="pathreplay: flight"):
         u = sampler.next_1d(flying)
         σ_bar = mi.Float(σ_max)
         step = dr.select(σ_bar > 0, -dr.log(1 - u) * dr.rcp(σ_bar), dr.inf)
@@ -98,10 +128,20 @@ def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any) -> Flight:
         p = dr.clip(p, 0, 1)
         real = inside & (sampler.next_1d(inside) < p)
         flying = inside & ~real
+        if dr.hint(visit is not None, mode="scalar"):
+            visit(mei, σ_bar, flying, real)
+        if dr.hint(walk.branch, mode="scalar"):
+            ω = mi.Spectrum(W * (BRANCHING * branch_weight(p) / σ_bar))
+            m = dr.mean(dr.abs(β * ω))
+            mass += dr.select(flying, m, 0)
+            kept = flying & (sampler.next_1d(flying) * mass < m)
+            t_null = dr.select(kept, t_next, t_null)
+            ω_null = dr.select(kept, ω / m, ω_null)
         if dr.hint(media.chromatic, mode="scalar"):
             W = dr.select(flying, W * (1 - σ_t / σ_bar) * reciprocal(1 - p), W)
         event |= real
         density = dr.select(real, p * σ_bar, density)
+        p_real = dr.select(real, p, p_real)
         σ_s = dr.select(real, σ_s_here, σ_s)
         t = dr.select(inside, t_next, t)
 
@@ -109,6 +149,8 @@ def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any) -> Flight:
     flight = Flight(event=event, t=t, density=density, W=W, along=along, σ_s=σ_s)
     if dr.hint(media.emissive, mode="scalar"):
         flight.t_emit, flight.c_emit, flight.E = t_emit, c_emit * count, E
+    if dr.hint(walk.branch, mode="scalar"):
+        flight.p, flight.null = p_real, NullCollision(t_null, ω_null, mass, sampler.next_1d(active))
     return flight
 
 
@@ -151,16 +193,22 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: Any, attached: boo
         length = dr.select(through, end - a, 0)
         at_y = interaction(medium, ray, a + flight.along * length)
 
-    σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
-    _, _, σ_y = medium.get_scattering_coefficients(at_y, through)
-    w = dr.select(event, σ_s * stretch * dr.rcp(flight.density), 1) * flight.W
+    with dr.suspend_grad(when=walk.listing):
+        σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
+        _, _, σ_y = medium.get_scattering_coefficients(at_y, through)
+    w_event = σ_s * stretch * dr.rcp(flight.density)
+    share = mi.Float(1)  # of the derivative of a collision that is estimated by real ones
+    if walk.branch and not attached:
+        share = flight.p * branch_weight(flight.p)
+        w_event = dr.replace_grad(w_event, w_event * share)
+    w = dr.select(event, w_event, 1) * flight.W
     e = mi.Spectrum(0)
     if dr.grad_enabled(σ_y, length):
         log_T = dr.select(through, -length * σ_y, 0)
         w *= dr.replace_grad(mi.Spectrum(1), log_T)
         if walk.baseline is not None:
             score = dr.select(through, length * σ_y * walk.baseline(at_y, σ_y, through), 0)
-            score -= dr.select(event, σ_t * dr.rcp(flight.density) * walk.baseline(mei, σ_t, event), 0)
+            score -= dr.select(event, σ_t * (share / flight.density) * walk.baseline(mei, σ_t, event), 0)
             e += score - dr.detach(score)
 
     if walk.media.emissive:
@@ -168,11 +216,15 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: Any, attached: boo
             if grid.emission is not None:
                 glows = in_medium & is_grid(grid, medium) & (flight.t_emit > 0)
                 with dr.suspend_grad(when=not attached):
-                    t = a + (flight.t_emit - dr.detach(a)) * (b - a) / dr.detach(b - a) if attached else flight.t_emit
+                    t, J = flight.t_emit, mi.Float(1)
+                    if attached:
+                        held = glows & dr.isfinite(b0) & (a0 < b0)
+                        scale = dr.select(held, dr.rcp(b0 - a0), 0)
+                        t = dr.select(held, dr.replace_grad(t, a + (t - a0) * scale * (b - a)), t)
+                        J = dr.select(held, dr.replace_grad(J, (b - a) * scale), J)
                     length = dr.select(glows, t - a, 0)
                     at_e = interaction(medium, ray, t)
                     at_y = interaction(medium, ray, a + flight.along * length)
-                    J = (b - a) / dr.detach(b - a) if attached else mi.Float(1)
                 ε = grid.emission_at(at_e, glows) * flight.c_emit * J
                 if dr.grad_enabled(σ_y, length):
                     _, _, σ_y = medium.get_scattering_coefficients(at_y, glows)

@@ -13,10 +13,10 @@ import mitsuba as mi
 class Media:
     """What the walk wants to know about the media of a scene.
 
-    ``grids`` are the media that have functions of their own for free flight and transmittance (`gridmedium`). The others
-    are known to Mitsuba only: ``plain`` says that there are any, ``homogeneous`` that some have the same coefficients
-    everywhere. ``chromatic`` says that some extinction differs between channels, ``emissive`` that some medium emits,
-    ``passes`` that some surface may also let light straight through by chance. ``around`` is the medium of the sensor.
+    ``grids`` are the media that have functions of their own for free flight and transmittance (`gridmedium`). The
+    others are known to Mitsuba only: ``plain`` says that there are any, ``homogeneous`` that some have the same
+    coefficients everywhere. ``chromatic`` says that some extinction differs between channels, ``emissive`` that some
+    medium emits, ``passes`` that some surface may let light straight through by chance. ``around`` is the sensor's.
     """
 
     grids: tuple[Any, ...]
@@ -70,6 +70,24 @@ def _medium_around(sensor: Any) -> Any:
 
     sensor.traverse(Collector())
     return found[0] if found else None
+
+
+def has_empty_voxels(nodes: set[Any]) -> bool:
+    """Whether some grid of extinction has gradients and voxels of zero."""
+    for medium in nodes:
+        if isinstance(medium, mi.Medium):
+            params = mi.traverse(medium)
+            for key in params.keys():
+                if key.startswith("sigma_t.") and _is_starved(params[key]):
+                    return True
+    return False
+
+
+def _is_starved(value: Any) -> bool:
+    with dr.resume_grad():
+        if not (dr.is_tensor_v(value) and dr.grad_enabled(value)):
+            return False
+    return bool(dr.any(dr.detach(value).array == 0))
 
 
 def interaction(medium: Any, ray: Any, t: Any) -> Any:

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .emitters import draw_emitter, emission, redraw_emitter
-from .flight import fly, fly_again
+from .flight import Flight, fly, fly_again
 from .lobes import held_at_hit, scatter
 from .media import interaction
 from .shadow import shadow, shadow_again
@@ -30,12 +30,13 @@ def medium_step(
     kept: Kept | None = None,
     attached: bool = False,
     hit_next: Any = None,
+    flight: Flight | None = None,
 ) -> Step:
     """Evaluate L_i = e_i + w_i L_{i+1} at one vertex, the flight that leads to it included.
 
     A first walk (``kept`` is None) draws the flight and the shadow ray from ``sampler``, choosing real collisions by
-    the throughput ``β``; a later pass has what was kept. Everything else is as `surface_step` says. Null boundaries
-    come back as steps with ``kept.null``, which `next_arrival` does not count as vertices.
+    the throughput ``β``, unless the ``flight`` is given; a later pass has what was kept. Everything else is as
+    `surface_step` says. Null boundaries come back as steps with ``kept.null``, which are not counted as vertices.
     """
     ray, medium = at.ray, at.medium
     with dr.suspend_grad(when=not attached):
@@ -44,11 +45,12 @@ def medium_step(
     # -------------------------- The flight --------------------------
 
     if kept is None:
-        flight = fly(walk, at, sampler, β, active)
+        if flight is None:
+            flight = fly(walk, at, sampler, β, active)
         event = active & flight.event
         mei = interaction(medium, dr.detach(ray), flight.t)
         w_flight = dr.select(event, flight.σ_s * dr.rcp(flight.density), 1) * flight.W
-        e = mi.Spectrum(flight.E) if walk.media.emissive else mi.Spectrum(0)
+        e = mi.Spectrum(0 if flight.E is None else flight.E)
     else:
         event = active & kept.flight.event
         reach = dr.select(si.is_valid(), si.t, dr.inf)
@@ -82,6 +84,7 @@ def medium_step(
         lit &= light.pdf != 0
         leaves = surface & si.is_medium_transition()
         start = dr.select(leaves, si.target_medium(light.d), medium)
+        shaded = lit
         dark = shadow(walk, origin, light, start, sampler, lit)
         lit &= dr.any(dark.T != 0)
         T = dark.T
@@ -99,7 +102,9 @@ def medium_step(
         kept = Kept(
             d=d,
             pdf=dr.select(event, pdf, dr.select(through, 1, sample.pdf)),
-            delta=dr.select(event, ~medium.use_emitter_sampling(), mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)),
+            delta=dr.select(
+                event, ~medium.use_emitter_sampling(), mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+            ),
             null=null,
             black=dr.all(w_surface == 0),
             lobe=dr.select(surface, sample.sampled_component, 0),
@@ -108,6 +113,9 @@ def medium_step(
             light=light,
             flight=flight,
             shadow=dark,
+            origin=origin,
+            start=start,
+            shaded=shaded,
         )
         w_medium = dr.select(pdf > 0, w_medium, 0)
         pdf = kept.pdf
@@ -126,9 +134,11 @@ def medium_step(
 
     f = dr.select(event, f_medium, f)
     mis = dr.select(light.delta, 1, mis_weight(light.pdf, dr.select(event, pdf_medium, pdf_light)))
-    arriving += dr.select(lit, f * Le * T * (mis if attached else dr.detach(mis)), 0)
+    lighting = dr.select(lit, f * Le * T * (mis if attached else dr.detach(mis)), 0)
+    arriving += lighting
     w = dr.select(event, w_medium, dr.select(through, 1, w_surface))
 
+    kept.lighting = w_flight * lighting
     ray_next = origin.spawn_ray(d)
     crossed = (surface | through) & si.is_medium_transition()
     return Step(

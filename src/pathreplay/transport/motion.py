@@ -29,4 +29,3 @@ def path_moves(walk: Walk, ray: Any, at: Arrival) -> bool:
         light, _ = walk.scene.sample_emitter_direction(still, mi.Point2f(0.5), False)
         moving += [light.p, light.d, light.pdf]
         return any(dr.grad_enabled(value) for value in moving)
-

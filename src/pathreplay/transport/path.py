@@ -1,4 +1,4 @@
-"""What all walks share: the first vertex, the step that a scene needs, Russian roulette, and the ray to the next vertex."""
+"""What all walks share: the first vertex, the step that a scene needs, Russian roulette, the ray to the next vertex."""
 
 from __future__ import annotations
 
@@ -37,7 +37,14 @@ def take_step(walk: Walk, at: Arrival, u: Numbers, sampler: Any, β: Any, go_on:
 
 
 def repeat_step(
-    walk: Walk, at: Arrival, u: Numbers, kept: Kept, go_on: Any, active: Any, attached: bool = False, hit_next: Any = None
+    walk: Walk,
+    at: Arrival,
+    u: Numbers,
+    kept: Kept,
+    go_on: Any,
+    active: Any,
+    attached: bool = False,
+    hit_next: Any = None,
 ) -> Step:
     """The same step once more, differentiable: see `surface_step` and `medium_step`."""
     if walk.media is None:
@@ -78,7 +85,7 @@ def sustain(β_alive: Any, β: Any, step: Step) -> Any:
 def next_arrival(walk: Walk, at: Arrival, step: Step, active: Any) -> Arrival:
     """Follow the continuation of a step, which was taken from ``at``, to the next vertex.
 
-    With media a null boundary is not a vertex for multiple importance sampling: what was sampled before it still counts.
+    With media a null boundary is no vertex for multiple importance sampling: what was sampled before it still counts.
     """
     kept, ray = step.kept, step.ray_next
     hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, reorder=False, active=active)

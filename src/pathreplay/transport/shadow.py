@@ -1,11 +1,12 @@
 """Shadow rays through media and null boundaries: ratio tracking, and the derivative of the transmittance it found.
 
-T = exp(-∫ σ_t ds) is estimated by walking from boundary to boundary; in homogeneous media it is known. Its derivative is
-taken at one point y, uniform over the whole length Λ of medium on the ray:  d log T = -Λ dσ_t(y).
+T = exp(-∫ σ_t ds) is estimated by walking from boundary to boundary; in homogeneous media it is known. Its derivative
+is taken at one point y, uniform over the whole length Λ of medium on the ray:  d log T = -Λ dσ_t(y).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,8 +28,19 @@ class Shadow:
 
 
 @dr.syntax
-def shadow(walk: Walk, origin: Any, light: Any, medium: Any, sampler: Any, active: Any) -> Shadow:
-    """Estimate the transmittance from the Interaction3f ``origin``, in ``medium``, to the emitter sample. Detached."""
+def shadow(
+    walk: Walk,
+    origin: Any,
+    light: Any,
+    medium: Any,
+    sampler: Any,
+    active: Any,
+    visit: Callable[..., None] | None = None,
+) -> Shadow:
+    """Estimate the transmittance from the Interaction3f ``origin``, in ``medium``, to the emitter sample. Detached.
+
+    ``visit`` is called at every tentative collision of ratio tracking: see `ratio_tracking`.
+    """
     scene, media = walk.scene, walk.media
     ray = dr.detach(origin.spawn_ray_to(light.p))
     gone = mi.Float(0)  # distance from the origin
@@ -38,7 +50,7 @@ def shadow(walk: Walk, origin: Any, light: Any, medium: Any, sampler: Any, activ
     T = mi.Spectrum(1)
     y, y_medium, length = mi.Float(0), dr.zeros(mi.MediumPtr), mi.Float(0)
 
-    while dr.hint(active, exclude=[walk, scene, media], label="pathreplay: shadow"):
+    while dr.hint(active, exclude=[walk, scene, media, visit], label="pathreplay: shadow"):
         ray.maxt = far - gone
         hit = scene.ray_intersect_preliminary(ray, coherent=False, reorder=False, active=active)
         met = active & hit.is_valid()
@@ -46,7 +58,7 @@ def shadow(walk: Walk, origin: Any, light: Any, medium: Any, sampler: Any, activ
         inside = active & (medium != None)  # noqa: E711
         a, b = span(medium, ray, dr.select(met, hit.t, ray.maxt), inside)
         inside &= a < b
-        T = dr.select(inside, T * _transmittance(walk, medium, ray, a, b, sampler, inside), T)
+        T = dr.select(inside, T * _transmittance(walk, medium, ray, a, b, sampler, inside, visit), T)
         length += b - a
         u = sampler.next_1d(inside) * length
         picked = inside & (u < b - a)
@@ -65,7 +77,9 @@ def shadow(walk: Walk, origin: Any, light: Any, medium: Any, sampler: Any, activ
     return Shadow(T=T, y=y, medium=y_medium, length=length)
 
 
-def _transmittance(walk: Walk, medium: Any, ray: Any, a: Any, b: Any, sampler: Any, active: Any) -> Any:
+def _transmittance(
+    walk: Walk, medium: Any, ray: Any, a: Any, b: Any, sampler: Any, active: Any, visit: Callable[..., None] | None
+) -> Any:
     """An unbiased estimate of the transmittance of one medium between the distances a and b (Spectrum)."""
     media = walk.media
     T = mi.Spectrum(1)
@@ -82,21 +96,29 @@ def _transmittance(walk: Walk, medium: Any, ray: Any, a: Any, b: Any, sampler: A
         T = dr.select(same, mi.Spectrum(dr.exp(-σ_t * (b - a))), T)
         rest &= ~same
     if media.plain:
-        T = dr.select(rest, ratio_tracking(walk, medium, ray, a, b, sampler, rest), T)
+        T = dr.select(rest, ratio_tracking(medium, ray, a, b, sampler, rest, visit), T)
     return T
 
 
 @dr.syntax
-def ratio_tracking(walk: Walk, medium: Any, ray: Any, a: Any, b: Any, sampler: Any, active: Any) -> Any:
-    """T = Π (1 - σ_t/σ̄) over tentative collisions between a and b, with Mitsuba's majorant of the whole medium."""
+def ratio_tracking(
+    medium: Any, ray: Any, a: Any, b: Any, sampler: Any, active: Any, visit: Callable[..., None] | None = None
+) -> Any:
+    """T = Π (1 - σ_t/σ̄) over tentative collisions between a and b, with Mitsuba's majorant of the whole medium.
+
+    ``visit`` is called at every one, with its MediumInteraction3f, the majorant (Float) and where there is one (Bool).
+    """
     σ_bar = majorant(medium, ray, active)
     active = active & (σ_bar > 0)
     t = mi.Float(a)
     T = mi.Spectrum(1)
-    while dr.hint(active, exclude=[walk], label="pathreplay: ratio tracking"):
+    while dr.hint(active, exclude=[visit], label="pathreplay: ratio tracking"):
         t -= dr.log(1 - sampler.next_1d(active)) / σ_bar
         active &= t < b
-        _, _, σ_t = medium.get_scattering_coefficients(interaction(medium, ray, t), active)
+        mei = interaction(medium, ray, t)
+        _, _, σ_t = medium.get_scattering_coefficients(mei, active)
+        if dr.hint(visit is not None, mode="scalar"):
+            visit(mei, σ_bar, active)
         T = dr.select(active, T * (1 - dr.detach(σ_t) / σ_bar), T)
         active &= dr.any(T != 0)
     return T
@@ -121,7 +143,8 @@ def shadow_again(walk: Walk, origin: Any, light: Any, kept: Shadow, attached: bo
         growth = dr.select(between, dr.replace_grad(growth, (b - a) * scale), growth)
     else:
         ray = dr.detach(ray)
-    _, _, σ_t = kept.medium.get_scattering_coefficients(interaction(kept.medium, ray, y), walked)
+    with dr.suspend_grad(when=walk.listing):
+        _, _, σ_t = kept.medium.get_scattering_coefficients(interaction(kept.medium, ray, y), walked)
     if not dr.grad_enabled(σ_t, growth):
         return kept.T
     log_T = dr.select(walked, -kept.length * growth * σ_t, 0)

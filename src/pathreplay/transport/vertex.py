@@ -39,6 +39,8 @@ class Walk:
     skip_area_emitters: Callable[..., Any]  # Mitsuba's, an integrator's method
     media: Media | None = None
     baseline: Callable[..., Any] | None = None
+    branch: bool = False  # keep a null collision of each path, for derivatives where collisions are never real
+    listing: bool = False  # leave the coefficients of media along flights and shadow rays to the `listing` driver
 
     @property
     def resamples(self) -> bool:
@@ -97,6 +99,12 @@ class Kept:
     # Only the first walk needs these; they are None in a record that is read back.
     light: Any = None  # DirectionSample3f of the emitter sample
     eta: Any = None  # Float: relative index of refraction that it crosses
+    # With media only: where the shadow ray started (Interaction3f), in what (MediumPtr), whether there was one (Bool),
+    # and what came of it (Spectrum: a part of e).
+    origin: Any = None
+    start: Any = None
+    shaded: Any = None
+    lighting: Any = None
 
 
 @dataclass

@@ -1,0 +1,94 @@
+"""The branch: one more path from a null collision, for derivatives where collisions are never real.
+
+The derivative of a collision is dσ_s L_s - dσ_t b, with L_s the radiance that it would scatter. Where σ_s is zero no
+path ever scatters, so that nobody knows L_s. One null collision of each path is kept, and an extra path from there
+estimates it; `branch_weight` shares the work with real collisions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.flight import Flight
+from ..transport.media import interaction
+from ..transport.medium_step import medium_step
+from ..transport.path import next_arrival
+from ..transport.vertex import Arrival, Numbers, Step, Walk
+from .primal import walk_on
+
+
+@dataclass
+class Branch:
+    """The null collision that was kept so far (loop state)."""
+
+    p: Any  # Point3f: where
+    d: Any  # Vector3f: direction of the path that came there
+    medium: Any  # MediumPtr
+    weight: Any  # Spectrum: throughput and weight of the collision, over its share of the mass
+    mass: Any  # Float: of all null collisions so far
+    depth: Any  # UInt32: vertices before
+    η: Any  # Float: relative index of refraction since the camera
+
+    @staticmethod
+    def none() -> Branch:
+        return Branch(
+            mi.Point3f(0),
+            mi.Vector3f(0),
+            dr.zeros(mi.MediumPtr),
+            mi.Spectrum(0),
+            mi.Float(0),
+            mi.UInt32(0),
+            mi.Float(1),
+        )
+
+    def offer(self, at: Arrival, step: Step, β: Any, depth: Any, η: Any, active: Any) -> Branch:
+        """This one, or the null collision of one more flight, by their masses."""
+        null = step.kept.flight.null  # type: ignore[union-attr]
+        mass = self.mass + dr.select(active, null.mass, 0)
+        taken = active & (null.pick * mass < null.mass)
+        return Branch(
+            p=dr.select(taken, at.ray.o + null.t * at.ray.d, self.p),
+            d=dr.select(taken, at.ray.d, self.d),
+            medium=dr.select(taken, at.medium, self.medium),
+            weight=mi.Spectrum(dr.select(taken, β * null.ω, self.weight)),
+            mass=mass,
+            depth=dr.select(taken, depth, self.depth),
+            η=dr.select(taken, η, self.η),
+        )
+
+
+def branch_term(walk: Walk, branch: Branch, sampler: Any, ray: Any) -> Any:
+    """Spectrum whose derivative is the branch's part of that of the radiance (its value means nothing).
+
+    Walks the extra path, detached; time and wavelengths are those of the camera ``ray``. Differentiable in the
+    coefficients of the medium. Call it under `dr.resume_grad`.
+    """
+    onward = replace(walk, branch=False)
+    active = branch.mass > 0
+    with dr.suspend_grad():
+        at = Arrival(
+            ray=mi.Ray3f(branch.p, branch.d, ray.time, ray.wavelengths),
+            hit=dr.zeros(mi.PreliminaryIntersection3f),
+            pdf=mi.Float(1),
+            delta=mi.Bool(True),
+            camera=mi.Bool(False),
+            medium=branch.medium,
+            behind=mi.Float(0),
+        )
+        one = mi.Spectrum(1)
+        flight = Flight(event=active, t=mi.Float(0), density=mi.Float(1), W=one, along=mi.Float(0), σ_s=one)
+        u = Numbers.draw(sampler)
+        step = medium_step(onward, at, u, branch.depth + 1 < walk.max_depth, active, sampler, one, flight=flight)
+        at_next = next_arrival(onward, at, step, step.active)
+        L, _ = walk_on(onward, sampler, at_next, branch.depth + 1, branch.η, step.active)
+        L_s = step.e + step.w * L
+    mei = interaction(branch.medium, at.ray, mi.Float(0))
+    σ_s, _, σ_t = branch.medium.get_scattering_coefficients(mei, active)
+    term = σ_s * L_s
+    if walk.baseline is not None:
+        term -= σ_t * walk.baseline(mei, σ_t, active)
+    return dr.select(active, branch.weight * branch.mass * term, 0)
