@@ -97,6 +97,22 @@ def test_config_of_the_example_is_valid() -> None:
 MINIMAL = {"scene": "cornell-box", "parameters": [{"key": "a"}], "target": {"images": ["t.exr"]}}
 BAD_CONFIGS = {
     "unknown key": ({"iteration": 3}, "unknown key 'iteration'; did you mean 'iterations'?"),
+    "resolutions without iterations": (
+        {"parameters": [{"key": "a", "resolutions": [8, 16]}]},
+        "'a': 2 resolutions and 0 entries in refine_at",
+    ),
+    "refined backwards": (
+        {"parameters": [{"key": "a", "resolutions": [4, 8, 16], "refine_at": [20, 10]}]},
+        "'a': refine_at [20, 10] does not increase",
+    ),
+    "refined after the end": (
+        {"parameters": [{"key": "a", "resolutions": [4, 8], "refine_at": [50]}], "iterations": 50},
+        "'a': refine_at 50 is not before the end of the 50 iterations",
+    ),
+    "a pose has no resolutions": (
+        {"parameters": [{"key": "a", "pose": "rigid", "resolutions": [4]}]},
+        "'resolutions' does not go with a pose",
+    ),
     "unknown key of a parameter": (
         {"parameters": [{"key": "a", "upr": 1}]},
         "'parameters.0.upr'; did you mean 'upper'?",

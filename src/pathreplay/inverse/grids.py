@@ -29,7 +29,8 @@ class Levels:
 def make_levels(shape: Sequence[int], longest: Sequence[int], refine_at: Sequence[int]) -> Levels:
     """Levels of a grid of that shape: its longest axis gets ``longest[j]`` entries, the others in proportion."""
     *axes, channels = shape
-    shapes = [(*(max(1, round(n * size / max(axes))) for n in axes), channels) for size in longest]
+    # Mitsuba's bitmaps refuse fewer than two texels on an axis.
+    shapes = [(*(max(min(n, 2), round(n * size / max(axes))) for n in axes), channels) for size in longest]
     return Levels(tuple(shapes), (0, *refine_at))
 
 

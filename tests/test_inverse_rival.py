@@ -1,0 +1,95 @@
+"""A rival: the same job by another integrator in the same time, and pictures judged without their noise."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import safetensors.numpy
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse import make_config, optimize
+from pathreplay.inverse.checkpoint import Entry
+from pathreplay.inverse.grids import rmse
+from pathreplay.inverse.loop import Pace, judged, make_adam, put_values, render_views
+from pathreplay.inverse.problem import build_problem
+from pathreplay.parameters import to_value
+from test_inverse_run import JOB, TEXTURE, interrupt_at, room, run  # noqa: F401 (room: its folder, for every test)
+
+# What the job itself has: its kernels are compiled when the rival's turn comes.
+RIVAL = {"type": "prb", "max_depth": 3}
+# Targets whose own noise is a sixteenth of that of 16 samples per pixel.
+SHARP = {"scene": "room.xml", "spp": 4096, "integrator": {"type": "path", "max_depth": 3}}
+
+
+def history(path: Path) -> list[dict[str, object]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_rival_gets_the_same_time_and_both_are_shown() -> None:
+    result = run(rival=RIVAL)
+    own, others = history(result.folder / "history.jsonl"), history(result.folder / "rival/history.jsonl")
+    spent = [sum(entry["seconds"] for entry in run) for run in (own, others)]
+    # It stops with the first iteration that ends after the time is over.
+    assert spent[1] - others[-1]["seconds"] < spent[0] <= spent[1]
+    for entries in (own, others):
+        assert entries[0]["picture_error"] is not None and entries[-1]["picture_error"] is not None
+        assert entries[-1]["picture_error"] < entries[0]["picture_error"]
+        assert entries[-1]["errors"][TEXTURE] < entries[0]["errors"][TEXTURE]
+    # From the same start with the same seeds.
+    assert others[0]["loss"] == pytest.approx(own[0]["loss"], rel=1e-5)
+    values = safetensors.numpy.load_file(result.folder / "rival/parameters.safetensors")
+    assert values[TEXTURE].shape == result.parameters[TEXTURE].shape
+
+    html = result.report.read_text()
+    assert "Next to prb, in the same time" in html
+    assert len(re.findall(r"<figcaption>rival</figcaption>", html)) == 2  # of both views
+    assert (result.folder / "comparison.svg").exists() and (result.folder / "images/rival-left.png").exists()
+
+
+def test_without_a_rival_nothing_is_judged() -> None:
+    result = run(iterations=1)
+    assert result.history[0].picture_error is None
+    assert not (result.folder / "rival").exists() and "Next to" not in result.report.read_text()
+
+
+def test_a_stopped_job_gets_its_rival_when_it_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        interrupt_at(3, patch)
+        stopped = run(rival=RIVAL)
+    assert stopped.stopped and not (stopped.folder / "rival").exists()
+    assert len(history(optimize(resume=stopped.folder, progress=False).folder / "rival/history.jsonl")) >= 1
+
+
+def test_the_schedule_of_a_rival_follows_its_share_of_the_time() -> None:
+    entries = [Entry(i, 1.0, 0.5, {}) for i in range(3)]
+    assert Pace(100).position(entries) == 3
+    assert Pace(100, seconds=6.0).position(entries) == pytest.approx(25)
+
+
+def test_judgement_is_free_of_the_noise_of_rendering(tmp_path: Path) -> None:
+    """At the truth pictures differ by noise only: the judgement is far below that, and sees the gap off the truth."""
+    config = make_config({**JOB, "spp": 16, "rival": RIVAL, "sensors": ["left"], "target": SHARP})
+    problem = build_problem(config, Path.cwd())
+    at_start = make_adam(problem)
+    put_values(problem, at_start)
+    gap = judged(problem, config, 0)
+    for variable in problem.variables:
+        assert variable.truth is not None
+        at_start[variable.key] = to_value(variable.like, variable.truth)
+    put_values(problem, at_start)
+    noisy = rmse(render_views(problem, config)["left"], problem.views[0].target)
+    left = max(judged(problem, config, i) for i in range(4))
+    assert left < 0.1 * gap and left < 0.3 * noisy
+
+
+@pytest.mark.parametrize(
+    ("rival", "words"),
+    [({"type": "path"}, "'path' computes no gradients"), ({"type": "prbb"}, "'prbb' cannot be made")],
+)
+def test_a_rival_that_cannot_run_is_told_before_anything_is_rendered(rival: dict[str, object], words: str) -> None:
+    with pytest.raises(PathreplayError, match=words):
+        run(rival=rival)
+    assert not Path("runs").exists()
