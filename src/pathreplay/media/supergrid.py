@@ -22,10 +22,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-#: Voxels along the side of the smallest cell. Cells of 2 halve the tentative collisions at best and double the steps.
+#: Voxels along the side of the smallest cell. With 2, images of 64³ grids gain nothing up to an optical thickness of 100.
 BASE = 4
-#: Cost of a step from cell to cell over that of a tentative collision (0.7 ms to 2.1 ms for 2^18 rays on two cores).
-STEP_COST = 1 / 3
+#: Cost of a step from cell to cell over that of a tentative collision: images of 64³ grids take the same CPU time from 0.1
+#: to 0.2, up to a fifth more at 0.33.
+STEP_COST = 0.15
 
 
 @dataclass(frozen=True)
