@@ -11,9 +11,8 @@ import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.grids import rmse
-from pathreplay.inverse.loop import Pace, judged, make_adam, put_values, render_views
+from pathreplay.inverse.loop import judged, new_run, put_values, render_views
 from pathreplay.inverse.problem import build_problem
 from pathreplay.parameters import to_value
 from test_inverse_run import JOB, TEXTURE, interrupt_at, room, run  # noqa: F401 (room: its folder, for every test)
@@ -55,31 +54,36 @@ def test_without_a_rival_nothing_is_judged() -> None:
     assert not (result.folder / "rival").exists() and "Next to" not in result.report.read_text()
 
 
-def test_a_stopped_job_gets_its_rival_when_it_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stopped_rival_goes_on_with_its_job(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         interrupt_at(3, patch)
         stopped = run(rival=RIVAL)
-    assert stopped.stopped and not (stopped.folder / "rival").exists()
-    assert len(history(optimize(resume=stopped.folder, progress=False).folder / "rival/history.jsonl")) >= 1
+    before = history(stopped.folder / "rival/history.jsonl")
+    assert stopped.stopped and len(before) >= 1
+    after = history(optimize(resume=stopped.folder, progress=False).folder / "rival/history.jsonl")
+    assert (
+        len(after) > len(before) and after[: len(before) - 1] == before[:-1]
+    )  # the last one is judged when it is over
 
 
-def test_the_schedule_of_a_rival_follows_its_share_of_the_time() -> None:
-    entries = [Entry(i, 1.0, 0.5, {}) for i in range(3)]
-    assert Pace(100).position(entries) == 3
-    assert Pace(100, seconds=6.0).position(entries) == pytest.approx(25)
+def test_a_rival_goes_through_the_same_resolutions() -> None:
+    grid = [{"key": TEXTURE, "initial": 0.5, "lower": 0.0, "upper": 1.0, "resolutions": [2, 5], "refine_at": [3]}]
+    result = run(rival=RIVAL, parameters=grid)
+    values = safetensors.numpy.load_file(result.folder / "rival/parameters.safetensors")
+    assert values[TEXTURE].shape == result.parameters[TEXTURE].shape == (5, 5, 3)
 
 
 def test_judgement_is_free_of_the_noise_of_rendering(tmp_path: Path) -> None:
     """At the truth pictures differ by noise only: the judgement is far below that, and sees the gap off the truth."""
     config = make_config({**JOB, "spp": 16, "rival": RIVAL, "sensors": ["left"], "target": SHARP})
     problem = build_problem(config, Path.cwd())
-    at_start = make_adam(problem)
-    put_values(problem, at_start)
+    adam = new_run(problem, problem.integrator).adam
+    put_values(problem, adam)
     gap = judged(problem, config, 0)
     for variable in problem.variables:
         assert variable.truth is not None
-        at_start[variable.key] = to_value(variable.like, variable.truth)
-    put_values(problem, at_start)
+        adam[variable.key] = to_value(variable.like, variable.truth)
+    put_values(problem, adam)
     noisy = rmse(render_views(problem, config)["left"], problem.views[0].target)
     left = max(judged(problem, config, i) for i in range(4))
     assert left < 0.1 * gap and left < 0.3 * noisy

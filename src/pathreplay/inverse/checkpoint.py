@@ -38,8 +38,8 @@ class Entry:
     picture_error: float | None = None
 
 
-def save(adam: Adam, iteration: int, history: list[Entry]) -> bytes:
-    """The state after ``iteration`` completed iterations, as the bytes of a safetensors file."""
+def save(adam: Adam, history: list[Entry]) -> bytes:
+    """The state after the iterations of ``history``, as the bytes of a safetensors file."""
     tensors: dict[str, Array] = {}
     steps: dict[str, int] = {}
     state: dict[str, Any] = adam.state
@@ -49,15 +49,14 @@ def save(adam: Adam, iteration: int, history: list[Entry]) -> bytes:
         tensors[f"second:{key}"] = get_array(second)
         steps[key] = int(step[0])
     metadata = {
-        "iteration": str(iteration),
         "steps": json.dumps(steps),
         "history": json.dumps([asdict(entry) for entry in history]),
     }
     return safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata)
 
 
-def restore(path: Path, adam: Adam, refined: Collection[str] = ()) -> tuple[int, list[Entry]]:
-    """Put the saved state into ``adam``, which already holds the same variables; returns iteration and history.
+def restore(path: Path, adam: Adam, refined: Collection[str] = ()) -> list[Entry]:
+    """Put the saved state into ``adam``, which already holds the same variables; returns the history.
 
     Variables in ``refined`` take the shape that they had when they were saved.
 
@@ -70,7 +69,6 @@ def restore(path: Path, adam: Adam, refined: Collection[str] = ()) -> tuple[int,
             tensors = {name: file.get_tensor(name) for name in file.keys()}
         steps = json.loads(metadata["steps"])
         history = [Entry(**entry) for entry in json.loads(metadata["history"])]
-        iteration = int(metadata["iteration"])
     except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise PathreplayError(f"Checkpoint {path} cannot be read ({error}); start the job from its config") from None
     if set(steps) != set(adam.state):
@@ -86,4 +84,4 @@ def restore(path: Path, adam: Adam, refined: Collection[str] = ()) -> tuple[int,
         dr.enable_grad(stored)
         moments = (to_value(first, tensors[f"first:{key}"]), to_value(second, tensors[f"second:{key}"]))
         adam.state[key] = (stored, promoted, rate, (type(count)(step), *moments, greatest))
-    return iteration, history
+    return history

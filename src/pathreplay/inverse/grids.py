@@ -21,9 +21,9 @@ class Levels:
     shapes: tuple[tuple[int, ...], ...]
     begins: tuple[int, ...]
 
-    def shape_at(self, position: float) -> tuple[int, ...]:
-        """The shape that the grid should have at a position in the run, counted in iterations."""
-        return max((b, s) for b, s in zip(self.begins, self.shapes, strict=True) if b <= position)[1]
+    def shape_at(self, iteration: int) -> tuple[int, ...]:
+        """The shape that the grid should have in an iteration."""
+        return max((b, s) for b, s in zip(self.begins, self.shapes, strict=True) if b <= iteration)[1]
 
 
 def make_levels(shape: Sequence[int], longest: Sequence[int], refine_at: Sequence[int]) -> Levels:

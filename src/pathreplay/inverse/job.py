@@ -10,20 +10,26 @@ from typing import Any
 
 import numpy as np
 import safetensors.numpy
-from drjit.opt import Adam
 
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes, read_image
-from pathreplay.inverse.loop import Pace, ctrl_c_stops, iterate, make_adam, put_values, render_views, scene_values
+from pathreplay.inverse.loop import Run, ctrl_c_stops, iterate, new_run, put_values, render_views, scene_values
 from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
 from pathreplay.inverse.report import Outcome, Recovered, RecoveredPose, ViewPictures, report_files
-from pathreplay.inverse.rival import Rival, run_rival
-from pathreplay.inverse.run_folder import CHECKPOINT, RunFolder, create_run_folder, default_output, open_run_folder
+from pathreplay.inverse.rival import Rival, finished
+from pathreplay.inverse.run_folder import (
+    CHECKPOINT,
+    RIVAL_CHECKPOINT,
+    RunFolder,
+    create_run_folder,
+    default_output,
+    open_run_folder,
+)
 from pathreplay.inverse.values import Array
 from pathreplay.media.volume_files import vol_bytes
 from pathreplay.parameters import get_array, to_value
@@ -91,39 +97,39 @@ def optimize(
         problem = build_problem(start.config, start.base, start.targets())
         for note in problem.notes:
             bar.note(note)
-        adam = make_adam(problem)
-        history: list[checkpoint.Entry] = []
+        run = new_run(problem, problem.integrator)
+        rival = None if problem.rival is None else new_run(problem, problem.rival)
         if start.folder is None:
-            put_values(problem, adam)
+            put_values(problem, run.adam)
             before = render_views(problem, start.config)
             folder = create_run_folder(start.output, start.config, start.source, start.base)
-            folder.write(_first_files(problem, before, adam))
+            folder.write({**_first_files(problem, before), **_checkpoints(run, rival)})
         else:
             folder = start.folder
             refined = [v.key for v in problem.variables if v.levels is not None]
-            _, history = checkpoint.restore(folder.path / CHECKPOINT, adam, refined)
+            run.history.extend(checkpoint.restore(folder.path / CHECKPOINT, run.adam, refined))
+            if rival is not None:
+                rival.history.extend(checkpoint.restore(folder.path / RIVAL_CHECKPOINT, rival.adam, refined))
             # All iterations but no report: the disk was full at the end. Then only the end is done again.
-            if len(history) >= start.config.iterations and (folder.path / "report.html").exists():
+            if len(run.history) >= start.config.iterations and (folder.path / "report.html").exists():
                 raise PathreplayError(
-                    f"Run {folder.path} has all its {len(history)} iterations; raise 'iterations' in its config"
+                    f"Run {folder.path} has all its {len(run.history)} iterations; raise 'iterations' in its config"
                 )
             before = {view.name: read_image(folder.path / f"images/start-{view.name}.exr") for view in problem.views}
-        bar.start(len(history), start.config.iterations)
+        bar.start(len(run.history), start.config.iterations)
 
         def after(entry: checkpoint.Entry) -> None:
             bar.advance(entry.loss)
             if (entry.iteration + 1) % start.config.checkpoint_every == 0:
-                folder.write({CHECKPOINT: checkpoint.save(adam, len(history), history)})
+                folder.write(_checkpoints(run, rival))
 
         with ctrl_c_stops() as stop:
-            iterate(problem, start.config, adam, history, stop, Pace(start.config.iterations), after)
-            result = render_views(problem, start.config)
-            rival = None
-            if problem.rival is not None and len(history) == start.config.iterations:
-                folder.write({CHECKPOINT: checkpoint.save(adam, len(history), history)})
-                rival = run_rival(problem, start.config, sum(entry.seconds for entry in history), stop, bar)
+            iterate(problem, start.config, run, rival, stop, after)
             bar.say("writing")
-            return _finish(start, folder, problem, adam, history, before, result, rival, variant)
+            result = render_views(problem, start.config)
+            theirs = None if rival is None else finished(problem, start.config, rival)
+            folder.write(_checkpoints(run, rival))
+            return _finish(start, folder, problem, run, before, result, theirs, variant)
 
 
 @dataclass(frozen=True)
@@ -158,25 +164,28 @@ def _resumed(path: Path, config: object, output: object) -> _Start:
     return _Start(job, None if source is None else Path(source), folder.origin, path, folder)
 
 
-def _first_files(problem: Problem, before: dict[str, Image], adam: Adam) -> dict[str, bytes]:
+def _first_files(problem: Problem, before: dict[str, Image]) -> dict[str, bytes]:
     files = {f"images/target-{view.name}.exr": exr_bytes(view.target) for view in problem.views}
-    files |= {f"images/start-{name}.exr": exr_bytes(image) for name, image in before.items()}
-    return {**files, CHECKPOINT: checkpoint.save(adam, 0, [])}
+    return files | {f"images/start-{name}.exr": exr_bytes(image) for name, image in before.items()}
+
+
+def _checkpoints(run: Run, rival: Run | None) -> dict[str, bytes]:
+    files = {CHECKPOINT: checkpoint.save(run.adam, run.history)}
+    return files if rival is None else {**files, RIVAL_CHECKPOINT: checkpoint.save(rival.adam, rival.history)}
 
 
 def _finish(
     start: _Start,
     folder: RunFolder,
     problem: Problem,
-    adam: Adam,
-    history: list[checkpoint.Entry],
+    run: Run,
     before: dict[str, Image],
     result: dict[str, Image],
     rival: Rival | None,
     variant: str,
 ) -> RunResult:
     config = start.config
-    theirs = rival.values if rival else {}
+    adam, history, theirs = run.adam, run.history, rival.values if rival else {}
     # The variables (translations, rotation vectors) and what they make of the scene (transforms).
     values = {key: get_array(value) for key, value in {**adam, **scene_values(problem, adam)}.items()}
     views = tuple(
@@ -197,7 +206,6 @@ def _finish(
         config, start.source, folder.path, views, recovered, poses, tuple(history), variant, problem.notes, rival
     )
     files = {
-        CHECKPOINT: checkpoint.save(adam, len(history), history),
         "parameters.safetensors": safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in values.items()}),
         "parameters.json": _parameters_json(recovered, poses).encode(),
         "history.jsonl": "".join(json.dumps(asdict(entry)) + "\n" for entry in history).encode(),

@@ -27,24 +27,20 @@ from pathreplay.parameters import get_array, to_value
 # Adam's second moment remembers about 1 / (1 - beta_2) steps. Its usual 0.999 outlasts a whole run of a few hundred.
 BETA_1, BETA_2 = 0.9, 0.99
 
-# How often the pictures are judged in a run with a rival: enough for a curve, at a few per cent of its time.
+# How often the pictures are judged in a job with a rival: enough for a curve, at some per cent of its time.
 JUDGEMENTS = 10
 
 
 @dataclass(frozen=True)
-class Pace:
-    """How far a run is, counted in iterations; a rival's by the share that has passed of the ``seconds`` it may take.
+class Run:
+    """An optimisation under way: who differentiates, Adam with the variables, and what happened so far."""
 
-    Learning rates and resolutions follow this position, so a rival goes through the same schedule in the same time.
-    """
+    integrator: mi.Integrator
+    adam: Adam
+    history: list[Entry]
 
-    iterations: int
-    seconds: float | None = None
-
-    def position(self, history: list[Entry]) -> float:
-        if self.seconds is None:
-            return float(len(history))
-        return self.iterations * sum(entry.seconds for entry in history) / self.seconds
+    def seconds(self) -> float:
+        return sum(entry.seconds for entry in self.history)
 
 
 @dataclass(frozen=True)
@@ -77,12 +73,12 @@ def ctrl_c_stops() -> Iterator[Stop]:
         signal.signal(signal.SIGINT, before)
 
 
-def make_adam(problem: Problem) -> Adam:
-    """Adam over the problem's variables at their start values."""
+def new_run(problem: Problem, integrator: mi.Integrator) -> Run:
+    """A run at the problem's start values."""
     adam = Adam(lr=1.0, beta_1=BETA_1, beta_2=BETA_2)
     for variable in problem.variables:
         adam[variable.key] = to_value(variable.like, variable.start)
-    return adam
+    return Run(integrator, adam, [])
 
 
 def put_values(problem: Problem, adam: Adam) -> None:
@@ -100,48 +96,54 @@ def scene_values(problem: Problem, adam: Adam) -> dict[str, Any]:
 
 
 def iterate(
-    problem: Problem,
-    config: Config,
-    adam: Adam,
-    history: list[Entry],
-    stop: Stop,
-    pace: Pace,
-    after: Callable[[Entry], None],
+    problem: Problem, config: Config, run: Run, rival: Run | None, stop: Stop, after: Callable[[Entry], None]
 ) -> None:
-    """Take steps until ``pace`` is at ``config.iterations``; ``after`` is called at the end of each.
+    """Take steps from ``len(run.history)`` to ``config.iterations``; ``after`` is called at the end of each.
 
-    One step: render every view with seeds of its own, back-propagate the mean of the views' losses, step Adam with the
-    learning rate lr·decay^(i / iterations), project every variable into its bounds. A grid whose next resolution is
-    due is interpolated before the step, and Adam starts anew on it. What is differentiated is decided by the
-    integrator; targets, bounds and the seeds' choice of paths are not.
+    After each step the ``rival`` takes as many as bring it to the same number of seconds. Taking turns, both have the
+    same share of a machine whose load changes. Its learning rate and resolutions are those of the job's iteration.
+    """
+    for i in range(len(run.history), config.iterations):
+        take_step(problem, config, run, i)
+        if rival is not None:
+            while rival.seconds() < run.seconds():
+                take_step(problem, config, rival, i)
+            if _due(i, config.iterations):
+                for each in (run, rival):
+                    put_values(problem, each.adam)
+                    each.history[-1] = replace(each.history[-1], picture_error=judged(problem, config, i))
+        after(run.history[-1])
+        if stop.wanted():
+            break
+    put_values(problem, run.adam)
+
+
+def take_step(problem: Problem, config: Config, run: Run, position: int) -> None:
+    """One step, with the learning rates and resolutions of iteration ``position``; adds an entry to the history.
+
+    Render every view with seeds of its own, back-propagate the mean of the views' losses, step Adam with the learning
+    rate lr·decay^(position / iterations), project every variable into its bounds. A grid whose next resolution is due
+    is interpolated before that, and Adam starts anew on it. What is differentiated is decided by the integrator;
+    targets, bounds and the seeds' choice of paths are not.
 
     Raises:
         PathreplayError: the loss is no longer finite.
     """
-    while (position := pace.position(history)) < config.iterations:
-        i = len(history)
-        begin = time.perf_counter()
-        _refine(problem, adam, position)
-        put_values(problem, adam)
-        loss = _loss(problem, config, i)
-        dr.backward(loss)
-        norms, dropped = _gradients(adam)
-        value = float(dr.detach(loss)[0]) if dr.width(loss) else float("nan")
-        if not np.isfinite(value):
-            raise PathreplayError(
-                f"The loss is {value} at iteration {i}; lower the learning rates, or bound the parameters that ran away"
-            )
-        _set_rates(problem, config, adam, position)
-        adam.step()
-        _project(problem, adam)
-        history.append(Entry(i, value, time.perf_counter() - begin, norms, dropped, errors(problem, adam)))
-        if problem.rival is not None and _due(position, pace.position(history), config.iterations):
-            put_values(problem, adam)
-            history[-1] = replace(history[-1], picture_error=judged(problem, config, i))
-        after(history[-1])
-        if stop.wanted():
-            break
+    begin, i, adam = time.perf_counter(), len(run.history), run.adam
+    _refine(problem, adam, position)
     put_values(problem, adam)
+    loss = _loss(problem, config, run.integrator, i)
+    dr.backward(loss)
+    norms, dropped = _gradients(adam)
+    value = float(dr.detach(loss)[0]) if dr.width(loss) else float("nan")
+    if not np.isfinite(value):
+        raise PathreplayError(
+            f"The loss is {value} at iteration {i}; lower the learning rates, or bound the parameters that ran away"
+        )
+    _set_rates(problem, config, adam, position)
+    adam.step()
+    _project(problem, adam)
+    run.history.append(Entry(i, value, time.perf_counter() - begin, norms, dropped, errors(problem, adam)))
 
 
 def render_views(problem: Problem, config: Config) -> dict[str, Image]:
@@ -186,12 +188,12 @@ def judged(problem: Problem, config: Config, iteration: int) -> float:
     return float(np.sqrt(max(total, 0.0)))
 
 
-def _due(before: float, now: float, iterations: int) -> bool:
-    """Whether a judgement is due: in the first step of a run, and in those that cross a tenth of it."""
-    return before == 0 or int(JUDGEMENTS * before / iterations) < int(JUDGEMENTS * now / iterations)
+def _due(i: int, iterations: int) -> bool:
+    """Whether a judgement is due: after the first iteration, and after those with which a tenth of them is done."""
+    return i == 0 or JUDGEMENTS * i // iterations < JUDGEMENTS * (i + 1) // iterations
 
 
-def _refine(problem: Problem, adam: Adam, position: float) -> None:
+def _refine(problem: Problem, adam: Adam, position: int) -> None:
     for variable in problem.variables:
         if variable.levels is None:
             continue
@@ -201,7 +203,7 @@ def _refine(problem: Problem, adam: Adam, position: float) -> None:
             adam[variable.key] = type(value)(resampled(get_array(value), shape))
 
 
-def _loss(problem: Problem, config: Config, iteration: int) -> mi.Float:
+def _loss(problem: Problem, config: Config, integrator: mi.Integrator, iteration: int) -> mi.Float:
     total = mi.Float(0)
     for view in problem.views:
         seed, seed_grad = seeds(config.seed, ITERATION, iteration, view.sensor)
@@ -209,7 +211,7 @@ def _loss(problem: Problem, config: Config, iteration: int) -> mi.Float:
             problem.scene,
             problem.params,
             sensor=view.sensor,
-            integrator=problem.integrator,
+            integrator=integrator,
             spp=config.spp,
             seed=mi.UInt32(seed),
             seed_grad=seed_grad,
@@ -233,7 +235,7 @@ def _gradients(adam: Adam) -> tuple[dict[str, float], int]:
     return norms, dropped
 
 
-def _set_rates(problem: Problem, config: Config, adam: Adam, position: float) -> None:
+def _set_rates(problem: Problem, config: Config, adam: Adam, position: int) -> None:
     decay = config.learning_rate_decay ** (position / config.iterations)
     # Opaque: as a literal the changing rate would be compiled into the kernel anew in every iteration.
     adam.set_learning_rate({v.key: dr.opaque(mi.Float, v.learning_rate * decay) for v in problem.variables})

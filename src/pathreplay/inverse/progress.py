@@ -42,14 +42,10 @@ class Progress:
         """One line that stays, above the bar."""
         self._bar.console.print(f"pathreplay: {text}", markup=False, highlight=False, soft_wrap=True)
 
-    def start(self, done: int, total: int, text: str = "optimizing") -> None:
+    def start(self, done: int, total: int) -> None:
         """Begin to count iterations."""
-        self._bar.reset(self._task, total=total, completed=done, description=text, loss="")
+        self._bar.reset(self._task, total=total, completed=done, description="optimizing", loss="")
 
     def advance(self, loss: float) -> None:
         """One iteration is done."""
         self._bar.update(self._task, advance=1, loss=f"loss {loss:.4g}")
-
-    def reach(self, position: float, loss: float) -> None:
-        """A run that is not counted in iterations is at this position."""
-        self._bar.update(self._task, completed=int(position), loss=f"loss {loss:.4g}")

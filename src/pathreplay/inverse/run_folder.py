@@ -16,6 +16,7 @@ from pathreplay.inverse.config import Config, load_config
 
 PART = ".part"
 CHECKPOINT = "checkpoint.safetensors"
+RIVAL_CHECKPOINT = "rival/checkpoint.safetensors"
 
 
 @dataclass(frozen=True)
