@@ -12,8 +12,10 @@ import pytest
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import images, load_config, make_config
+from pathreplay.inverse.grids import resampled
 from pathreplay.inverse.losses import LOSSES, RELATIVE_FLOOR, find_loss
 from pathreplay.inverse.values import make_value
+from pathreplay.media.volume_files import save_vol
 
 
 @pytest.fixture(autouse=True)
@@ -86,6 +88,18 @@ def test_values_take_the_parameter_s_shape(tmp_path: Path) -> None:
         make_value("k", colour, [1.0, 2.0], tmp_path)
     with pytest.raises(PathreplayError, match="no texture"):
         make_value("k", colour, "t.exr", tmp_path)
+
+
+def test_volume_files_are_values_of_grids(tmp_path: Path) -> None:
+    grid = mi.TensorXf(np.zeros((4, 4, 4, 1), np.float32))
+    data = np.random.default_rng(4).random((2, 3, 4, 1), np.float32)
+    save_vol(tmp_path / "v.vol", data)
+    assert np.array_equal(make_value("k", grid, "v.vol", tmp_path), resampled(data, (4, 4, 4, 1)))
+    save_vol(tmp_path / "rgb.vol", np.zeros((2, 2, 2, 3)))
+    with pytest.raises(PathreplayError, match=r"rgb\.vol has 3 channels, 'k' has 1"):
+        make_value("k", grid, "rgb.vol", tmp_path)
+    with pytest.raises(PathreplayError, match=r"No volume file .*none\.vol"):
+        make_value("k", grid, "none.vol", tmp_path)
 
 
 def test_config_of_the_example_is_valid() -> None:

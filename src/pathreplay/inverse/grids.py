@@ -9,9 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pathreplay.inverse.images import Image
-from pathreplay.inverse.values import Array
+
+Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Parameter values as the user writes them (numbers, colours, image files), in the shape that the scene wants."""
+"""Parameter values as the user writes them (numbers, colours, image and volume files), in the scene's shape."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import Picture, Value
+from pathreplay.inverse.grids import Array, resampled
 from pathreplay.inverse.images import find_image, read_image, resized, with_channels
+from pathreplay.media.volume_files import load_volume
 from pathreplay.parameters import get_array, is_transform
-
-Array = NDArray[np.float32]
 
 
 def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
     """What the user wrote as the new value of the parameter ``key``, in the shape that it has in the scene (``like``).
 
     A number fills every entry; a list is a colour (repeated over a texture) or all entries of a flat array; an image is
-    resampled to the texture's size, and its channels are adapted. ``base`` is where relative image paths start.
+    resampled to the texture's size, and its channels are adapted; a volume is resampled to the grid's. Relative paths
+    start at ``base``.
 
     Raises:
-        PathreplayError: the value does not fit the parameter, or the image is missing, unreadable or not finite.
+        PathreplayError: the value does not fit the parameter, or the file is missing, unreadable or not finite.
     """
     if is_transform(like):
         raise PathreplayError(
@@ -40,6 +40,8 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
                 f"Value of '{key}' has {len(given)} numbers, the parameter takes {width}; list {width}, or give one"
             )
         return np.broadcast_to(given, current.shape).copy()
+    if current.ndim == 4 and isinstance(value, str):
+        return _volume(key, base / value, current.shape)
     picture = value if isinstance(value, Picture) else Picture(image=value)
     if current.ndim != 3:
         raise PathreplayError(
@@ -54,6 +56,13 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
         )
     require_finite_array(f"Image '{picture.image}'", adapted)
     return resized(adapted, current.shape[0], current.shape[1], crop=picture.fit == "crop")
+
+
+def _volume(key: str, path: Path, shape: tuple[int, ...]) -> Array:
+    data = load_volume(path).data
+    if data.shape[3] != shape[3]:
+        raise PathreplayError(f"Volume {path} has {data.shape[3]} channels, '{key}' has {shape[3]}; convert the volume")
+    return resampled(data, shape)
 
 
 def require_finite_array(name: str, array: Array) -> None:
