@@ -302,7 +302,26 @@ def test_an_edge_in_a_dense_medium_makes_no_outliers() -> None:
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, RAYS)
     found = np.array(grid.transmittance(ray, sampler))[0]
-    assert found.std() < 2.5  # exp(RISK · 16 cells) - 1 = 4 is the bound of the variance
+    # The variance is at most exp(RISK · 16 cells) - 1 = 4. With the mean as control nearly all estimates are 0.
+    assert found.std() < 2.5
+    assert abs(found.mean() - 1) < 0.2
+
+
+def test_faint_transmittance_is_unbiased() -> None:
+    """All of the estimates here are below the threshold from which they go on by chance only."""
+    grid = medium(np.random.default_rng(0).random((16, 16, 16)), 14)
+    start = np.random.default_rng(1).random((2, RAYS)).astype(np.float32)
+    ray = mi.Ray3f(mi.Point3f(start[0], start[1], -1), mi.Vector3f(0, 0, 1))
+    truth = transmittance(grid, ray)[0]
+    assert truth.mean() < cellwalk.FAINT / 3
+    sampler = mi.load_dict({"type": "independent"})
+    means = []
+    for seed in range(16):
+        sampler.seed(seed, RAYS)
+        means.append((np.array(grid.transmittance(ray, sampler))[0] - truth).mean())
+    deviation = np.std(means, ddof=1) / np.sqrt(len(means))
+    assert deviation < 0.05 * truth.mean()
+    assert abs(np.mean(means)) < 6 * deviation
 
 
 # --------------------------------------- the same as Mitsuba's heterogeneous ----------------------------------------
@@ -406,6 +425,17 @@ def test_updates_and_new_resolutions_reach_everything() -> None:
         np.testing.assert_array_equal(np.array(ours.table), np.array(theirs.table))
 
 
+def test_the_scale_alone_can_be_updated() -> None:
+    grid = medium(smooth(), 2, supergrid=True)
+    params = mi.traverse(grid)
+    params["scale"] = 30.0
+    params.update()
+    fresh = medium(smooth(), 30, supergrid=True)
+    for ours, theirs in ((grid.flight_cells, fresh.flight_cells), (grid.shadow_cells, fresh.shadow_cells)):
+        np.testing.assert_array_equal(np.array(ours.table), np.array(theirs.table))
+    np.testing.assert_allclose(np.array(grid.majorant), 30 * smooth().max(), rtol=1e-6)
+
+
 def test_only_the_coefficients_follow_the_parameters() -> None:
     grid = medium(smooth(), 20, supergrid=True, emission=0.5)
     params = mi.traverse(grid)
@@ -501,19 +531,19 @@ scene, ours = image("gridmedium")
 np.testing.assert_allclose(ours, image("heterogeneous")[1], rtol=1e-4)
 grid = scene.shapes()[0].interior_medium()
 assert grid.is_chromatic == (not mi.is_monochromatic)
-n = 1 << 14
+n, points = 1 << 12, 100
 sampler = mi.load_dict({"type": "independent"})
 sampler.seed(0, n)
 ray = mi.Ray3f(mi.Point3f(sampler.next_1d(), sampler.next_1d(), -1), mi.Vector3f(0, 0, 1))
 if mi.is_spectral:
     ray.wavelengths = type(ray.wavelengths)(450, 500, 550, 600)
-depth = mi.UnpolarizedSpectrum(0)
-for k in range(200):
-    at = dr.zeros(mi.MediumInteraction3f)
-    at.p, at.wavelengths = mi.Point3f(ray.o.x, ray.o.y, (k + 0.5) / 200), ray.wavelengths
-    depth += grid.get_scattering_coefficients(at)[2] / 200
-    dr.eval(depth)
-error = np.array(grid.transmittance(ray, sampler) - dr.exp(-depth))
+at = dr.zeros(mi.MediumInteraction3f, n * points)
+along = (dr.arange(mi.UInt32, n * points) % points + 0.5) / points
+at.p = mi.Point3f(dr.repeat(ray.o.x, points), dr.repeat(ray.o.y, points), along)
+at.wavelengths = dr.repeat(ray.wavelengths, points) if dr.width(ray.wavelengths) > 1 else ray.wavelengths
+coefficients = np.array(grid.get_scattering_coefficients(at)[2])
+truth = np.exp(-coefficients.reshape(-1, n, points).mean(axis=2))
+error = np.array(grid.transmittance(ray, sampler)) - truth
 z = error.mean(axis=1) / error.std(axis=1) * np.sqrt(n)
 assert (np.abs(z) < 4).all(), z
 t, m = grid.free_flight(ray, sampler.next_1d())
