@@ -45,8 +45,8 @@ def cell(name: str, scene: Callable[[], dict], key: str, move: Move, **options: 
         "stencil": WIDE,
         "step": 0.15,
         "depth": 8,
-        "spp": 256,
-        "reference_spp": 512,
+        "spp": 32,
+        "reference_spp": 128,
         "lanes": None,
         "peer": True,
     }
@@ -79,7 +79,9 @@ GLASS = {"type": "smoothdielectric"}
 ROUGH = {"type": "roughdielectric", "alpha": 0.3}
 ETA = "object.bsdf.eta"
 LISTING = {"options": {"volume_gradient": "listing"}}
-DENSE = {"depth": 512, "rr_depth": 1000, "spp": 32, "reference_spp": 12, "step": 0.4}
+DENSE = {"depth": 512, "rr_depth": 1000, "spp": 4, "reference_spp": 8, "step": 0.4}
+MOVES = {"step": 0.08, "drivers": ("sweep",)}  # the replay driver refuses paths that move through media
+BLACK = {"stencil": UPWARD, "step": 0.1, "drivers": ("sweep",)}  # the replay driver divides by the weight
 UP = {"stencil": UPWARD, "step": 0.1}
 
 GRIDS = [
@@ -90,10 +92,10 @@ GRIDS = [
     cell("binary density, empty voxels", lambda: cloud(heterogeneous(checkers(), constant(0.6), scale=2.0)), DENSITY,
          where(1 - checkers()), **UP),
     cell("albedo", smooth_cloud, ALBEDO, random(0.5)),
-    cell("black albedo", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.0))), ALBEDO, random(1.0), **UP),
+    cell("black albedo", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.0))), ALBEDO, random(1.0), **BLACK),
     cell("black albedo, density", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.0))), DENSITY, random(1.0)),
     cell("one black channel of the albedo", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant((0.8, 0.5, 0.0)))),
-         ALBEDO, where(constant((0.0, 0.0, 1.0))), **UP),
+         ALBEDO, where(constant((0.0, 0.0, 1.0))), **BLACK),
     cell("chromatic density", lambda: cloud(heterogeneous(smooth(0.4, 2.0, 3), smooth(0.3, 0.9, 3))), DENSITY,
          random(1.0)),
     cell("chromatic albedo", lambda: cloud(heterogeneous(smooth(0.4, 2.0, 3), smooth(0.3, 0.9, 3))), ALBEDO,
@@ -110,7 +112,8 @@ HOMOGENEOUS = [
          add([0.5, 0.4, 0.3])),
     cell("homogeneous chromatic albedo", lambda: cloud(rainbow()), MEDIUM + "albedo.value.value",
          add([1.0, 0.8, 0.6]), step=0.1),
-    cell("homogeneous black albedo", lambda: cloud(homogeneous(1.0, 0.0)), MEDIUM + "albedo.value.value", add(), **UP),
+    cell("homogeneous black albedo", lambda: cloud(homogeneous(1.0, 0.0)), MEDIUM + "albedo.value.value", add(),
+         **BLACK),
     cell("homogeneous phase g", lambda: sunlit(homogeneous(1.0, 0.8, FORWARD)), G, add()),
 ]  # fmt: skip
 
@@ -132,15 +135,15 @@ PLACES = [
     cell("in glass, albedo", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", GLASS), ALBEDO,
          random(0.5)),
     cell("in glass, index", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", GLASS), ETA, add(),
-         step=0.08),
-    cell("in glass, index, homogeneous", lambda: cloud(homogeneous(1.0), "sphere", GLASS), ETA, add(), step=0.08),
+         **MOVES),
+    cell("in glass, index, homogeneous", lambda: cloud(homogeneous(1.0), "sphere", GLASS), ETA, add(), **MOVES),
     cell("in rough glass, density", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", ROUGH),
          DENSITY, random(1.0)),
     cell("in rough glass, homogeneous density", lambda: cloud(homogeneous(1.0), "sphere", ROUGH),
          MEDIUM + "sigma_t.value.value", add()),
-    cell("behind a pane, its index", lambda: behind_glass(GLASS, uniform()), "pane.bsdf.eta", add(), step=0.08),
-    cell("in a mirror, its index", lambda: in_the_mirror(GLASS, uniform()), "pane.bsdf.eta", add(), step=0.08),
-    cell("moving camera", smooth_cloud, "camera.to_world", translate(0.5, 0.2, 1), step=0.12),
+    cell("behind a pane, its index", lambda: behind_glass(GLASS, uniform()), "pane.bsdf.eta", add(), **MOVES),
+    cell("in a mirror, its index", lambda: in_the_mirror(GLASS, uniform()), "pane.bsdf.eta", add(), **MOVES),
+    cell("moving camera", smooth_cloud, "camera.to_world", translate(0.5, 0.2, 1), **{**MOVES, "step": 0.12}),
     cell("nested, outer density", lambda: nested(heterogeneous(smooth(0.4, 2.0)), homogeneous(2.0)),
          "outer.sigma_t.data", random(1.0)),
     cell("nested, inner density", lambda: nested(heterogeneous(smooth(0.4, 2.0)), homogeneous(2.0)),

@@ -47,7 +47,7 @@ class Branch:
 
     def offer(self, at: Arrival, step: Step, β: Any, depth: Any, η: Any, active: Any) -> Branch:
         """This one, or the null collision of one more flight, by their masses."""
-        null = step.kept.flight.null  # type: ignore[union-attr]
+        null = step.kept.flight.null
         mass = self.mass + dr.select(active, null.mass, 0)
         taken = active & (null.pick * mass < null.mass)
         return Branch(

@@ -16,7 +16,6 @@ from ..transport.motion import path_moves
 from ..transport.path import count, first_arrival, next_arrival, survival, sustain, take_step
 from ..transport.vertex import Numbers, Walk
 from .adjoint import LostPaths, RayDerivative, Replayed, backward, backward_step
-from .baseline import Baseline
 from .branch import Branch, branch_term
 from .record import arrival_of, continuation_of, numbers_of, record, record_type
 
@@ -42,7 +41,7 @@ def _records(walk: Walk) -> int:
 
 @dr.syntax
 def sweep(
-    walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostPaths, baseline: Baseline | None = None
+    walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostPaths, baseline: Any = None
 ) -> bool:
     """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
 

@@ -22,10 +22,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-#: Voxels along the side of the smallest cell. With 2, images of 64³ grids gain nothing up to an optical thickness of 100.
+#: Voxels along the side of the smallest cell. With 2, images of 64³ grids gain nothing up to a thickness of 100.
 BASE = 4
-#: Cost of a step from cell to cell over that of a tentative collision: images of 64³ grids take the same CPU time from 0.1
-#: to 0.2, up to a fifth more at 0.33.
+#: Cost of a step from cell to cell over that of a tentative collision: images of 64³ grids take the same CPU time from
+#: 0.1 to 0.2, up to a fifth more at 0.33.
 STEP_COST = 0.15
 
 

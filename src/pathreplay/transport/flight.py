@@ -11,7 +11,6 @@ It divides by nothing that may be zero, so that it also holds where null collisi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,7 +37,7 @@ class Flight:
     # Only the first walk needs these; they are None in a record that is read back.
     σ_s: Any = None  # Spectrum: scattering coefficient at the collision
     E: Any = None  # Spectrum: emission gathered on the way
-    null: NullCollision | None = None  # one of those on the way, if the walk branches
+    null: Any = None  # NullCollision, one of those on the way, if the walk branches
 
 
 @dataclass
@@ -66,7 +65,7 @@ def branch_weight(p: Any) -> Any:
 
 
 @dr.syntax
-def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any, visit: Callable[..., None] | None = None) -> Flight:
+def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any, visit: Any = None) -> Flight:
     """Sample the flight along ``at.ray``, in ``at.medium``, up to the surface ``at.hit``. Detached.
 
     ``β`` (Spectrum) is the throughput: in chromatic media a collision is real with probability
@@ -208,7 +207,7 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: Any, attached: boo
         w *= dr.replace_grad(mi.Spectrum(1), log_T)
         if walk.baseline is not None:
             score = dr.select(through, length * σ_y * walk.baseline(at_y, σ_y, through), 0)
-            score -= dr.select(event, σ_t * (share / flight.density) * walk.baseline(mei, σ_t, event), 0)
+            score -= dr.select(event, σ_t * stretch * (share / flight.density) * walk.baseline(mei, σ_t, event), 0)
             e += score - dr.detach(score)
 
     if walk.media.emissive:

@@ -6,7 +6,6 @@ is taken at one point y, uniform over the whole length Λ of medium on the ray: 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +34,7 @@ def shadow(
     medium: Any,
     sampler: Any,
     active: Any,
-    visit: Callable[..., None] | None = None,
+    visit: Any = None,
 ) -> Shadow:
     """Estimate the transmittance from the Interaction3f ``origin``, in ``medium``, to the emitter sample. Detached.
 
@@ -77,9 +76,7 @@ def shadow(
     return Shadow(T=T, y=y, medium=y_medium, length=length)
 
 
-def _transmittance(
-    walk: Walk, medium: Any, ray: Any, a: Any, b: Any, sampler: Any, active: Any, visit: Callable[..., None] | None
-) -> Any:
+def _transmittance(walk: Walk, medium: Any, ray: Any, a: Any, b: Any, sampler: Any, active: Any, visit: Any) -> Any:
     """An unbiased estimate of the transmittance of one medium between the distances a and b (Spectrum)."""
     media = walk.media
     T = mi.Spectrum(1)
@@ -101,9 +98,7 @@ def _transmittance(
 
 
 @dr.syntax
-def ratio_tracking(
-    medium: Any, ray: Any, a: Any, b: Any, sampler: Any, active: Any, visit: Callable[..., None] | None = None
-) -> Any:
+def ratio_tracking(medium: Any, ray: Any, a: Any, b: Any, sampler: Any, active: Any, visit: Any = None) -> Any:
     """T = Π (1 - σ_t/σ̄) over tentative collisions between a and b, with Mitsuba's majorant of the whole medium.
 
     ``visit`` is called at every one, with its MediumInteraction3f, the majorant (Float) and where there is one (Bool).

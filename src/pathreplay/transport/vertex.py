@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from .media import Media
 from .traits import Traits
-
-if TYPE_CHECKING:
-    from .flight import Flight
-    from .shadow import Shadow
 
 
 @dataclass(frozen=True)
@@ -37,8 +32,8 @@ class Walk:
     max_depth: int
     rr_depth: int
     skip_area_emitters: Callable[..., Any]  # Mitsuba's, an integrator's method
-    media: Media | None = None
-    baseline: Callable[..., Any] | None = None
+    media: Any = None  # Media
+    baseline: Any = None
     branch: bool = False  # keep a null collision of each path, for derivatives where collisions are never real
     listing: bool = False  # leave the coefficients of media along flights and shadow rays to the `listing` driver
 
@@ -94,8 +89,8 @@ class Kept:
     lit: Any  # Bool: an emitter sample was taken, and nothing is in its way
     null: Any = None  # Bool: the lobe passes straight through (None in a record without media)
     # With media only, else None:
-    flight: Flight | None = None  # on the way to the vertex
-    shadow: Shadow | None = None  # between the vertex and its emitter sample
+    flight: Any = None  # Flight on the way to the vertex
+    shadow: Any = None  # Shadow between the vertex and its emitter sample
     # Only the first walk needs these; they are None in a record that is read back.
     light: Any = None  # DirectionSample3f of the emitter sample
     eta: Any = None  # Float: relative index of refraction that it crosses
