@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -196,9 +197,15 @@ def _make_class() -> type:
 
         @contextmanager
         def _looking_through(self, scene: Any, sensor: Any, seed: Any, spp: int) -> Iterator[None]:
-            """Remember the sensor, which may be in a medium, and what tells passes apart; make errors plain."""
+            """Remember the sensor, which may be in a medium, and what tells passes apart; make errors plain.
+
+            No garbage is collected on the way: should an old scene vanish between two virtual calls, Dr.Jit counts
+            their instances differently and writes functions that both call twice ("invalid redefinition").
+            """
             self.sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             self.seed = (seed if isinstance(seed, int) else int(seed[0]), spp, self.sensor.ptr)
+            collecting = gc.isenabled()
+            gc.disable()
             try:
                 yield
             except RuntimeError as error:
@@ -208,6 +215,8 @@ def _make_class() -> type:
                 raise mended from None
             finally:
                 self.sensor = None
+                if collecting:
+                    gc.enable()
 
         def _walk(self, scene: Any, differentiate: bool) -> Walk:
             nodes = nodes_of(scene)

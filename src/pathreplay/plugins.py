@@ -10,7 +10,12 @@ from __future__ import annotations
 import importlib
 
 #: Each has `register() -> None`, which registers its plugins for the active variant; doing so again is harmless.
-PLUGIN_MODULES = ("pathreplay.integrator", "pathreplay.bsdfs.smoothdielectric", "pathreplay.media.gridmedium")
+PLUGIN_MODULES = (
+    "pathreplay.integrator",
+    "pathreplay.rivals",
+    "pathreplay.bsdfs.smoothdielectric",
+    "pathreplay.media.gridmedium",
+)
 
 
 def has_derivatives(variant: str | None) -> bool:

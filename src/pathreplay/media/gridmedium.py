@@ -22,6 +22,10 @@ from ..errors import PathreplayError
 from . import cellwalk
 from .supergrid import Bounds, all_bounds, cheapest, constant_bounds, find_lattice, mean_chord, voxel_bounds
 
+#: A density that is given as a number reaches this far from the origin along each axis: beyond any scene, and far from
+#: overflow. (A `constvolume` ends at the unit cube.)
+FAR = 1e6
+
 
 def register() -> None:
     """Registers `gridmedium` for the variant that is active now. Doing so again is harmless.
@@ -156,7 +160,10 @@ def _plugin_class() -> type:
 
 
 def _volume(props: Any, name: str, default: float | None) -> Any:
-    """The volume of that name; textures, colours and numbers become a `constvolume`. None without and no default."""
+    """The volume of that name; textures, colours and numbers become a `constvolume`, without end.
+
+    None without the name and no default.
+    """
     if name not in props and default is None:
         return None
     value = props[name] if name in props else default
@@ -166,6 +173,7 @@ def _volume(props: Any, name: str, default: float | None) -> Any:
         raise PathreplayError(f"gridmedium: {name} is {value!r:.40}; give a volume, a colour or a number")
     constant = mi.Properties("constvolume")
     constant["value"] = value
+    constant["to_world"] = mi.ScalarTransform4f().scale(2 * FAR).translate(-0.5)
     return mi.PluginManager.instance().create_object(constant)
 
 
