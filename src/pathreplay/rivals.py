@@ -6,6 +6,7 @@ them: `pathreplay` gives the same gradients for less.
 
 from __future__ import annotations
 
+import gc
 from typing import Any
 
 import drjit as dr
@@ -29,8 +30,9 @@ def _make_classes() -> tuple[type, type]:
     class Rival(RBIntegrator):  # type: ignore[misc]
         """What both have: properties ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5), ``hide_emitters`` (False).
 
-        Media are differentiated by the score, without a baseline, and where they are empty not at all. Raises
-        PathreplayError for unusable properties and in polarised variants.
+        Each has its ``propagate``, which takes what a driver takes and back-propagates the adjoint radiance. Media are
+        differentiated by the score, without a baseline, and where they are empty not at all. Raises PathreplayError for
+        unusable properties and in polarised variants.
         """
 
         name = ""
@@ -67,10 +69,6 @@ def _make_classes() -> tuple[type, type]:
             """Tangent of the radiance (Spectrum) and whether anything was met (Bool), per ray."""
             raise PathreplayError(f"{self.name} has no forward mode: use the integrator 'pathreplay'")
 
-        def propagate(self, walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
-            """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray)."""
-            raise NotImplementedError
-
         def render_backward(
             self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
         ) -> None:
@@ -94,8 +92,13 @@ def _make_classes() -> tuple[type, type]:
             return self._looking_through(scene, sensor, super().render, sensor, seed, spp, develop, evaluate)
 
         def _looking_through(self, scene: Any, sensor: Any, render: Any, *args: Any) -> Any:
-            """Remember the sensor, which may be in a medium, and make errors plain."""
+            """Remember the sensor, which may be in a medium; make errors plain; let no old scene vanish on the way.
+
+            Dr.Jit counts the instances of virtual calls, and writes kernels that do not compile if they change.
+            """
             self.sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            collecting = gc.isenabled()
+            gc.disable()
             try:
                 return render(scene, *args)
             except RuntimeError as error:
@@ -105,6 +108,8 @@ def _make_classes() -> tuple[type, type]:
                 raise mended from None
             finally:
                 self.sensor = None
+                if collecting:
+                    gc.enable()
 
         def _walk(self, scene: Any) -> Walk:
             nodes = nodes_of(scene)
@@ -140,9 +145,11 @@ def _make_classes() -> tuple[type, type]:
                 raise PathreplayError(f"{self.name}: attach = {self.attach!r} is unknown: use one of {choices}")
 
         def propagate(self, walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
+            """Back-propagate ``δL``: see `tape_backward`."""
             tape_backward(walk, sampler, ray, δL, active)
 
         def tangent(self, walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
+            """Tangent of the radiance: see `tape_forward`."""
             return tape_forward(walk, sampler, ray, active)
 
     class RadiativeIntegrator(Rival):
@@ -159,6 +166,7 @@ def _make_classes() -> tuple[type, type]:
             self.linear = props.get("linear", False)
 
         def propagate(self, walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
+            """Back-propagate ``δL``: see `radiative`."""
             radiative(walk, sampler, ray, δL, active, self.linear)
 
     return TapeIntegrator, RadiativeIntegrator

@@ -24,7 +24,7 @@ def tape_backward(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> 
     The estimator is that of the sweep driver, and with the same random numbers so is the gradient. Not differentiated:
     see `tape`. Raises PathreplayError when no parameter reaches the paths.
     """
-    with dr.resume_grad():
+    with dr.resume_grad(), dr.isolate_grad():
         L, _ = tape(walk, sampler, ray, active)
         backward(dr.sum(δL * L))
 
@@ -37,6 +37,29 @@ def tape_forward(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, 
     with dr.resume_grad():
         L, valid = tape(walk, sampler, ray, active)
         return tangents(L)[0], valid
+
+
+def _cut(state: tuple[Any, ...]) -> Any:
+    """The same values; on the way back, all that comes from behind them is evaluated before it goes on.
+
+    Without it the way back is a single kernel, whose code grows with the depth: a minute to compile at 64 vertices.
+    """
+
+    class Cut(dr.CustomOp):  # type: ignore[misc]
+        def eval(self, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            return tuple(type(value)(value) for value in state)
+
+        def backward(self) -> None:
+            gradient = self.grad_out()
+            dr.eval(gradient)
+            self.set_grad_in("state", gradient)
+
+        def forward(self) -> None:
+            gradient = self.grad_in("state")
+            dr.eval(gradient)
+            self.set_grad_out(gradient)
+
+    return dr.custom(Cut, state)
 
 
 @dr.syntax
@@ -64,8 +87,8 @@ def tape(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
     while dr.hint(active, mode="evaluated", exclude=[walk, attached], label="pathreplay: tape"):
         with dr.suspend_grad():
             u = Numbers.draw(sampler)
-            here = dr.detach(at)
-            step = take_step(walk, here, u, sampler, β_alive, depth + 1 < walk.max_depth, active)
+            still = dr.detach(at)
+            step = take_step(walk, still, u, sampler, β_alive, depth + 1 < walk.max_depth, active)
             kept = step.kept
             β_alive = sustain(β_alive, dr.detach(β), step)
             η *= kept.eta
@@ -74,8 +97,10 @@ def tape(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
             go_on = step.active & survives & (dr.max(β_alive) != 0)
             β_alive *= rr_weight
             depth += count(walk, step)
-            at_next = next_arrival(walk, here, step, go_on)
+            at_next = next_arrival(walk, still, step, go_on)
 
+        here = at.ray
+        L, β, here.o, here.d, at.pdf = _cut((L, β, here.o, here.d, at.pdf))
         step = repeat_step(walk, at, u, kept, go_on, active, attached, at_next.hit)
         L += β * step.e
         β *= step.w * rr_weight

@@ -1,0 +1,154 @@
+"""The rivals: the tape has the gradient of the sweep; radiative backpropagation has its mean, unless it is linear."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from media_scenes import cloud, heterogeneous, lit_floor, smooth
+from pathreplay import PathreplayError
+from truth import (
+    RESOLVED,
+    WIDE,
+    Z_MAX,
+    Bench,
+    Case,
+    add,
+    bitmap,
+    lit_room,
+    noise,
+    random,
+    rgb,
+    tilt_vertices,
+    translate,
+)
+
+
+def textured(shape: str = "sphere") -> dict:
+    return lit_room({"type": "diffuse", "reflectance": bitmap(noise(16, 3, 0.2, 0.8))}, shape)
+
+
+def black_and_green() -> dict:
+    return lit_room({"type": "diffuse", "reflectance": rgb(0, 0.5, 0)})
+
+
+def foggy() -> dict:
+    return cloud(heterogeneous(smooth(0.5, 3), 0.8))
+
+
+def colourful_fog_on_the_floor() -> dict:
+    return lit_floor(heterogeneous(smooth(0.5, 3, 3), 0.8))
+
+
+def glass_ball() -> dict:
+    return lit_room({"type": "smoothdielectric"})
+
+
+TEXTURE = Case("texture", textured, "object.bsdf.reflectance.data", random(), depth=5)
+FLOOR = Case("floor", textured, "floor.bsdf.reflectance.value", add(), depth=5)
+VERTICES = Case("vertices", lambda: textured("cube"), "object.vertex_positions", tilt_vertices())
+DENSITY = Case(
+    "density",
+    foggy,
+    "object.interior_medium.sigma_t.data",
+    random(),
+    depth=5,
+    step=0.15,
+    spp=128,
+    reference="volpath",
+    stencil=WIDE,
+)
+SLOW = [
+    Case("zero reflectance", black_and_green, "object.bsdf.reflectance.value", add([0.3, -0.2, 0.5])),
+    Case("camera", textured, "camera.to_world", translate(0.3, 0.2, -1)),
+    Case("index of glass", glass_ball, "object.bsdf.eta", add(), depth=5),
+    Case("chromatic density and lamp", colourful_fog_on_the_floor, DENSITY.key, random()),
+]
+CASES = [TEXTURE, VERTICES, DENSITY, *(pytest.param(case, marks=pytest.mark.slow) for case in SLOW)]
+# Sums of some thousand float32 terms in another order.
+ROUNDING = 1e-4
+
+
+@pytest.fixture
+def bench() -> Callable[[Case], Bench]:
+    """Load a case; its parameter is released in the end."""
+    loaded = []
+
+    def load(case: Case) -> Bench:
+        gc.collect()  # scenes of earlier tests would be traced, too
+        loaded.append(Bench(case))
+        return loaded[-1]
+
+    yield load
+    for each in loaded:
+        each.release()
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_the_tape_has_the_gradient_of_the_sweep(case: Case, bench) -> None:
+    """With the same seed, while roulette plays."""
+    b = bench(case)
+    sweep = b.backward(b.integrator(rr_depth=2, branch=False), 1, spp=16)
+    assert sweep != 0
+    assert b.backward(b.integrator("pathreplay_tape", rr_depth=2), 1, spp=16) == pytest.approx(sweep, rel=ROUNDING)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [TEXTURE, VERTICES, DENSITY, *SLOW], ids=lambda case: case.name)
+def test_the_tape_has_the_tangent_of_the_forward_driver(case: Case, bench) -> None:
+    b = bench(case)
+    ours = b.forward(b.integrator(rr_depth=2, branch=False), 1, spp=16)
+    tape = b.forward(b.integrator("pathreplay_tape", rr_depth=2), 1, spp=16)
+    assert 0 < np.abs(ours).sum() and np.abs(tape - ours).sum() < ROUNDING * np.abs(ours).sum()
+
+
+def z_score(b: Bench, integrator: mi.Integrator, reference: np.ndarray) -> float:
+    """Of the gradient against the finite differences, which it must resolve."""
+    gradients = np.array([b.backward(integrator, seed) for seed in range(1, b.case.seeds + 1)])
+    error = np.sqrt((gradients.var(ddof=1) + reference.var(ddof=1)) / b.case.seeds)
+    assert error < RESOLVED * abs(reference.mean())
+    return float((gradients.mean() - reference.mean()) / error)
+
+
+@pytest.mark.parametrize("case", [TEXTURE, FLOOR, DENSITY], ids=lambda case: case.name)
+def test_radiative_backpropagation_is_right_and_its_linear_variant_is_not(case: Case, bench) -> None:
+    """Light that comes back from other surfaces or from the fog is not one."""
+    b = bench(case)
+    plain = b.integrator(case.reference, rr_depth=case.rr_depth)
+    seeds = range(1001, 1001 + case.seeds)
+    reference = np.array([b.dot(b.difference(plain, seed, stencil=case.stencil)) for seed in seeds])
+    assert abs(z_score(b, b.integrator("pathreplay_rb", rr_depth=case.rr_depth), reference)) < Z_MAX
+    assert abs(z_score(b, b.integrator("pathreplay_rb", rr_depth=case.rr_depth, linear=True), reference)) > 2 * Z_MAX
+
+
+@pytest.mark.parametrize("plugin", ["pathreplay_tape", "pathreplay_rb"])
+def test_images_are_those_of_pathreplay(plugin: str, bench) -> None:
+    b = bench(TEXTURE)
+    assert np.array_equal(b.image(b.integrator(plugin), 1, spp=4), b.image(b.integrator(), 1, spp=4))
+
+
+@pytest.mark.parametrize(
+    ("plugin", "properties", "words"),
+    [
+        ("pathreplay_tape", {"max_depth": -2}, ["pathreplay_tape", "max_depth = -2", "-1"]),
+        ("pathreplay_rb", {"rr_depth": 0}, ["pathreplay_rb", "rr_depth = 0"]),
+        ("pathreplay_tape", {"attach": "all"}, ["attach = 'all'", "'delta'"]),
+    ],
+)
+def test_bad_properties_are_named_with_the_way_out(plugin: str, properties: dict, words: list[str]) -> None:
+    with pytest.raises(Exception) as error:  # Mitsuba wraps what a plugin raises
+        mi.load_dict({"type": plugin, **properties})
+    assert all(word in str(error.value) for word in words), str(error.value)
+
+
+def test_radiative_backpropagation_says_what_it_cannot_do(bench) -> None:
+    b = bench(VERTICES)
+    rb = b.integrator("pathreplay_rb")
+    with pytest.raises(PathreplayError, match="no forward mode"):
+        b.forward(rb, 1, spp=1)
+    with pytest.raises(PathreplayError, match="no parameter with gradients reaches"):
+        b.backward(rb, 1, spp=1)
