@@ -1,51 +1,133 @@
-"""The command line: `python -m benchmarks [TASK ...] [--quick] [--save]`, and `python -m benchmarks report`."""
+"""The command line: `pathreplay bench` or `python -m benchmarks [TASK ...]`, and `... report`."""
 
 from __future__ import annotations
 
 import sys
+import time
+from pathlib import Path
+from types import ModuleType
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
-from . import attached, depth, events, media, records, supergrid, surface
-from .report import EVIDENCE, fill
-from .runner import ROOT, run_jobs
+from pathreplay.errors import PathreplayError
+
+from . import attached, depth, events, iteration, media, noise, records, startup, supergrid, surface, truth
+from .compare import compare
+from .drafts import ROOT, Draft, draft_of
+from .job import Record
+from .report import fill
+from .runner import run_jobs
 from .tables import footnote
 
-TASKS = {task.TITLE: task for task in (surface, depth, attached, media, events, supergrid)}
+# Quick ones first, so that a run that is cut short has most of the answers.
+TASKS: dict[str, ModuleType] = {
+    task.TITLE: task for task in (startup, surface, iteration, attached, truth, noise, depth, events, supergrid, media)
+}
 
 
 def main(
     tasks: Annotated[list[str] | None, typer.Argument(help=f"{', '.join(TASKS)}, or report. Default: all.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Smaller and fewer: to see that it works.")] = False,
     save: Annotated[bool, typer.Option("--save", help="Keep the samples under benchmarks/results/.")] = False,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            "--compare",
+            metavar="OLD.json",
+            help="Say what got slower or noisier since that record: of its task, measured again, or of another "
+            "record, NEW.json, given in place of a task. Exit status 1 if anything did.",
+        ),
+    ] = None,
+    report: Annotated[bool, typer.Option("--report", help="Then put all saved records into docs/evidence.md.")] = False,
 ) -> None:
-    """Measure gradients next to Mitsuba's own; `report` puts the saved results into docs/evidence.md."""
-    wanted = tasks or list(TASKS)
-    if wanted == ["report"]:
-        missing = fill({name: task.table for name, task in TASKS.items()})
-        typer.echo(f"{EVIDENCE.relative_to(ROOT)}: not measured: {', '.join(missing) or 'nothing'}")
-        return
-    unknown = [name for name in wanted if name not in TASKS]
-    if unknown:
-        _fail(f"there is no task {unknown[0]!r}: use {', '.join(TASKS)}, or report alone")
+    """Measure gradients next to Mitsuba's own; `report` puts the saved records into docs/evidence.md, with pictures.
+
+    A run that was interrupted goes on where it was when it is started again.
+    """
+    wanted = tasks or []
     if quick and save:
-        _fail("--save keeps full runs only: leave out --quick")
-    for name in wanted:
-        task = TASKS[name]
-        load = records.load_average()
-        measured = run_jobs(name, task.jobs(quick))
-        command = f"python -m benchmarks {name}" + (" --quick" if quick else "")
-        record = records.make_record(name, command, load, measured)
-        typer.echo(f"\n## {name}\n\n{task.table(record)}\n\n{footnote(record)}")
-        if save:
-            typer.echo(f"\nSaved as {records.save(record).relative_to(ROOT)}")
+        raise PathreplayError("--save keeps full runs only: leave out --quick")
+    if against is not None:
+        _compare(against, wanted, quick, save or report)
+        return
+    if wanted == ["report"]:
+        wanted, report = [], True
+    else:
+        wanted = wanted or list(TASKS)
+    _require_known(wanted)
+    drafts = [_run(name, quick, save)[1] for name in wanted]
+    # Only now: if the third task is interrupted, the first two need not be run again.
+    for draft in drafts:
+        draft.discard()
+    if report:
+        _report()
 
 
-def _fail(message: str) -> None:
-    print(f"benchmarks: error: {message}", file=sys.stderr)
-    raise typer.Exit(2)
+def _require_known(names: list[str]) -> None:
+    for name in names:
+        if name not in TASKS:
+            raise PathreplayError(f"there is no task {name!r}: use {', '.join(TASKS)}, or report alone")
+
+
+def _run(name: str, quick: bool, save: bool) -> tuple[Record, Draft]:
+    """Measure one task, print its table, and save its record if that is wanted."""
+    task, console = TASKS[name], Console(stderr=True, highlight=False, soft_wrap=True)
+    draft, jobs = draft_of(name, quick), task.jobs(quick)
+    ready = len(draft.contents.done)
+    console.print(f"{name}: {len(jobs)} jobs, {_duration(task.TAKES[0 if quick else 1])} on two quiet cores")
+    if ready:
+        told = draft.path.relative_to(ROOT)
+        console.print(f"{name}: going on with a run of {draft.begun}: {ready} jobs are done (to begin anew: rm {told})")
+    load, start = records.load_average(), time.perf_counter()
+    measured = run_jobs(name, jobs, draft)
+    console.print(f"{name}: took {_duration(time.perf_counter() - start)}")
+    command = f"pathreplay bench {name}" + (" --quick" if quick else "")
+    record = records.make_record(name, command, load, measured, draft)
+    typer.echo(f"\n## {name}\n\n{task.table(record)}\n\n{footnote(record)}")
+    if save:
+        typer.echo(f"\nSaved as {records.save(record).relative_to(ROOT)}")
+    return record, draft
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.1f} min"
+
+
+def _compare(path: Path, wanted: list[str], quick: bool, writes: bool) -> None:
+    old = records.read(path)
+    others = [Path(name) for name in wanted if name.endswith(".json")]
+    if writes or len(others) > 1 or (others and (len(wanted) > 1 or quick)):
+        raise PathreplayError("--compare OLD.json takes one NEW.json, or nothing (and --quick) to measure again")
+    if others:
+        new = records.read(others[0])
+    else:
+        if wanted not in ([], [old.task]):
+            raise PathreplayError(f"{path} is a record of task {old.task!r}: compare it with that one")
+        _require_known([old.task])
+        new, draft = _run(old.task, quick, save=False)
+        draft.discard()
+    if old.task != new.task:
+        raise PathreplayError(f"{path} is a record of task {old.task!r}, {others[0]} one of {new.task!r}")
+    comparison = compare(old, new)
+    typer.echo(f"\n{comparison.table()}")
+    if comparison.worse:
+        raise typer.Exit(1)
+
+
+def _report() -> None:
+    from . import plots
+
+    for path in plots.draw_all():
+        typer.echo(f"drawn: {path.relative_to(ROOT)}")
+    page, missing = fill({name: task.table for name, task in TASKS.items()})
+    typer.echo(f"{page.relative_to(ROOT)}: not measured: {', '.join(missing) or 'nothing'}")
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    try:
+        typer.run(main)
+    except PathreplayError as error:
+        print(f"benchmarks: error: {error}", file=sys.stderr)
+        sys.exit(2)

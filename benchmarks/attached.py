@@ -6,6 +6,7 @@ from .job import Job, Point, Record
 from .tables import comparison, groups, markdown, method_cell
 
 TITLE = "attached"
+TAKES = (20, 120)
 TEXTURE = "back.bsdf.reflectance.data"
 BALL = "ball.to_world"
 BOX = "small-box.vertex_positions"

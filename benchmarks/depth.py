@@ -2,14 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 from .estimates import growth
 from .job import Job, Point, Record
+from .media_scenes import DENSITY
 from .tables import markdown
 
 TITLE = "depth"
+TAKES = (45, 360)
 WALLS = ("box.bsdf.reflectance.data",)
-DEEPEST = {"prb": 4096, "sweep": 1024, "replay": 4096}
-SHALLOWEST = 8
+
+#: Scene, parameter, and for each method its greatest depth and the factor from one depth to the next. Where a claim
+#: rests on the exponent there are more depths; radiative backpropagation ends where one pass takes some ten seconds.
+SURFACES, MEDIA = "closed-box", "sealed-fog"
+ROWS: dict[str, tuple[tuple[str, ...], dict[str, tuple[int, int]]]] = {
+    SURFACES: (
+        WALLS,
+        {
+            "sweep": (1024, 2),
+            "replay": (4096, 4),
+            "prb": (1024, 2),
+            "prb_basic": (1024, 4),
+            "tape": (1024, 2),
+            "rb": (256, 2),
+            "rb linear": (1024, 4),
+        },
+    ),
+    MEDIA: (
+        (DENSITY,),
+        {
+            "score": (1024, 4),
+            "prbvolpath": (1024, 4),
+            "tape": (256, 4),
+            "rb": (64, 2),
+            "rb linear": (1024, 4),
+        },
+    ),
+}
+QUICK = {"sweep": (256, 8), "prb": (256, 8), "tape": (32, 8), "rb": (32, 8)}
+SHALLOWEST = 4
+# One pass beyond it is enough to know how slow a method is.
+PATIENCE_S = 15
 
 
 def jobs(quick: bool) -> list[Job]:
@@ -17,40 +52,65 @@ def jobs(quick: bool) -> list[Job]:
 
     Russian roulette starts beyond the last vertex, so that every path in the closed box has ``max_depth`` of them.
     """
-    deepest = {method: min(depth, 512) if quick else depth for method, depth in DEEPEST.items()}
-    depths = [SHALLOWEST * 2**k for k in range(max(deepest.values()).bit_length() - SHALLOWEST.bit_length() + 1)]
+    rows = {SURFACES: (WALLS, QUICK)} if quick else ROWS
     return [
         Job(
-            scene="closed-box",
-            parameters=WALLS,
+            scene=scene,
+            parameters=parameters,
             methods=(method,),
             max_depth=depth,
             rr_depth=depth + 1,
             resolution=16,
             spp=4,
             rounds=3 if quick else 7,
-            warm_up=1,
+            warm_up=2
+            if scene == MEDIA
+            else 1,  # a method that learns may have another kernel for when it knows nothing
             threads=1,
+            patience=PATIENCE_S,
         )
-        for depth in depths
-        for method in deepest
-        if depth <= deepest[method]
+        for scene, (parameters, methods) in rows.items()
+        for depth in _ladder(max(deepest for deepest, _ in methods.values()), 2)
+        for method, (deepest, factor) in methods.items()
+        if depth in _ladder(deepest, factor)
     ]
 
 
+def _ladder(deepest: int, factor: int) -> list[int]:
+    """SHALLOWEST, and so on by the factor."""
+    depths = [SHALLOWEST]
+    while depths[-1] * factor <= deepest:
+        depths.append(depths[-1] * factor)
+    return depths
+
+
 def table(record: Record) -> str:
-    """Seconds (of the fastest round) and MiB by depth and method; then the exponent of time and growth of memory."""
+    """Time, then memory, of surfaces and of media."""
+    scenes = dict.fromkeys(point.scene for point in record.points)
+    return "\n\n".join(part for scene in scenes for part in _tables(of_scene(record, scene)))
+
+
+def of_scene(record: Record, scene: str) -> Record:
+    """The record with the points of one scene only."""
+    return replace(record, points=tuple(point for point in record.points if point.scene == scene))
+
+
+def _tables(record: Record) -> list[str]:
+    """Seconds (of the fastest round), the exponent of time; then MiB, and their growth; by depth and method."""
     methods = list(dict.fromkeys(point.method for point in record.points))
     depths = sorted({point.max_depth for point in record.points})
     cells = {(point.max_depth, point.method): point for point in record.points}
-    header = ["depth", *(f"{m}, s" for m in methods), *(f"{m}, MiB" for m in methods)]
-    rows = []
-    for depth in depths:
-        row = [cells.get((depth, method)) for method in methods]
-        rows.append([str(depth), *map(seconds_cell, row), *map(memory_cell, row)])
-    rows.append(["exponent of time", *(_exponent(record, m) for m in methods), *[""] * len(methods)])
-    rows.append(["last / first", *[""] * len(methods), *(memory_growth(record, m) for m in methods)])
-    return markdown(header, rows)
+    scene = record.points[0].scene
+
+    def rows(cell: Callable[[Point | None], str]) -> list[list[str]]:
+        return [[str(depth), *(cell(cells.get((depth, method))) for method in methods)] for depth in depths]
+
+    exponents = ["exponent", *(_exponent(record, method) for method in methods)]
+    growths = ["last / first", *(memory_growth(record, method) for method in methods)]
+    return [
+        markdown([f"{scene}: seconds at depth", *methods], [*rows(seconds_cell), exponents]),
+        markdown([f"{scene}: MiB at depth", *methods], [*rows(memory_cell), growths]),
+    ]
 
 
 def fastest(point: Point) -> float:
@@ -85,4 +145,4 @@ def _exponent(record: Record, method: str) -> str:
 def memory_growth(record: Record, method: str) -> str:
     """Peak memory at the largest depth over that at the smallest."""
     peaks = [point.peak_mib for point in alive(record, method) if point.peak_mib is not None]
-    return f"{peaks[-1] / peaks[0]:.3f}" if peaks else ""
+    return f"{peaks[-1] / peaks[0]:.2f}" if peaks else ""

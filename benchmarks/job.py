@@ -5,9 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-#: Integrators by the name that the tables give them.
+#: Integrators by the name that the tables give them. One that does not load is a row that says so.
 METHODS: dict[str, dict[str, Any]] = {
     "prb": {"type": "prb"},
+    "prb_basic": {"type": "prb_basic"},
+    "tape": {"type": "pathreplay_tape"},
+    "rb": {"type": "pathreplay_rb"},
+    "rb linear": {"type": "pathreplay_rb", "linear": True},
     "sweep": {"type": "pathreplay", "driver": "sweep"},
     "replay": {"type": "pathreplay", "driver": "replay"},
     "volpath": {"type": "volpath"},
@@ -16,6 +20,12 @@ METHODS: dict[str, dict[str, Any]] = {
     "branch": {"type": "pathreplay", "volume_gradient": "score", "branch": True},
     "listing": {"type": "pathreplay", "volume_gradient": "listing"},
 }
+
+#: Mitsuba's own: what ours is compared with, and not held to anything when two records are compared.
+STOCK = ("prb", "prb_basic", "prbvolpath", "volpath", "finite differences", "half steps")
+
+# What a pass is, and by that which module runs it: see `worker.MEASURES`.
+Kind = Literal["gradient", "image", "events", "truth", "noise", "step", "cold start", "warm start"]
 
 
 @dataclass(frozen=True)
@@ -38,8 +48,10 @@ class Job:
     warm_up: int = 2
     restart: int = 0  # make all integrators anew every so many rounds; 0 = never
     threads: int = 0  # 0 = all processors
-    # A gradient pass, or a primal one with the noise of the image, or the mean number of real events a path.
-    measure: Literal["gradient", "image", "events"] = "gradient"
+    patience: float = 0  # seconds after which a method sits out the rounds that are left; 0 = endless
+    # A gradient pass, a primal one with the noise of the image, the mean number of real events a path, a derivative
+    # to hold against finite differences, the error of a replay, an optimisation step, or the start of a process.
+    measure: Kind = "gradient"
     # Adjoint image: one everywhere, or a smooth wave (both over the number of entries).
     weights: Literal["even", "wave"] = "even"
     # Announce new parameters before each pass, as an optimiser does: majorants are then made anew; this is timed.
@@ -74,8 +86,11 @@ class Point:
     # Of each seed, with d = gradient - reference of that seed: mean over entries of d · (mean of d over other seeds).
     # Their mean estimates the squared bias without bias. Empty if there is no reference.
     bias_products: tuple[float, ...] = ()
-    measure: str = "gradient"
+    measure: Kind = "gradient"
     mean: float | None = None  # of what was measured, over entries and seeds
+    values: tuple[float, ...] = ()  # of each seed, where what was measured is one number
+    z: float | None = None  # of task `truth`: the difference from the reference, in standard errors
+    verdict: str | None = None  # of task `truth`: see pathreplay.check.verdict
 
 
 @dataclass(frozen=True)
@@ -105,3 +120,4 @@ class Record:
     load: tuple[float, float]  # processes waiting for a processor (1 minute mean) before and after
     machines: tuple[Machine, ...]  # one entry, unless jobs used different numbers of threads
     points: tuple[Point, ...]
+    sittings: int = 1  # runs that it took: more than one where it was interrupted and gone on with

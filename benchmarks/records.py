@@ -7,10 +7,13 @@ import subprocess
 from datetime import datetime, timezone
 from pathlib import Path
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
+from pathreplay.errors import PathreplayError
+
+from .drafts import ROOT, Draft
 from .job import Record
-from .runner import ROOT, Measured
+from .runner import Measured
 
 RESULTS = ROOT / "benchmarks" / "results"
 _JSON = TypeAdapter(Record)
@@ -26,7 +29,7 @@ def _git(*arguments: str) -> str:
     return result.stdout.strip() if result.returncode == 0 else ""
 
 
-def make_record(task: str, command: str, load_before: float, measured: Measured) -> Record:
+def make_record(task: str, command: str, load_before: float, measured: Measured, draft: Draft) -> Record:
     """The record of a run that has just ended."""
     modified = _git("status", "--porcelain", "--untracked-files=no", "--", "src", "benchmarks/*.py")
     return Record(
@@ -37,6 +40,7 @@ def make_record(task: str, command: str, load_before: float, measured: Measured)
         load=(load_before, load_average()),
         machines=tuple(measured.machines),
         points=tuple(measured.points),
+        sittings=draft.sittings,
     )
 
 
@@ -53,4 +57,20 @@ def save(record: Record) -> Path:
 def load(task: str) -> Record | None:
     """The saved record of a task, if there is one."""
     path = RESULTS / f"{task}.json"
-    return _JSON.validate_json(path.read_bytes()) if path.exists() else None
+    return read(path) if path.exists() else None
+
+
+def read(path: Path) -> Record:
+    """The record in a file.
+
+    Raises:
+        PathreplayError: there is no such file, or it holds something else.
+    """
+    try:
+        return _JSON.validate_json(path.read_bytes())
+    except OSError as error:
+        raise PathreplayError(f"{path} cannot be read: {error.strerror}; give a file that --save wrote") from None
+    except ValidationError as error:
+        raise PathreplayError(
+            f"{path} is no record of a benchmark ({error.error_count()} faults); give a file that --save wrote"
+        ) from None

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 from . import records
+from .drafts import ROOT
 from .job import Record
-from .runner import ROOT
 from .tables import footnote
 
 EVIDENCE = ROOT / "docs" / "evidence.md"
@@ -15,8 +16,8 @@ MARKED = re.compile(r"(<!-- begin (?P<task>[\w-]+) -->\n).*?(<!-- end (?P=task) 
 NOT_MEASURED = "*Not measured yet.*"
 
 
-def fill(tables: Mapping[str, Callable[[Record], str]]) -> list[str]:
-    """Rewrite the marked parts for which there is a table; returns the tasks that have no record yet."""
+def fill(tables: Mapping[str, Callable[[Record], str]]) -> tuple[Path, list[str]]:
+    """Rewrite the marked parts for which there is a table; returns the page, and the tasks that have no record yet."""
     missing: list[str] = []
 
     def replacement(match: re.Match[str]) -> str:
@@ -30,4 +31,4 @@ def fill(tables: Mapping[str, Callable[[Record], str]]) -> list[str]:
         return f"{match[1]}{text}\n{match[3]}"
 
     EVIDENCE.write_text(MARKED.sub(replacement, EVIDENCE.read_text()))
-    return missing
+    return EVIDENCE, missing

@@ -10,15 +10,13 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from .drafts import ROOT, Done, Draft
 from .job import Job, Machine, Point
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @dataclass
@@ -27,7 +25,7 @@ class _Samples:
 
     seeds: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
-    errors: dict[str, Any] = field(default_factory=dict)  # as `spread` gives them
+    facts: dict[str, Any] = field(default_factory=dict)  # fields of `Point`
     not_finite: list[int] = field(default_factory=list)
     error: str | None = None
 
@@ -46,22 +44,30 @@ class Measured:
     machines: list[Machine] = field(default_factory=list)
 
 
-def run_jobs(title: str, jobs: list[Job]) -> Measured:
-    """Run the jobs one after another, with a progress bar on stderr."""
+def run_jobs(title: str, jobs: list[Job], draft: Draft) -> Measured:
+    """Run the jobs that the draft lacks one after another, with a progress bar on stderr; keep each in the draft."""
     measured = Measured()
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
         bar = progress.add_task(title, total=sum(job.passes for job in jobs))
-        done = 0
-        for job in jobs:
+        passed = 0
+        for k, job in enumerate(jobs):
+            turn = jobs[:k].count(job)
+            done = draft.find(job, turn)
+            if done is None:
 
-            def show(method: str, passes: int, job: Job = job, done: int = done) -> None:
-                text = f"{title}: {job.scene}, depth {job.max_depth}, {method}"
-                progress.update(bar, description=text, completed=done + min(passes, job.passes))
+                def show(method: str, passes: int, job: Job = job, passed: int = passed) -> None:
+                    text = f"{title}: {job.scene}, depth {job.max_depth}, {method}"
+                    progress.update(bar, description=text, completed=passed + min(passes, job.passes))
 
-            _run_job(job, measured, show)
-            done += job.passes
-        progress.update(bar, description=title, completed=done)
+                found = Measured()
+                _run_job(job, found, show)
+                done = Done(job, turn, tuple(found.points), tuple(found.machines))
+                draft.add(done)
+            measured.points += done.points
+            measured.machines += [machine for machine in done.machines if machine not in measured.machines]
+            passed += job.passes
+        progress.update(bar, description=title, completed=passed)
     return measured
 
 
@@ -80,7 +86,7 @@ def _attempt(job: Job, measured: Measured, show: Callable[[str, int], None]) -> 
     # An empty home has an empty kernel cache: compiling is in the peak memory of every job or, by chance, of some.
     with tempfile.TemporaryDirectory() as home, tempfile.TemporaryFile("w+") as complaints:
         command = [sys.executable, "-m", "benchmarks.worker", json.dumps(asdict(job))]
-        environment = os.environ | {"HOME": home}
+        environment = os.environ | {"HOME": home, "DRJIT_CACHE_DIR": home}
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=complaints, text=True, cwd=ROOT, env=environment
         ) as worker:
@@ -98,8 +104,8 @@ def _attempt(job: Job, measured: Measured, show: Callable[[str, int], None]) -> 
                                 samples[method].add(sample["seed"], sample["seconds"], sample["finite"])
                         case {"event": "error", "method": method, "message": message}:
                             samples[method].error = message
-                        case {"event": "errors", "method": method, **errors}:
-                            samples[method].errors = errors
+                        case {"event": "facts", "method": method, **facts}:
+                            samples[method].facts = facts
                         case {"event": "peak", "mib": peak}:
                             pass
             except BaseException:
@@ -139,12 +145,10 @@ def _point(job: Job, method: str, told: _Samples, peak: float | None) -> Point:
         paths=job.resolution**2 * job.spp,
         seeds=tuple(told.seeds),
         seconds=tuple(told.seconds),
-        squared_errors=tuple(told.errors.get("squared_errors", ())),
+        squared_errors=tuple(told.facts.pop("squared_errors", ())),
         not_finite=tuple(told.not_finite),
         peak_mib=peak,
         error=told.error,
-        smooth_errors=tuple(told.errors.get("smooth_errors", ())),
-        bias_products=tuple(told.errors.get("bias_products", ())),
         measure=job.measure,
-        mean=told.errors.get("mean"),
+        **{name: tuple(fact) if isinstance(fact, list) else fact for name, fact in told.facts.items()},
     )

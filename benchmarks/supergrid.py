@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from .estimates import unpaired_ratio
 from .job import Job, Point, Record
 from .media_scenes import DENSITY
-from .tables import markdown, median_seconds
+from .tables import markdown, median_seconds, pooled
 
 TITLE = "supergrid"
+TAKES = (20, 120)
 WITHOUT = "one majorant"
 GRIDS = {"sparse": ("supergrid", "auto"), "uniform": ("supergrid", "auto")}
 # A process has one medium only, since a virtual call traces every medium that there is: so the processes take turns.
@@ -44,29 +43,12 @@ def jobs(quick: bool) -> list[Job]:
 
 def table(record: Record) -> str:
     """Speed and noise relative to one majorant for the whole grid."""
-    found = _pooled(record)
+    found = {(point.scene, point.measure): point for point in pooled(record.points)}
     rows = []
     for (scene, measure), point in found.items():
         grid, choice = scene.split(", ")
         rows.append([grid, measure, choice, *_cells(point, found.get((f"{grid}, {WITHOUT}", measure)))])
     return markdown(["grid", "pass", "majorants", "seconds (median)", "speed-up", "variance ratio"], rows)
-
-
-def _pooled(record: Record) -> dict[tuple[str, str], Point]:
-    """One point for each scene and measure: the seconds of all turns. Their errors are the same, as are the seeds."""
-    found: dict[tuple[str, str], Point] = {}
-    for point in record.points:
-        key = (point.scene, point.measure)
-        if key not in found:
-            found[key] = point
-            continue
-        so_far = found[key]
-        found[key] = replace(
-            so_far,
-            seconds=so_far.seconds + point.seconds,
-            error=so_far.error or point.error,
-        )
-    return found
 
 
 def _cells(point: Point, rival: Point | None) -> list[str]:

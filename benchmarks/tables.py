@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics as st
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 from .estimates import cost_ratio, time_ratio, variance_ratio
 from .job import Point, Record
@@ -34,6 +35,19 @@ def groups(points: Iterable[Point]) -> dict[tuple[object, ...], dict[str, Point]
     return found
 
 
+def pooled(points: Iterable[Point]) -> list[Point]:
+    """One point for jobs that came several times, in turn: the seconds of all. Their errors are alike, as are seeds."""
+    found: dict[tuple[object, ...], Point] = {}
+    for point in points:
+        key = (point.scene, point.parameters, point.method, point.max_depth, point.paths, point.measure)
+        before = found.get(key)
+        if before is not None:
+            error = before.error or point.error
+            point = replace(before, seconds=before.seconds + point.seconds, error=error)
+        found[key] = point
+    return list(found.values())
+
+
 def comparison(point: Point, rival: Point | None) -> list[str]:
     """Cells: median seconds, then time, variance and time x variance relative to a rival."""
     if point.error:
@@ -53,9 +67,10 @@ def footnote(record: Record) -> str:
     machine = record.machines[0]
     rounds = max((len(point.seconds) for point in record.points), default=0)
     threads = " and ".join(str(m.threads) for m in record.machines)
+    sittings = f"; in {record.sittings} sittings" if record.sittings > 1 else ""
     return (
         f"`{record.command}`, {record.date[:10]}, commit {record.commit}: {machine.processor}, "
         f"{machine.processors} processors, {threads} threads, {machine.variant}, Mitsuba {machine.mitsuba}, "
         f"Dr.Jit {machine.drjit}, libLLVM {machine.libllvm}, Python {machine.python}; {rounds} rounds; "
-        f"load average {record.load[0]:.1f} before, {record.load[1]:.1f} after."
+        f"load average {record.load[0]:.1f} before, {record.load[1]:.1f} after{sittings}."
     )

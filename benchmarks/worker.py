@@ -6,24 +6,24 @@ following rounds; one that kills the process is known by the line that said it w
 
 from __future__ import annotations
 
-import gc
 import json
 import os
 import platform
 import resource
 import sys
-import time
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
+
+import numpy as np
 
 from pathreplay import __version__, backend
 
-from .job import METHODS, Job, Machine
-from .spread import spread
+from .job import Job, Machine
 
-PIXEL_CHANNELS = 3
+#: What a process may allocate: a method whose memory grows without bound dies of it before the machine swaps.
+MEMORY_LIMIT_GIB = 8
 
 
 def _say(event: str, **facts: Any) -> None:
@@ -62,102 +62,84 @@ def peak_mib() -> float:
     return peak / (1024 if sys.platform != "darwin" else 1024**2)
 
 
-class Pass:
-    """A scene, ready for gradients: each call times one gradient pass of the weighted image, or one primal pass."""
+def limit_memory() -> None:
+    """Let allocations beyond the limit fail."""
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    wanted = MEMORY_LIMIT_GIB * 1024**3
+    resource.setrlimit(resource.RLIMIT_DATA, (wanted if hard < 0 else min(wanted, hard), hard))
 
-    def __init__(self, job: Job) -> None:
-        import drjit as dr
-        import mitsuba as mi
-        import numpy as np
 
-        from pathreplay.check.objective import smooth_weights
+class Measure(Protocol):
+    """What a job is measured with, made from the job."""
 
-        from . import counting
-        from .scenes import SCENES
+    def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
+        """Seconds of one pass and what came of it, as one flat array; raises what the method raises."""
 
-        self.job = job
-        self.counter: Any = counting.register()
-        self.scene = mi.load_dict(SCENES[job.scene](job.resolution), optimize=False)
-        self.params = mi.traverse(self.scene)
-        for key in job.parameters:
-            dr.enable_grad(self.params[key])
-        self.params.update()
-        shape = (job.resolution, job.resolution, PIXEL_CHANNELS)
-        even = dr.full(mi.TensorXf, 1 / (shape[0] * shape[1] * shape[2]), shape)
-        wave = smooth_weights(shape, alpha=False).astype(np.float32)
-        self.adjoint = even if job.weights == "even" else mi.TensorXf(wave)
-        self.grid = getattr(self.params[job.parameters[0]], "shape", ()) if len(job.parameters) == 1 else ()
-        self.integrators: dict[str, Any] = {}
+    def forget(self) -> None:
+        """Begin anew: the methods have learned nothing."""
 
-    def __call__(self, method: str, seed: int) -> tuple[float, Any]:
-        """Seconds, and the gradients of all parameters (or image, or event count) as one flat array.
+    def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
+        """By method: fields of `Point` that follow from the arrays of all rounds together."""
 
-        Raises what the method raises.
-        """
-        import drjit as dr
-        import mitsuba as mi
-        import numpy as np
 
-        if method not in self.integrators:
-            depths = {"max_depth": self.job.max_depth, "rr_depth": self.job.rr_depth}
-            self.integrators[method] = mi.load_dict(METHODS[method] | depths)
-        for key in self.job.parameters:
-            dr.clear_grad(self.params[key])
-        self.counter.count = dr.zeros(mi.UInt32, 1)
-        gc.collect()  # not in the middle of the measurement
-        dr.sync_thread()
-        start = time.perf_counter()
-        if self.job.update:
-            for key in self.job.parameters:
-                self.params.set_dirty(key)
-            self.params.update()
-        if self.job.measure != "gradient":
-            results = [self.integrators[method].render(self.scene, seed=seed, spp=self.job.spp)]
-        else:
-            self.integrators[method].render_backward(self.scene, self.params, self.adjoint, seed=seed, spp=self.job.spp)
-            results = [dr.grad(self.params[key]) for key in self.job.parameters]
-        dr.eval(results)  # so far the kernel has only been recorded
-        dr.sync_thread()
-        seconds = time.perf_counter() - start
-        if self.job.measure == "events":
-            return seconds, np.array(self.counter.count) / (self.job.resolution**2 * self.job.spp)
-        flat = [np.ravel(np.array(getattr(result, "matrix", result))) for result in results]
-        return seconds, np.concatenate(flat)
+def _measure(job: Job) -> Measure:
+    """Modules that load mitsuba are imported here, once there is a variant."""
+    if job.measure == "truth":
+        from .truth_pass import Derivative
+
+        return Derivative(job)
+    if job.measure == "noise":
+        from .noise_pass import ReplayError
+
+        return ReplayError(job)
+    if job.measure == "step":
+        from .iteration_pass import Step
+
+        return Step(job)
+    if job.measure in ("cold start", "warm start"):
+        from .startup_pass import Start
+
+        return Start(job)
+    from .passes import Pass
+
+    return Pass(job)
 
 
 def run(job: Job) -> None:
-    """Run a job; events are `machine`, `start`, `sample`, `error`, `errors` (see `spread`), `peak`."""
+    """Run a job; events are `machine`, `start`, `sample`, `error`, `facts` (fields of `Point`), `peak`."""
+    limit_memory()
     variant = backend.set_variant(None)
 
     import drjit as dr
-    import numpy as np
 
     from pathreplay.scenes import one_line
 
     if job.threads:
         dr.set_thread_count(job.threads)
     _say("machine", **asdict(_machine(variant)))
-    one_pass = Pass(job)
+    measure = _measure(job)
     kept: dict[str, list[Any]] = {name: [] for name in job.methods}
+    spent = dict.fromkeys(job.methods, 0.0)
     for k in range(-job.warm_up, job.rounds):
         if k == 0 or (k > 0 and job.restart and k % job.restart == 0):
-            one_pass.integrators.clear()
+            measure.forget()
         for method in list(kept):
+            if job.patience and spent[method] > job.patience and kept[method]:
+                continue
             _say("start", method=method)
             try:
-                seconds, result = one_pass(method, seed=k % 2**32)
+                seconds, result = measure(method, seed=k % 2**32)
             except Exception as error:
                 _say("error", method=method, message=one_line(error)[:200])
                 del kept[method]
                 continue
+            spent[method] += seconds
             finite = bool(np.isfinite(result).all())
             _say("sample", method=method, seed=k, seconds=seconds, finite=finite, kept=k >= 0)
             if k >= 0:
                 kept[method].append(result)
-    reference = kept.get(job.reference or "")
-    for method, rows in kept.items():
-        if len(rows) > 1 and np.isfinite(rows).all():
-            _say("errors", method=method, **spread(rows, reference, one_pass.grid))
+    for method, facts in measure.conclude(kept).items():
+        _say("facts", method=method, **facts)
     _say("peak", mib=peak_mib())
 
 

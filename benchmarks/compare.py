@@ -1,0 +1,179 @@
+"""The regression guard: what is slower, noisier, heavier or wrong in one record of a task and was not in another.
+
+Times of different days and machines differ, so that what is compared is the ratio to Mitsuba's method of the same job
+in the same run, where both runs have it. A change counts if its 95 % interval, resampled from both records, lies
+beyond a margin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from .estimates import RESAMPLES, Estimate
+from .job import STOCK, Machine, Point, Record
+from .tables import markdown, pooled
+
+# Two runs of the same code differ by more than each of them tells: kernels lie elsewhere in memory, rivals meet other
+# loads. In ratios to a rival that takes turns it is a few per cent; seconds alone drift with the machine's clock.
+MARGIN = 0.05
+ALONE_MARGIN = 0.15
+
+Outcome = Literal["worse", "better", "same", "missing", "new", "not comparable"]
+Key = tuple[object, ...]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One quantity of one method in one job, then and now."""
+
+    scene: str
+    method: str
+    depth: int
+    quantity: str
+    outcome: Outcome
+    told: str  # new over old with its interval, or the reason for the outcome
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All rows of two records of a task."""
+
+    rows: tuple[Row, ...]
+
+    @property
+    def worse(self) -> tuple[Row, ...]:
+        """What got slower, noisier, heavier or wrong."""
+        return tuple(row for row in self.rows if row.outcome == "worse")
+
+    def table(self) -> str:
+        """What changed, as Markdown, the bad news first; then how much is the same."""
+        order: tuple[Outcome, ...] = ("worse", "missing", "not comparable", "new", "better")
+        told = [row for outcome in order for row in self.rows if row.outcome == outcome]
+        same = len(self.rows) - len(told)
+        summary = f"{same} of {len(self.rows)} quantities are the same within their spread, {len(self.worse)} worse."
+        if not told:
+            return summary
+        cells = [[r.scene, r.method, str(r.depth), r.quantity, r.outcome, r.told] for r in told]
+        return markdown(["scene", "method", "depth", "quantity", "is", "new / old"], cells) + "\n\n" + summary
+
+
+def compare(old: Record, new: Record) -> Comparison:
+    """Compare two records of a task; Mitsuba's own methods are the yardstick and not judged."""
+    before, now = ({_key(point): point for point in pooled(record.points)} for record in (old, new))
+    same_machine = _place(old.machines) == _place(new.machines)
+    rows: list[Row] = []
+    for key in dict.fromkeys([*before, *now]):
+        a, b = before.get(key), now.get(key)
+        if a is None or b is None:
+            point = a or b
+            assert point is not None
+            outcome: Outcome = "missing" if b is None else "new"
+            rows.append(_row(point, "all", outcome, f"not in the {'new' if b is None else 'old'} record"))
+        elif not _is_stock(a.method):
+            rows += _rows(a, b, _yardstick(key, before, now), same_machine)
+    return Comparison(tuple(rows))
+
+
+def _key(point: Point) -> Key:
+    return point.scene, point.parameters, point.max_depth, point.paths, point.measure, point.method
+
+
+def _row(point: Point, quantity: str, outcome: Outcome, told: str) -> Row:
+    return Row(point.scene, point.method, point.max_depth, quantity, outcome, told)
+
+
+def _is_stock(method: str) -> bool:
+    return method.split(", ")[0] in STOCK
+
+
+def _place(machines: Sequence[Machine]) -> set[tuple[str, int, int]]:
+    return {(machine.processor, machine.processors, machine.threads) for machine in machines}
+
+
+def _yardstick(key: Key, before: dict[Key, Point], now: dict[Key, Point]) -> tuple[Point, Point] | None:
+    """Mitsuba's method of the same job in both records: that of the same stage ('prb, import') if there are stages."""
+    rivals = [
+        other
+        for other in before
+        if other[:-1] == key[:-1] and _is_stock(str(other[-1])) and _timed(before[other]) and _timed(now.get(other))
+    ]
+    stage = str(key[-1]).partition(", ")[2]
+    rivals.sort(key=lambda other: str(other[-1]).partition(", ")[2] != stage)
+    return (before[rivals[0]], now[rivals[0]]) if rivals else None
+
+
+def _timed(point: Point | None) -> bool:
+    return point is not None and point.error is None and len(point.seconds) > 1
+
+
+def _rows(a: Point, b: Point, rivals: tuple[Point, Point] | None, same_machine: bool) -> list[Row]:
+    if a.error or b.error:
+        if a.error and b.error:
+            return [_row(b, "all", "same", b.error)]
+        return [_row(b, "all", "worse" if b.error else "better", b.error or f"was: {a.error}")]
+    rows: list[Row] = []
+    if a.verdict is not None and b.verdict is not None:
+        good = [verdict in ("pass", "zero") for verdict in (a.verdict, b.verdict)]
+        outcome: Outcome = "same" if good[0] == good[1] else "better" if good[1] else "worse"
+        return [_row(b, "truth", outcome, f"{b.verdict}, was {a.verdict}")]
+    lost = len(b.not_finite) > len(a.not_finite)
+    if lost:
+        rows.append(_row(b, "finite", "worse", f"{len(b.not_finite)} gradients are not, were {len(a.not_finite)}"))
+    rows.append(_time(a, b, rivals, same_machine))
+    if len(a.squared_errors) > 1 and len(b.squared_errors) > 1:
+        noise = _change(_means(a.squared_errors, 0), _means(b.squared_errors, 1))
+        rows.append(_judged(b, "variance", noise, MARGIN))
+    if len(a.values) > 1 and len(b.values) > 1:
+        rows.append(_judged(b, "error", _change(_means(a.values, 0), _means(b.values, 1)), MARGIN))
+    if same_machine and a.peak_mib and b.peak_mib:
+        ratio = b.peak_mib / a.peak_mib
+        rows.append(_judged(b, "memory", Estimate(ratio, ratio, ratio), MARGIN))
+    return rows
+
+
+def _time(a: Point, b: Point, rivals: tuple[Point, Point] | None, same_machine: bool) -> Row:
+    if rivals is not None and _timed(a) and _timed(b):
+        change = _change(_time_ratios(a, rivals[0], 0), _time_ratios(b, rivals[1], 1))
+        return _judged(b, f"time / {rivals[0].method}", change, MARGIN)
+    if not (same_machine and _timed(a) and _timed(b)):
+        return _row(b, "time", "not comparable", "another machine and no rival in both, or a single round")
+    return _judged(b, "time", _change(_medians(a.seconds, 0), _medians(b.seconds, 1)), ALONE_MARGIN)
+
+
+def _judged(point: Point, quantity: str, change: Estimate, margin: float) -> Row:
+    if change.low > 1 + margin:
+        return _row(point, quantity, "worse", str(change))
+    return _row(point, quantity, "better" if change.high < 1 - margin else "same", str(change))
+
+
+# ------------------------------ Resampling ------------------------------
+# Each returns the statistic of the run itself and then of RESAMPLES resampled runs, by other draws for old and new.
+
+
+def _change(old: np.ndarray, new: np.ndarray) -> Estimate:
+    low, high = np.quantile(new[1:] / old[1:], [0.025, 0.975])
+    return Estimate(float(new[0] / old[0]), float(low), float(high))
+
+
+def _time_ratios(ours: Point, theirs: Point, seed: int) -> np.ndarray:
+    if len(ours.seconds) == len(theirs.seconds):
+        return _medians(np.asarray(ours.seconds) / np.asarray(theirs.seconds), seed)
+    return _medians(ours.seconds, seed) / _medians(theirs.seconds, seed + 2)
+
+
+def _medians(samples: Sequence[float] | np.ndarray, seed: int) -> np.ndarray:
+    return _resampled(samples, np.median, seed)
+
+
+def _means(samples: Sequence[float] | np.ndarray, seed: int) -> np.ndarray:
+    return _resampled(samples, np.mean, seed)
+
+
+def _resampled(samples: Sequence[float] | np.ndarray, statistic: Callable[..., np.ndarray], seed: int) -> np.ndarray:
+    x = np.asarray(samples, dtype=float)
+    draws = np.random.default_rng(seed).integers(len(x), size=(RESAMPLES, len(x)))
+    return np.concatenate([[statistic(x)], statistic(x[draws], axis=-1)])

@@ -1,0 +1,246 @@
+"""Draws the pictures of docs/evidence.md from the saved records: log-log, error bars, every line labelled at its end.
+
+Colours are those of Okabe and Ito, which differ for colour-blind eyes; markers differ as well, for print.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from . import depth, media, noise, records
+from .drafts import ROOT
+from .estimates import Estimate, efficiency
+from .job import Point, Record
+from .tables import groups
+
+IMAGES = ROOT / "docs" / "images"
+
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+BLUE, RED, PINK, GREY = "#0072B2", "#D55E00", "#CC79A7", "#888888"
+
+#: Colour and marker by method.
+LOOKS = {
+    "sweep": (BLUE, "o"),
+    "score": (BLUE, "o"),
+    "replay": (SKY, "s"),
+    "branch": (SKY, "s"),
+    "listing": (GREEN, "D"),
+    "prb": (RED, "^"),
+    "prbvolpath": (RED, "^"),
+    "prb_basic": (ORANGE, "v"),
+    "tape": (PINK, "P"),
+    "rb": (BLACK, "X"),
+    "rb linear": (GREY, "d"),
+}
+TITLES = {depth.SURFACES: "surfaces: a closed box", depth.MEDIA: "media: a sealed room of fog"}
+LABEL_SIZE = 9
+# Least distance of two labels, as a share of the height of the axes.
+APART = 0.055
+
+
+def draw_all(folder: Path = IMAGES, load: Callable[[str], Record | None] = records.load) -> list[Path]:
+    """Draw every picture for which there is a record; returns the files, SVG and PNG."""
+    drawn: list[Path] = []
+    for task, name, draw in (
+        (depth.TITLE, "depth-time", _depth_time),
+        (depth.TITLE, "depth-memory", _depth_memory),
+        (media.TITLE, "media-efficiency", _media_efficiency),
+        (noise.TITLE, "replay-noise", _replay_noise),
+    ):
+        record = load(task)
+        if record is not None:
+            # The same record gives the same file: element names from a fixed salt, and no date.
+            with mpl.rc_context({"svg.hashsalt": "pathreplay", "font.size": 10}):
+                drawn += _write(draw(record), folder / name)
+    return drawn
+
+
+def _write(figure: Figure, stem: Path) -> list[Path]:
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    svg, png = stem.with_suffix(".svg"), stem.with_suffix(".png")
+    figure.savefig(svg, metadata={"Date": None})
+    figure.savefig(png, dpi=120)
+    return [svg, png]
+
+
+# ------------------------------ Depth ------------------------------
+
+
+def _depth_time(record: Record) -> Figure:
+    """Fastest round, with a bar up to the slowest."""
+
+    def seconds(point: Point) -> tuple[float, float, float]:
+        return min(point.seconds), 0.0, max(point.seconds) - min(point.seconds)
+
+    return _against_depth(record, seconds, "seconds of a gradient pass")
+
+
+def _depth_memory(record: Record) -> Figure:
+    return _against_depth(record, lambda point: (point.peak_mib or np.nan, 0.0, 0.0), "peak memory of the process, MiB")
+
+
+def _against_depth(record: Record, value: Callable[[Point], tuple[float, float, float]], name: str) -> Figure:
+    """A panel for each scene: value, and how far the bar goes down and up, by depth, a line for each method."""
+    scenes = list(dict.fromkeys(point.scene for point in record.points))
+    figure, panels = _panels(len(scenes), width=5.0)
+    for axes, scene in zip(panels, scenes, strict=True):
+        part = depth.of_scene(record, scene)
+        labels: list[tuple[float, float, str, str]] = []
+        for method in dict.fromkeys(point.method for point in part.points):
+            points = depth.alive(part, method)
+            if not points:
+                continue
+            x = [point.max_depth for point in points]
+            y, down, up = np.transpose([value(point) for point in points])
+            colour, marker = LOOKS[method]
+            axes.errorbar(x, y, yerr=[down, up], color=colour, marker=marker, markersize=4, linewidth=1.3, capsize=2)
+            labels.append((x[-1], y[-1], method, colour))
+        axes.set(xscale="log", yscale="log", xlabel="path length (max_depth)", title=TITLES.get(scene, scene))
+        axes.set_xticks(_powers_of_four(part), [f"{n}" for n in _powers_of_four(part)])
+        axes.minorticks_off()
+        _label_ends(axes, labels)
+    panels[0].set_ylabel(name)
+    return figure
+
+
+def _powers_of_four(record: Record) -> list[int]:
+    deepest = max(point.max_depth for point in record.points)
+    return [4**k for k in range(1, 8) if 4**k <= deepest]
+
+
+# ------------------------------ Media ------------------------------
+
+
+def _media_efficiency(record: Record) -> Figure:
+    """Bars of efficiency relative to prbvolpath, grouped by scene and parameter."""
+    figure, (axes,) = _panels(1, width=7.5, height=4.6)
+    names: list[str] = []
+    at = 0.0
+    found = [(key, methods) for key, methods in groups(record.points).items() if _efficiencies(methods)]
+    ticks = []
+    for (scene, parameters, *_), methods in reversed(found):
+        bars = _efficiencies(methods)
+        ticks.append(at + (len(bars) - 1) / 2)
+        names.append(f"{scene}, {media.WHAT[parameters[0]]}")  # type: ignore[index]
+        for method, gain in reversed(bars.items()):
+            error = [[gain.value - gain.low], [gain.high - gain.value]]
+            axes.barh(at, gain.value, height=0.8, color=LOOKS[method][0], xerr=error, error_kw={"capsize": 2, "lw": 1})
+            axes.annotate(
+                f"{method}  {gain.value:.2g}x",
+                (gain.high, at),
+                xytext=(5, 0),
+                textcoords="offset points",
+                va="center",
+                fontsize=8,
+            )
+            at += 1
+        at += 0.8
+    axes.axvline(1, color=RED, linewidth=1.2)
+    axes.annotate("prbvolpath", (1, at - 0.6), color=RED, ha="center", va="bottom", fontsize=LABEL_SIZE)
+    axes.set(xscale="log", xlabel="time x variance of prbvolpath over that of the method (more is better)")
+    axes.set_yticks(ticks, names)
+    low, high = axes.get_xlim()
+    axes.set_xlim(low, high * 2.5)  # room for the labels
+    axes.set_ylim(-0.8, at + 0.2)
+    axes.grid(False, axis="y")
+    return figure
+
+
+def _efficiencies(methods: dict[str, Point]) -> dict[str, Estimate]:
+    rival = methods.get(media.RIVAL)
+    if rival is None or not rival.squared_errors:
+        return {}
+    return {
+        name: efficiency((point.seconds, rival.seconds), (point.squared_errors, rival.squared_errors))
+        for name, point in methods.items()
+        if point is not rival and point.squared_errors
+    }
+
+
+# ------------------------------ Noise of replay ------------------------------
+
+
+def _replay_noise(record: Record) -> Figure:
+    """Error against noise level, a panel for each kind of bookkeeping, a line for each number of diffuse bounces."""
+    scene = "diffuse sheets"
+    points = [point for point in record.points if point.scene == scene and not point.error]
+    depths = sorted({point.max_depth for point in points})
+    kinds = [kind for kind in noise.KINDS if any(point.method.startswith(kind) for point in points)]
+    figure, panels = _panels(len(kinds), width=3.6, share=True)
+    colours = [SKY, GREEN, ORANGE, RED, BLACK]
+    for axes, kind in zip(panels, kinds, strict=True):
+        labels = []
+        for max_depth, colour in zip(depths, colours, strict=False):
+            cells = {p.method: p for p in points if p.max_depth == max_depth}
+            told = [(level, cells.get(f"{kind}, {level:g}")) for level in noise.NOISES]
+            line = [(level, point.values) for level, point in told if point is not None and _finite(point)]
+            if not line:
+                continue
+            x = [level for level, _ in line]
+            y = [float(np.exp(np.mean(np.log(values)))) for _, values in line]
+            bars = [[a - min(v) for a, (_, v) in zip(y, line, strict=True)]]
+            bars.append([max(v) - a for a, (_, v) in zip(y, line, strict=True)])
+            axes.errorbar(x, y, yerr=bars, color=colour, marker="o", markersize=4, linewidth=1.3, capsize=2)
+            labels.append((x[0], y[0], f"{max_depth - 1} bounces", colour))
+        sweeps = [v for p in points if p.method == noise.SWEEP and _finite(p) for v in p.values]
+        if sweeps:
+            axes.axhspan(min(sweeps), max(sweeps), color=GREY, alpha=0.3, linewidth=0)
+            axes.annotate(
+                "Monte Carlo error of one pass",
+                (0.03, max(sweeps)),
+                xycoords=("axes fraction", "data"),
+                xytext=(0, 2),
+                textcoords="offset points",
+                fontsize=8,
+                color="#555555",
+            )
+        axes.set(xscale="log", yscale="log", title=kind, xlabel="noise put into the Jacobians")
+        _label_ends(axes, labels)
+    panels[0].set_ylabel("error of the gradient, relative to the sweep")
+    return figure
+
+
+def _finite(point: Point) -> bool:
+    return len(point.values) > 0 and bool(np.isfinite(point.values).all())
+
+
+# ------------------------------ Parts ------------------------------
+
+
+def _panels(count: int, width: float, height: float = 3.8, share: bool = False) -> tuple[Figure, Sequence[Axes]]:
+    figure = Figure(figsize=(width * count, height), layout="constrained")
+    panels: Any = figure.subplots(1, count, squeeze=False, sharey=share)[0]
+    for axes in panels:
+        axes.grid(True, color="#dddddd", linewidth=0.6)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.title.set_fontsize(10)
+    return figure, panels
+
+
+def _label_ends(axes: Axes, labels: Iterable[tuple[float, float, str, str]]) -> None:
+    """Write names (x, y, name, colour) at the right-hand ends of their lines, pushed apart where they would meet."""
+    low, high = np.log(axes.get_ylim())
+    left, right = axes.get_xlim()
+    axes.set_xlim(left, right * (right / left) ** 0.28)
+    floor = -np.inf
+    for x, y, name, colour in sorted(labels, key=lambda label: label[1]):
+        height = max((np.log(y) - low) / (high - low), floor + APART)
+        floor = height
+        axes.annotate(
+            name,
+            (x, float(np.exp(low + height * (high - low)))),
+            xytext=(7, 0),
+            textcoords="offset points",
+            color=colour,
+            va="center",
+            fontsize=LABEL_SIZE,
+        )
+    axes.set_ylim(*np.exp((low, high)))

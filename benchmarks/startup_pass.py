@@ -1,0 +1,61 @@
+"""Processes of their own, timed from import to second gradient, with a kernel cache or without: for `startup`."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from .drafts import ROOT
+from .job import METHODS, STOCK, Job
+from .startup import STAGES
+
+
+class Start:
+    """Each method and seed has one process, which is started by the call that asks for its first stage."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        # Of a warm start: filled in the rounds that are not kept.
+        self.homes = {name: tempfile.TemporaryDirectory() for name in ("ours", "theirs")}
+        self.stages: dict[tuple[str, int], list[float]] = {}
+
+    def forget(self) -> None:
+        """Nothing is learned but the kernels."""
+
+    def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
+        """Seconds of one stage."""
+        name, stage = method.split(", ")
+        if (name, seed) not in self.stages:
+            whose = "theirs" if name in STOCK else "ours"
+            if self.job.measure == "warm start":
+                self.stages[name, seed] = self._start(name, whose, self.homes[whose].name)
+            else:
+                with tempfile.TemporaryDirectory() as home:
+                    self.stages[name, seed] = self._start(name, whose, home)
+        seconds = self.stages[name, seed][STAGES.index(stage)]
+        return seconds, np.array([seconds])
+
+    def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
+        """Nothing follows but the seconds themselves."""
+        for home in self.homes.values():
+            home.cleanup()
+        return {}
+
+    def _start(self, name: str, whose: str, home: str) -> list[float]:
+        arguments = [json.dumps(asdict(self.job)), json.dumps(METHODS[name]), whose]
+        environment = os.environ | {"HOME": home, "DRJIT_CACHE_DIR": home, "PYTHONPATH": str(ROOT)}
+        if whose == "ours":
+            environment.pop("DRJIT_LIBLLVM_PATH", None)  # finding it is part of the import
+        command = [sys.executable, "-m", "benchmarks.first", *arguments]
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+        if done.returncode != 0:
+            lines = done.stderr.strip().splitlines()
+            raise RuntimeError(lines[-1] if lines else f"ended with status {done.returncode}")
+        return json.loads(done.stdout.splitlines()[-1])
