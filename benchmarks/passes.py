@@ -10,8 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.check.objective import smooth_weights
-
 from . import counting
 from .job import METHODS, Job
 from .scenes import SCENES
@@ -32,9 +30,7 @@ class Pass:
             dr.enable_grad(self.params[key])
         self.params.update()
         shape = (job.resolution, job.resolution, PIXEL_CHANNELS)
-        even = dr.full(mi.TensorXf, 1 / (shape[0] * shape[1] * shape[2]), shape)
-        wave = smooth_weights(shape, alpha=False).astype(np.float32)
-        self.adjoint = even if job.weights == "even" else mi.TensorXf(wave)
+        self.adjoint = _wave(shape) if job.weights == "wave" else dr.full(mi.TensorXf, 1 / np.prod(shape), shape)
         self.grid = getattr(self.params[job.parameters[0]], "shape", ()) if len(job.parameters) == 1 else ()
         self.integrators: dict[str, Any] = {}
 
@@ -76,6 +72,13 @@ class Pass:
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """What the gradients of all seeds say, by method: see `spread`."""
         return spreads(kept, self.job.reference, self.grid)
+
+
+def _wave(shape: tuple[int, int, int]) -> Any:
+    # Imported here: it brings scipy along, 60 MiB that belong to no method's peak.
+    from pathreplay.check.objective import smooth_weights
+
+    return mi.TensorXf(smooth_weights(shape, alpha=False).astype(np.float32))
 
 
 def spreads(

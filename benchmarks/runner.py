@@ -18,6 +18,8 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from .drafts import ROOT, Done, Draft
 from .job import Job, Machine, Point
 
+WORKER = (sys.executable, "-m", "benchmarks.worker")
+
 
 @dataclass
 class _Samples:
@@ -85,7 +87,7 @@ def _attempt(job: Job, measured: Measured, show: Callable[[str, int], None]) -> 
     running, peak, passes = job.methods[0], None, 0
     # An empty home has an empty kernel cache: compiling is in the peak memory of every job or, by chance, of some.
     with tempfile.TemporaryDirectory() as home, tempfile.TemporaryFile("w+") as complaints:
-        command = [sys.executable, "-m", "benchmarks.worker", json.dumps(asdict(job))]
+        command = [*WORKER, json.dumps(asdict(job))]
         environment = os.environ | {"HOME": home, "DRJIT_CACHE_DIR": home}
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=complaints, text=True, cwd=ROOT, env=environment

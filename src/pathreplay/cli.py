@@ -8,6 +8,7 @@ modules are imported inside the commands, so that `pathreplay --help` answers at
 from __future__ import annotations
 
 import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -111,14 +112,21 @@ def optimize(
     typer.echo(result.describe())
 
 
-# The options are those of `python -m benchmarks`, which prints its own help.
+# The options are those of `python -m benchmarks`, which prints its own help. It runs where the user is: files that are
+# named on the command line are found from there.
 @app.command(add_help_option=False, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def bench(context: typer.Context) -> None:
-    """Measure time, memory and variance next to Mitsuba's own integrators; needs a checkout."""
+    """Measure time, memory, noise and truth next to Mitsuba's own integrators; needs a checkout."""
     root = Path(__file__).resolve().parents[2]
     if not (root / "benchmarks" / "__main__.py").is_file():
-        raise PathreplayError("the benchmarks are not installed: clone the repository and run make bench there")
-    raise typer.Exit(subprocess.run([sys.executable, "-m", "benchmarks", *context.args], cwd=root).returncode)
+        raise PathreplayError(
+            "the benchmarks are not part of the installed package: they are the folder 'benchmarks' of the repository; "
+            "clone it and run 'make bench' there"
+        )
+    paths = [str(root), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+    command = [sys.executable, "-m", "benchmarks", *context.args]
+    raise typer.Exit(subprocess.run(command, env=environment).returncode)
 
 
 def _fail(message: str) -> NoReturn:

@@ -1,0 +1,275 @@
+"""The benchmarks' own machinery: going on after a break, methods that die, comparisons, plots, messages."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # the benchmarks run from the checkout and are not installed
+
+from benchmarks import depth, drafts, media, noise, plots, records, runner, surface, tables  # noqa: E402
+from benchmarks.compare import Row, compare  # noqa: E402
+from benchmarks.job import Job, Machine, Point, Record  # noqa: E402
+
+MACHINE = Machine("a processor", 2, 2, "Linux", "3.11", "3.9.1", "1.5.0", "0.1.0", "23.1.4", "llvm_ad_rgb")
+ROUNDS = 12
+
+
+def point(method: str, slowness: float = 1.0, noise: float = 1.0, seed: int = 0, **more) -> Point:
+    """A point with samples that spread by some per cent."""
+    random = np.random.default_rng([seed, len(method)])
+    seconds = 0.1 * slowness * random.lognormal(0, 0.03, ROUNDS)
+    errors = noise * random.lognormal(0, 0.1, ROUNDS)
+    known = {"scene": "box", "parameters": ("texture",), "max_depth": 8, "paths": 64, "peak_mib": None}
+    return Point(
+        method=method,
+        seeds=tuple(range(ROUNDS)),
+        seconds=tuple(seconds.tolist()),
+        squared_errors=tuple(errors.tolist()),
+        not_finite=(),
+        **known | more,
+    )
+
+
+def record(*points: Point, task: str = "surface", machine: Machine = MACHINE) -> Record:
+    return Record(
+        task, f"pathreplay bench {task}", "2026-01-01T00:00:00", "0123456789ab", (0.1, 0.2), (machine,), points
+    )
+
+
+def rows(old: Record, new: Record, outcome: str) -> list[Row]:
+    return [row for row in compare(old, new).rows if row.outcome == outcome]
+
+
+# ------------------------------ The regression guard ------------------------------
+
+
+def test_a_run_that_is_as_fast_and_as_noisy_is_not_flagged() -> None:
+    old, new = (record(point("prb", seed=s), point("sweep", 0.7, seed=s)) for s in (1, 2))
+    comparison = compare(old, new)
+    assert [row.outcome for row in comparison.rows] == ["same", "same"]  # time and variance of the sweep
+    assert not comparison.worse and "2 of 2" in comparison.table()
+
+
+def test_a_slower_method_is_flagged_relative_to_its_rival() -> None:
+    old = record(point("prb", seed=1), point("sweep", 0.7, seed=1))
+    new = record(point("prb", 3.0, seed=2), point("sweep", 0.7 * 3.0 * 1.3, seed=2))  # a machine three times slower
+    (slow,) = compare(old, new).worse
+    assert (slow.method, slow.quantity) == ("sweep", "time / prb")
+    assert slow.told.startswith("1.3") or slow.told.startswith("1.2")
+    assert [row.quantity for row in rows(new, old, "better")] == ["time / prb"]
+
+
+def test_a_rival_that_gets_slower_is_no_regression() -> None:
+    old, new = record(point("prb", seed=1)), record(point("prb", 2.0, seed=2))
+    assert compare(old, new).rows == ()
+
+
+def test_a_noisier_method_is_flagged() -> None:
+    old, new = (record(point("prb", seed=s), point("sweep", noise=s, seed=s)) for s in (1, 2))
+    assert [row.quantity for row in compare(old, new).worse] == ["variance"]
+
+
+def test_seconds_without_a_rival_are_compared_on_the_same_machine_only() -> None:
+    old, new = record(point("sweep", seed=1)), record(point("sweep", 1.5, seed=2))
+    assert [row.quantity for row in compare(old, new).worse] == ["time"]
+    other = replace(new, machines=(replace(MACHINE, processor="another processor"),))
+    assert [row.quantity for row in rows(old, other, "not comparable")] == ["time"]
+
+
+def test_memory_death_and_a_failed_truth_are_flagged() -> None:
+    fine = point("sweep", peak_mib=100.0)
+    assert [r.quantity for r in compare(record(fine), record(replace(fine, peak_mib=120.0))).worse] == ["memory"]
+    dead = compare(record(fine), record(replace(fine, error="died: SIGKILL"))).worse
+    assert [r.told for r in dead] == ["died: SIGKILL"]
+    right, wrong = (replace(fine, verdict=verdict) for verdict in ("pass", "fail"))
+    assert [r.told for r in compare(record(right), record(wrong)).worse] == ["fail, was pass"]
+    assert [r.outcome for r in compare(record(wrong), record(right)).rows] == ["better"]
+
+
+def test_rows_that_only_one_record_has_are_named() -> None:
+    old, new = record(point("prb"), point("sweep")), record(point("prb"), point("replay"))
+    assert [row.method for row in rows(old, new, "missing")] == ["sweep"]
+    assert [row.method for row in rows(old, new, "new")] == ["replay"]
+    assert "not in the new record" in compare(old, new).table()
+
+
+def test_stages_are_compared_with_the_same_stage_of_the_rival() -> None:
+    def start(slowness: float, seed: int) -> Record:
+        stages = ("import", 0.1), ("first gradient", 1.0)
+        rival = [point(f"prb, {stage}", length, seed=seed) for stage, length in stages]
+        return record(*rival, *(point(f"sweep, {stage}", length * slowness, seed=seed) for stage, length in stages))
+
+    times = [row for row in compare(start(1, 1), start(1.4, 2)).rows if "time" in row.quantity]
+    assert [(row.method, row.quantity, row.outcome) for row in times] == [
+        ("sweep, import", "time / prb, import", "worse"),
+        ("sweep, first gradient", "time / prb, first gradient", "worse"),
+    ]
+
+
+# ------------------------------ Going on after a break ------------------------------
+
+JOB = Job(
+    scene="closed-box",
+    parameters=depth.WALLS,
+    methods=("sweep",),
+    max_depth=2,
+    rr_depth=3,
+    resolution=4,
+    spp=1,
+    rounds=2,
+    warm_up=0,
+    threads=1,
+)
+
+
+def test_finished_jobs_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[Job] = []
+
+    def run(job: Job, measured: runner.Measured, show: object) -> None:
+        if len(ran) == 2:
+            raise KeyboardInterrupt
+        ran.append(job)
+        measured.points.append(point("sweep", seed=len(ran), max_depth=job.max_depth))
+        measured.machines.append(MACHINE)
+
+    monkeypatch.setattr(runner, "_run_job", run)
+    jobs = [JOB, replace(JOB, max_depth=3), JOB]  # the first one twice, in turn
+    path = tmp_path / "depth.json"
+    with pytest.raises(KeyboardInterrupt):
+        runner.run_jobs("depth", jobs, drafts.Draft(path))
+    first = list(ran)
+    ran.clear()
+    draft = drafts.Draft(path)
+    measured = runner.run_jobs("depth", jobs, draft)
+    assert first == jobs[:2] and ran == jobs[2:]
+    assert [p.max_depth for p in measured.points] == [2, 3, 2] and measured.machines == [MACHINE]
+    assert draft.sittings == 2 and "2 sittings" in tables.footnote(replace(record(*measured.points), sittings=2))
+    draft.discard()
+    assert not path.exists()
+
+
+def test_a_draft_of_other_code_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "depth.json"
+    drafts.Draft(path).add(drafts.Done(JOB, 0, (point("sweep"),), (MACHINE,)))
+    assert drafts.Draft(path).find(JOB, 0) is not None
+    monkeypatch.setattr(drafts, "stamp", lambda: "of other code")
+    assert drafts.Draft(path).find(JOB, 0) is None
+    path.write_text("half a file")
+    assert drafts.Draft(path).find(JOB, 0) is None
+
+
+# ------------------------------ Workers ------------------------------
+
+
+def test_methods_that_raise_or_die_are_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In one job: a plugin that does not exist, and a process that is killed at its second method."""
+    worker = tmp_path / "worker.py"
+    worker.write_text(
+        "import json, os, signal, sys\n"
+        "def say(**facts): print(json.dumps(facts), flush=True)\n"
+        "for method in json.loads(sys.argv[-1])['methods']:\n"
+        "    say(event='start', method=method)\n"
+        "    if method == 'refuses': say(event='error', method=method, message='no such plugin'); continue\n"
+        "    if method == 'dies': os.kill(os.getpid(), signal.SIGKILL)\n"
+        "    for seed in (0, 1):\n"
+        "        say(event='sample', method=method, seed=seed, seconds=0.5, finite=True, kept=True)\n"
+        "    say(event='facts', method=method, mean=1.0, values=[0.5, 1.5])\n"
+    )
+    monkeypatch.setattr(runner, "WORKER", (sys.executable, str(worker)))
+    job = replace(JOB, methods=("refuses", "dies", "works"))
+    found = {p.method: p for p in runner.run_jobs("depth", [job], drafts.Draft(tmp_path / "draft.json")).points}
+    assert found["refuses"].error == "no such plugin"
+    assert found["dies"].error == "died: SIGKILL"
+    assert found["works"].error is None
+    assert found["works"].seconds == (0.5, 0.5) and found["works"].values == (0.5, 1.5)
+    assert "died: SIGKILL" in depth.table(record(*found.values(), task="depth"))
+
+
+def test_a_worker_measures_and_stays_within_its_memory(tmp_path: Path) -> None:
+    measured = runner.run_jobs("depth", [replace(JOB, methods=("sweep",))], drafts.Draft(tmp_path / "draft.json"))
+    (found,) = measured.points
+    assert found.error is None and len(found.seconds) == 2 and len(found.squared_errors) == 2
+    assert found.peak_mib is not None and 20 < found.peak_mib < 1000
+    assert measured.machines[0].threads == 1
+    code = "from benchmarks.worker import limit_memory; limit_memory(); bytearray(9 * 1024**3)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stderr.strip().endswith("MemoryError")
+
+
+# ------------------------------ Plots and the command line ------------------------------
+
+
+def test_plots_are_drawn_from_records(tmp_path: Path) -> None:
+    sizes = (4, 16, 64)
+    by_depth = [
+        point(method, n / 4, scene=scene, max_depth=n, peak_mib=100.0 + n)
+        for scene in (depth.SURFACES, depth.MEDIA)
+        for method in ("sweep", "prb", "rb")
+        for n in sizes
+    ]
+    clouds = [point(m, 0.5 if m == "score" else 1, scene="cloud", parameters=(media.DENSITY,)) for m in media.METHODS]
+    errors = [
+        replace(point(name, scene="diffuse sheets", max_depth=n), values=(1e-3 * n, 2e-3 * n))
+        for name in (noise.SWEEP, *noise.NOISY)
+        for n in (3, 6)
+    ]
+    known = {
+        "depth": record(*by_depth, replace(by_depth[0], method="tape", error="died: SIGKILL"), task="depth"),
+        "media": record(*clouds, task="media"),
+        "noise": record(*errors, task="noise"),
+    }
+    drawn = plots.draw_all(tmp_path, known.get)
+    names = {"depth-time", "depth-memory", "media-efficiency", "replay-noise"}
+    assert {path.stem for path in drawn} == names and {path.suffix for path in drawn} == {".svg", ".png"}
+    assert all(path.stat().st_size > 5000 for path in drawn)
+    first = (tmp_path / "depth-time.svg").read_bytes()
+    assert plots.draw_all(tmp_path / "again", known.get)
+    assert (tmp_path / "again" / "depth-time.svg").read_bytes() == first, "the same record draws the same picture"
+    assert plots.draw_all(tmp_path, {}.get) == []
+
+
+def bench(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pathreplay.cli", "bench", *arguments]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True)
+
+
+def test_wrong_usage_is_one_line_and_status_2(tmp_path: Path) -> None:
+    for arguments, told in (
+        (("nonsense",), "there is no task 'nonsense': use "),
+        (("--quick", "--save"), "--save keeps full runs only"),
+        (("--compare", "none.json"), "none.json cannot be read"),
+    ):
+        done = bench(*arguments, cwd=tmp_path)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert told in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_two_records_are_compared_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records, "RESULTS", tmp_path)
+    for name, slowness in (("old", 0.7), ("new", 1.4)):
+        path = records.save(record(point("prb", seed=1), point("sweep", slowness, seed=2)))
+        path.rename(tmp_path / f"{name}.json")
+    worse = bench("--compare", "old.json", "new.json", cwd=tmp_path)
+    assert worse.returncode == 1 and "| box | sweep | 8 | time / prb | worse | 2.00 [" in worse.stdout, worse.stderr
+    same = bench("--compare", "old.json", "old.json", cwd=tmp_path)
+    assert same.returncode == 0 and "2 of 2 quantities are the same" in same.stdout
+    (tmp_path / "broken.json").write_text("{}")
+    assert "is no record of a benchmark" in bench("--compare", "broken.json", cwd=tmp_path).stderr
+
+
+def test_saved_records_can_be_read_and_tabled() -> None:
+    """Those in the repository, which the documentation shows."""
+    from benchmarks.__main__ import TASKS
+
+    found = {path.stem: records.read(path) for path in records.RESULTS.glob("*.json")}
+    assert surface.TITLE in found and set(found) <= set(TASKS)
+    for name, kept in found.items():
+        assert kept.task == name and TASKS[name].table(kept).startswith("| ")
+        assert not kept.command.endswith("--quick")
