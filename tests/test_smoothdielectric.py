@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import pathreplay  # noqa: F401 (registers the plugin)
+from pathreplay.bsdfs.smoothdielectric import MAX_REFLECTION
 
 N = 20000
 RADIANCE, IMPORTANCE = "Radiance", "Importance"
@@ -90,11 +91,34 @@ def test_samples_equal_those_of_dielectric(parameters, name, mode):
         mi.load_dict({"type": kind, **parameters}).sample(ctx, si, sample1, mi.Point2f(0.5), active)
         for kind in ("smoothdielectric", "dielectric")
     )
+    critical = near_critical(si, parameters) if name == "both lobes" else mi.Mask(False)
     for field in ("wo", "pdf", "eta", "sampled_component", "sampled_type"):
-        assert dr.all(getattr(bs, field) == getattr(bs_ref, field), axis=None), field
-    assert dr.all(weight == weight_ref, axis=None)
+        assert dr.all(critical | (getattr(bs, field) == getattr(bs_ref, field)), axis=None), field
+    assert dr.all(critical | (weight == weight_ref), axis=None)
     if name == "both lobes":
-        assert dr.any(weight > 0, axis=None)
+        assert dr.any(weight > 0, axis=None) and dr.count(critical)[0] < N / 10
+
+
+def near_critical(si, parameters):
+    """Where the two plugins choose between the lobes with different probabilities."""
+    eta = mi.traverse(mi.load_dict({"type": "smoothdielectric", **parameters}))["eta"]
+    F, _, η_it, _ = mi.fresnel(mi.Frame3f.cos_theta(si.wi), eta)
+    return (η_it < 1) & (F > MAX_REFLECTION) & (F < 1)
+
+
+def test_transmission_is_likely_near_the_critical_angle():
+    """A quarter of the samples or more, and the same mean weights as if each lobe were drawn by itself."""
+    bsdf = mi.load_dict({"type": "smoothdielectric", "int_ior": 1.5, "ext_ior": 1.0})
+    θ = np.arcsin(1 / 1.5) * 0.9999
+    si = interaction(dr.repeat(mi.Vector3f(float(np.sin(θ)), 0, float(-np.cos(θ))), N))
+    bs, weight = bsdf.sample(context(), si, uniform(), mi.Point2f(0.5))
+    F, *_ = mi.fresnel(mi.Frame3f.cos_theta(si.wi), mi.Float(1.5))
+    assert MAX_REFLECTION < F[0] < 1
+    reflected = bs.sampled_component == 0
+    assert np.allclose(np.unique(bs.pdf), [1 - MAX_REFLECTION, MAX_REFLECTION])
+    assert abs(dr.count(reflected)[0] / N - MAX_REFLECTION) < 4 * np.sqrt(3 / 16 / N)
+    assert np.allclose(dr.select(reflected, weight[0] * bs.pdf, F), F)
+    assert np.allclose(dr.select(reflected, 1 - F, weight[0] * bs.pdf * 1.5**-2), 1 - F)
 
 
 def test_flags_and_parameters_are_those_of_dielectric():
@@ -351,8 +375,9 @@ def ball(kind: str, emitter: dict, **parameters):
 def test_white_furnace(indices):
     scene = ball("smoothdielectric", {"type": "constant"}, int_ior=indices[0], ext_ior=indices[1])
     image = mi.render(scene, spp=16, seed=3).numpy()
-    # Each refraction rounds η_ti² once: a few float32 roundings (6e-8) a path.
-    assert np.abs(image - 1).max() < 1e-6
+    # But for rays near the critical angle, which are rare here and whose two weights are not the same, there is no noise.
+    off = np.abs(image - 1)
+    assert np.median(off) < 1e-6 and off.max() < 0.05 and abs(image.mean() - 1) < 1e-4
 
 
 def test_image_equals_that_of_dielectric():
@@ -365,7 +390,9 @@ def test_image_equals_that_of_dielectric():
         ).numpy()
         for kind in ("smoothdielectric", "dielectric")
     ]
-    assert np.array_equal(*images) and images[0].std() > 0.1
+    same = (images[0] == images[1]).all(-1)
+    assert same.mean() > 0.9 and images[0].std() > 0.1  # the others have a ray near the critical angle
+    assert abs(images[0].mean() / images[1].mean() - 1) < 1e-3
 
 
 def test_image_derivative_through_two_refractions():

@@ -6,8 +6,10 @@ unpolarised Fresnel reflectance and η_ti = 1/η (from outside) or η (from insi
     reflection      wo = (-wi_x, -wi_y, wi_z)                            f = F · specular_reflectance
     transmission    wo = (-η_ti wi_x, -η_ti wi_y, -sign(wi_z) cos θ_t)   f = (1 - F) · specular_transmittance · s
 
-where s = η_ti² in radiance mode and 1 in importance mode. Values, use of random numbers and flags are those of
-Mitsuba's plugin.
+where s = η_ti² in radiance mode and 1 in importance mode. Flags and values are those of Mitsuba's plugin, and so is the
+probability of reflection, F, but for one range: near the critical angle, coming from the denser side, transmission is
+chosen at least once in four. There dF grows beyond all bounds, and samples that are as rare as 1 - F is small would
+carry nearly all of the derivative.
 
 Differentiated: wo and the weight with respect to `eta` and si.wi, the weight with respect to the tints.
 *Not* differentiated: the probability of choosing a lobe (bs.pdf is detached, and the weight is f / detach(pdf), so
@@ -23,6 +25,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
+
+#: Highest probability of reflection from the denser side, unless it is total.
+MAX_REFLECTION = 0.75
 
 
 def register() -> None:
@@ -104,13 +109,16 @@ def _plugin_class() -> type:
             F = dr.select(cos_t == 0, dr.detach(F), F)
 
             # Choice of the lobe; its probability takes no part in differentiation
-            selected_r = mi.Mask(active) & ((sample1 <= F) if has_t else True) & has_r
+            p_r = dr.detach(F)
+            p_r = dr.select((η_it < 1) & (p_r < 1), dr.minimum(p_r, MAX_REFLECTION), p_r)
+            selected_r = mi.Mask(active) & ((sample1 <= p_r) if has_t else True) & has_r
             selected_t = ~selected_r & active
             f = dr.select(selected_r, F, 1 - F)
             if has_r and has_t:
-                bs.pdf = dr.detach(f)
-                # The quotient's value is one; it may miss it by rounding, and a lobe of probability zero is 0 / 0.
-                weight = dr.replace_grad(mi.Float(1), f / bs.pdf)
+                bs.pdf = dr.select(selected_r, p_r, 1 - p_r)
+                weight = f / bs.pdf
+                # Mostly the quotient's value is one; it may miss it by rounding, and no probability at all is 0 / 0.
+                weight = dr.replace_grad(dr.select(p_r == F, 1, weight), weight)
             else:
                 bs.pdf = mi.Float(1)
                 weight = F if has_r else 1 - F

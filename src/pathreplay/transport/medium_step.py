@@ -165,14 +165,16 @@ def _scatter_in_medium(
 ) -> tuple[Any, Any, Any]:
     """Weight (Spectrum), direction and density of the kept continuation at a particle, differentiably.
 
-    Its direction is held as on surfaces: towards the next surface point, or, where that is a null boundary (which may
-    be arbitrarily near) or nothing, fixed in space.
+    Its direction is held as on surfaces, towards the next surface point, but only where that matters: where the surface
+    scatters or emits, and so may have seams and edges. Otherwise it is fixed in space. (A particle may be arbitrarily
+    near to the surface around its medium: a held point there has a derivative of infinite variance.)
     """
     ctx = mi.PhaseFunctionContext(None)
     d, J = kept.d, mi.Float(1)
     if attached:
-        solid = active & hit_next.is_valid() & ~_is_null(hit_next.shape.bsdf())
-        d, J = held_at_hit(origin, kept.d, hit_next, solid)
+        shape = hit_next.shape
+        seen = is_smooth(shape.bsdf()) | (shape.emitter() != None)  # noqa: E711 (an array of pointers)
+        d, J = held_at_hit(origin, kept.d, hit_next, active & hit_next.is_valid() & seen)
     f, pdf = phase.eval_pdf(ctx, mei, d, active)
     pdf = dr.replace_grad(kept.pdf, dr.select(active, pdf, 0)) if attached else kept.pdf
     return f * J * dr.detach(reciprocal(kept.pdf)), d, pdf

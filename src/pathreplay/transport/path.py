@@ -75,10 +75,13 @@ def sustain(β_alive: Any, β: Any, step: Step) -> Any:
 
     A weight that is zero now still has a derivative, times the light beyond it; so the path goes on as if that weight
     were the largest among the channels (one, if all are zero). A second zero makes every derivative zero and ends it.
+    So does a null collision that was impossible in a channel: its weight is a choice of the walk.
     """
     w = dr.detach(step.w)
     w_max = dr.max(w)
     stand_in = dr.select(step.kept.pdf != 0, dr.select(w_max != 0, w_max, 1), 0)
+    if step.kept.flight is not None:
+        stand_in = dr.select(step.kept.flight.W != 0, stand_in, 0)
     return β_alive * mi.Spectrum(dr.select((w == 0) & (β != 0), stand_in, w))
 
 
