@@ -35,7 +35,7 @@ ROWS: dict[str, tuple[tuple[str, ...], dict[str, tuple[int, int]]]] = {
         {
             "score": (1024, 4),
             "prbvolpath": (1024, 4),
-            "tape": (256, 4),
+            "tape": (128, 2),
             "rb": (64, 2),
             "rb linear": (1024, 4),
         },

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .depth import alive, fastest, memory_cell, memory_growth, seconds_cell
+from .depth import PATIENCE_S, alive, fastest, memory_cell, memory_growth, seconds_cell
 from .estimates import growth
 from .job import Job, Record
 from .media_scenes import DENSITY
@@ -33,6 +33,7 @@ def jobs(quick: bool) -> list[Job]:
             resolution=16,
             spp=4,
             rounds=2 if counted else 3 if quick else 7,
+            patience=PATIENCE_S,
             warm_up=2,  # a method that learns may have another kernel for when it knows nothing
             threads=1,
             measure="events" if counted else "gradient",

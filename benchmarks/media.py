@@ -24,10 +24,11 @@ ROWS = (
     ("dense-core", DENSITY, 96, 97, 1),
     ("room-with-cloud", DENSITY, 32, 5, 1),
     ("cloud-of-albedos", ALBEDO, 64, 5, 1),
-    ("cloud", ASYMMETRY, 64, 5, 4),
+    ("cloud", ASYMMETRY, 64, 5, 2),
     ("dark-cloud", DENSITY, 64, 5, 1),
-    ("homogeneous", EXTINCTION, 64, 5, 4),
+    ("homogeneous", EXTINCTION, 64, 5, 2),
 )
+QUICK = (("cloud", DENSITY, 64, 5, 1), ("homogeneous", EXTINCTION, 64, 5, 1))
 WHAT = {DENSITY: "density", ALBEDO: "albedo", ASYMMETRY: "g", EXTINCTION: "sigma_t"}
 
 
@@ -42,7 +43,7 @@ def jobs(quick: bool) -> list[Job]:
             rr_depth=rr_depth,
             resolution=32,
             spp=16,
-            rounds=6 if quick else runs * RUN,
+            rounds=4 if quick else runs * RUN,
             # Of kernels only, since what was learned is dropped; several, since a method may have two: with and without
             # something learned.
             warm_up=3,
@@ -51,7 +52,7 @@ def jobs(quick: bool) -> list[Job]:
             update=True,
             reference=REFERENCE,
         )
-        for scene, parameter, max_depth, rr_depth, runs in ROWS
+        for scene, parameter, max_depth, rr_depth, runs in (QUICK if quick else ROWS)
     ]
 
 

@@ -8,6 +8,8 @@ magnify (grows as the noise shrinks, does not average out). The sweep inverts no
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from .estimates import time_ratio
@@ -62,14 +64,18 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """Error by scene and bounces (down), kind of books and noise (across); then the sweep's own error, and time."""
-    present = [name for name in RECOVERIES if any(point.method == name for point in record.points)]
+    """Error by scene, bounces and kind of books (down) and noise (across); then the sweep's own, and time."""
+    levels = [level for level in (*NOISES, 0) if any(p.method.endswith(f", {level:g}") for p in record.points)]
     rows = []
     for (scene, _, depth, _), found in groups(record.points).items():
         sweep = found.get(SWEEP)
-        cells = [_error(found.get(name)) for name in present]
-        rows.append([str(scene), str(int(str(depth)) - 1), *cells, _error(sweep), _slowness(found, sweep)])
-    return markdown(["scene", "bounces", *present, "Monte Carlo", "time / sweep"], rows)
+        for kind in KINDS:
+            points = [found.get(f"{kind}, {level:g}") for level in levels]
+            if any(points):
+                cells = [kind, *map(_error, points), _error(sweep), _slowness(points, sweep)]
+                rows.append([str(scene), str(int(str(depth)) - 1), *cells])
+    header = ["scene", "bounces", "noise is put", *(f"{level:g}" for level in levels), "Monte Carlo", "time / sweep"]
+    return markdown(header, rows)
 
 
 def geometric_mean(point: Point) -> float:
@@ -86,10 +92,9 @@ def _error(point: Point | None) -> str:
     return f"{geometric_mean(point):.1e}" if finite else "not finite"
 
 
-def _slowness(found: dict[str, Point], sweep: Point | None) -> str:
-    """Of the slowest kind."""
+def _slowness(points: Iterable[Point | None], sweep: Point | None) -> str:
+    """Of the slowest level."""
     if sweep is None or sweep.error:
         return ""
-    others = [point for name, point in found.items() if name != SWEEP and not point.error]
-    ratios = [time_ratio(point.seconds, sweep.seconds).value for point in others]
+    ratios = [time_ratio(point.seconds, sweep.seconds).value for point in points if point and not point.error]
     return f"{max(ratios):.1f}" if ratios else ""

@@ -5,7 +5,7 @@ Colours are those of Okabe and Ito, which differ for colour-blind eyes; markers 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 from . import depth, media, noise, records
 from .drafts import ROOT
@@ -103,16 +104,19 @@ def _against_depth(record: Record, value: Callable[[Point], tuple[float, float, 
             axes.errorbar(x, y, yerr=[down, up], color=colour, marker=marker, markersize=4, linewidth=1.3, capsize=2)
             labels.append((x[-1], y[-1], method, colour))
         axes.set(xscale="log", yscale="log", xlabel="path length (max_depth)", title=TITLES.get(scene, scene))
-        axes.set_xticks(_powers_of_four(part), [f"{n}" for n in _powers_of_four(part)])
+        low, high = axes.get_ylim()
+        if high < 100 * low:  # too little for powers of ten; and lines that are flat want room below
+            axes.set_ylim(low / 2, high * 1.2)
+            axes.set_yticks(ticks := _powers(2, low / 2, high * 1.2), [f"{n}" for n in ticks])
+        axes.set_xticks(ticks := _powers(4, *axes.get_xlim()), [f"{n}" for n in ticks])
         axes.minorticks_off()
         _label_ends(axes, labels)
     panels[0].set_ylabel(name)
     return figure
 
 
-def _powers_of_four(record: Record) -> list[int]:
-    deepest = max(point.max_depth for point in record.points)
-    return [4**k for k in range(1, 8) if 4**k <= deepest]
+def _powers(base: int, low: float, high: float) -> list[int]:
+    return [base**k for k in range(1, 24) if low <= base**k <= high]
 
 
 # ------------------------------ Media ------------------------------
@@ -143,13 +147,14 @@ def _media_efficiency(record: Record) -> Figure:
             at += 1
         at += 0.8
     axes.axvline(1, color=RED, linewidth=1.2)
-    axes.annotate("prbvolpath", (1, at - 0.6), color=RED, ha="center", va="bottom", fontsize=LABEL_SIZE)
+    axes.annotate("prbvolpath", (1, at - 0.8), color=RED, va="bottom", fontsize=LABEL_SIZE, **_beside("right"))
     axes.set(xscale="log", xlabel="time x variance of prbvolpath over that of the method (more is better)")
     axes.set_yticks(ticks, names)
     low, high = axes.get_xlim()
     axes.set_xlim(low, high * 2.5)  # room for the labels
-    axes.set_ylim(-0.8, at + 0.2)
+    axes.set_ylim(-0.8, at + 0.1)
     axes.grid(False, axis="y")
+    axes.minorticks_off()
     return figure
 
 
@@ -175,8 +180,10 @@ def _replay_noise(record: Record) -> Figure:
     kinds = [kind for kind in noise.KINDS if any(point.method.startswith(kind) for point in points)]
     figure, panels = _panels(len(kinds), width=3.6, share=True)
     colours = [SKY, GREEN, ORANGE, RED, BLACK]
+    ends: list[list[tuple[float, float, str, str]]] = []
     for axes, kind in zip(panels, kinds, strict=True):
-        labels = []
+        labels: list[tuple[float, float, str, str]] = []
+        ends.append(labels)
         for max_depth, colour in zip(depths, colours, strict=False):
             cells = {p.method: p for p in points if p.max_depth == max_depth}
             told = [(level, cells.get(f"{kind}, {level:g}")) for level in noise.NOISES]
@@ -188,21 +195,26 @@ def _replay_noise(record: Record) -> Figure:
             bars = [[a - min(v) for a, (_, v) in zip(y, line, strict=True)]]
             bars.append([max(v) - a for a, (_, v) in zip(y, line, strict=True)])
             axes.errorbar(x, y, yerr=bars, color=colour, marker="o", markersize=4, linewidth=1.3, capsize=2)
-            labels.append((x[0], y[0], f"{max_depth - 1} bounces", colour))
+            labels.append((x[-1], y[-1], f"{max_depth - 1} bounces", colour))
         sweeps = [v for p in points if p.method == noise.SWEEP and _finite(p) for v in p.values]
         if sweeps:
-            axes.axhspan(min(sweeps), max(sweeps), color=GREY, alpha=0.3, linewidth=0)
-            axes.annotate(
-                "Monte Carlo error of one pass",
-                (0.03, max(sweeps)),
-                xycoords=("axes fraction", "data"),
-                xytext=(0, 2),
-                textcoords="offset points",
-                fontsize=8,
-                color="#555555",
-            )
+            typical = float(np.exp(np.mean(np.log(sweeps))))
+            axes.axhline(typical, color=GREY, linewidth=1.3, linestyle="--")
+            if kind == kinds[-1]:
+                monte_carlo = axes.annotate(
+                    "Monte Carlo error of one pass",
+                    (noise.NOISES[0], typical),
+                    xytext=(8, 3),
+                    textcoords="offset points",
+                    color="#555555",
+                    ha="right",
+                    fontsize=8,
+                )
+                monte_carlo.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
         axes.set(xscale="log", yscale="log", title=kind, xlabel="noise put into the Jacobians")
-        _label_ends(axes, labels)
+    # Only now are the limits known that the panels share.
+    for axes, labels in zip(panels, ends, strict=True):
+        _label_ends(axes, labels, "left")
     panels[0].set_ylabel("error of the gradient, relative to the sweep")
     return figure
 
@@ -225,22 +237,39 @@ def _panels(count: int, width: float, height: float = 3.8, share: bool = False) 
     return figure, panels
 
 
-def _label_ends(axes: Axes, labels: Iterable[tuple[float, float, str, str]]) -> None:
-    """Write names (x, y, name, colour) at the right-hand ends of their lines, pushed apart where they would meet."""
+def _label_ends(axes: Axes, labels: Sequence[tuple[float, float, str, str]], side: str = "right") -> None:
+    """Write names (x, y, name, colour) beside the ends of their lines, pushed apart where they would meet."""
     low, high = np.log(axes.get_ylim())
     left, right = axes.get_xlim()
-    axes.set_xlim(left, right * (right / left) ** 0.28)
-    floor = -np.inf
-    for x, y, name, colour in sorted(labels, key=lambda label: label[1]):
-        height = max((np.log(y) - low) / (high - low), floor + APART)
-        floor = height
-        axes.annotate(
-            name,
-            (x, float(np.exp(low + height * (high - low)))),
-            xytext=(7, 0),
-            textcoords="offset points",
-            color=colour,
-            va="center",
-            fontsize=LABEL_SIZE,
-        )
+    room = (right / left) ** (0.28 if side == "right" else 0.5)
+    axes.set_xlim((left, right * room) if side == "right" else (left / room, right))
+    for end in dict.fromkeys(x for x, *_ in labels):
+        group = sorted((label for label in labels if label[0] == end), key=lambda label: label[1])
+        heights = (np.log([y for _, y, _, _ in group]) - low) / (high - low)
+        for (x, _, name, colour), height in zip(group, _spread(heights), strict=True):
+            at = (x, float(np.exp(low + height * (high - low))))
+            text = axes.annotate(name, at, color=colour, va="center", fontsize=LABEL_SIZE, **_beside(side))
+            text.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
     axes.set_ylim(*np.exp((low, high)))
+
+
+def _spread(heights: np.ndarray) -> np.ndarray:
+    """Heights in increasing order, moved no more than it takes to be APART, each cluster about its middle."""
+    clusters = [[height] for height in heights]
+    k = 1
+    while k < len(clusters):
+        lower, upper = clusters[k - 1], clusters[k]
+        reach = APART * (len(lower) + len(upper)) / 2
+        if np.mean(upper) - np.mean(lower) < reach:
+            clusters[k - 1 : k + 1] = [lower + upper]
+            k = max(1, k - 1)
+        else:
+            k += 1
+    middles = [np.mean(cluster) + APART * (np.arange(len(cluster)) - (len(cluster) - 1) / 2) for cluster in clusters]
+    return np.concatenate(middles)
+
+
+def _beside(side: str) -> dict[str, Any]:
+    """Arguments of `annotate`: the text on this side of the point."""
+    sign, align = (1, "left") if side == "right" else (-1, "right")
+    return {"xytext": (7 * sign, 0), "textcoords": "offset points", "ha": align}

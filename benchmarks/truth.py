@@ -87,7 +87,7 @@ def jobs(quick: bool) -> list[Job]:
             rr_depth=3,
             resolution=16,
             spp=cell.spp,
-            rounds=6 if quick else 16,
+            rounds=6 if quick else 12,
             warm_up=0,
             measure="truth",
         )
