@@ -22,9 +22,10 @@ from .primal import walk_on
 def radiative(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, linear: bool) -> None:
     """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
 
-    ``linear`` is the biased variant: no fresh paths, L_{i+1} is taken to be one in all channels wherever a path goes
-    on, while emission and next-event estimation (e_i) are as they are. The sign of a gradient is mostly right, its size
-    is not. Not differentiated: everything that moves (as with ``attach='none'``), and visibility. Raises
+    ``linear`` is a biased variant in linear time, after those of the paper, which leave the incident radiance out: no
+    fresh paths, and L_{i+1} is taken to be one in all channels wherever a path goes on, while emission and next-event
+    estimation (e_i) are as they are. The size of a gradient is wrong, and where media are also dark its sign may be.
+    Not differentiated: everything that moves (as with ``attach='none'``), and visibility. Raises
     PathreplayError when no parameter reaches the paths.
     """
     β = mi.Spectrum(1)  # throughput

@@ -99,8 +99,7 @@ def tape(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
             depth += count(walk, step)
             at_next = next_arrival(walk, still, step, go_on)
 
-        here = at.ray
-        L, β, here.o, here.d, at.pdf = _cut((L, β, here.o, here.d, at.pdf))
+        L, β, at.ray.o, at.ray.d, at.pdf = _cut((L, β, at.ray.o, at.ray.d, at.pdf))
         step = repeat_step(walk, at, u, kept, go_on, active, attached, at_next.hit)
         L += β * step.e
         β *= step.w * rr_weight
