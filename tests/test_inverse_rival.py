@@ -33,9 +33,11 @@ def test_rival_gets_the_same_time_and_both_are_shown() -> None:
     spent = [sum(entry["seconds"] for entry in run) for run in (own, others)]
     # It stops with the first iteration that ends after the time is over.
     assert spent[1] - others[-1]["seconds"] < spent[0] <= spent[1]
+    # While the job compiles its kernels the rival takes many steps before the first judgement: the job's is the start.
+    first = own[0]["picture_error"]
     for entries in (own, others):
-        assert entries[0]["picture_error"] is not None and entries[-1]["picture_error"] is not None
-        assert entries[-1]["picture_error"] < entries[0]["picture_error"]
+        judgements = [entry["picture_error"] for entry in entries if entry["picture_error"] is not None]
+        assert len(judgements) > 1 and entries[-1]["picture_error"] == judgements[-1] < first
         assert entries[-1]["errors"][TEXTURE] < entries[0]["errors"][TEXTURE]
     # From the same start with the same seeds.
     assert others[0]["loss"] == pytest.approx(own[0]["loss"], rel=1e-5)
@@ -43,8 +45,8 @@ def test_rival_gets_the_same_time_and_both_are_shown() -> None:
     assert values[TEXTURE].shape == result.parameters[TEXTURE].shape
 
     html = result.report.read_text()
-    assert "Next to prb, in the same time" in html
-    assert len(re.findall(r"<figcaption>rival</figcaption>", html)) == 2  # of both views
+    assert "Next to prb (rival), in the same time" in html  # the job has prb as well
+    assert len(re.findall(r"<figcaption>recovered by prb \(rival\)</figcaption>", html)) == 2  # of both views
     assert (result.folder / "comparison.svg").exists() and (result.folder / "images/rival-left.png").exists()
 
 

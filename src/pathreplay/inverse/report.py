@@ -43,10 +43,12 @@ class ViewPictures:
     rival: Image | None = None
 
     def pictures(self) -> dict[str, Image]:
-        """The pictures to show; the difference is result - target, red above and blue below, DIFFERENCE_GAIN times."""
+        """The pictures to show; a difference is result - target, red above and blue below, DIFFERENCE_GAIN times."""
         gap = difference(self.result, self.target) * DIFFERENCE_GAIN
         found = {"target": self.target, "start": self.start, "result": self.result, "difference": gap}
-        return found if self.rival is None else {**found, "rival": self.rival}
+        if self.rival is None:
+            return found
+        return {**found, "rival": self.rival, "rival-difference": difference(self.rival, self.target) * DIFFERENCE_GAIN}
 
     def error(self) -> float:
         """Root mean square difference of result and target; includes the noise of both."""
@@ -207,17 +209,32 @@ class Outcome:
         target = self.config.target
         return self.config.integrator.type if target.images is not None else target.integrator.type
 
+    def names(self) -> tuple[str, str]:
+        """What the job and its rival are called: their integrators; a run against itself has one name twice."""
+        ours = self.config.integrator.type
+        theirs = ours if self.config.rival is None else self.config.rival.type
+        return ours, theirs if theirs != ours else f"{theirs} (rival)"
+
+    def caption(self, kind: str) -> str:
+        """What stands below a picture, texture or volume of that kind."""
+        ours, theirs = self.names()
+        captions = {
+            "result": "recovered" if self.rival is None else f"recovered by {ours}",
+            "rival": f"recovered by {theirs}",
+            "difference": f"difference ×{DIFFERENCE_GAIN:g}",
+            "rival-difference": f"its difference ×{DIFFERENCE_GAIN:g}",
+        }
+        return captions.get(kind, kind)
+
     def comparison(self) -> list[Contestant]:
         """The job and its rival in numbers; empty where there was none."""
-        if self.rival is None or self.config.rival is None:
+        if self.rival is None:
             return []
         known = [item for item in self.recovered if item.truth is not None]
         ours = {item.key: item.error() or 0.0 for item in known}
         theirs = {item.key: item.rival_error() or 0.0 for item in known}
-        return [
-            _contestant(self.config.integrator.type, self.history, ours),
-            _contestant(self.config.rival.type, self.rival.history, theirs),
-        ]
+        name, rival = self.names()
+        return [_contestant(name, self.history, ours), _contestant(rival, self.rival.history, theirs)]
 
 
 def report_files(outcome: Outcome) -> dict[str, bytes]:
@@ -225,10 +242,7 @@ def report_files(outcome: Outcome) -> dict[str, bytes]:
     curves = {"loss": loss_figure(outcome.history)}
     runs = outcome.comparison()
     if runs:
-        # A run against itself with other options has one name twice.
-        names = [run.name if run.name != runs[0].name or run is runs[0] else f"{run.name} (rival)" for run in runs]
-        histories = {name: run.history for name, run in zip(names, runs, strict=True)}
-        curves["comparison"] = comparison_figure(histories, list(runs[0].errors))
+        curves["comparison"] = comparison_figure({run.name: run.history for run in runs}, list(runs[0].errors))
     drawings = {f"{name}.{kind}": drawn(curve, kind) for name, curve in curves.items() for kind in ("svg", "png")}
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pathreplay.inverse", "."),
@@ -244,7 +258,6 @@ def report_files(outcome: Outcome) -> dict[str, bytes]:
         curves={name: _uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves},
         runs=runs,
         judge=outcome.judge(),
-        gain=DIFFERENCE_GAIN,
         versions=versions(outcome.variant),
     )
     return {"report.html": html.encode(), **drawings, "summary.png": summary(outcome)}
@@ -269,7 +282,7 @@ def summary(outcome: Outcome) -> bytes:
             axes.axis("off")
         for column, (kind, image) in enumerate(pictures.items()):
             line[column].imshow(_shown(image, exposure), interpolation="nearest", vmin=0, vmax=1, cmap="gray")
-            label = f"{kind} ×{DIFFERENCE_GAIN:g}" if kind == "difference" else kind
+            label = outcome.caption(kind)
             line[column].set_title(label if column else f"{_short(name)}: {label}", fontsize=8)
     return _with_palette(drawn(figure, "png"))
 
