@@ -6,7 +6,7 @@ from .job import Job, Point, Record
 from .tables import comparison, groups, markdown, method_cell
 
 TITLE = "attached"
-TAKES = (20, 120)
+TAKES = (12, 100)
 TEXTURE = "back.bsdf.reflectance.data"
 BALL = "ball.to_world"
 BOX = "small-box.vertex_positions"
@@ -23,13 +23,13 @@ def jobs(quick: bool) -> list[Job]:
             rr_depth=5,
             resolution=64 if quick else 128,
             spp=16,
-            rounds=4 if quick else 25,
+            rounds=4 if quick else 15,
         )
-        for parameters in ((BALL,), (BOX,), (BALL, TEXTURE))
-        for depth in (6, 16)
+        for parameters in (((BALL,),) if quick else ((BALL,), (BOX,), (BALL, TEXTURE)))
+        for depth in ((6,) if quick else (6, 16))
     ]
     by_depth = [(depth, 4) for depth in ((8, 128) if quick else (8, 64, 512, 2048))]
-    by_paths = [(64, spp) for spp in ((64,) if quick else (64, 1024))]
+    by_paths = [] if quick else [(64, 64), (64, 1024)]
     alone = [
         Job(
             scene="closed-box",

@@ -11,7 +11,7 @@ from .media_scenes import DENSITY
 from .tables import markdown
 
 TITLE = "depth"
-TAKES = (45, 360)
+TAKES = (25, 300)
 WALLS = ("box.bsdf.reflectance.data",)
 
 #: Scene, parameter, and for each method its greatest depth and the factor from one depth to the next. Where a claim
@@ -25,7 +25,7 @@ ROWS: dict[str, tuple[tuple[str, ...], dict[str, tuple[int, int]]]] = {
             "replay": (4096, 4),
             "prb": (1024, 2),
             "prb_basic": (1024, 4),
-            "tape": (1024, 2),
+            "tape": (512, 2),
             "rb": (256, 2),
             "rb linear": (1024, 4),
         },
@@ -44,7 +44,7 @@ ROWS: dict[str, tuple[tuple[str, ...], dict[str, tuple[int, int]]]] = {
 QUICK = {"sweep": (256, 8), "prb": (256, 8), "tape": (32, 8), "rb": (32, 8)}
 SHALLOWEST = 4
 # One pass beyond it is enough to know how slow a method is.
-PATIENCE_S = 15
+PATIENCE_S = 10
 
 
 def jobs(quick: bool) -> list[Job]:

@@ -9,7 +9,7 @@ from .media_scenes import DENSITY
 from .tables import markdown
 
 TITLE = "events"
-TAKES = (20, 120)
+TAKES = (12, 220)
 METHODS = ("prbvolpath", "score", "listing")
 COUNTED = "sealed-fog, counted"
 

@@ -8,7 +8,7 @@ from .surface import BACK_WALL, FLOOR
 from .tables import comparison, groups, markdown, method_cell
 
 TITLE = "iteration"
-TAKES = (20, 120)
+TAKES = (10, 130)
 
 USUAL, OWN = "usual loop", "own loop"
 SURFACE = (f"prb, {USUAL}", f"sweep, {USUAL}", f"sweep, {OWN}")
@@ -34,7 +34,7 @@ def jobs(quick: bool) -> list[Job]:
             rr_depth=5,
             resolution=min(resolution, 64) if quick else resolution,
             spp=16,
-            rounds=4 if quick else 25,
+            rounds=4 if quick else 15,
             warm_up=2,
             measure="step",
         )

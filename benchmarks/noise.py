@@ -17,7 +17,7 @@ from .job import Job, Point, Record
 from .tables import groups, markdown
 
 TITLE = "noise"
-TAKES = (20, 200)
+TAKES = (7, 120)
 KEY = "low.vertex_positions"
 SWEEP = "sweep"
 

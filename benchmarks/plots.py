@@ -19,6 +19,7 @@ from . import depth, media, noise, records
 from .drafts import ROOT
 from .estimates import Estimate, efficiency
 from .job import Point, Record
+from .report import PICTURES
 from .tables import groups
 
 IMAGES = ROOT / "docs" / "images"
@@ -49,17 +50,13 @@ APART = 0.055
 def draw_all(folder: Path = IMAGES, load: Callable[[str], Record | None] = records.load) -> list[Path]:
     """Draw every picture for which there is a record; returns the files, SVG and PNG."""
     drawn: list[Path] = []
-    for task, name, draw in (
-        (depth.TITLE, "depth-time", _depth_time),
-        (depth.TITLE, "depth-memory", _depth_memory),
-        (media.TITLE, "media-efficiency", _media_efficiency),
-        (noise.TITLE, "replay-noise", _replay_noise),
-    ):
+    for task, pictures in PICTURES.items():
         record = load(task)
         if record is not None:
             # The same record gives the same file: element names from a fixed salt, and no date.
             with mpl.rc_context({"svg.hashsalt": "pathreplay", "font.size": 10}):
-                drawn += _write(draw(record), folder / name)
+                for name in pictures:
+                    drawn += _write(DRAW[name](record), folder / name)
     return drawn
 
 
@@ -273,3 +270,11 @@ def _beside(side: str) -> dict[str, Any]:
     """Arguments of `annotate`: the text on this side of the point."""
     sign, align = (1, "left") if side == "right" else (-1, "right")
     return {"xytext": (7 * sign, 0), "textcoords": "offset points", "ha": align}
+
+
+DRAW: dict[str, Callable[[Record], Figure]] = {
+    "depth-time": _depth_time,
+    "depth-memory": _depth_memory,
+    "media-efficiency": _media_efficiency,
+    "replay-noise": _replay_noise,
+}

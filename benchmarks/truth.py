@@ -11,7 +11,7 @@ from .job import Job, Point, Record
 from .tables import groups, markdown
 
 TITLE = "truth"
-TAKES = (25, 240)
+TAKES = (25, 200)
 
 STEPS = ("finite differences", "half steps")
 SURFACE = ("sweep", "replay", "forward", "prb", "prb_basic")

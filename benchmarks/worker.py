@@ -14,7 +14,7 @@ import sys
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO
 
 import numpy as np
 
@@ -25,9 +25,21 @@ from .job import Job, Machine
 #: What a process may allocate: a method whose memory grows without bound dies of it before the machine swaps.
 MEMORY_LIMIT_GIB = 8
 
+_PIPE: TextIO = sys.stdout
+
+
+def _take_stdout() -> TextIO:
+    """The pipe to the commanding process; from now on whatever else is written to stdout goes to stderr.
+
+    Mitsuba's log is: in the middle of a line, when its threads are at it.
+    """
+    pipe = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    return pipe
+
 
 def _say(event: str, **facts: Any) -> None:
-    print(json.dumps({"event": event} | facts), flush=True)
+    print(json.dumps({"event": event} | facts), file=_PIPE, flush=True)
 
 
 def processor_name() -> str:
@@ -144,5 +156,6 @@ def run(job: Job) -> None:
 
 
 if __name__ == "__main__":
+    _PIPE = _take_stdout()
     arguments = json.loads(sys.argv[1])
     run(Job(**arguments | {name: tuple(arguments[name]) for name in ("parameters", "methods")}))

@@ -10,10 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pathreplay.errors import PathreplayError
+
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # the benchmarks run from the checkout and are not installed
 
-from benchmarks import depth, drafts, media, noise, plots, records, runner, surface, tables  # noqa: E402
+from benchmarks import depth, drafts, media, noise, plots, records, report, runner, surface, tables  # noqa: E402
+from benchmarks.__main__ import TASKS, main  # noqa: E402
 from benchmarks.compare import Row, compare  # noqa: E402
 from benchmarks.job import Job, Machine, Point, Record  # noqa: E402
 
@@ -230,44 +233,62 @@ def test_plots_are_drawn_from_records(tmp_path: Path) -> None:
     assert {path.stem for path in drawn} == names and {path.suffix for path in drawn} == {".svg", ".png"}
     assert all(path.stat().st_size > 5000 for path in drawn)
     first = (tmp_path / "depth-time.svg").read_bytes()
-    assert plots.draw_all(tmp_path / "again", known.get)
+    assert plots.draw_all(tmp_path / "again", {"depth": known["depth"]}.get)
     assert (tmp_path / "again" / "depth-time.svg").read_bytes() == first, "the same record draws the same picture"
     assert plots.draw_all(tmp_path, {}.get) == []
 
 
-def bench(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pathreplay.cli", "bench", *arguments]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True)
+def test_the_page_shows_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = tmp_path / "evidence.md"
+    page.write_text("".join(f"<!-- begin {task} -->\nold\n<!-- end {task} -->\n" for task in ("depth", "media")))
+    monkeypatch.setattr(report, "EVIDENCE", page)
+    monkeypatch.setattr(records, "RESULTS", tmp_path)
+    records.save(record(point("sweep", scene=depth.SURFACES), task="depth"))
+    assert report.fill({"depth": depth.table, "media": media.table}) == (page, ["media"])
+    told = page.read_text()
+    assert "![Peak memory against path length](images/depth-memory.svg)" in told and "`pathreplay bench depth`" in told
+    assert told.endswith("<!-- begin media -->\n*Not measured yet.*\n<!-- end media -->\n") and "old" not in told
 
 
-def test_wrong_usage_is_one_line_and_status_2(tmp_path: Path) -> None:
-    for arguments, told in (
-        (("nonsense",), "there is no task 'nonsense': use "),
-        (("--quick", "--save"), "--save keeps full runs only"),
-        (("--compare", "none.json"), "none.json cannot be read"),
-    ):
-        done = bench(*arguments, cwd=tmp_path)
-        assert (done.returncode, done.stdout) == (2, "")
-        assert told in done.stderr and done.stderr.count("\n") == 1
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ({"tasks": ["nonsense"]}, "there is no task 'nonsense': use "),
+        ({"quick": True, "save": True}, "--save keeps full runs only"),
+        ({"against": Path("none.json")}, "none.json cannot be read"),
+        ({"against": records.RESULTS / "surface.json", "tasks": ["depth"]}, "is a record of task 'surface'"),
+        (
+            {"against": records.RESULTS / "surface.json", "tasks": [str(records.RESULTS / "depth.json")]},
+            "one of 'depth'",
+        ),
+    ],
+)
+def test_wrong_usage_says_what_would_be_right(arguments: dict, told: str) -> None:
+    with pytest.raises(PathreplayError, match=told):
+        main(**arguments)
 
 
-def test_two_records_are_compared_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_records_are_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the command, which is run where the user is: exit status, table, and a mistake as one line."""
     monkeypatch.setattr(records, "RESULTS", tmp_path)
     for name, slowness in (("old", 0.7), ("new", 1.4)):
         path = records.save(record(point("prb", seed=1), point("sweep", slowness, seed=2)))
         path.rename(tmp_path / f"{name}.json")
-    worse = bench("--compare", "old.json", "new.json", cwd=tmp_path)
+    main(tasks=[str(tmp_path / "old.json")], against=tmp_path / "old.json")
+    assert "2 of 2 quantities are the same" in capsys.readouterr().out
+    command = [sys.executable, "-m", "pathreplay.cli", "bench", "--compare", "old.json", "new.json"]
+    worse = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert worse.returncode == 1 and "| box | sweep | 8 | time / prb | worse | 2.00 [" in worse.stdout, worse.stderr
-    same = bench("--compare", "old.json", "old.json", cwd=tmp_path)
-    assert same.returncode == 0 and "2 of 2 quantities are the same" in same.stdout
-    (tmp_path / "broken.json").write_text("{}")
-    assert "is no record of a benchmark" in bench("--compare", "broken.json", cwd=tmp_path).stderr
+    (tmp_path / "new.json").write_text("{}")
+    wrong = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert "new.json is no record of a benchmark" in wrong.stderr and wrong.stderr.count("\n") == 1
 
 
 def test_saved_records_can_be_read_and_tabled() -> None:
     """Those in the repository, which the documentation shows."""
-    from benchmarks.__main__ import TASKS
-
     found = {path.stem: records.read(path) for path in records.RESULTS.glob("*.json")}
     assert surface.TITLE in found and set(found) <= set(TASKS)
     for name, kept in found.items():
