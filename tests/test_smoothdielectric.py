@@ -110,7 +110,7 @@ def test_transmission_is_likely_near_the_critical_angle():
     """A quarter of the samples or more, and the same mean weights as if each lobe were drawn by itself."""
     bsdf = mi.load_dict({"type": "smoothdielectric", "int_ior": 1.5, "ext_ior": 1.0})
     θ = np.arcsin(1 / 1.5) * 0.9999
-    si = interaction(dr.repeat(mi.Vector3f(float(np.sin(θ)), 0, float(-np.cos(θ))), N))
+    si = interaction(np.tile([np.sin(θ), 0, -np.cos(θ)], (N, 1)))
     bs, weight = bsdf.sample(context(), si, uniform(), mi.Point2f(0.5))
     F, *_ = mi.fresnel(mi.Frame3f.cos_theta(si.wi), mi.Float(1.5))
     assert MAX_REFLECTION < F[0] < 1
@@ -375,7 +375,7 @@ def ball(kind: str, emitter: dict, **parameters):
 def test_white_furnace(indices):
     scene = ball("smoothdielectric", {"type": "constant"}, int_ior=indices[0], ext_ior=indices[1])
     image = mi.render(scene, spp=16, seed=3).numpy()
-    # But for rays near the critical angle, which are rare here and whose two weights are not the same, there is no noise.
+    # But for rays near the critical angle, which are rare here and have two weights, there is no noise.
     off = np.abs(image - 1)
     assert np.median(off) < 1e-6 and off.max() < 0.05 and abs(image.mean() - 1) < 1e-4
 

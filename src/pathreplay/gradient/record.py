@@ -63,7 +63,7 @@ def _record_type(
     if chromatic:
         fields |= {"W": mi.Spectrum}
     if emissive:
-        fields |= {"t_emit": mi.Float, "c_emit": mi.Spectrum}
+        fields |= {"E": mi.Spectrum, "t_emit": mi.Float, "c_emit": mi.Spectrum}
     if passes:
         fields |= {"chance": mi.Float}  # density of the continuation, also where it passes straight through
     if branch:
@@ -111,6 +111,7 @@ def record(walk: Walk, at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: 
             "y_medium": dr.reinterpret_array(mi.UInt32, dark.medium),
             "length": dark.length,
             "W": flight.W,
+            "E": flight.E,
             "t_emit": flight.t_emit,
             "c_emit": flight.c_emit,
             "chance": kept.pdf,
@@ -173,7 +174,7 @@ def continuation_of(walk: Walk, read: Any, onward: Arrival) -> Kept:
         p=read.p if walk.branch else None,
     )
     if walk.media.emissive:
-        kept.flight.t_emit, kept.flight.c_emit = read.t_emit, read.c_emit
+        kept.flight.E, kept.flight.t_emit, kept.flight.c_emit = read.E, read.t_emit, read.c_emit
     y_medium = dr.reinterpret_array(mi.MediumPtr, read.y_medium)
     kept.shadow = Shadow(T=read.T, y=read.y, medium=y_medium, length=read.length)
     return kept

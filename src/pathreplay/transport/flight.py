@@ -32,11 +32,11 @@ class Flight:
     along: Any  # Float: where on the flight its derivative is taken, in [0, 1)
     p: Any = None  # Float: probability that the collision was real (if the walk branches, else None)
     # Of walks with emission only, else None:
+    E: Any = None  # Spectrum: emission gathered on the way
     t_emit: Any = None  # Float: distance of the tentative collision at which emission is differentiated
     c_emit: Any = None  # Spectrum: weight of the emission there
     # Only the first walk needs these; they are None in a record that is read back.
     σ_s: Any = None  # Spectrum: scattering coefficient at the collision
-    E: Any = None  # Spectrum: emission gathered on the way
     null: Any = None  # NullCollision, one of those on the way, if the walk branches
 
 
@@ -211,6 +211,7 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: Any, attached: boo
             e += score - dr.detach(score)
 
     if walk.media.emissive:
+        emitted = mi.Spectrum(0)
         for grid in walk.media.grids:
             if grid.emission is not None:
                 glows = in_medium & is_grid(grid, medium) & (flight.t_emit > 0)
@@ -228,5 +229,6 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: Any, attached: boo
                 if dr.grad_enabled(σ_y, length):
                     _, _, σ_y = medium.get_scattering_coefficients(at_y, glows)
                     ε *= dr.replace_grad(mi.Spectrum(1), -length * σ_y)
-                e += dr.select(glows, ε, 0)
+                emitted += dr.select(glows, ε, 0)
+        e += dr.replace_grad(flight.E, emitted)
     return Flown(mei=mei, w=w, e=e)
