@@ -41,7 +41,7 @@ ROWS: dict[str, tuple[tuple[str, ...], dict[str, tuple[int, int]]]] = {
         },
     ),
 }
-QUICK = {"sweep": (256, 8), "prb": (256, 8), "tape": (32, 8), "rb": (32, 8)}
+QUICK = {"sweep": (256, 64), "prb": (256, 64), "tape": (32, 8), "rb": (32, 8)}
 SHALLOWEST = 4
 # One pass beyond it is enough to know how slow a method is.
 PATIENCE_S = 10

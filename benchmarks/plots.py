@@ -103,8 +103,8 @@ def _against_depth(record: Record, value: Callable[[Point], tuple[float, float, 
         axes.set(xscale="log", yscale="log", xlabel="path length (max_depth)", title=TITLES.get(scene, scene))
         low, high = axes.get_ylim()
         if high < 100 * low:  # too little for powers of ten; and lines that are flat want room below
-            axes.set_ylim(low / 2, high * 1.2)
-            axes.set_yticks(ticks := _powers(2, low / 2, high * 1.2), [f"{n}" for n in ticks])
+            axes.set_ylim(low / 2, max(1.2 * high, 4 * low))
+            axes.set_yticks(ticks := _powers(2, *axes.get_ylim()), [f"{n}" for n in ticks])
         axes.set_xticks(ticks := _powers(4, *axes.get_xlim()), [f"{n}" for n in ticks])
         axes.minorticks_off()
         _label_ends(axes, labels)

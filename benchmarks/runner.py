@@ -139,6 +139,7 @@ def _cause_of_death(status: int, complaints: str) -> str:
 
 
 def _point(job: Job, method: str, told: _Samples, peak: float | None) -> Point:
+    facts: dict[str, Any] = {name: tuple(f) if isinstance(f, list) else f for name, f in told.facts.items()}
     return Point(
         scene=job.scene,
         parameters=job.parameters,
@@ -147,10 +148,10 @@ def _point(job: Job, method: str, told: _Samples, peak: float | None) -> Point:
         paths=job.resolution**2 * job.spp,
         seeds=tuple(told.seeds),
         seconds=tuple(told.seconds),
-        squared_errors=tuple(told.facts.pop("squared_errors", ())),
+        squared_errors=facts.pop("squared_errors", ()),
         not_finite=tuple(told.not_finite),
         peak_mib=peak,
         error=told.error,
         measure=job.measure,
-        **{name: tuple(fact) if isinstance(fact, list) else fact for name, fact in told.facts.items()},
+        **facts,
     )

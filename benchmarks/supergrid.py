@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .estimates import unpaired_ratio
-from .job import Job, Point, Record
+from .job import Job, Kind, Point, Record
 from .media_scenes import DENSITY
 from .tables import markdown, median_seconds, pooled
 
@@ -13,6 +13,7 @@ TITLE = "supergrid"
 TAKES = (12, 150)
 WITHOUT = "one majorant"
 GRIDS = {"sparse": ("supergrid", "auto"), "uniform": ("supergrid", "auto")}
+PASSES: tuple[Kind, ...] = ("gradient", "image")
 # A process has one medium only, since a virtual call traces every medium that there is: so the processes take turns.
 TURNS = 2
 
@@ -35,7 +36,7 @@ def jobs(quick: bool) -> list[Job]:
             update=True,
         )
         for grid, choices in GRIDS.items()
-        for measure in (("gradient",) if quick else ("image", "gradient"))
+        for measure in (PASSES[:1] if quick else PASSES)
         for _ in range(1 if quick else TURNS)
         for choice in ((WITHOUT, "auto") if quick else (WITHOUT, *choices))
     ]

@@ -101,7 +101,7 @@ def table(record: Record) -> str:
     parts = []
     for room, methods in (("surfaces", SURFACE), ("media", MEDIA)):
         rows = [
-            [scene, *(_cell(found.get(method)) for method in (STEPS[1], *methods))]
+            [str(scene), *(_cell(found.get(method)) for method in (STEPS[1], *methods))]
             for (scene, *_), found in groups(record.points).items()
             if CELLS[str(scene)].room == room
         ]

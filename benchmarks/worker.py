@@ -74,6 +74,16 @@ def peak_mib() -> float:
     return peak / (1024 if sys.platform != "darwin" else 1024**2)
 
 
+def told(error: BaseException) -> str:
+    """What an exception says, short enough for a table."""
+    from pathreplay.scenes import one_line
+
+    text = one_line(error)
+    if isinstance(error, MemoryError) or "out of memory" in text:
+        return f"out of memory (of {MEMORY_LIMIT_GIB} GiB)"
+    return text[:200]
+
+
 def limit_memory() -> None:
     """Let allocations beyond the limit fail."""
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
@@ -124,8 +134,6 @@ def run(job: Job) -> None:
 
     import drjit as dr
 
-    from pathreplay.scenes import one_line
-
     if job.threads:
         dr.set_thread_count(job.threads)
     _say("machine", **asdict(_machine(variant)))
@@ -142,7 +150,7 @@ def run(job: Job) -> None:
             try:
                 seconds, result = measure(method, seed=k % 2**32)
             except Exception as error:
-                _say("error", method=method, message=one_line(error)[:200])
+                _say("error", method=method, message=told(error))
                 del kept[method]
                 continue
             spent[method] += seconds

@@ -19,6 +19,7 @@ from benchmarks import depth, drafts, media, noise, plots, records, report, runn
 from benchmarks.__main__ import TASKS, main  # noqa: E402
 from benchmarks.compare import Row, compare  # noqa: E402
 from benchmarks.job import Job, Machine, Point, Record  # noqa: E402
+from benchmarks.worker import told  # noqa: E402
 
 MACHINE = Machine("a processor", 2, 2, "Linux", "3.11", "3.9.1", "1.5.0", "0.1.0", "23.1.4", "llvm_ad_rgb")
 ROUNDS = 12
@@ -204,6 +205,13 @@ def test_a_worker_measures_and_stays_within_its_memory(tmp_path: Path) -> None:
     code = "from benchmarks.worker import limit_memory; limit_memory(); bytearray(9 * 1024**3)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.stderr.strip().endswith("MemoryError")
+
+
+def test_a_cause_of_death_fits_into_a_table() -> None:
+    crash = RuntimeError("dr.while_loop(): jit_malloc(): out of memory! Could not allocate 262144 bytes. " + "x" * 999)
+    assert told(crash) == told(MemoryError()) == "out of memory (of 8 GiB)"
+    assert len(told(RuntimeError("x" * 999))) == 200
+    assert tables.markdown(["a", "b"], [["x|y", "z"]]).splitlines()[2] == r"| x\|y | z |"
 
 
 # ------------------------------ Plots and the command line ------------------------------
