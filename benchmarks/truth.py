@@ -73,7 +73,7 @@ CELLS = {
         _medium("index of glass around fog", "fog in glass", OBJECT + "eta", 0.05),
     )
 }
-QUICK = ("texture", "plastic, diffuse part", "constant density", "binary density, empty voxels")
+QUICK = ("plastic, diffuse part", "constant density", "binary density, empty voxels")
 
 
 def jobs(quick: bool) -> list[Job]:
