@@ -137,7 +137,8 @@ def _cloud_on_a_floor() -> SceneDict:
         "to_world": T().translate([0.5, 3, 1]).rotate([1, 0, 0], 90),
         "emitter": {"type": "area", "radiance": _rgb(9, 6, 3)},
     }
-    scene = _cloud(_grid(_waving(0.4, 2)), floor=floor, light=light)
+    # Dark: in a bright cloud what it scatters and what its shadow takes away nearly cancel.
+    scene = _cloud(_grid(_waving(0.4, 2), _even(0.2)), floor=floor, light=light)
     del scene["sky"]
     return scene
 
