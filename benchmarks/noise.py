@@ -17,7 +17,7 @@ from .job import Job, Point, Record
 from .tables import groups, markdown
 
 TITLE = "noise"
-TAKES = (7, 120)
+TAKES = (7, 150)
 KEY = "low.vertex_positions"
 SWEEP = "sweep"
 
@@ -55,7 +55,7 @@ def jobs(quick: bool) -> list[Job]:
             rr_depth=10_000,
             resolution=16,
             spp=16,
-            rounds=2 if quick else 5,
+            rounds=2 if quick else 3,
             warm_up=1,
             measure="noise",
         )
