@@ -17,7 +17,7 @@ from . import attached, depth, events, iteration, media, noise, records, startup
 from .compare import compare
 from .drafts import ROOT, Draft, draft_of
 from .job import Record
-from .report import fill
+from .report import fill, pages
 from .runner import run_jobs
 from .tables import footnote
 
@@ -40,9 +40,9 @@ def main(
             "record, NEW.json, given in place of a task. Exit status 1 if anything did.",
         ),
     ] = None,
-    report: Annotated[bool, typer.Option("--report", help="Then put all saved records into docs/evidence.md.")] = False,
+    report: Annotated[bool, typer.Option("--report", help="Then put all saved records into the pages.")] = False,
 ) -> None:
-    """Measure gradients next to Mitsuba's own; `report` puts the saved records into docs/evidence.md, with pictures.
+    """Measure gradients next to Mitsuba's own; `report` puts saved records into docs/evidence.md and its pictures.
 
     A run that was interrupted goes on where it was when it is started again.
     """
@@ -121,8 +121,8 @@ def _report() -> None:
 
     for path in plots.draw_all():
         typer.echo(f"drawn: {path.relative_to(ROOT)}")
-    page, missing = fill({name: task.table for name, task in TASKS.items()})
-    typer.echo(f"{page.relative_to(ROOT)}: not measured: {', '.join(missing) or 'nothing'}")
+    missing = fill({name: task.table for name, task in TASKS.items()}, pages())
+    typer.echo(f"Pages are filled; not measured: {', '.join(missing) or 'nothing'}")
 
 
 if __name__ == "__main__":

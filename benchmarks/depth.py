@@ -105,7 +105,7 @@ def _tables(record: Record) -> list[str]:
     def rows(cell: Callable[[Point | None], str]) -> list[list[str]]:
         return [[str(depth), *(cell(cells.get((depth, method))) for method in methods)] for depth in depths]
 
-    exponents = ["exponent", *(_exponent(record, method) for method in methods)]
+    exponents = ["exponent", *(exponent(record, method) for method in methods)]
     growths = ["last / first", *(memory_growth(record, method) for method in methods)]
     return [
         markdown([f"{scene}: seconds at depth", *methods], [*rows(seconds_cell), exponents]),
@@ -135,7 +135,8 @@ def alive(record: Record, method: str) -> list[Point]:
     return [point for point in record.points if point.method == method and not point.error]
 
 
-def _exponent(record: Record, method: str) -> str:
+def exponent(record: Record, method: str) -> str:
+    """Exponent of time, with its interval."""
     points = alive(record, method)
     if len(points) < 5:
         return "too few depths"

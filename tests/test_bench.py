@@ -15,7 +15,21 @@ from pathreplay.errors import PathreplayError
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # the benchmarks run from the checkout and are not installed
 
-from benchmarks import depth, drafts, media, noise, plots, records, report, runner, surface, tables  # noqa: E402
+from benchmarks import (  # noqa: E402
+    depth,
+    drafts,
+    iteration,
+    media,
+    noise,
+    plots,
+    records,
+    report,
+    runner,
+    summaries,
+    surface,
+    tables,
+    truth,
+)
 from benchmarks.__main__ import TASKS, main  # noqa: E402
 from benchmarks.compare import Row, compare  # noqa: E402
 from benchmarks.job import Job, Machine, Point, Record  # noqa: E402
@@ -248,14 +262,32 @@ def test_plots_are_drawn_from_records(tmp_path: Path) -> None:
 
 def test_the_page_shows_what_was_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = tmp_path / "evidence.md"
-    page.write_text("".join(f"<!-- begin {task} -->\nold\n<!-- end {task} -->\n" for task in ("depth", "media")))
-    monkeypatch.setattr(report, "EVIDENCE", page)
+    page.write_text(
+        "".join(f"<!-- begin {task} -->\nold\n<!-- end {task} -->\n" for task in ("depth", "media", "depth-summary"))
+    )
     monkeypatch.setattr(records, "RESULTS", tmp_path)
     records.save(record(point("sweep", scene=depth.SURFACES), task="depth"))
-    assert report.fill({"depth": depth.table, "media": media.table}) == (page, ["media"])
+    assert report.fill({"depth": depth.table, "media": media.table}, [page]) == ["media"]
     told = page.read_text()
     assert "![Peak memory against path length](images/depth-memory.svg)" in told and "`pathreplay bench depth`" in told
-    assert told.endswith("<!-- begin media -->\n*Not measured yet.*\n<!-- end media -->\n") and "old" not in told
+    assert "<!-- begin media -->\n*Not measured yet.*\n<!-- end media -->\n" in told and "old" not in told
+    assert "| closed-box | sweep | 8 to 8 | too few depths |" in told
+
+
+def test_summaries_count_and_compare() -> None:
+    names = truth.STEPS + truth.SURFACE
+    points = [replace(point(name, scene="texture"), verdict=None if name in truth.STEPS else "pass") for name in names]
+    points[-1] = replace(points[-1], verdict="fail")
+    points[-2] = replace(points[-2], error="cannot")
+    told = summaries.SUMMARIES["truth-summary"][1](record(*points))
+    assert "| sweep | 1 | 1 | 0 | 0 | 0 |" in told and "| prb_basic | 1 | 0 | 1 | 0 | 0 |" in told
+    assert "| prb | 1 | 0 | 0 | 0 | 1 |" in told
+    told = summaries.SUMMARIES["surface-summary"][1](record(point("prb"), point("sweep", 0.5)))
+    assert told.splitlines()[2].startswith("| box | 0.5") or told.splitlines()[2].startswith("| box | 0.4")
+    steps = [point(name, 0.5 if "own" in name else 1, scene="cloud") for name in iteration.MEDIA]
+    assert "| cloud | 0." in summaries.SUMMARIES["iteration-summary"][1](record(*steps))
+    clouds = [point(m, parameters=(media.DENSITY,)) for m in ("prbvolpath", "score")]
+    assert "| density: box | " in summaries.SUMMARIES["media-summary"][1](record(*clouds))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,92 @@
+"""Short tables for pages that tell the story and not the details: marked `<!-- begin TASK-summary -->` there."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+
+from . import depth, iteration, media, surface, truth
+from .estimates import cost_ratio, efficiency, time_ratio, variance_ratio
+from .job import Point, Record
+from .tables import groups, markdown
+
+
+def _surface(record: Record) -> str:
+    """The sweep next to `prb`."""
+    rows = []
+    for (scene, *_), found in groups(record.points).items():
+        if pair := _pair(found, "sweep", "prb"):
+            ours, rival = pair
+            times = time_ratio(ours.seconds, rival.seconds)
+            rows.append([str(scene), str(times), str(variance_ratio(ours.squared_errors, rival.squared_errors))])
+    return markdown(["gradient of a texture, sweep / prb", "time", "variance"], rows)
+
+
+def _iteration(record: Record) -> str:
+    """Our own loop next to the usual one with Mitsuba's integrator."""
+    rows = []
+    for (scene, *_), found in groups(record.points).items():
+        for theirs, _, own in (iteration.SURFACE, iteration.MEDIA):
+            if pair := _pair(found, own, theirs):
+                ours, rival = pair
+                times, errors = (ours.seconds, rival.seconds), (ours.squared_errors, rival.squared_errors)
+                rows.append([str(scene), str(time_ratio(*times)), str(cost_ratio(times, errors))])
+    return markdown(["optimisation step, relative to Mitsuba's", "time", "time at equal variance"], rows)
+
+
+def _media(record: Record) -> str:
+    """How many times less (time x variance) the default needs than `prbvolpath`."""
+    rows = []
+    for (scene, parameters, *_), found in groups(record.points).items():
+        if pair := _pair(found, "score", media.RIVAL):
+            ours, rival = pair
+            gain = efficiency((ours.seconds, rival.seconds), (ours.squared_errors, rival.squared_errors))
+            what = media.WHAT[parameters[0]]  # type: ignore[index]
+            rows.append([f"{what}: {scene}", str(gain)])
+    return markdown(["gradient of media", "time x variance, prbvolpath / pathreplay"], rows)
+
+
+def _depth(record: Record) -> str:
+    """Exponent of time and growth of memory from the smallest depth to the largest, by scene and method."""
+    rows = []
+    for scene in dict.fromkeys(point.scene for point in record.points):
+        part = depth.of_scene(record, scene)
+        for method in dict.fromkeys(point.method for point in part.points):
+            depths = [point.max_depth for point in depth.alive(part, method)]
+            if depths:
+                reach = f"{depths[0]} to {depths[-1]}"
+                rows.append([scene, method, reach, depth.exponent(part, method), depth.memory_growth(part, method)])
+    return markdown(["scene", "method", "depth", "exponent of time", "peak memory, last / first"], rows)
+
+
+def _truth(record: Record) -> str:
+    """How many cells each method gets right."""
+    counts: dict[str, Counter[str]] = {}
+    for point in record.points:
+        if point.method not in truth.STEPS:
+            verdict = "raises" if point.error else point.verdict or "not finite"
+            counts.setdefault(point.method, Counter())[{"zero": "pass"}.get(verdict, verdict)] += 1
+    verdicts = ["pass", "fail", "inconclusive", "raises"]
+    rows = [[method, str(sum(c.values())), *(str(c[v]) for v in verdicts)] for method, c in counts.items()]
+    return markdown(["gradient against finite differences", "cells", *verdicts], rows)
+
+
+def _pair(found: Mapping[str, Point], ours: str, theirs: str) -> tuple[Point, Point] | None:
+    """Both methods, if both have come to an end with finite gradients."""
+    a, b = found.get(ours), found.get(theirs)
+    if a is None or b is None or not (a.squared_errors and b.squared_errors):
+        return None
+    return a, b
+
+
+#: By the name of its marker: the task, and its summary.
+SUMMARIES: dict[str, tuple[str, Callable[[Record], str]]] = {
+    f"{task}-summary": (task, summary)
+    for task, summary in (
+        (surface.TITLE, _surface),
+        (iteration.TITLE, _iteration),
+        (media.TITLE, _media),
+        (depth.TITLE, _depth),
+        (truth.TITLE, _truth),
+    )
+}
