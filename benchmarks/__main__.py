@@ -83,6 +83,8 @@ def _run(name: str, quick: bool, save: bool) -> tuple[Record, Draft]:
     load, start = records.load_average(), time.perf_counter()
     measured = run_jobs(name, jobs, draft)
     console.print(f"{name}: took {_duration(time.perf_counter() - start)}")
+    if draft.stale:
+        console.print(f"{name}: the code changed while it was measured: run it again for figures that can be trusted")
     command = f"pathreplay bench {name}" + (" --quick" if quick else "")
     record = records.make_record(name, command, load, measured, draft)
     typer.echo(f"\n## {name}\n\n{task.table(record)}\n\n{footnote(record)}")

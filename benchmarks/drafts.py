@@ -66,6 +66,11 @@ class Draft:
         """Runs that it took, this one included."""
         return self.contents.sittings
 
+    @property
+    def stale(self) -> bool:
+        """Whether the code has changed since the jobs were begun: they are then not all of one kind."""
+        return stamp() != self.contents.stamp
+
     def find(self, job: Job, turn: int) -> Done | None:
         """The job, if it is done."""
         return next((done for done in self.contents.done if (done.job, done.turn) == (job, turn)), None)

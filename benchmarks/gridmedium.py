@@ -14,7 +14,7 @@ import argparse
 import json
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,7 @@ def medium(values: np.ndarray, scale: float, supergrid: bool | str) -> Any:
     )
 
 
-def cpu_seconds(runs: dict[str, Callable[[int], Any]], rounds: int) -> dict[str, float]:
+def cpu_seconds(runs: Mapping[str, Callable[..., Any]], rounds: int) -> dict[str, float]:
     """CPU time of each, in turn: the mean of some rounds, after one that compiles.
 
     CPU time, since it counts all threads and hardly feels what else the machine does; the mean, since some clocks tick

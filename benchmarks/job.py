@@ -116,7 +116,7 @@ class Record:
     task: str
     command: str
     date: str
-    commit: str  # with "+" where the working tree differed from it
+    commit: str  # with "+" where the working tree differed from it, or changed while it was measured
     load: tuple[float, float]  # processes waiting for a processor (1 minute mean) before and after
     machines: tuple[Machine, ...]  # one entry, unless jobs used different numbers of threads
     points: tuple[Point, ...]

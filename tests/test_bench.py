@@ -176,8 +176,10 @@ def test_finished_jobs_are_not_run_again(tmp_path: Path, monkeypatch: pytest.Mon
 def test_a_draft_of_other_code_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "depth.json"
     drafts.Draft(path).add(drafts.Done(JOB, 0, (point("sweep"),), (MACHINE,)))
-    assert drafts.Draft(path).find(JOB, 0) is not None
+    draft = drafts.Draft(path)
+    assert draft.find(JOB, 0) is not None and not draft.stale
     monkeypatch.setattr(drafts, "stamp", lambda: "of other code")
+    assert draft.stale
     assert drafts.Draft(path).find(JOB, 0) is None
     path.write_text("half a file")
     assert drafts.Draft(path).find(JOB, 0) is None
