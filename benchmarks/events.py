@@ -9,7 +9,7 @@ from .media_scenes import DENSITY
 from .tables import markdown
 
 TITLE = "events"
-TAKES = (12, 220)
+TAKES = (12, 200)
 METHODS = ("prbvolpath", "score", "listing")
 COUNTED = "sealed-fog, counted"
 
@@ -20,7 +20,7 @@ def jobs(quick: bool) -> list[Job]:
     Russian roulette starts beyond the last vertex, so that nearly all paths have ``max_depth`` of them. How many of
     these are events in the medium is counted by a job of its own at each depth.
     """
-    depths = (4, 64) if quick else (4, 16, 64, 256, 512, 1024, 2048)
+    depths = (4, 64) if quick else (4, 16, 64, 256, 1024, 2048)
 
     def job(method: str, depth: int) -> Job:
         counted = method == "volpath"

@@ -11,7 +11,7 @@ from .job import Job, Point, Record
 from .tables import groups, markdown
 
 TITLE = "truth"
-TAKES = (25, 200)
+TAKES = (18, 240)
 
 STEPS = ("finite differences", "half steps")
 SURFACE = ("sweep", "replay", "forward", "prb", "prb_basic")
@@ -39,9 +39,9 @@ OBJECT, MEDIUM = "object.bsdf.", "object.interior_medium."
 DENSITY, ALBEDO = MEDIUM + "sigma_t.data", MEDIUM + "albedo.data"
 
 
-def _medium(name: str, scene: str, key: str, step: float, where: Where = "everywhere", depth: int = 4) -> Cell:
+def _medium(name: str, scene: str, key: str, step: float, where: Where = "everywhere", spp: int = 64) -> Cell:
     """Delta tracking decides anew at every step, so that its noise does not shrink with it: steps are large."""
-    return Cell(name, scene, key, "media", depth, step, where, spp=128, reference_spp=256)
+    return Cell(name, scene, key, "media", 4, step, where, spp, reference_spp=256)
 
 
 CELLS = {
@@ -61,8 +61,8 @@ CELLS = {
         Cell("camera that moves", "waves", "camera.to_world"),
         _medium("smooth density", "smooth cloud", DENSITY, 0.1),
         _medium("constant density", "even cloud", DENSITY, 0.1),
-        _medium("binary density, full voxels", "checkered cloud", DENSITY, 0.1, "full"),
-        _medium("binary density, empty voxels", "checkered cloud", DENSITY, 0.1, "empty"),
+        _medium("binary density, full voxels", "checkered cloud", DENSITY, 0.1, "full", 128),
+        _medium("binary density, empty voxels", "checkered cloud", DENSITY, 0.1, "empty", 128),
         _medium("chromatic density", "coloured cloud", DENSITY, 0.1),
         _medium("albedo", "smooth cloud", ALBEDO, 0.1),
         _medium("black albedo", "black cloud", ALBEDO, 0.1),
