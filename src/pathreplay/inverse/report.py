@@ -289,7 +289,7 @@ def summary(outcome: Outcome) -> bytes:
 
 def _short(name: str) -> str:
     """What of a name fits over a picture: of a long key the end."""
-    return name if len(name) <= 28 else f"…{name[-27:]}"
+    return name if len(name) <= 24 else f"…{name[-23:]}"
 
 
 def versions(variant: str) -> dict[str, str]:
