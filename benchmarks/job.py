@@ -17,7 +17,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "volpath": {"type": "volpath"},
     "prbvolpath": {"type": "prbvolpath"},
     "score": {"type": "pathreplay", "volume_gradient": "score"},
-    "branch": {"type": "pathreplay", "volume_gradient": "score", "branch": True},
+    "no branch": {"type": "pathreplay", "volume_gradient": "score", "branch": False},
     "listing": {"type": "pathreplay", "volume_gradient": "listing"},
 }
 

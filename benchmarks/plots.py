@@ -32,7 +32,7 @@ LOOKS = {
     "sweep": (BLUE, "o"),
     "score": (BLUE, "o"),
     "replay": (SKY, "s"),
-    "branch": (SKY, "s"),
+    "no branch": (SKY, "s"),
     "listing": (GREEN, "D"),
     "prb": (RED, "^"),
     "prbvolpath": (RED, "^"),

@@ -350,14 +350,29 @@ def test_furnace() -> None:
     assert against(pictures(scene, "pathreplay", 1, max_depth=64, rr_depth=64), np.float64(FURNACE)) < Z_MAX
 
 
+@pytest.mark.parametrize("supergrid", [True, False])
+def test_glow_of_emptiness(supergrid: bool) -> None:
+    """A box that emits and does nothing else: L = 2 Q + L_sky straight through it, also in cells without density."""
+    glow, sky = 0.5, 0.3
+    medium = heterogeneous(0 * sparse(), 0.0, plugin="gridmedium", emission=grid(np.full((6, 6, 6, 1), glow)),
+                           supergrid=supergrid)  # fmt: skip
+    scene = straight_through(cloud(medium, sky={"type": "constant", "radiance": sky}))
+    assert against(pictures(mi.load_dict(scene), "pathreplay", 1, max_depth=8), np.float64(2 * glow + sky)) < Z_MAX
+
+
+def straight_through(scene: dict) -> dict:
+    """The same scene, seen along the axis of its box."""
+    scene["camera"].update(type="orthographic", to_world=mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+                           .scale([0.9, 0.9, 1]))  # fmt: skip
+    del scene["camera"]["fov"]
+    return scene
+
+
 def test_glow_of_a_slab() -> None:
     """Without scattering, L = Q/σ (1 - exp(-2σ)) + L_sky exp(-2σ) straight through the box."""
     σ, glow, sky = 0.8, 0.5, 0.3
     medium = homogeneous(σ, 0.0)
     medium.update(type="gridmedium", emission={"type": "constvolume", "value": glow})
-    scene = cloud(medium, sky={"type": "constant", "radiance": sky})
-    scene["camera"].update(type="orthographic", to_world=mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
-                           .scale([0.9, 0.9, 1]))  # fmt: skip
-    del scene["camera"]["fov"]
+    scene = straight_through(cloud(medium, sky={"type": "constant", "radiance": sky}))
     expected = glow / σ * (1 - np.exp(-2 * σ)) + sky * np.exp(-2 * σ)
     assert against(pictures(mi.load_dict(scene), "pathreplay", 1, max_depth=8), np.float64(expected)) < Z_MAX

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -25,9 +26,10 @@ from media_scenes import (
     nested,
     overlapping,
     smooth,
+    sparse,
     sunlit,
 )
-from truth import TRANSPOSE_MAX, UPWARD, WIDE, Case, Move, add, hold, random, rgb, translate
+from truth import RESOLVED, TRANSPOSE_MAX, UPWARD, WIDE, Z_MAX, Case, Move, add, hold, random, rgb, translate
 
 MEDIUM = "object.interior_medium."
 DENSITY, ALBEDO, G = MEDIUM + "sigma_t.data", MEDIUM + "albedo.data", MEDIUM + "phase_function.g"
@@ -158,6 +160,9 @@ EMISSION = [
     cell("gridmedium density", lambda: smooth_cloud(**PLUGIN), DENSITY, random(1.0)),
     cell("gridmedium albedo", lambda: smooth_cloud(**PLUGIN), ALBEDO, random(0.5)),
     cell("gridmedium scale", lambda: smooth_cloud(**PLUGIN), MEDIUM + "scale", add()),
+    cell("gridmedium density, empty cells",
+         lambda: cloud(heterogeneous(sparse(), constant(0.6), scale=3.0, supergrid=True, **PLUGIN)), DENSITY,
+         where(sparse() == 0, 0.05), **UP),
     cell("gridmedium scale, chromatic", lambda: cloud({**rainbow(), **GRIDMEDIUM}), MEDIUM + "scale", add()),
     cell("gridmedium emission", glowing, MEDIUM + "emission.data", random(1.0), reference="pathreplay"),
     cell("gridmedium emission zero", lambda: glowing(0.0), MEDIUM + "emission.data", random(1.0),
@@ -189,6 +194,30 @@ QUICK = {
 def test_gradient_against_finite_differences(case: Case) -> None:
     # Forward mode is always `score`, which differs from the listing where transmittance is differentiated.
     hold(case, transpose=np.inf if case.name == "listing, smooth density" else TRANSPOSE_MAX)
+
+
+def test_density_beside_a_moving_camera() -> None:
+    """Null collisions take their share of the derivative by the density, not of that by the place of a collision."""
+    scene = mi.load_dict(cloud(heterogeneous(checkers(), constant(0.6), scale=2.0)), optimize=False)
+    params = mi.traverse(scene)
+    adjoint = dr.full(mi.TensorXf, 1 / 1024, (16, 16, 3))
+    found = []
+    for keys in ((DENSITY,), (DENSITY, "camera.to_world")):
+        for key in keys:
+            dr.enable_grad(params[key])
+        params.update()
+        integrator = mi.load_dict({"type": "pathreplay", "max_depth": 8})
+        sums = []
+        for seed in range(1, 25):
+            dr.clear_grad(params[DENSITY])
+            integrator.render_backward(scene, params, adjoint, seed=seed, spp=64)
+            g = np.array(dr.grad(params[DENSITY]))
+            sums.append([g[checkers() == 1].sum(), g[checkers() == 0].sum()])
+        found.append(np.array(sums))
+    still, moving = found
+    error = np.sqrt((still.var(0, ddof=1) + moving.var(0, ddof=1)) / len(still))
+    assert (error < RESOLVED * np.abs(still.mean(0))).all()
+    assert (np.abs(still.mean(0) - moving.mean(0)) < Z_MAX * error).all()
 
 
 SPECTRAL = """

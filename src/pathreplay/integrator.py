@@ -12,14 +12,14 @@ import mitsuba as mi
 
 from .errors import PathreplayError
 from .gradient.adjoint import LostPaths
-from .gradient.baseline import Baseline
+from .gradient.baseline import FIRST_BRANCHING, Baseline
 from .gradient.forward import forward
 from .gradient.listing import listing
 from .gradient.primal import primal
 from .gradient.ray_jacobian import Recovery
 from .gradient.replay import replay
 from .gradient.sweep import MAX_DEPTH, deepest, sweep
-from .transport.media import has_empty_voxels, scene_media
+from .transport.media import extinction_varies, scene_media
 from .transport.traits import Traits, nodes_of, scene_traits
 from .transport.vertex import Walk
 
@@ -59,8 +59,9 @@ def _make_class() -> type:
 
         ``volume_gradient='score'`` differentiates media where paths went, less a baseline that is learned from earlier
         gradient passes of this integrator (with other seeds); ``listing`` is delta tracking as first published.
-        ``branch`` walks one more path from where a medium is empty; ``auto`` does so where a grid with gradients has
-        voxels without extinction.
+        ``branch`` walks one more path from where a medium might have scattered and did not, without which a gradient by
+        extinction is wrong where it is zero; ``auto`` does so for media that vary in space and whose extinction has
+        gradients, since this is also less noisy for its time.
 
         Not differentiated: visibility; with ``attach='none'`` all motion of shapes, cameras and directions; by
         extinction where it is zero if ``branch`` is off; with the replay driver, by weights that are exactly zero.
@@ -152,6 +153,7 @@ def _make_class() -> type:
                 moves = replay(walk, sampler, ray, δL, active, lost, self.recovery)
             if moves:
                 self._tell_edges(walk.traits)
+            if moves or walk.media is not None:
                 self.lost = lost, dr.width(ray)
             return mi.Spectrum(0), mi.Bool(True), [], None
 
@@ -221,12 +223,16 @@ def _make_class() -> type:
         def _walk(self, scene: Any, differentiate: bool) -> Walk:
             nodes = nodes_of(scene)
             media = scene_media(nodes, self.sensor)
+            known = None if media is None else self._baseline(scene)
+            branching = None
+            if media is not None and differentiate and self._branches(nodes):
+                branching = dr.opaque(mi.Float, FIRST_BRANCHING) if known is None else known.branching
             return Walk(
                 scene=scene,
                 traits=scene_traits(nodes, scene, media is not None),
                 media=media,
-                baseline=None if media is None else self._baseline(scene),
-                branch=media is not None and differentiate and self._branches(nodes),
+                baseline=None if known is None else known.look,
+                branching=branching,
                 attach=self.attach,
                 hide_emitters=self.hide_emitters,
                 max_depth=self.max_depth,
@@ -234,7 +240,7 @@ def _make_class() -> type:
                 skip_area_emitters=self.skip_area_emitters,
             )
 
-        def _baseline(self, scene: Any) -> Any:
+        def _baseline(self, scene: Any) -> Baseline | None:
             """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
             if self.baseline is None or self.baseline[0] != scene.ptr:
                 self.baseline = scene.ptr, Baseline(scene.bbox())
@@ -245,10 +251,10 @@ def _make_class() -> type:
                     "one goes without; give every pass a seed of its own"
                 )
                 return None
-            return self.baseline[1].look
+            return self.baseline[1]
 
         def _branches(self, nodes: set[Any]) -> bool:
-            return has_empty_voxels(nodes) if self.branch == "auto" else self.branch
+            return extinction_varies(nodes) if self.branch == "auto" else self.branch
 
         def _refuse_instances(self, traits: Traits) -> None:
             if traits.instances_move and self.attach != "none":
@@ -285,7 +291,8 @@ def _make_class() -> type:
             (lost, paths), self.lost = self.lost, None
             if lost.count[0] > 0:
                 share = f"{lost.count[0] / paths:.2%}"
-                mi.Log(mi.LogLevel.Warn, f"pathreplay: {share} of the paths had a ray adjoint that was not finite")
+                why = "a ray adjoint was not finite, or media have more boundaries on the way than the record holds"
+                mi.Log(mi.LogLevel.Warn, f"pathreplay: {share} of the paths lost a part of their gradient: {why}")
 
         def to_string(self) -> str:
             depth = -1 if self.max_depth == UNBOUNDED else self.max_depth

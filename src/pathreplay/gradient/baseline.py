@@ -15,11 +15,14 @@ import mitsuba as mi
 
 from ..transport.media import interaction, majorant, span
 
-# Cells along each axis of space, and along each side of the octahedron of directions. 16³ x 4² cells of two averages
-# with four numbers each are 2 MiB, twice: once to read and once to learn.
-CELLS, SIDES = 16, 4
-# How much of what was known before stays when a pass has been learned: about the last five passes count.
-MEMORY = 0.8
+# Cells along each axis of space, and along each side of the octahedron of directions. 8³ x 4² cells of two averages
+# with four numbers each are 256 KiB, three times: what is known, its sums, and what the present pass sees. More cells
+# know less each: with 16³ gradients of a cloud are a tenth noisier, with 32³ a fifth.
+CELLS, SIDES = 8, 4
+# How much of what was known before stays when a pass has been learned: about the last ten passes count.
+MEMORY = 0.9
+# What a null collision counts at first (see `branch_weight`): as if there were fifty on a path.
+FIRST_BRANCHING = 0.02
 # A cell believes the mean of all cells as much as this many samples of its own.
 PRIOR = 2.0
 
@@ -33,7 +36,7 @@ class Baseline:
     """Averages over the cells of a box that holds all media.
 
     ``look`` is the guess; ``learn``, called in the loop of a pass, collects what that pass sees, and ``absorb``, called
-    after it, makes it known to later passes.
+    after it, makes it known to later passes. ``branching`` (Float) is what a null collision is to count.
     """
 
     def __init__(self, box: Any) -> None:
@@ -43,7 +46,9 @@ class Baseline:
         self.known = dr.zeros(mi.Float, 4 * self.count)  # the averages
         self.sums = dr.zeros(mi.Float, 4 * self.count)  # Σ weight·L and Σ weight
         self.seen = dr.zeros(mi.Float, 4 * self.count)  # the same of the present pass
-        dr.make_opaque(self.known, self.sums, self.seen)
+        self.branching = mi.Float(FIRST_BRANCHING)
+        self.nulls = dr.zeros(mi.Float, 2)  # null collisions, and paths, of the present pass
+        dr.make_opaque(self.known, self.sums, self.seen, self.branching, self.nulls)
 
     def _cell(self, p: Any, d: Any) -> Any:
         """Index (UInt32) of the first average of the cell."""
@@ -55,12 +60,11 @@ class Baseline:
         to = mi.Vector2u(dr.clip((mi.Vector2f(x, y) + 1) * (0.5 * SIDES), 0, SIDES - 1))
         return 2 * (((at.z * CELLS + at.y) * CELLS + at.x) * SIDES**2 + to.y * SIDES + to.x)
 
-    def look(self, mei: Any, σ_t: Any, active: Any) -> Any:
-        """The guess (Spectrum) at a MediumInteraction3f, for radiance that travels along -mei.wi."""
+    def look(self, mei: Any, σ_t: Any, σ_bar: Any, active: Any) -> Any:
+        """The guess (Spectrum) at a MediumInteraction3f, for radiance that travels along -mei.wi; σ̄ is the majorant."""
         mei, σ_t = dr.detach(mei), dr.detach(σ_t)
         cell = self._cell(mei.p, -mei.wi)
         X, Y = dr.gather(mi.Vector4f, self.known, cell, active), dr.gather(mi.Vector4f, self.known, cell + 1, active)
-        σ_bar = dr.max(dr.detach(mei.medium.get_majorant(mei, active)))
         p = dr.select(σ_bar > 0, dr.clip(dr.mean(σ_t) / σ_bar, 0, 1), 0)
         b = X + p * (Y - X)
         return mi.Spectrum(b.x, b.y, b.z) if _channels() == 3 else mi.Spectrum(b.x)
@@ -82,10 +86,13 @@ class Baseline:
 
     def _add(self, cell: Any, L: Any, weight: Any, active: Any) -> None:
         active = active & dr.all(dr.isfinite(L))
-        L = L if _channels() == 3 else [dr.mean(L)]
-        for k in range(_channels()):
-            dr.scatter_add(self.seen, weight * L[k], 4 * cell + k, active)
-        dr.scatter_add(self.seen, weight, 4 * cell + 3, active)
+        x, y, z = L if _channels() == 3 else 3 * [dr.mean(L)]
+        dr.scatter_add(self.seen, mi.Vector4f(x, y, z, 1) * weight, cell, active)
+
+    def tally(self, nulls: Any) -> None:
+        """Collect the number of null collisions of each path (Float)."""
+        dr.scatter_add(self.nulls, nulls, mi.UInt32(0))
+        dr.scatter_add(self.nulls, mi.Float(1), mi.UInt32(1), nulls >= 0)
 
     def absorb(self) -> None:
         """Let later passes know what the last one saw."""
@@ -102,4 +109,7 @@ class Baseline:
             value = (sums + PRIOR * dr.select(is_y, mean[1], mean[0])) / (weight + PRIOR)
             dr.scatter(known, value, 4 * i + k)
         self.known = known
-        dr.make_opaque(self.known, self.sums, self.seen)
+        nulls, paths = dr.gather(mi.Float, self.nulls, 0), dr.gather(mi.Float, self.nulls, 1)
+        self.branching = dr.select(paths > 0, paths / (paths + nulls), self.branching)
+        self.nulls = dr.zeros(mi.Float, 2)
+        dr.make_opaque(self.known, self.sums, self.seen, self.branching, self.nulls)

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.flight import Flight
-from ..transport.media import interaction
+from ..transport.media import interaction, majorant
 from ..transport.medium_step import medium_step
 from ..transport.path import next_arrival
 from ..transport.vertex import Arrival, Numbers, Step, Walk
@@ -30,6 +30,7 @@ class Branch:
     medium: Any  # MediumPtr
     weight: Any  # Spectrum: throughput and weight of the collision, over its share of the mass
     mass: Any  # Float: of all null collisions so far
+    number: Any  # Float: of null collisions so far
     depth: Any  # UInt32: vertices before
     η: Any  # Float: relative index of refraction since the camera
 
@@ -40,6 +41,7 @@ class Branch:
             mi.Vector3f(0),
             dr.zeros(mi.MediumPtr),
             mi.Spectrum(0),
+            mi.Float(0),
             mi.Float(0),
             mi.UInt32(0),
             mi.Float(1),
@@ -56,6 +58,7 @@ class Branch:
             medium=dr.select(taken, at.medium, self.medium),
             weight=mi.Spectrum(dr.select(taken, β * null.ω, self.weight)),
             mass=mass,
+            number=self.number + dr.select(active, null.number, 0),
             depth=dr.select(taken, depth, self.depth),
             η=dr.select(taken, η, self.η),
         )
@@ -67,7 +70,7 @@ def branch_term(walk: Walk, branch: Branch, sampler: Any, ray: Any) -> Any:
     Walks the extra path, detached; time and wavelengths are those of the camera ``ray``. Differentiable in the
     coefficients of the medium. Call it under `dr.resume_grad`.
     """
-    onward = replace(walk, branch=False)
+    onward = replace(walk, branching=None)
     active = branch.mass > 0
     with dr.suspend_grad():
         at = Arrival(
@@ -90,5 +93,5 @@ def branch_term(walk: Walk, branch: Branch, sampler: Any, ray: Any) -> Any:
     σ_s, _, σ_t = branch.medium.get_scattering_coefficients(mei, active)
     term = σ_s * L_s
     if walk.baseline is not None:
-        term -= σ_t * walk.baseline(mei, σ_t, active)
+        term -= σ_t * walk.baseline(mei, σ_t, majorant(branch.medium, at.ray, active), active)
     return dr.select(active, branch.weight * branch.mass * term, 0)

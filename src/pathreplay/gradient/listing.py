@@ -32,7 +32,7 @@ def listing(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
     media, and everything that moves: a path that moves with the parameters raises PathreplayError.
     """
     # A grid medium's own tracking is left out, so that every collision is one that can be differentiated.
-    walk = replace(walk, listing=True, baseline=None, branch=False, media=replace(walk.media, grids=(), plain=True))
+    walk = replace(walk, listing=True, baseline=None, branching=None, media=replace(walk.media, grids=(), plain=True))
     active = mi.Bool(active) & (walk.max_depth > 0)
     at = first_arrival(walk, ray, active)
     if dr.hint(path_moves(walk, ray, at), mode="scalar"):

@@ -123,6 +123,8 @@ def sweep(
     # ---------------------- The path that branched --------------------
 
     if dr.hint(walk.branch, mode="scalar"):
+        if dr.hint(baseline is not None, mode="scalar"):
+            baseline.tally(branch.number)
         with dr.resume_grad():
             term = branch_term(walk, branch, sampler, camera_ray)
             if dr.hint(dr.grad_enabled(term), mode="scalar"):

@@ -84,7 +84,13 @@ def _plugin_class() -> type:
         def _choose_cells(self) -> None:
             """Tables of majorants and of control densities for the present scale, each with the cells that pay."""
             scale = dr.detach(self.scale)
-            majorants = [(cellwalk.majorants(level, scale),) for level in self.levels]
+            # Where something glows or is differentiated, empty cells want (null) collisions, too: one a crossing.
+            with dr.resume_grad():
+                params = mi.traverse(self.sigma_t)
+                moves = dr.grad_enabled(self.scale) or any(dr.grad_enabled(params[key]) for key in params.keys())
+            chord = mean_chord(self.box)
+            least = 1 / chord if chord > 0 and (moves or self.emission is not None) else 0.0
+            majorants = [(dr.maximum(cellwalk.majorants(level, scale), least),) for level in self.levels]
             self.flight_cells = self._cheapest_cells(majorants)
             self.shadow_cells = self._cheapest_cells([cellwalk.control(level, scale) for level in self.levels])
             self.majorant = mi.Float(majorants[-1][0])

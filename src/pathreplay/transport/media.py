@@ -72,22 +72,16 @@ def _medium_around(sensor: Any) -> Any:
     return found[0] if found else None
 
 
-def has_empty_voxels(nodes: set[Any]) -> bool:
-    """Whether some grid of extinction has gradients and voxels of zero."""
+def extinction_varies(nodes: set[Any]) -> bool:
+    """Whether the extinction of some medium that is not the same everywhere has gradients."""
     for medium in nodes:
-        if isinstance(medium, mi.Medium):
+        if isinstance(medium, mi.Medium) and not medium.is_homogeneous():
             params = mi.traverse(medium)
-            for key in params.keys():
-                if key.startswith("sigma_t.") and _is_starved(params[key]):
+            extinction = [params[key] for key in params.keys() if key.split(".")[0] in ("sigma_t", "scale")]
+            with dr.resume_grad():
+                if any(map(dr.grad_enabled, extinction)):
                     return True
     return False
-
-
-def _is_starved(value: Any) -> bool:
-    with dr.resume_grad():
-        if not (dr.is_tensor_v(value) and dr.grad_enabled(value)):
-            return False
-    return bool(dr.any(dr.detach(value).array == 0))
 
 
 def interaction(medium: Any, ray: Any, t: Any) -> Any:

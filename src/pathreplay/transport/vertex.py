@@ -21,8 +21,8 @@ class Walk:
     leaves out emitters that the camera sees directly. ``max_depth`` and ``rr_depth`` are Mitsuba's; an unbounded depth
     is 2^32 - 1. ``media`` is None in a scene without media, which then walks as Mitsuba's `path` does; with media all
     conventions are those of `volpath`: null boundaries are no vertices. ``baseline`` (MediumInteraction3f, extinction,
-    Bool) -> Spectrum guesses the radiance that arrives at a point of a medium from beyond (None: zero); a better guess
-    makes gradients less noisy, and none makes them wrong.
+    majorant, Bool) -> Spectrum guesses the radiance that arrives at a point of a medium from beyond (None: zero); a
+    better guess makes gradients less noisy, and none makes them wrong.
     """
 
     scene: Any  # mi.Scene
@@ -34,13 +34,20 @@ class Walk:
     skip_area_emitters: Callable[..., Any]  # Mitsuba's, an integrator's method
     media: Any = None  # Media
     baseline: Any = None
-    branch: bool = False  # keep a null collision of each path, for derivatives where collisions are never real
+    # To keep a null collision of each path, for derivatives where collisions are never real: how much it counts (Float,
+    # see `branch_weight`); else None.
+    branching: Any = None
     listing: bool = False  # leave the coefficients of media along flights and shadow rays to the `listing` driver
 
     @property
     def resamples(self) -> bool:
         """Whether a later pass samples BSDFs once more, with the random numbers of the first walk."""
         return self.traits.lobes > 0 or self.attach == "all"
+
+    @property
+    def branch(self) -> bool:
+        """Whether a null collision of each path is kept."""
+        return self.branching is not None
 
     @property
     def background_is_opaque(self) -> bool:
