@@ -186,8 +186,8 @@ def _supergrid_medium(density: np.ndarray, depth: float, supergrid: str | bool) 
     return _medium(density, depth, 0.9, 0, supergrid=supergrid) | {"type": "gridmedium"}
 
 
-def _sparse(supergrid: str | bool) -> SceneDict:
-    return _supergrid_medium(blobs(64), 10, supergrid)
+def _sparse(supergrid: str | bool, depth: float = 40) -> SceneDict:
+    return _supergrid_medium(blobs(64), depth, supergrid)
 
 
 def _uniform(supergrid: str | bool) -> SceneDict:
@@ -206,6 +206,9 @@ MEDIA_SCENES: dict[str, Callable[[int], SceneDict]] = {
     "sparse, one majorant": partial(_outdoors, partial(_sparse, False)),
     "sparse, supergrid": partial(_outdoors, partial(_sparse, True)),
     "sparse, auto": partial(_outdoors, partial(_sparse, "auto")),
+    "thin sparse, one majorant": partial(_outdoors, partial(_sparse, False, depth=10)),
+    "thin sparse, supergrid": partial(_outdoors, partial(_sparse, True, depth=10)),
+    "thin sparse, auto": partial(_outdoors, partial(_sparse, "auto", depth=10)),
     "uniform, one majorant": partial(_outdoors, partial(_uniform, False)),
     "uniform, supergrid": partial(_outdoors, partial(_uniform, True)),
     "uniform, auto": partial(_outdoors, partial(_uniform, "auto")),

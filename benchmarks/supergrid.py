@@ -10,9 +10,9 @@ from .media_scenes import DENSITY
 from .tables import markdown, median_seconds, pooled
 
 TITLE = "supergrid"
-TAKES = (12, 150)
+TAKES = (20, 200)
 WITHOUT = "one majorant"
-GRIDS = {"sparse": ("supergrid", "auto"), "uniform": ("supergrid", "auto")}
+GRIDS = {"sparse": ("supergrid", "auto"), "thin sparse": ("auto",), "uniform": ("supergrid", "auto")}
 PASSES: tuple[Kind, ...] = ("gradient", "image")
 # A process has one medium only, since a virtual call traces every medium that there is: so the processes take turns.
 TURNS = 2
@@ -28,7 +28,7 @@ def jobs(quick: bool) -> list[Job]:
             max_depth=32,
             rr_depth=5,
             resolution=32 if quick else 64,
-            spp=16,
+            spp=16 if quick else 64,  # enough that tracing the kernels does not count
             rounds=4 if quick else 8,
             warm_up=3,
             measure=measure,
