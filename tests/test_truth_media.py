@@ -220,6 +220,32 @@ def test_density_beside_a_moving_camera() -> None:
     assert (np.abs(still.mean(0) - moving.mean(0)) < Z_MAX * error).all()
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+def test_one_thread_and_many_agree(channels: int) -> None:
+    """Sums into grids, and into what is learned, lose nothing when threads meet: two passes, one with a baseline."""
+    scene = mi.load_dict(cloud(heterogeneous(smooth(0.4, 2.0, channels), smooth(0.3, 0.9, channels))), optimize=False)
+    params = mi.traverse(scene)
+    for key in (DENSITY, ALBEDO):
+        dr.enable_grad(params[key])
+    params.update()
+    adjoint = dr.full(mi.TensorXf, 1 / 1024, (16, 16, 3))
+    threads, found = dr.thread_count(), []
+    try:
+        for count in (1, threads, threads):
+            dr.set_thread_count(count)
+            integrator = mi.load_dict({"type": "pathreplay", "max_depth": 8})
+            for seed in (1, 2):
+                for key in (DENSITY, ALBEDO):
+                    dr.clear_grad(params[key])
+                integrator.render_backward(scene, params, adjoint, seed=seed, spp=256)
+            found.append(np.concatenate([np.ravel(np.array(dr.grad(params[key]))) for key in (DENSITY, ALBEDO)]))
+    finally:
+        dr.set_thread_count(threads)
+    one, many, again = found
+    assert np.abs(many - again).max() < 1e-4 * np.abs(one).max()
+    assert np.abs(many - one).max() < 1e-4 * np.abs(one).max()
+
+
 SPECTRAL = """
 import sys
 sys.path.insert(0, sys.argv[1])

@@ -164,7 +164,8 @@ def _make_class() -> type:
 
             Warns when a part of the gradient was not finite and had to be left out.
             """
-            with self._looking_through(scene, sensor, seed, spp):
+            # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
+            with self._looking_through(scene, sensor, seed, spp), dr.isolate_grad():
                 super().render_backward(scene, params, grad_in, sensor, seed, spp)
             self._tell_lost()
             if self.learner is not None:
