@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -19,7 +20,7 @@ from .gradient.primal import primal
 from .gradient.ray_jacobian import Recovery
 from .gradient.replay import replay
 from .gradient.sweep import MAX_DEPTH, deepest, sweep
-from .transport.media import extinction_varies, scene_media
+from .transport.media import opacity_moves, scene_media, wants_branch
 from .transport.traits import Traits, nodes_of, scene_traits
 from .transport.vertex import Walk
 
@@ -60,8 +61,8 @@ def _make_class() -> type:
         ``volume_gradient='score'`` differentiates media where paths went, less a baseline that is learned from earlier
         gradient passes of this integrator (with other seeds); ``listing`` is delta tracking as first published.
         ``branch`` walks one more path from where a medium might have scattered and did not, without which a gradient by
-        extinction is wrong where it is zero; ``auto`` does so for media that vary in space and whose extinction has
-        gradients, since this is also less noisy for its time.
+        extinction is wrong where it is zero; ``auto`` does so where extinction with gradients varies in space or is
+        zero, which mostly takes less time for the same noise, too.
 
         Not differentiated: visibility; with ``attach='none'`` all motion of shapes, cameras and directions; by
         extinction where it is zero if ``branch`` is off; with the replay driver, by weights that are exactly zero.
@@ -128,6 +129,11 @@ def _make_class() -> type:
                     "a mask lies over delta lobes, which Mitsuba cannot sample one by one there: derivatives by what "
                     "decides among them (an index, or a reflectance of plastic) are wrong"
                 )
+            if walk.media is not None and walk.media.passes and opacity_moves(nodes_of(scene)):
+                self._tell_once(
+                    "the opacity of a mask has gradients in a scene with media: what it does to the light of emitters "
+                    "that shadow rays see through it is missing from the gradient"
+                )
             if self.attach == "all":
                 self._tell_attachable(walk.traits)
             if mode == dr.ADMode.Forward:
@@ -145,12 +151,12 @@ def _make_class() -> type:
             if walk.media is not None and self.volume_gradient == "listing":
                 listing(walk, sampler, ray, δL, active)
             elif driver == "sweep":
-                if walk.baseline is not None and self.baseline is not None:
+                if walk.baseline is not None and self.baseline is not None and self.seed is not None:
                     self.learner = self.baseline[1]
                     self.seeds.add(self.seed)
                 moves = sweep(walk, sampler, ray, δL, active, lost, self.learner)
             else:
-                moves = replay(walk, sampler, ray, δL, active, lost, self.recovery)
+                moves = replay(replace(walk, baseline=None), sampler, ray, δL, active, lost, self.recovery)
             if moves:
                 self._tell_edges(walk.traits)
             if moves or walk.media is not None:
@@ -165,12 +171,12 @@ def _make_class() -> type:
             Warns when a part of the gradient was not finite and had to be left out.
             """
             # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
-            with self._looking_through(scene, sensor, seed, spp), dr.isolate_grad():
-                super().render_backward(scene, params, grad_in, sensor, seed, spp)
-            self._tell_lost()
-            if self.learner is not None:
-                self.learner.absorb()
-                self.learner = None
+            with self._looking_through(scene, sensor, seed, spp):
+                with dr.isolate_grad():
+                    super().render_backward(scene, params, grad_in, sensor, seed, spp)
+                self._tell_lost()
+                if self.learner is not None:
+                    self.learner.absorb()
 
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
@@ -217,14 +223,14 @@ def _make_class() -> type:
                     raise
                 raise mended from None
             finally:
-                self.sensor = None
+                self.sensor = self.seed = self.learner = None
                 if collecting:
                     gc.enable()
 
         def _walk(self, scene: Any, differentiate: bool) -> Walk:
             nodes = nodes_of(scene)
             media = scene_media(nodes, self.sensor)
-            known = None if media is None else self._baseline(scene)
+            known = self._baseline(scene) if media is not None and differentiate else None
             branching = None
             if media is not None and differentiate and self._branches(nodes):
                 branching = dr.opaque(mi.Float, FIRST_BRANCHING) if known is None else known.branching
@@ -255,7 +261,7 @@ def _make_class() -> type:
             return self.baseline[1]
 
         def _branches(self, nodes: set[Any]) -> bool:
-            return extinction_varies(nodes) if self.branch == "auto" else self.branch
+            return wants_branch(nodes) if self.branch == "auto" else self.branch
 
         def _refuse_instances(self, traits: Traits) -> None:
             if traits.instances_move and self.attach != "none":
@@ -299,7 +305,8 @@ def _make_class() -> type:
             depth = -1 if self.max_depth == UNBOUNDED else self.max_depth
             return (
                 f"PathReplayIntegrator[max_depth = {depth}, rr_depth = {self.rr_depth}, "
-                f"hide_emitters = {self.hide_emitters}, driver = {self.driver}, attach = {self.attach}]"
+                f"hide_emitters = {self.hide_emitters}, driver = {self.driver}, attach = {self.attach}, "
+                f"volume_gradient = {self.volume_gradient}, branch = {self.branch}]"
             )
 
     return PathReplayIntegrator

@@ -2,8 +2,8 @@
 
 Two averages over cells of position and direction: X of what real collisions scatter, and Y of what comes through where
 a ray goes on. With p the probability of a real collision there, b = (1 - p) X + p Y. Only earlier passes are asked, so
-that b is independent of the pass that it serves and its score has mean zero, whatever b is: a bad guess is noise, not
-bias. Nothing here is differentiated.
+that b is independent of the pass that it serves and its score has mean zero, whatever b is, since real and (if the walk
+branches) null collisions are asked everywhere: a bad guess is noise, not bias. Nothing here is differentiated.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ CELLS, SIDES = 8, 4
 MEMORY = 0.9
 # What a null collision counts at first (see `branch_weight`): as if there were fifty on a path.
 FIRST_BRANCHING = 0.02
+SLOTS = 256
 # A cell believes the mean of all cells as much as this many samples of its own.
 PRIOR = 2.0
 
@@ -47,7 +48,8 @@ class Baseline:
         self.sums = dr.zeros(mi.Float, 4 * self.count)  # Σ weight·L and Σ weight
         self.seen = dr.zeros(mi.Float, 4 * self.count)  # the same of the present pass
         self.branching = mi.Float(FIRST_BRANCHING)
-        self.nulls = dr.zeros(mi.Float, 2)  # null collisions, and paths, of the present pass
+        self.nulls = dr.zeros(mi.Float, SLOTS)  # null collisions of the present pass, in parts that float32 can hold
+        self.paths = 0  # of the present pass
         dr.make_opaque(self.known, self.sums, self.seen, self.branching, self.nulls)
 
     def _cell(self, p: Any, d: Any) -> Any:
@@ -91,8 +93,9 @@ class Baseline:
 
     def tally(self, nulls: Any) -> None:
         """Collect the number of null collisions of each path (Float)."""
-        dr.scatter_add(self.nulls, nulls, mi.UInt32(0))
-        dr.scatter_add(self.nulls, mi.Float(1), mi.UInt32(1), nulls >= 0)
+        paths = dr.width(nulls)
+        dr.scatter_add(self.nulls, nulls, dr.arange(mi.UInt32, paths) % SLOTS)
+        self.paths += paths
 
     def absorb(self) -> None:
         """Let later passes know what the last one saw."""
@@ -109,7 +112,7 @@ class Baseline:
             value = (sums + PRIOR * dr.select(is_y, mean[1], mean[0])) / (weight + PRIOR)
             dr.scatter(known, value, 4 * i + k)
         self.known = known
-        nulls, paths = dr.gather(mi.Float, self.nulls, 0), dr.gather(mi.Float, self.nulls, 1)
-        self.branching = dr.select(paths > 0, paths / (paths + nulls), self.branching)
-        self.nulls = dr.zeros(mi.Float, 2)
+        if self.paths:
+            self.branching = self.paths / (self.paths + dr.sum(self.nulls))
+        self.nulls, self.paths = dr.zeros(mi.Float, SLOTS), 0
         dr.make_opaque(self.known, self.sums, self.seen, self.branching, self.nulls)

@@ -29,6 +29,7 @@ class Branch:
     d: Any  # Vector3f: direction of the path that came there
     medium: Any  # MediumPtr
     weight: Any  # Spectrum: throughput and weight of the collision, over its share of the mass
+    bare: Any  # Spectrum: the same without the null collisions before it on its flight
     mass: Any  # Float: of all null collisions so far
     number: Any  # Float: of null collisions so far
     depth: Any  # UInt32: vertices before
@@ -41,6 +42,7 @@ class Branch:
             mi.Vector3f(0),
             dr.zeros(mi.MediumPtr),
             mi.Spectrum(0),
+            mi.Spectrum(0),
             mi.Float(0),
             mi.Float(0),
             mi.UInt32(0),
@@ -50,6 +52,7 @@ class Branch:
     def offer(self, at: Arrival, step: Step, β: Any, depth: Any, η: Any, active: Any) -> Branch:
         """This one, or the null collision of one more flight, by their masses."""
         null = step.kept.flight.null
+        active = active & dr.any(β != 0)
         mass = self.mass + dr.select(active, null.mass, 0)
         taken = active & (null.pick * mass < null.mass)
         return Branch(
@@ -57,6 +60,7 @@ class Branch:
             d=dr.select(taken, at.ray.d, self.d),
             medium=dr.select(taken, at.medium, self.medium),
             weight=mi.Spectrum(dr.select(taken, β * null.ω, self.weight)),
+            bare=mi.Spectrum(dr.select(taken, β * null.bare, self.bare)),
             mass=mass,
             number=self.number + dr.select(active, null.number, 0),
             depth=dr.select(taken, depth, self.depth),
@@ -91,7 +95,7 @@ def branch_term(walk: Walk, branch: Branch, sampler: Any, ray: Any) -> Any:
         L_s = step.e + step.w * L
     mei = interaction(branch.medium, at.ray, mi.Float(0))
     σ_s, _, σ_t = branch.medium.get_scattering_coefficients(mei, active)
-    term = σ_s * L_s
+    term = branch.weight * σ_s * L_s
     if walk.baseline is not None:
-        term -= σ_t * walk.baseline(mei, σ_t, majorant(branch.medium, at.ray, active), active)
-    return dr.select(active, branch.weight * branch.mass * term, 0)
+        term -= branch.bare * σ_t * walk.baseline(mei, σ_t, majorant(branch.medium, at.ray, active), active)
+    return dr.select(active, branch.mass * term, 0)

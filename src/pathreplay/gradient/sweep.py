@@ -22,7 +22,7 @@ from .record import arrival_of, continuation_of, numbers_of, record, record_type
 # Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x about 100 bytes are 3.3 MB, and a
 # thread's stack is 8 MB. Beyond the stack the process would die without a word.
 MAX_DEPTH = 2048
-# With media a vertex takes about 170 bytes, and null boundaries have records of their own.
+# With media a vertex takes up to 210 bytes, and null boundaries have records of their own.
 MAX_DEPTH_MEDIA = 1024
 MAX_RECORDS_MEDIA = 2000
 
@@ -49,7 +49,7 @@ def sweep(
     paths with an adjoint that was not finite, and those that crossed so many null boundaries between media that they
     had to end. ``baseline`` learns from this pass, for later ones. A weight that is exactly zero keeps its derivative.
     Not differentiated: visibility and, with ``attach='none'``, everything that moves.
-    Raises PathreplayError when ``max_depth`` is above `MAX_DEPTH`, or when no parameter reaches the paths.
+    Raises PathreplayError when ``max_depth`` is above `deepest`, or when no parameter reaches the paths.
     """
     if dr.hint(walk.max_depth > deepest(walk), mode="scalar"):
         raise PathreplayError(

@@ -45,7 +45,8 @@ class NullCollision:
     """A null collision, kept with a probability proportional to ``mass``: see `branch_weight`."""
 
     t: Any  # Float: distance
-    ω: Any  # Spectrum: weight of the collision itself, over the probability that it was kept
+    ω: Any  # Spectrum: weight of the collision and of those before, over the probability that it was kept
+    bare: Any  # Float: the same without those before
     mass: Any  # Float: of all null collisions on the way
     number: Any  # Float: of null collisions on the way
     pick: Any  # Float: a random number, to choose among flights
@@ -93,7 +94,7 @@ def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any, visit: Any 
     σ_s = mi.Spectrum(0)
     E = mi.Spectrum(0)
     t_emit, c_emit, count = mi.Float(0), mi.Spectrum(0), mi.Float(0)
-    t_null, ω_null, mass, nulls = mi.Float(0), mi.Spectrum(0), mi.Float(0), mi.Float(0)
+    t_null, ω_null, bare, mass, nulls = mi.Float(0), mi.Spectrum(0), mi.Float(0), mi.Float(0), mi.Float(0)
 
     while dr.hint(flying, exclude=[walk, at, media, visit], label="pathreplay: flight"):
         u = sampler.next_1d(flying)
@@ -135,13 +136,14 @@ def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any, visit: Any 
         if dr.hint(visit is not None, mode="scalar"):
             visit(mei, σ_bar, flying, real)
         if dr.hint(walk.branch, mode="scalar"):
-            ω = mi.Spectrum(W * (walk.branching * branch_weight(p, walk.branching) / σ_bar))
-            m = dr.mean(dr.abs(β * ω))
+            share = walk.branching * branch_weight(p, walk.branching) / σ_bar
+            m = share * dr.mean(dr.abs(β) * dr.maximum(dr.abs(W), 1))
             mass += dr.select(flying, m, 0)
             nulls += dr.select(flying, 1, 0)
             kept = flying & (sampler.next_1d(flying) * mass < m)
             t_null = dr.select(kept, t_next, t_null)
-            ω_null = dr.select(kept, ω / m, ω_null)
+            ω_null = dr.select(kept, W * (share / m), ω_null)
+            bare = dr.select(kept, share / m, bare)
         if dr.hint(media.chromatic, mode="scalar"):
             W = dr.select(flying, W * (1 - σ_t / σ_bar) * reciprocal(1 - p), W)
         event |= real
@@ -155,7 +157,7 @@ def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any, visit: Any 
     if dr.hint(media.emissive, mode="scalar"):
         flight.t_emit, flight.c_emit, flight.E = t_emit, c_emit * count, E
     if dr.hint(walk.branch, mode="scalar"):
-        flight.p, flight.null = p_real, NullCollision(t_null, ω_null, mass, nulls, sampler.next_1d(active))
+        flight.p, flight.null = p_real, NullCollision(t_null, ω_null, bare, mass, nulls, sampler.next_1d(active))
     return flight
 
 
@@ -213,9 +215,9 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: Any, attached: boo
         w *= dr.replace_grad(mi.Spectrum(1), log_T)
         if walk.baseline is not None:
             σ_bar = majorant(medium, ray, in_medium)
-            guesses = [σ * walk.baseline(y, σ, σ_bar, through) for y, σ in zip(points, σ_y, strict=True)]
+            guesses = [σ * _guess(walk, y, σ, σ_bar, through) for y, σ in zip(points, σ_y, strict=True)]
             score = dr.select(through, length / POINTS * sum(guesses), 0)
-            score -= dr.select(event, σ_t * stretch * dr.rcp(flight.density) * walk.baseline(mei, σ_t, σ_bar, event), 0)
+            score -= dr.select(event, σ_t * stretch * dr.rcp(flight.density) * _guess(walk, mei, σ_t, σ_bar, event), 0)
             e += score - dr.detach(score)
 
     if walk.media.emissive:
@@ -240,3 +242,9 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: Any, attached: boo
                 emitted += dr.select(glows, ε, 0)
         e += dr.replace_grad(flight.E, emitted)
     return Flown(mei=mei, w=w, e=e)
+
+
+def _guess(walk: Walk, mei: Any, σ_t: Any, σ_bar: Any, active: Any) -> Any:
+    """The baseline; where collisions are never real, and null ones not asked, it would be a bias, and is left out."""
+    b = walk.baseline(mei, σ_t, σ_bar, active)
+    return b if walk.branch else mi.Spectrum(dr.select(dr.detach(σ_t) != 0, b, 0))

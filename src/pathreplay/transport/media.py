@@ -72,14 +72,26 @@ def _medium_around(sensor: Any) -> Any:
     return found[0] if found else None
 
 
-def extinction_varies(nodes: set[Any]) -> bool:
-    """Whether the extinction of some medium that is not the same everywhere has gradients."""
+def wants_branch(nodes: set[Any]) -> bool:
+    """Whether the extinction of some medium has gradients, and varies in space or is zero."""
     for medium in nodes:
-        if isinstance(medium, mi.Medium) and not medium.is_homogeneous():
+        if isinstance(medium, mi.Medium):
             params = mi.traverse(medium)
             extinction = [params[key] for key in params.keys() if key.split(".")[0] in ("sigma_t", "scale")]
             with dr.resume_grad():
-                if any(map(dr.grad_enabled, extinction)):
+                moving = [value for value in extinction if dr.grad_enabled(value)]
+            if moving and not (medium.is_homogeneous() and all(dr.all(dr.detach(v) != 0, axis=None) for v in moving)):
+                return True
+    return False
+
+
+def opacity_moves(nodes: set[Any]) -> bool:
+    """Whether the opacity of some mask has gradients."""
+    for bsdf in nodes:
+        if isinstance(bsdf, mi.BSDF) and bsdf.class_name() == "MaskBSDF":
+            params = mi.traverse(bsdf)
+            with dr.resume_grad():
+                if any(dr.grad_enabled(params[key]) for key in params.keys() if key.startswith("opacity")):
                     return True
     return False
 
