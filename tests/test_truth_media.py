@@ -223,6 +223,45 @@ def test_density_beside_a_moving_camera() -> None:
     assert (np.abs(still.mean(0) - moving.mean(0)) < Z_MAX * error).all()
 
 
+class Fixed:
+    """A baseline that knows nothing and says so loudly."""
+
+    def __init__(self, b: float) -> None:
+        self.b, self.branching = b, dr.opaque(mi.Float, 0.2)
+
+    def look(self, *_: Any) -> Any:
+        return mi.Spectrum(self.b)
+
+
+@pytest.mark.parametrize("name, σ_t", [
+    ("grey", checkers()), ("one channel", smooth(0.2, 1.0) * np.array([2.0, 1.0, 0.5])),
+])  # fmt: skip
+@pytest.mark.parametrize("keys", [
+    pytest.param((DENSITY,), id="still"),
+    pytest.param((DENSITY, "camera.to_world"), id="moving", marks=pytest.mark.slow),
+])  # fmt: skip
+def test_any_baseline_leaves_the_mean_alone(name: str, σ_t: np.ndarray, keys: tuple[str, ...]) -> None:
+    scene = mi.load_dict(cloud(heterogeneous(σ_t, constant(0.6), scale=2.0)), optimize=False)
+    params = mi.traverse(scene)
+    for key in keys:
+        dr.enable_grad(params[key])
+    params.update()
+    adjoint = dr.full(mi.TensorXf, 1 / 1024, (16, 16, 3))
+    found = []
+    for b in (0.0, 2.0):
+        integrator = mi.load_dict({"type": "pathreplay", "max_depth": 4, "branch": True})
+        integrator._baseline = lambda scene, b=b: Fixed(b)
+        sums = []
+        for seed in range(1, 17):
+            dr.clear_grad(params[DENSITY])
+            integrator.render_backward(scene, params, adjoint, seed=seed, spp=256)
+            sums.append(np.array(dr.grad(params[DENSITY]))[..., 0].sum())
+        found.append(np.array(sums))
+    error = np.sqrt(sum(g.var(ddof=1) for g in found) / len(found[0]))
+    assert error < RESOLVED * abs(found[0].mean())
+    assert abs(found[1].mean() - found[0].mean()) < Z_MAX * error
+
+
 @pytest.mark.parametrize("channels", [1, 3])
 def test_one_thread_and_many_agree(channels: int) -> None:
     """Sums into grids, and into what is learned, lose nothing when threads meet: two passes, one with a baseline."""
