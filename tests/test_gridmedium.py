@@ -555,4 +555,4 @@ print("fine")
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"])
 def test_other_variants(run_python: Any, variant: str) -> None:
     done = run_python(OTHER_VARIANT, args=(variant,))
-    assert done.stdout.strip().endswith("fine"), done.stderr
+    assert "fine" in done.stdout, done.stderr  # Mitsuba colours its log, at either end
