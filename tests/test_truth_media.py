@@ -143,8 +143,9 @@ PLACES = [
     cell("in glass, index", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", GLASS), ETA, add(),
          **GLASSY),
     cell("in glass, index, homogeneous", lambda: cloud(homogeneous(1.0), "sphere", GLASS), ETA, add(), **GLASSY),
+    # Where a sample of the rough glass fails, the replay driver ends the path, and its branch draws other numbers.
     cell("in rough glass, density", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", ROUGH),
-         DENSITY, random(1.0)),
+         DENSITY, random(1.0), drivers=("sweep",)),
     cell("in rough glass, homogeneous density", lambda: cloud(homogeneous(1.0), "sphere", ROUGH),
          MEDIUM + "sigma_t.value.value", add()),
     cell("behind a pane, its index", lambda: behind_glass(GLASS, uniform()), "pane.bsdf.eta", add(), **MOVES),
