@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -20,43 +17,25 @@ from .gradient.primal import primal
 from .gradient.ray_jacobian import Recovery
 from .gradient.replay import replay
 from .gradient.sweep import MAX_DEPTH, deepest, sweep
-from .transport.media import opacity_moves, scene_media, wants_branch
-from .transport.traits import Traits, nodes_of, scene_traits
+from .path_integrator import UNBOUNDED, choice, path_integrator
+from .transport.traits import Traits
 from .transport.vertex import Walk
 
 DRIVERS = ("auto", "sweep", "replay")
 ATTACH = ("delta", "all", "none")
 VOLUME_GRADIENTS = ("score", "listing")
 BRANCH = ("auto", True, False)
-UNBOUNDED = 0xFFFFFFFF
-
-
-def _choice(props: Any, name: str, default: Any, choices: tuple[Any, ...]) -> Any:
-    value = props.get(name, default)
-    if value not in choices:
-        raise PathreplayError(f"pathreplay: {name} = {value!r} is unknown: use one of {', '.join(map(repr, choices))}")
-    return value
-
-
-def mendable(error: BaseException) -> BaseException:
-    """The PathreplayError that Dr.Jit wrapped in errors of its own on the way out of a loop; else the error itself."""
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, PathreplayError):
-        cause = cause.__cause__
-    return cause or error
 
 
 def _make_class() -> type:
-    from mitsuba.ad.integrators.common import RBIntegrator
-
-    class PathReplayIntegrator(RBIntegrator):  # type: ignore[misc]
+    class PathReplayIntegrator(path_integrator()):  # type: ignore[misc]
         """Differentiable path tracer for surfaces and media.
 
         Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
-        (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``,
-        ``none``), ``noise`` (0.01; of ray adjoints with the replay driver: see `Recovery`), ``volume_gradient``
-        (``score``, ``listing``) and ``branch`` (``auto``, True, False). ``auto`` drivers sweep unless ``max_depth`` is
-        more than the sweep can hold. Forward mode is the same whatever the driver.
+        (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``, ``none``), ``noise``
+        (0.01; of ray adjoints with the replay driver: see `Recovery`), ``volume_gradient`` (``score``, ``listing``)
+        and ``branch`` (``auto``, True, False). ``auto`` drivers sweep unless ``max_depth`` is more than the sweep can
+        hold. Forward mode is the same whatever the driver.
 
         ``volume_gradient='score'`` differentiates media where paths went, less a baseline that is learned from earlier
         gradient passes of this integrator (with other seeds); ``listing`` is delta tracking as first published.
@@ -69,23 +48,14 @@ def _make_class() -> type:
         Raises PathreplayError for unknown or unusable properties and in polarised variants.
         """
 
+        name = "pathreplay"
+
         def __init__(self, props: Any) -> None:
-            if mi.is_polarized:
-                raise PathreplayError(
-                    f"pathreplay: variant {mi.variant()!r} tracks polarisation, which is not supported: "
-                    f"use {mi.variant().replace('_polarized', '')!r}"
-                )
-            max_depth, rr_depth = props.get("max_depth", 6), props.get("rr_depth", 5)
-            if max_depth < -1:
-                raise PathreplayError(f"pathreplay: max_depth = {max_depth}: use -1 (unbounded) or a depth >= 0")
-            if rr_depth < 1:
-                raise PathreplayError(f"pathreplay: rr_depth = {rr_depth}: use a depth >= 1")
             super().__init__(props)
-            self.hide_emitters = props.get("hide_emitters", False)
-            self.attach = _choice(props, "attach", "delta", ATTACH)
-            driver = _choice(props, "driver", "auto", DRIVERS)
+            self.attach = choice(props, self.name, "attach", "delta", ATTACH)
+            driver = choice(props, self.name, "driver", "auto", DRIVERS)
             if driver == "sweep" and self.max_depth > MAX_DEPTH:
-                depth = "-1 (unbounded)" if max_depth == -1 else max_depth
+                depth = "-1 (unbounded)" if self.max_depth == UNBOUNDED else self.max_depth
                 raise PathreplayError(
                     f"pathreplay: max_depth = {depth} is more than the sweep driver can hold ({MAX_DEPTH}): "
                     "use driver = 'replay', which has no limit"
@@ -94,18 +64,16 @@ def _make_class() -> type:
             if self.auto:
                 driver = "sweep" if self.max_depth <= MAX_DEPTH else "replay"
             self.driver = driver
-            self.volume_gradient = _choice(props, "volume_gradient", "score", VOLUME_GRADIENTS)
-            self.branch = _choice(props, "branch", "auto", BRANCH)
+            self.volume_gradient = choice(props, self.name, "volume_gradient", "score", VOLUME_GRADIENTS)
+            self.branch = choice(props, self.name, "branch", "auto", BRANCH)
             noise = props.get("noise", Recovery.noise)
             if noise < 0:
                 raise PathreplayError(f"pathreplay: noise = {noise}: use a standard deviation >= 0 (0 = off)")
             self.recovery = Recovery(noise=noise)
             self.told: set[str] = set()  # what has been said in the log
             self.lost: tuple[LostPaths, int] | None = None  # of how many paths
-            self.sensor: Any = None  # that is rendered
             self.baseline: tuple[int, Baseline] | None = None  # and the scene that it belongs to
             self.learner: Baseline | None = None  # the same, in a pass that it may learn from
-            self.seed: Any = None  # of the pass, with what else tells passes apart
             self.seeds: set[Any] = set()  # of the passes that it has learned from
 
         def sample(
@@ -129,21 +97,20 @@ def _make_class() -> type:
                     "a mask lies over delta lobes, which Mitsuba cannot sample one by one there: derivatives by what "
                     "decides among them (an index, or a reflectance of plastic) are wrong"
                 )
-            if walk.media is not None and walk.media.passes and opacity_moves(nodes_of(scene)):
+            if walk.media is not None and walk.media.passes and walk.traits.opacity_moves:
                 self._tell_once(
                     "the opacity of a mask has gradients in a scene with media: what it does to the light of emitters "
                     "that shadow rays see through it is missing from the gradient"
                 )
             if self.attach == "all":
                 self._tell_attachable(walk.traits)
+            lost = LostPaths()
             if mode == dr.ADMode.Forward:
-                lost = LostPaths()
                 tangent, valid, moves = forward(walk, sampler, ray, active, lost)
                 if moves:
                     self._tell_edges(walk.traits)
                     self.lost = lost, dr.width(ray)
                 return tangent, valid, [], None
-            lost = LostPaths()
             driver = self.driver
             if self.auto and self.max_depth > deepest(walk):
                 driver = "replay"
@@ -170,13 +137,11 @@ def _make_class() -> type:
 
             Warns when a part of the gradient was not finite and had to be left out.
             """
-            # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
-            with self._looking_through(scene, sensor, seed, spp):
-                with dr.isolate_grad():
-                    super().render_backward(scene, params, grad_in, sensor, seed, spp)
-                self._tell_lost()
-                if self.learner is not None:
-                    self.learner.absorb()
+            self.learner = None
+            super().render_backward(scene, params, grad_in, sensor, seed, spp)
+            self._tell_lost()
+            if self.learner is not None:
+                self.learner.absorb()
 
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
@@ -184,68 +149,21 @@ def _make_class() -> type:
             The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
             from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
             """
-            with self._looking_through(scene, sensor, seed, spp):
-                tangent = super().render_forward(scene, params, sensor, seed, spp)
+            tangent = super().render_forward(scene, params, sensor, seed, spp)
             if self.lost is not None:
                 dr.eval(tangent)  # in one kernel with the count of lost paths
             self._tell_lost()
             return tangent
 
-        def render(
-            self,
-            scene: Any,
-            sensor: Any = 0,
-            seed: Any = 0,
-            spp: int = 0,
-            develop: bool = True,
-            evaluate: bool = True,
-        ) -> Any:
-            """Render an image: see Mitsuba's ADIntegrator."""
-            with self._looking_through(scene, sensor, seed, spp):
-                return super().render(scene, sensor, seed, spp, develop, evaluate)
-
-        @contextmanager
-        def _looking_through(self, scene: Any, sensor: Any, seed: Any, spp: int) -> Iterator[None]:
-            """Remember the sensor, which may be in a medium, and what tells passes apart; make errors plain.
-
-            No garbage is collected on the way: should an old scene vanish between two virtual calls, Dr.Jit counts
-            their instances differently and writes functions that both call twice ("invalid redefinition").
-            """
-            self.sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            self.seed = (seed if isinstance(seed, int) else int(seed[0]), spp, self.sensor.ptr)
-            collecting = gc.isenabled()
-            gc.disable()
-            try:
-                yield
-            except RuntimeError as error:
-                mended = mendable(error)
-                if mended is error:
-                    raise
-                raise mended from None
-            finally:
-                self.sensor = self.seed = self.learner = None
-                if collecting:
-                    gc.enable()
-
         def _walk(self, scene: Any, differentiate: bool) -> Walk:
-            nodes = nodes_of(scene)
-            media = scene_media(nodes, self.sensor)
-            known = self._baseline(scene) if media is not None and differentiate else None
+            walk = super()._walk(scene, differentiate)
+            if walk.media is None or not differentiate:
+                return walk
+            known = self._baseline(scene)
             branching = None
-            if media is not None and differentiate and self._branches(nodes):
+            if walk.media.branches if self.branch == "auto" else self.branch:
                 branching = dr.opaque(mi.Float, FIRST_BRANCHING) if known is None else known.branching
-            return Walk(
-                scene=scene,
-                traits=scene_traits(nodes, scene, media is not None),
-                media=media,
-                baseline=None if known is None else known.look,
-                branching=branching,
-                attach=self.attach,
-                hide_emitters=self.hide_emitters,
-                max_depth=self.max_depth,
-                rr_depth=self.rr_depth,
-                skip_area_emitters=self.skip_area_emitters,
-            )
+            return replace(walk, baseline=None if known is None else known.look, branching=branching)
 
         def _baseline(self, scene: Any) -> Baseline | None:
             """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
@@ -259,9 +177,6 @@ def _make_class() -> type:
                 )
                 return None
             return self.baseline[1]
-
-        def _branches(self, nodes: set[Any]) -> bool:
-            return wants_branch(nodes) if self.branch == "auto" else self.branch
 
         def _refuse_instances(self, traits: Traits) -> None:
             if traits.instances_move and self.attach != "none":
@@ -302,11 +217,12 @@ def _make_class() -> type:
                 mi.Log(mi.LogLevel.Warn, f"pathreplay: {share} of the paths lost a part of their gradient: {why}")
 
         def to_string(self) -> str:
-            depth = -1 if self.max_depth == UNBOUNDED else self.max_depth
-            return (
-                f"PathReplayIntegrator[max_depth = {depth}, rr_depth = {self.rr_depth}, "
-                f"hide_emitters = {self.hide_emitters}, driver = {self.driver}, attach = {self.attach}, "
-                f"volume_gradient = {self.volume_gradient}, branch = {self.branch}]"
+            return self._described(
+                hide_emitters=self.hide_emitters,
+                driver=self.driver,
+                attach=self.attach,
+                volume_gradient=self.volume_gradient,
+                branch=self.branch,
             )
 
     return PathReplayIntegrator

@@ -17,7 +17,7 @@ from ..transport.media import interaction, majorant, span
 
 # Cells along each axis of space, and along each side of the octahedron of directions. 8³ x 4² cells of two averages
 # with four numbers each are 256 KiB, three times: what is known, its sums, and what the present pass sees. More cells
-# know less each: with 16³ gradients of a cloud are a tenth noisier, with 32³ a fifth.
+# know less each, so that gradients get noisier again: see the cloud of `pathreplay bench media`.
 CELLS, SIDES = 8, 4
 # How much of what was known before stays when a pass has been learned: about the last ten passes count.
 MEMORY = 0.9

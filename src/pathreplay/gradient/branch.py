@@ -18,6 +18,7 @@ from ..transport.media import interaction, majorant
 from ..transport.medium_step import medium_step
 from ..transport.path import next_arrival
 from ..transport.vertex import Arrival, Numbers, Step, Walk
+from .adjoint import backward
 from .primal import walk_on
 
 
@@ -66,6 +67,14 @@ class Branch:
             depth=dr.select(taken, depth, self.depth),
             η=dr.select(taken, η, self.η),
         )
+
+
+def branch_backward(walk: Walk, branch: Branch, sampler: Any, ray: Any, δL: Any) -> None:
+    """Back-propagate ``δL`` (Spectrum) through the branch's part of the radiance, if any parameter reaches it."""
+    with dr.resume_grad():
+        term = branch_term(walk, branch, sampler, ray)
+        if dr.grad_enabled(term):
+            backward(dr.sum(δL * term))
 
 
 def branch_term(walk: Walk, branch: Branch, sampler: Any, ray: Any) -> Any:

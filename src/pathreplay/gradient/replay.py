@@ -18,7 +18,7 @@ from ..transport.motion import path_moves
 from ..transport.path import count, first_arrival, next_arrival, repeat_step, survival, take_step
 from ..transport.vertex import Numbers, Walk, reciprocal
 from .adjoint import LostPaths, backward
-from .branch import Branch, branch_term
+from .branch import Branch, branch_backward
 from .primal import primal
 from .ray_jacobian import Recovery, has_smooth_lobes
 from .replay_attached import replay_attached
@@ -99,7 +99,4 @@ def _replay_still(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> 
         depth += count(walk, step)
 
     if dr.hint(walk.branch, mode="scalar"):
-        with dr.resume_grad():
-            term = branch_term(walk, branch, sampler, dr.detach(ray))
-            if dr.hint(dr.grad_enabled(term), mode="scalar"):
-                backward(dr.sum(δL * term))
+        branch_backward(walk, branch, sampler, dr.detach(ray), δL)

@@ -16,7 +16,7 @@ from ..transport.motion import path_moves
 from ..transport.path import count, first_arrival, next_arrival, survival, sustain, take_step
 from ..transport.vertex import Numbers, Walk
 from .adjoint import LostPaths, RayDerivative, Replayed, backward, backward_step
-from .branch import Branch, branch_term
+from .branch import Branch, branch_backward
 from .record import arrival_of, continuation_of, numbers_of, record, record_type
 
 # Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x about 100 bytes are 3.3 MB, and a
@@ -40,9 +40,7 @@ def _records(walk: Walk) -> int:
 
 
 @dr.syntax
-def sweep(
-    walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostPaths, baseline: Any = None
-) -> bool:
+def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostPaths, baseline: Any = None) -> bool:
     """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
 
     ``ray`` may be attached to the camera. Returns whether the path moves with the parameters; if so, ``lost`` counts
@@ -125,10 +123,7 @@ def sweep(
     if dr.hint(walk.branch, mode="scalar"):
         if dr.hint(baseline is not None, mode="scalar"):
             baseline.tally(branch.number)
-        with dr.resume_grad():
-            term = branch_term(walk, branch, sampler, camera_ray)
-            if dr.hint(dr.grad_enabled(term), mode="scalar"):
-                backward(dr.sum(δL * term))
+        branch_backward(walk, branch, sampler, camera_ray, δL)
 
     # ----------------------- Back to the camera ----------------------
 

@@ -8,6 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .traits import with_gradients
+
 
 @dataclass(frozen=True)
 class Media:
@@ -16,7 +18,8 @@ class Media:
     ``grids`` are the media that have functions of their own for free flight and transmittance (`gridmedium`). The
     others are known to Mitsuba only: ``plain`` says that there are any, ``homogeneous`` that some have the same
     coefficients everywhere. ``chromatic`` says that some extinction differs between channels, ``emissive`` that some
-    medium emits, ``passes`` that some surface may let light straight through by chance. ``around`` is the sensor's.
+    medium emits, ``passes`` that some surface may let light straight through by chance, ``branches`` that the gradient
+    by some extinction would miss what collisions tell where there are none. ``around`` is the sensor's.
     """
 
     grids: tuple[Any, ...]
@@ -25,6 +28,7 @@ class Media:
     chromatic: bool
     emissive: bool
     passes: bool
+    branches: bool
     around: Any
 
 
@@ -43,6 +47,7 @@ def scene_media(nodes: set[Any], sensor: Any) -> Media | None:
         chromatic=any(grid.is_chromatic for grid in grids) or any(map(_is_chromatic, plain)),
         emissive=any(grid.emission is not None for grid in grids),
         passes=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and bsdf.class_name() != "Null" for bsdf in bsdfs),
+        branches=any(map(_wants_branch, media)),
         around=None if sensor is None else _medium_around(sensor),
     )
 
@@ -72,28 +77,12 @@ def _medium_around(sensor: Any) -> Any:
     return found[0] if found else None
 
 
-def wants_branch(nodes: set[Any]) -> bool:
-    """Whether the extinction of some medium has gradients, and varies in space or is zero."""
-    for medium in nodes:
-        if isinstance(medium, mi.Medium):
-            params = mi.traverse(medium)
-            extinction = [params[key] for key in params.keys() if key.split(".")[0] in ("sigma_t", "scale")]
-            with dr.resume_grad():
-                moving = [value for value in extinction if dr.grad_enabled(value)]
-            if moving and not (medium.is_homogeneous() and all(dr.all(dr.detach(v) != 0, axis=None) for v in moving)):
-                return True
-    return False
-
-
-def opacity_moves(nodes: set[Any]) -> bool:
-    """Whether the opacity of some mask has gradients."""
-    for bsdf in nodes:
-        if isinstance(bsdf, mi.BSDF) and bsdf.class_name() == "MaskBSDF":
-            params = mi.traverse(bsdf)
-            with dr.resume_grad():
-                if any(dr.grad_enabled(params[key]) for key in params.keys() if key.startswith("opacity")):
-                    return True
-    return False
+def _wants_branch(medium: Any) -> bool:
+    """Whether the extinction has gradients, and varies in space or is zero."""
+    moving = with_gradients(medium, "sigma_t", "scale")
+    return bool(moving) and not (
+        medium.is_homogeneous() and all(dr.all(dr.detach(value) != 0, axis=None) for value in moving)
+    )
 
 
 def interaction(medium: Any, ray: Any, t: Any) -> Any:
@@ -119,6 +108,19 @@ def span(medium: Any, ray: Any, reach: Any, active: Any) -> tuple[Any, Any]:
     a, b = dr.maximum(near, 0), dr.minimum(far, reach)
     met &= a < b
     return dr.select(met, a, 0), dr.select(met, b, 0)
+
+
+def carried(t: Any, a: Any, b: Any, where: Any) -> tuple[Any, Any]:
+    """A distance that keeps its place relative to the ends of [a, b] as they move, and how much that stretches.
+
+    Values are those without motion, ``t`` and 1; derivatives are those of a + x (b - a) and (b - a) / (b₀ - a₀), with
+    x the place. Where ``where`` is false, or the end is infinitely far, nothing moves.
+    """
+    a0, b0 = dr.detach(a), dr.detach(b)
+    held = where & dr.isfinite(b0) & (a0 < b0)
+    scale = dr.select(held, dr.rcp(b0 - a0), 0)
+    moved = dr.select(held, dr.replace_grad(t, a + (t - a0) * scale * (b - a)), t)
+    return moved, dr.select(held, dr.replace_grad(mi.Float(1), (b - a) * scale), 1)
 
 
 def majorant(medium: Any, ray: Any, active: Any) -> Any:

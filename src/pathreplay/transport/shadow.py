@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .media import interaction, is_grid, majorant, span
+from .media import carried, interaction, is_grid, majorant, span
 from .vertex import Walk
 
 
@@ -132,10 +132,7 @@ def shadow_again(walk: Walk, origin: Any, light: Any, kept: Shadow, attached: bo
         near, reach = _boundary(walk, ray, still, kept.y, -1, walked), _boundary(walk, ray, still, kept.y, 1, walked)
         a, b = span(kept.medium, ray, reach, walked)
         a = dr.maximum(a, near)
-        between = walked & (dr.detach(a) < dr.detach(b))
-        scale = dr.select(between, dr.rcp(dr.detach(b - a)), 0)
-        y = dr.select(between, dr.replace_grad(y, a + (kept.y - dr.detach(a)) * scale * (b - a)), y)
-        growth = dr.select(between, dr.replace_grad(growth, (b - a) * scale), growth)
+        y, growth = carried(y, a, b, walked)
     else:
         ray = dr.detach(ray)
     with dr.suspend_grad(when=walk.listing):

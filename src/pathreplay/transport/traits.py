@@ -22,7 +22,8 @@ class Traits:
     ``attachable`` tells so by BSDF registry index (Bool; None if nowhere); ``detached_names`` are the classes of the
     other BSDFs with smooth lobes. ``lights_deform`` says that an emitting mesh has vertex positions with gradients,
     ``instances_move`` that an instance's ``to_world`` has, ``area_lights`` that there are emitters with an edge,
-    ``two_sides`` that a surface may have another BSDF on its back, ``masks_mirrors`` that a mask lies over delta lobes.
+    ``two_sides`` that a surface may have another BSDF on its back, ``masks_mirrors`` that a mask lies over delta lobes,
+    ``opacity_moves`` that the opacity of a mask has gradients.
     """
 
     mirrors: tuple[Any, ...]
@@ -35,6 +36,7 @@ class Traits:
     area_lights: bool
     two_sides: bool
     masks_mirrors: bool
+    opacity_moves: bool
 
 
 def scene_traits(nodes: set[Any], scene: Any, media: bool) -> Traits:
@@ -49,17 +51,19 @@ def scene_traits(nodes: set[Any], scene: Any, media: bool) -> Traits:
     seen = {shape.bsdf() for shape in shapes if not shape.is_emitter()}
     attachable = [bsdf for bsdf in bsdfs if _is_attachable(bsdf) and bsdf not in of_lamps - seen]
     others = [bsdf for bsdf in bsdfs if not _is_attachable(bsdf) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
+    masks = [bsdf for bsdf in bsdfs if bsdf.class_name() == "MaskBSDF"]
     return Traits(
         mirrors=tuple(bsdf for bsdf in bsdfs if _delta_lobes(bsdf)),
         lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs), default=0),
         attachables=tuple(attachable),
         attachable=_mask_by_index(attachable) if attachable else None,
         detached_names=tuple(sorted({bsdf.class_name() for bsdf in others})),
-        lights_deform=any(_has_gradient(s, "vertex_positions") for s in shapes if s.is_mesh() and s.is_emitter()),
-        instances_move=any(_has_gradient(s, "to_world") for s in shapes if s.class_name() == "Instance"),
+        lights_deform=any(with_gradients(s, "vertex_positions") for s in shapes if s.is_mesh() and s.is_emitter()),
+        instances_move=any(with_gradients(s, "to_world") for s in shapes if s.class_name() == "Instance"),
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
         two_sides=any(bsdf.class_name() == "TwoSidedBRDF" for bsdf in bsdfs),
-        masks_mirrors=any(bsdf.class_name() == "MaskBSDF" and _delta_lobes(_nested(bsdf)) for bsdf in bsdfs),
+        masks_mirrors=any(_delta_lobes(_nested(mask)) for mask in masks),
+        opacity_moves=any(with_gradients(mask, "opacity") for mask in masks),
     )
 
 
@@ -101,7 +105,9 @@ def _mask_by_index(bsdfs: list[Any]) -> Any:
     return mi.Bool(mask)
 
 
-def _has_gradient(shape: Any, name: str) -> bool:
-    params = mi.traverse(shape)
+def with_gradients(node: Any, *names: str) -> list[Any]:
+    """The parameters of a node that have gradients and one of these names, or one that goes on after it with a dot."""
+    params = mi.traverse(node)
+    found = [params[key] for key in params.keys() if any(key == name or key.startswith(name + ".") for name in names)]
     with dr.resume_grad():
-        return name in params and bool(dr.grad_enabled(params[name]))
+        return [value for value in found if dr.grad_enabled(value)]
