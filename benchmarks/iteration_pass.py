@@ -14,6 +14,7 @@ from drjit.opt import Adam
 from pathreplay.inverse.config import make_config
 from pathreplay.inverse.loop import Run, take_step
 from pathreplay.inverse.losses import l2
+from pathreplay.inverse.passes import Passes
 from pathreplay.inverse.problem import Problem, Variable, View
 from pathreplay.parameters import get_array
 
@@ -79,7 +80,7 @@ class Step:
         name, loop = method.split(", ")
         if method not in self.runs:
             depths = {"max_depth": self.job.max_depth, "rr_depth": self.job.rr_depth}
-            self.runs[method] = Run(mi.load_dict(METHODS[name] | depths), Watched(lr=RATE), [])
+            self.runs[method] = Run(Passes(self.problem, mi.load_dict(METHODS[name] | depths)), Watched(lr=RATE), [])
         run = self.runs[method]
         run.adam[self.key] = type(self.start)(self.start)
         if loop != OWN:
@@ -99,7 +100,7 @@ class Step:
     def _usual(self, run: Run, seed: int) -> None:
         """The loop of Mitsuba's tutorials."""
         adam = run.adam
-        image = mi.render(self.scene, self.params, integrator=run.integrator, spp=self.job.spp, seed=seed)
+        image = mi.render(self.scene, self.params, integrator=run.passes.integrator, spp=self.job.spp, seed=seed)
         loss = dr.mean(dr.square(image - self.target), axis=None)
         dr.backward(loss)
         adam.step()

@@ -13,12 +13,13 @@ from .gradient.adjoint import LostPaths
 from .gradient.baseline import FIRST_BRANCHING, Baseline
 from .gradient.forward import forward
 from .gradient.listing import listing
+from .gradient.pixel_sweep import PixelLoss, paths_per_lane, pixel_camera, pixel_sweep, sweepable
 from .gradient.primal import primal
 from .gradient.ray_jacobian import Recovery
 from .gradient.replay import replay
 from .gradient.sweep import MAX_DEPTH, deepest, sweep
 from .path_integrator import UNBOUNDED, choice, path_integrator
-from .transport.traits import Traits
+from .transport.traits import Traits, nodes_of
 from .transport.vertex import Walk
 
 DRIVERS = ("auto", "sweep", "replay")
@@ -71,10 +72,10 @@ def _make_class() -> type:
                 raise PathreplayError(f"pathreplay: noise = {noise}: use a standard deviation >= 0 (0 = off)")
             self.recovery = Recovery(noise=noise)
             self.told: set[str] = set()  # what has been said in the log
-            self.lost: tuple[LostPaths, int] | None = None  # of how many paths
+            self.lost: list[tuple[LostPaths, int]] = []  # of how many paths each, not told yet
             self.baseline: tuple[int, Baseline] | None = None  # and the scene that it belongs to
             self.learner: Baseline | None = None  # the same, in a pass that it may learn from
-            self.seeds: set[Any] = set()  # of the passes that it has learned from
+            self.known: set[Any] = set()  # keys of the passes that it has learned from
 
         def sample(
             self,
@@ -91,25 +92,13 @@ def _make_class() -> type:
             if mode == dr.ADMode.Primal:
                 L, valid = primal(walk, sampler, dr.detach(ray), active)
                 return L, valid, [], None
-            self._refuse_instances(walk.traits)
-            if walk.traits.masks_mirrors:
-                self._tell_once(
-                    "a mask lies over delta lobes, which Mitsuba cannot sample one by one there: derivatives by what "
-                    "decides among them (an index, or a reflectance of plastic) are wrong"
-                )
-            if walk.media is not None and walk.media.passes and walk.traits.opacity_moves:
-                self._tell_once(
-                    "the opacity of a mask has gradients in a scene with media: what it does to the light of emitters "
-                    "that shadow rays see through it is missing from the gradient"
-                )
-            if self.attach == "all":
-                self._tell_attachable(walk.traits)
+            self._check(walk)
             lost = LostPaths()
             if mode == dr.ADMode.Forward:
                 tangent, valid, moves = forward(walk, sampler, ray, active, lost)
                 if moves:
                     self._tell_edges(walk.traits)
-                    self.lost = lost, dr.width(ray)
+                    self.lost.append((lost, dr.width(ray)))
                 return tangent, valid, [], None
             driver = self.driver
             if self.auto and self.max_depth > deepest(walk):
@@ -118,16 +107,16 @@ def _make_class() -> type:
             if walk.media is not None and self.volume_gradient == "listing":
                 listing(walk, sampler, ray, δL, active)
             elif driver == "sweep":
-                if walk.baseline is not None and self.baseline is not None and self.seed is not None:
+                if walk.baseline is not None and self.baseline is not None and self.of_pass is not None:
                     self.learner = self.baseline[1]
-                    self.seeds.add(self.seed)
+                    self.known.add(self._pass_key())
                 moves = sweep(walk, sampler, ray, δL, active, lost, self.learner)
             else:
                 moves = replay(replace(walk, baseline=None), sampler, ray, δL, active, lost, self.recovery)
             if moves:
                 self._tell_edges(walk.traits)
             if moves or walk.media is not None:
-                self.lost = lost, dr.width(ray)
+                self.lost.append((lost, dr.width(ray)))
             return mi.Spectrum(0), mi.Bool(True), [], None
 
         def render_backward(
@@ -143,6 +132,41 @@ def _make_class() -> type:
             if self.learner is not None:
                 self.learner.absorb()
 
+        def sweeps_pixels(self, scene: Any, sensor: Any, spp: int) -> bool:
+            """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
+            if self.driver != "sweep" or not sweepable(sensor, self.max_depth, spp):
+                return False
+            return not any(isinstance(node, mi.Medium) for node in nodes_of(scene))
+
+        def render_and_backward(
+            self, scene: Any, offset: Any, slope: Any, sensor: Any, seed: Any = 0, spp: int = 0
+        ) -> Any:
+            """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
+
+            ``offset`` and ``slope`` are tensors like the image (height x width x 3); the loss adds up over its values.
+            Each path is judged by the others of its pixel: see `pixel_sweep`. What is not differentiated: see `sweep`.
+            Warns as `render_backward` does. Use it where `sweeps_pixels` allows it.
+            """
+            width, height = sensor.film().crop_size()
+            paths = paths_per_lane(self.max_depth, spp)
+            lanes = spp // paths  # of each pixel
+            with self._looking_through(scene, sensor, seed, spp), dr.suspend_grad(), dr.isolate_grad():
+                sampler = sensor.sampler().clone()
+                sampler.seed(seed, width * height * lanes)
+                pixel = dr.arange(mi.UInt32, width * height * lanes) // lanes
+                o, k = (dr.gather(mi.Color3f, tensor.array, pixel) for tensor in (offset, slope))
+                wanted = PixelLoss(o, k, 1 / spp)
+                walk, lost = self._walk(scene, True), LostPaths()
+                self._check(walk)
+                moves, L = pixel_sweep(walk, sampler, pixel_camera(sensor, pixel), paths, wanted, lost)
+                if moves:
+                    self._tell_edges(walk.traits)
+                    self.lost.append((lost, width * height * spp))
+                dr.eval(L)  # in one kernel with the gradients
+                image = mi.TensorXf(dr.ravel(dr.block_sum(L, lanes) / spp), (height, width, 3))
+            self._tell_lost()
+            return image
+
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
 
@@ -150,7 +174,7 @@ def _make_class() -> type:
             from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
             """
             tangent = super().render_forward(scene, params, sensor, seed, spp)
-            if self.lost is not None:
+            if self.lost:
                 dr.eval(tangent)  # in one kernel with the count of lost paths
             self._tell_lost()
             return tangent
@@ -169,21 +193,36 @@ def _make_class() -> type:
             """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
             if self.baseline is None or self.baseline[0] != scene.ptr:
                 self.baseline = scene.ptr, Baseline(scene.bbox())
-                self.seeds.clear()
-            if self.seed in self.seeds:
+                self.known.clear()
+            key = self._pass_key()
+            if key in self.known:
                 self._tell_once(
-                    f"seed {self.seed[0]} was used before: a pass cannot serve as baseline for itself, so that this "
+                    f"seed {key[0]} was used before: a pass cannot serve as baseline for itself, so that this "
                     "one goes without; give every pass a seed of its own"
                 )
                 return None
             return self.baseline[1]
 
-        def _refuse_instances(self, traits: Traits) -> None:
+        def _check(self, walk: Walk) -> None:
+            """Refuse, or warn of, what would make the gradient of this scene wrong."""
+            traits = walk.traits
             if traits.instances_move and self.attach != "none":
                 raise PathreplayError(
                     "pathreplay: an instance's to_world has a gradient, but Mitsuba does not differentiate the normals "
                     "of instances: move the vertex_positions of the shapes in its group, or use a shape of its own"
                 )
+            if traits.masks_mirrors:
+                self._tell_once(
+                    "a mask lies over delta lobes, which Mitsuba cannot sample one by one there: derivatives by what "
+                    "decides among them (an index, or a reflectance of plastic) are wrong"
+                )
+            if walk.media is not None and walk.media.passes and traits.opacity_moves:
+                self._tell_once(
+                    "the opacity of a mask has gradients in a scene with media: what it does to the light of emitters "
+                    "that shadow rays see through it is missing from the gradient"
+                )
+            if self.attach == "all":
+                self._tell_attachable(traits)
 
         def _tell_attachable(self, traits: Traits) -> None:
             if traits.attachable is None:
@@ -208,12 +247,21 @@ def _make_class() -> type:
                 mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
 
         def _tell_lost(self) -> None:
-            if self.lost is None:
-                return
-            (lost, paths), self.lost = self.lost, None
-            if lost.count[0] > 0:
-                share = f"{lost.count[0] / paths:.2%}"
+            if self.lost and not dr.flag(dr.JitFlag.FreezingScope):
+                paths = sum(number for _, number in self.lost)
+                self.tell_lost(self.take_lost(), paths)
+
+        def take_lost(self) -> Any:
+            """How many paths lost a part of their gradient (UInt32) or None: a frozen function cannot look itself."""
+            counts = [lost.count for lost, _ in self.lost]
+            self.lost.clear()
+            return sum(counts[1:], counts[0]) if counts else None
+
+        def tell_lost(self, count: Any, paths: int) -> None:
+            """Warn if paths lost a part of their gradient; ``count`` (UInt32) of so many ``paths``."""
+            if count[0] > 0:
                 why = "a ray adjoint was not finite, or media have more boundaries on the way than the record holds"
+                share = f"{count[0] / paths:.2%}"
                 mi.Log(mi.LogLevel.Warn, f"pathreplay: {share} of the paths lost a part of their gradient: {why}")
 
         def to_string(self) -> str:

@@ -26,7 +26,7 @@ def choice(props: Any, plugin: str, name: str, default: Any, choices: tuple[Any,
     return value
 
 
-def _mendable(error: BaseException) -> BaseException:
+def mendable(error: BaseException) -> BaseException:
     """The PathreplayError that Dr.Jit wrapped in errors of its own on the way out of a loop; else the error itself."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, PathreplayError):
@@ -62,7 +62,7 @@ def path_integrator() -> type:
             super().__init__(props)
             self.hide_emitters = props.get("hide_emitters", False)
             self.sensor: Any = None  # that is rendered
-            self.seed: Any = None  # of the pass, with what else tells passes apart
+            self.of_pass: Any = None  # what tells passes apart: seed, samples per pixel, sensor
 
         def render_backward(
             self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
@@ -98,20 +98,27 @@ def path_integrator() -> type:
             their instances differently and writes functions that both call twice ("invalid redefinition").
             """
             self.sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            self.seed = (seed if isinstance(seed, int) else int(seed[0]), spp, self.sensor.ptr)
+            self.of_pass = seed, spp, self.sensor.ptr
             collecting = gc.isenabled()
             gc.disable()
             try:
                 yield
             except RuntimeError as error:
-                mended = _mendable(error)
+                mended = mendable(error)
                 if mended is error:
                     raise
                 raise mended from None
             finally:
-                self.sensor = self.seed = None
+                self.sensor = self.of_pass = None
                 if collecting:
                     gc.enable()
+
+        def _pass_key(self) -> tuple[int, int, int] | None:
+            """What tells the pass under way from others (None if there is none). The seed is read: that takes time."""
+            if self.of_pass is None:
+                return None
+            seed, spp, sensor = self.of_pass
+            return seed if isinstance(seed, int) else int(seed[0]), spp, sensor
 
         def _walk(self, scene: Any, differentiate: bool) -> Walk:
             """How the scene is walked through; ``differentiate`` says that it is for a gradient."""

@@ -12,6 +12,7 @@ import mitsuba as mi
 from ..transport.flight import Flight
 from ..transport.shadow import Shadow
 from ..transport.vertex import Arrival, Kept, Numbers, Step, Walk
+from .adjoint import Replayed
 
 # Bits of Record.flags: Dr.Jit's local memory cannot hold Bool.
 HIT, DELTA, LIT, BLACK, CAMERA, EVENT, NULL = 1, 2, 4, 8, 16, 32, 64
@@ -121,7 +122,35 @@ def record(walk: Walk, at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: 
     return Record(**{name: value for name, value in fields.items() if name in names})
 
 
-def arrival_of(walk: Walk, read: Any, ray0: Any) -> Arrival:
+@cache
+def _end_type(variant: str) -> type:
+    return make_dataclass("End", {"L": mi.Spectrum, "records": mi.UInt32}.items())
+
+
+def end_type() -> type:
+    """What is kept of a path that has ended, where many are recorded: its radiance, and its number of records."""
+    return _end_type(mi.variant())
+
+
+def read_back(walk: Walk, tape: Any, index: Any, last: Any, ray0: Any) -> tuple[Replayed, Any]:
+    """The vertex recorded at ``index`` (UInt32), and the throughput before it (Spectrum).
+
+    ``last`` is the index of the path's last vertex; time and wavelengths are those of the camera ray ``ray0``.
+    """
+    read = tape[index]
+    onward = _arrival(walk, tape[dr.minimum(index + 1, last)], ray0)
+    vertex = Replayed(
+        at=_arrival(walk, read, ray0),
+        u=_numbers(walk, read),
+        kept=_continuation(walk, read, onward),
+        go_on=index < last,
+        hit_next=onward.hit,
+        rr_weight=read.rr_weight,
+    )
+    return vertex, read.β
+
+
+def _arrival(walk: Walk, read: Any, ray0: Any) -> Arrival:
     """How the path came to the recorded vertex; time and wavelengths are those of the camera ray ``ray0``."""
     hit = dr.zeros(mi.PreliminaryIntersection3f)
     hit.valid = (read.flags & HIT) != 0
@@ -143,14 +172,14 @@ def arrival_of(walk: Walk, read: Any, ray0: Any) -> Arrival:
     return at
 
 
-def numbers_of(walk: Walk, read: Any) -> Numbers:
+def _numbers(walk: Walk, read: Any) -> Numbers:
     """The random numbers that later passes need."""
     again = walk.resamples or walk.media is not None
     lobe, direction = (read.lobe, read.direction) if again else (mi.Float(0), mi.Point2f(0))
     return Numbers(light=read.light, lobe=lobe, direction=direction, roulette=mi.Float(0))
 
 
-def continuation_of(walk: Walk, read: Any, onward: Arrival) -> Kept:
+def _continuation(walk: Walk, read: Any, onward: Arrival) -> Kept:
     """What the first walk chose at the recorded vertex; ``onward`` is the arrival at the next."""
     kept = Kept(
         d=onward.ray.d,

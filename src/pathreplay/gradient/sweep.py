@@ -15,9 +15,9 @@ from ..errors import PathreplayError
 from ..transport.motion import path_moves
 from ..transport.path import count, first_arrival, next_arrival, survival, sustain, take_step
 from ..transport.vertex import Numbers, Walk
-from .adjoint import LostPaths, RayDerivative, Replayed, backward, backward_step
+from .adjoint import LostPaths, RayDerivative, backward, backward_step
 from .branch import Branch, branch_backward
-from .record import arrival_of, continuation_of, numbers_of, record, record_type
+from .record import read_back, record, record_type
 
 # Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x about 100 bytes are 3.3 MB, and a
 # thread's stack is 8 MB. Beyond the stack the process would die without a word.
@@ -101,17 +101,8 @@ def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostP
 
     while dr.hint(records > 0, exclude=[walk, ray, camera_ray, lost, baseline], label="pathreplay: sweep"):
         records -= 1
-        read = tape[records]
-        onward = arrival_of(walk, tape[dr.minimum(records + 1, last)], camera_ray)
-        replayed = Replayed(
-            at=arrival_of(walk, read, camera_ray),
-            u=numbers_of(walk, read),
-            kept=continuation_of(walk, read, onward),
-            go_on=records < last,
-            hit_next=onward.hit,
-            rr_weight=read.rr_weight,
-        )
-        L, q, breaks = backward_step(walk, replayed, attached, δL * read.β, L, q, mi.Bool(True))
+        replayed, β_before = read_back(walk, tape, records, last, camera_ray)
+        L, q, breaks = backward_step(walk, replayed, attached, δL * β_before, L, q, mi.Bool(True))
         if dr.hint(baseline is not None, mode="scalar"):
             baseline.learn(replayed, L)
         if dr.hint(attached, mode="scalar"):

@@ -21,6 +21,7 @@ from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
+from pathreplay.inverse.passes import Passes
 from pathreplay.inverse.problem import ITERATION, JUDGEMENT, PICTURE, Problem, seeds
 from pathreplay.parameters import get_array, to_value
 
@@ -35,7 +36,7 @@ JUDGEMENTS = 10
 class Run:
     """An optimisation under way: who differentiates, Adam with the variables, and what happened so far."""
 
-    integrator: mi.Integrator
+    passes: Passes
     adam: Adam
     history: list[Entry]
 
@@ -78,7 +79,7 @@ def new_run(problem: Problem, integrator: mi.Integrator) -> Run:
     adam = Adam(lr=1.0, beta_1=BETA_1, beta_2=BETA_2)
     for variable in problem.variables:
         adam[variable.key] = to_value(variable.like, variable.start)
-    return Run(integrator, adam, [])
+    return Run(Passes(problem, integrator), adam, [])
 
 
 def put_values(problem: Problem, adam: Adam) -> None:
@@ -121,9 +122,9 @@ def iterate(
 def take_step(problem: Problem, config: Config, run: Run, position: int) -> None:
     """One step, with the learning rates and resolutions of iteration ``position``; adds an entry to the history.
 
-    Render every view with seeds of its own, back-propagate the mean of the views' losses, step Adam with the learning
-    rate lr·decay^(position / iterations), project every variable into its bounds. A grid whose next resolution is due
-    is interpolated before that, and Adam starts anew on it. What is differentiated is decided by the integrator;
+    Render every view with a seed of its own, back-propagate the mean of the losses (see `Passes`), step Adam with the
+    learning rate lr·decay^(position / iterations), project every variable into its bounds. A grid whose next resolution
+    is due is interpolated before that, and Adam starts anew on it. What is differentiated is decided by the integrator;
     targets, bounds and the seeds' choice of paths are not.
 
     Raises:
@@ -132,10 +133,8 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> None
     begin, i, adam = time.perf_counter(), len(run.history), run.adam
     _refine(problem, adam, position)
     put_values(problem, adam)
-    loss = _loss(problem, config, run.integrator, i)
-    dr.backward(loss)
+    value = run.passes([seeds(config.seed, ITERATION, i, view.sensor)[0] for view in problem.views], config.spp)
     norms, dropped = _gradients(adam)
-    value = float(dr.detach(loss)[0]) if dr.width(loss) else float("nan")
     if not np.isfinite(value):
         raise PathreplayError(
             f"The loss is {value} at iteration {i}; lower the learning rates, or bound the parameters that ran away"
@@ -201,23 +200,6 @@ def _refine(problem: Problem, adam: Adam, position: int) -> None:
         if tuple(value.shape) != shape:
             # Of another shape: Adam forgets its moments, which belong to cells of another size.
             adam[variable.key] = type(value)(resampled(get_array(value), shape))
-
-
-def _loss(problem: Problem, config: Config, integrator: mi.Integrator, iteration: int) -> mi.Float:
-    total = mi.Float(0)
-    for view in problem.views:
-        seed, seed_grad = seeds(config.seed, ITERATION, iteration, view.sensor)
-        image = mi.render(
-            problem.scene,
-            problem.params,
-            sensor=view.sensor,
-            integrator=integrator,
-            spp=config.spp,
-            seed=mi.UInt32(seed),
-            seed_grad=seed_grad,
-        )
-        total += problem.loss(image, mi.TensorXf(view.target)).array / len(problem.views)
-    return total
 
 
 def _gradients(adam: Adam) -> tuple[dict[str, float], int]:

@@ -45,6 +45,9 @@ def log(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
     return dr.mean(dr.square(dr.log(1 + positive) - dr.log(1 + dr.maximum(target, 0))), axis=None)
 
 
+#: Losses whose derivative by a pixel is a linear function of that pixel alone.
+QUADRATIC = frozenset({l2, relative_l2})
+
 LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "relative-l2": relative_l2, "log": log}
 
 

@@ -1,0 +1,99 @@
+"""The loss of a problem and its gradient: one pass over the paths where that is possible, traced only once.
+
+A loss whose derivative is linear in each pixel can be back-propagated while its image is rendered, see `pixel_sweep`;
+for the others an image is rendered first, and paths of their own are differentiated. Where Dr.Jit can record all that
+as a frozen function, later calls launch its kernels without tracing them again.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.inverse.losses import QUADRATIC, Loss
+from pathreplay.inverse.problem import Problem
+from pathreplay.path_integrator import mendable
+from pathreplay.transport.traits import nodes_of
+
+
+class Passes:
+    """The mean over the views of the loss, by one integrator, and its gradient."""
+
+    def __init__(self, problem: Problem, integrator: mi.Integrator) -> None:
+        self.problem, self.integrator = problem, integrator
+        self.targets = [mi.TensorXf(view.target) for view in problem.views]
+        # What an integrator learns of media from pass to pass is read and written between kernels.
+        self.freezes = not any(isinstance(node, mi.Medium) for node in nodes_of(problem.scene))
+        self.began = False
+        self.frozen: dict[Any, Callable[..., Any]] = {}  # recorded functions, by the shapes of the parameters
+
+    def __call__(self, seeds: list[int], spp: int) -> float:
+        """The loss, with ``spp`` samples per pixel and a seed for every view; adds its gradient to the parameters.
+
+        Unbiased for the losses in `QUADRATIC`; the value itself carries the variance of the pictures on top. Raises
+        what the integrator raises; warns as it does, of the paths of all views together.
+        """
+        keys = tuple(self.problem.params.keys())
+        sensors = tuple(view.sensor for view in self.problem.views)
+        numbers = [dr.opaque(mi.UInt32, seed) for seed in seeds]
+        # The first call is not recorded: scenes make some of their parts when they are first rendered.
+        differentiate = self._recorded(keys) if self.freezes and self.began else _differentiate
+        self.began = True
+        try:
+            value, lost = differentiate(
+                self.problem.scene, self.integrator, self.targets, numbers, sensors, keys, self.problem.loss, spp
+            )
+        except RuntimeError as error:
+            raise mendable(error) from None
+        if lost is not None:
+            paths = sum(target.shape[0] * target.shape[1] for target in self.targets) * spp
+            self.integrator.tell_lost(lost, paths)
+        return float(value[0]) if dr.width(value) else float("nan")
+
+    def _recorded(self, keys: tuple[str, ...]) -> Callable[..., Any]:
+        shapes = tuple(dr.shape(self.problem.params[key]) for key in keys)
+        if shapes not in self.frozen:
+            gc.collect()  # scenes of the past would be traced, too
+            # A plain function, so that neither holds this object nor the scene when the run is over.
+            self.frozen[shapes] = dr.freeze(_differentiate)
+        return self.frozen[shapes]
+
+
+def _differentiate(
+    scene: Any,
+    integrator: Any,
+    targets: list[Any],
+    seeds: list[Any],
+    sensors: tuple[int, ...],
+    keys: tuple[str, ...],
+    loss: Loss,
+    spp: int,
+) -> tuple[Any, Any]:
+    """The loss, and how many paths lost a part of their gradient (None if nobody counts, or it has been told)."""
+    params = mi.traverse(scene)
+    params.keep(list(keys))
+    total, attached = mi.Float(0), mi.Float(0)
+    for index, target, seed in zip(sensors, targets, seeds, strict=True):
+        sensor = scene.sensors()[index]
+        if loss in QUADRATIC and hasattr(integrator, "sweeps_pixels") and integrator.sweeps_pixels(scene, sensor, spp):
+            offset = _derivative(loss, dr.zeros(mi.TensorXf, target.shape), target) / len(sensors)
+            slope = _derivative(loss, dr.ones(mi.TensorXf, target.shape), target) / len(sensors) - offset
+            image = integrator.render_and_backward(scene, offset, slope, sensor, seed, spp)
+            total += loss(image, target).array / len(sensors)
+        else:
+            image = mi.render(scene, params, sensor=index, integrator=integrator, spp=spp, seed=seed)
+            attached += loss(image, target).array / len(sensors)
+    if dr.grad_enabled(attached):
+        dr.backward(attached)
+    return total + dr.detach(attached), integrator.take_lost() if hasattr(integrator, "take_lost") else None
+
+
+def _derivative(loss: Loss, image: Any, target: Any) -> Any:
+    """Derivative of a loss by the image, a tensor like it."""
+    dr.enable_grad(image)
+    dr.backward(loss(image, target))
+    return dr.grad(image)

@@ -1,0 +1,191 @@
+"""The pixel sweep against finite differences of Mitsuba's images, and what the optimisation loop makes of it."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from pathreplay.gradient.pixel_sweep import paths_per_lane
+from pathreplay.inverse.config import make_config
+from pathreplay.inverse.job import build_problem
+from pathreplay.inverse.loop import new_run, take_step
+from truth import (
+    RESOLVED,
+    Z_MAX,
+    Bench,
+    Case,
+    add,
+    bitmap,
+    camera,
+    lit_room,
+    noise,
+    random,
+    rgb,
+    translate,
+    under_sky,
+)
+
+MIRROR = {"type": "conductor", "material": "none"}
+METAL = {"type": "roughconductor", "alpha": 0.3, "distribution": "ggx"}
+
+
+def painted_floor() -> dict:
+    room = lit_room({"type": "diffuse", "reflectance": rgb(0.6, 0.5, 0.4)})
+    room["floor"]["bsdf"]["reflectance"] = bitmap(noise(8, 3, 0.2, 0.9))
+    return room
+
+
+def through_a_lens() -> dict:
+    lens = camera(fov=22) | {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 4.0}
+    return painted_floor() | {"camera": lens}
+
+
+FLOOR = "floor.bsdf.reflectance.data"
+CASES = [
+    Case("painted floor", painted_floor, FLOOR, random(1.0), spp=4, seeds=48),
+    Case("painted floor, two samples", painted_floor, FLOOR, random(1.0), spp=2, seeds=64),
+    Case("painted floor, two lanes a pixel", painted_floor, FLOOR, random(1.0), spp=24, seeds=24),
+    Case("painted floor, hidden lamps", painted_floor, FLOOR, random(1.0), spp=4, seeds=48,
+         options={"hide_emitters": True}),
+    Case("painted floor through a lens", through_a_lens, FLOOR, random(1.0), spp=4, seeds=48),
+    Case("lamp", lambda: lit_room(MIRROR), "light.emitter.radiance.value", add([1.0, 0.5, 0.2]), spp=4, seeds=48),
+    Case("rough metal", lambda: under_sky(METAL), "object.bsdf.alpha.value", add(), spp=8, seeds=48),
+    Case("mirror ball moves", lambda: under_sky(MIRROR), "object.to_world", translate(0.5, 0.2, 1), spp=4, seeds=48),
+]  # fmt: skip
+
+
+def swept(bench: Bench, integrator: mi.Integrator, seed: int, offset: np.ndarray, slope: np.ndarray) -> tuple:
+    """Image and gradient by the case's t, of a loss with this derivative."""
+    t = dr.opaque(mi.Float, 0)
+    dr.enable_grad(t)
+    bench.put(t)
+    loss = (mi.TensorXf(offset.astype(np.float32)), mi.TensorXf(slope.astype(np.float32)))
+    sensor = bench.scene.sensors()[0]
+    image = integrator.render_and_backward(bench.scene, *loss, sensor, mi.UInt32(seed), bench.case.spp)
+    value = bench.params[bench.case.key]
+    dr.enqueue(dr.ADMode.Backward, value)
+    dr.traverse(dr.ADMode.Backward)
+    return np.array(image), float(dr.grad(t)[0])
+
+
+@pytest.fixture
+def opened() -> Iterator:
+    """Opens cases, and releases them at the end."""
+    benches: list[Bench] = []
+
+    def open_case(case: Case) -> Bench:
+        gc.collect()
+        benches.append(Bench(case))
+        return benches[-1]
+
+    yield open_case
+    for bench in benches:
+        bench.release()
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_image_and_gradient_are_those_of_a_quadratic_loss(case: Case, opened) -> None:
+    """The loss is Σ W (I - T)² with a target T close to the picture, so that judging a path by itself would show."""
+    bench = opened(case)
+    plain = bench.integrator("path", rr_depth=case.rr_depth, **case.options)
+    expected = np.mean([bench.image(plain, 5000 + seed, spp=1024) for seed in range(4)], axis=0)
+    slope = 2 * bench.weights
+    offset = -slope * 0.8 * expected
+    adjoint = offset + slope * expected
+
+    ours = bench.integrator(rr_depth=case.rr_depth, **case.options)
+    assert ours.sweeps_pixels(bench.scene, bench.scene.sensors()[0], case.spp)
+    seeds = range(1, case.seeds + 1)
+    found = [swept(bench, ours, seed, offset, slope) for seed in seeds]
+    reference = [(bench.difference(plain, 1000 + seed, 1024) * adjoint).sum() for seed in range(8)]
+
+    gradients = np.array([gradient for _, gradient in found])
+    error = np.sqrt(gradients.var(ddof=1) / case.seeds + np.var(reference, ddof=1) / 8)
+    gap = gradients.mean() - np.mean(reference)
+    assert error < RESOLVED * abs(np.mean(reference))
+    assert abs(gap) < Z_MAX * error, (gradients.mean(), np.mean(reference), error)
+
+    brightness = np.array([(image * bench.weights).sum() for image, _ in found])
+    error = brightness.std(ddof=1) / np.sqrt(case.seeds)
+    assert abs(brightness.mean() - (expected * bench.weights).sum()) < Z_MAX * error
+
+
+def test_the_same_seed_gives_the_same_gradient_in_one_thread_and_many(opened) -> None:
+    bench = opened(CASES[0])
+    integrator = bench.integrator()
+    adjoint = (-bench.weights, bench.weights)
+    threads = dr.thread_count()
+    try:
+        dr.set_thread_count(1)
+        image, one = swept(bench, integrator, 1, *adjoint)
+    finally:
+        dr.set_thread_count(threads)
+    again, many = swept(bench, integrator, 1, *adjoint)
+    _, other = swept(bench, integrator, 2, *adjoint)
+    np.testing.assert_allclose(again, image, rtol=1e-5, atol=1e-6)
+    assert many == pytest.approx(one, rel=1e-4)
+    assert abs(other - one) > 1e-3 * abs(one)
+
+
+@pytest.mark.parametrize("why", ["gaussian filter", "alpha", "stratified", "moving camera", "too deep", "one sample"])
+def test_what_cannot_be_swept_by_pixels_is_told(why: str, opened) -> None:
+    def scene() -> dict:
+        room = painted_floor()
+        if why == "gaussian filter":
+            room["camera"]["film"]["rfilter"] = {"type": "gaussian"}
+        if why == "alpha":
+            room["camera"]["film"]["pixel_format"] = "rgba"
+        if why == "stratified":
+            room["camera"]["sampler"] = {"type": "stratified", "sample_count": 4}
+        return room
+
+    key, move = ("camera.to_world", translate(1, 0, 0)) if why == "moving camera" else (FLOOR, random(1.0))
+    bench = opened(Case(why, scene, key, move))
+    integrator = bench.integrator() if why != "too deep" else mi.load_dict({"type": "pathreplay", "max_depth": 1500})
+    t = dr.opaque(mi.Float, 0)
+    dr.enable_grad(t)
+    bench.put(t)
+    assert not integrator.sweeps_pixels(bench.scene, bench.scene.sensors()[0], 1 if why == "one sample" else 4)
+
+
+@pytest.mark.parametrize(("depth", "spp", "paths"), [(8, 16, 16), (8, 48, 16), (8, 34, 2), (200, 64, 8), (8, 1, 1)])
+def test_paths_of_a_lane_divide_the_samples_and_fit_its_record(depth: int, spp: int, paths: int) -> None:
+    assert paths_per_lane(depth, spp) == paths
+
+
+JOB = {
+    "scene": "cornell-box",
+    "parameters": [{"key": "red.reflectance.value"}],
+    "target": {"values": {"red.reflectance.value": 0.7}, "spp": 16},
+    "spp": 8,
+    "iterations": 4,
+    "integrator": {"type": "pathreplay", "max_depth": 3},
+}
+
+
+def steps(problem, config, passes: str) -> list[np.ndarray]:
+    """Gradients of three steps, recorded or traced anew each time."""
+    run = new_run(problem, problem.integrator)
+    run.passes.freezes = passes == "recorded"
+    seen = []
+    key = problem.variables[0].key
+    for i in range(3):
+        take_step(problem, config, run, i)
+        seen.append(np.array(run.adam[key]))
+    return seen
+
+
+@pytest.mark.parametrize("loss", ["l2", "l1"])
+def test_steps_that_were_recorded_are_those_that_are_traced(loss: str, tmp_path) -> None:
+    config = make_config(JOB | {"loss": loss})
+    problem = build_problem(config, tmp_path)
+    recorded, traced = steps(problem, config, "recorded"), steps(problem, config, "traced")
+    for a, b in zip(recorded, traced, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+    assert np.abs(recorded[0] - recorded[2]).max() > 1e-2  # and they go somewhere
+    problem.params.update({problem.variables[0].key: dr.detach(problem.params[problem.variables[0].key])})
