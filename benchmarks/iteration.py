@@ -8,17 +8,18 @@ from .surface import BACK_WALL, FLOOR
 from .tables import comparison, groups, markdown, method_cell
 
 TITLE = "iteration"
-TAKES = (10, 130)
+TAKES = (12, 240)
 
 USUAL, OWN = "usual loop", "own loop"
-SURFACE = (f"prb, {USUAL}", f"sweep, {USUAL}", f"sweep, {OWN}")
+SURFACE = (f"prb, {USUAL}", f"prb, {OWN}", f"sweep, {USUAL}", f"sweep, {OWN}")
 MEDIA = (f"prbvolpath, {USUAL}", f"score, {USUAL}", f"score, {OWN}")
 
 #: Scene, parameter, methods, depth, largest resolution.
 ROWS = (
-    ("cornell-box", BACK_WALL, SURFACE, 8, 128),
+    ("cornell-box, box filter", BACK_WALL, SURFACE, 8, 128),
     ("glossy-environment", FLOOR, SURFACE, 8, 128),
-    ("glass-and-diffuse", BACK_WALL, SURFACE, 8, 128),
+    ("glass-and-diffuse, box filter", BACK_WALL, SURFACE, 8, 128),
+    ("cornell-box", BACK_WALL, SURFACE, 8, 128),
     ("cloud", (DENSITY,), MEDIA, 64, 32),
 )
 
@@ -34,7 +35,7 @@ def jobs(quick: bool) -> list[Job]:
             rr_depth=5,
             resolution=min(resolution, 64) if quick else resolution,
             spp=16,
-            rounds=4 if quick else 15,
+            rounds=4 if quick else 30,
             warm_up=2,
             measure="step",
         )

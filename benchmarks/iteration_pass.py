@@ -23,8 +23,10 @@ from .job import METHODS, Job
 from .passes import spreads
 from .scenes import SCENES
 
-# The start values over those with which the target was rendered: a gradient that is not all noise.
-START = 0.5
+# Where steps begin. Textures are grey, so that some texels are too bright and some too dark, as in most problems: with
+# one set of paths for image and gradient the variance depends on that. Densities are half of what they should be.
+GREY = 0.5
+HALF = 0.5
 RATE = 0.02
 TARGET_SPP = 256
 
@@ -51,8 +53,8 @@ class Step:
         judge = mi.load_dict({"type": "volpath", "max_depth": job.max_depth})
         target = mi.render(self.scene, integrator=judge, spp=TARGET_SPP, seed=1)
         truth = self.params[self.key]
-        self.start = dr.detach(truth * START)
         texture = len(truth.shape) == 3
+        self.start = dr.full(type(truth), GREY, truth.shape) if texture else dr.detach(truth * HALF)
         self.upper = 1.0 if texture else None  # a density has no upper bound
         self.target = mi.TensorXf(target)
         like, array = type(truth)(truth), get_array(self.start)

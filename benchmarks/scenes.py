@@ -109,10 +109,23 @@ def closed_box(resolution: int) -> SceneDict:
     }
 
 
+def _boxed(make: Callable[[int], SceneDict]) -> Callable[[int], SceneDict]:
+    """The scene with a box filter on its film; Mitsuba's Cornell box has a gaussian one."""
+
+    def boxed(resolution: int) -> SceneDict:
+        scene = make(resolution)
+        scene["sensor"]["film"] |= {"rfilter": {"type": "box"}}
+        return scene
+
+    return boxed
+
+
 SCENES: dict[str, Callable[[int], SceneDict]] = {
     "cornell-box": cornell_box,
+    "cornell-box, box filter": _boxed(cornell_box),
     "glossy-environment": glossy_environment,
     "glass-and-diffuse": glass_and_diffuse,
+    "glass-and-diffuse, box filter": _boxed(glass_and_diffuse),
     "closed-box": closed_box,
 } | MEDIA_SCENES
 """Scene by name: resolution -> dictionary for mi.load_dict (with optimize=False, to keep the keys)."""

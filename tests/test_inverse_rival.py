@@ -35,9 +35,10 @@ def test_rival_gets_the_same_time_and_both_are_shown() -> None:
     assert spent[1] - others[-1]["seconds"] < spent[0] <= spent[1]
     # While the job compiles its kernels the rival takes many steps before the first judgement: the job's is the start.
     first = own[0]["picture_error"]
-    for entries in (own, others):
+    # It may take all its steps at that turn, since the job's later ones are launched and not traced.
+    for entries, least in ((own, 2), (others, 1)):
         judgements = [entry["picture_error"] for entry in entries if entry["picture_error"] is not None]
-        assert len(judgements) > 1 and entries[-1]["picture_error"] == judgements[-1] < first
+        assert len(judgements) >= least and entries[-1]["picture_error"] == judgements[-1] < first
         assert entries[-1]["errors"][TEXTURE] < entries[0]["errors"][TEXTURE]
     # From the same start with the same seeds.
     assert others[0]["loss"] == pytest.approx(own[0]["loss"], rel=1e-5)
