@@ -94,12 +94,12 @@ def pixel_sweep(
     # ---------------- First pass: record the paths -----------------
 
     room = max(walk.max_depth, 1)
-    tape = dr.alloc_local(record_type(walk), paths * room)
-    ends = dr.alloc_local(end_type(), paths)
     total = mi.Spectrum(0)  # radiance of all paths
     with dr.suspend_grad():
         ray0, _ = camera(sampler.clone(), mi.Bool(True))
         attached = path_moves(walk, ray0, first_arrival(walk, ray0, mi.Bool(True)))
+    tape = dr.alloc_local(record_type(walk, attached), paths * room)
+    ends = dr.alloc_local(end_type(), paths)
     s = mi.UInt32(0)  # number of the path
 
     while dr.hint(s < paths, exclude=[walk, camera], label="pathreplay: paths of a pixel"):
@@ -119,7 +119,7 @@ def pixel_sweep(
             η *= step.kept.eta
             rr_weight, survives = survival(β_alive, η, depth, u.roulette, walk, step)
             # All lanes of a packet write to the same place: elsewhere writes to local memory get lost (Dr.Jit 1.5).
-            tape[s * room + depth] = record(walk, at, u, step, β, rr_weight)
+            tape[s * room + depth] = record(walk, attached, at, u, step, β, rr_weight)
 
             L += β * step.e
             active = step.active & survives & (dr.max(β_alive) != 0)

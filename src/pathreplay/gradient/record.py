@@ -19,18 +19,26 @@ HIT, DELTA, LIT, BLACK, CAMERA, EVENT, NULL = 1, 2, 4, 8, 16, 32, 64
 LOBE_SHIFT = 8
 
 
-def record_type(walk: Walk) -> type:
-    """The fields that the records of this walk have."""
+def record_type(walk: Walk, attached: bool) -> type:
+    """The fields that the records of this walk have; ``attached`` says that the path moves with the parameters."""
     media = walk.media
+    fixed = media is None and not attached and not walk.traits.lights_vary
     return _record_type(
         mi.variant(), walk.resamples or media is not None, media is not None, bool(media and media.chromatic),
-        bool(media and media.emissive), bool(media and media.passes), walk.branch,
+        bool(media and media.emissive), bool(media and media.passes), walk.branch, fixed,
     )  # fmt: skip
 
 
 @cache
 def _record_type(
-    variant: str, resamples: bool, media: bool, chromatic: bool, emissive: bool, passes: bool, branch: bool
+    variant: str,
+    resamples: bool,
+    media: bool,
+    chromatic: bool,
+    emissive: bool,
+    passes: bool,
+    branch: bool,
+    fixed: bool,
 ) -> type:
     fields = {
         "o": mi.Point3f,  # ray
@@ -44,9 +52,12 @@ def _record_type(
         "pdf": mi.Float,  # of ray.d
         "β": mi.Spectrum,  # throughput before the vertex
         "rr_weight": mi.Float,  # 1 / survival probability after the vertex
-        "light": mi.Point2f,  # random numbers
         "flags": mi.UInt32,
     }
+    if fixed:
+        fields |= {"glow": mi.Spectrum, "light_d": mi.Vector3f, "light_w": mi.Spectrum}
+    else:
+        fields |= {"light": mi.Point2f}  # random numbers
     if resamples:
         fields |= {"lobe": mi.Float, "direction": mi.Point2f}
     if media:
@@ -72,7 +83,7 @@ def _record_type(
     return make_dataclass("Record", list(fields.items()))
 
 
-def record(walk: Walk, at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: Any) -> Any:
+def record(walk: Walk, attached: bool, at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: Any) -> Any:
     """A vertex, to be written."""
     kept = step.kept
     bits = {HIT: at.hit.valid, DELTA: at.delta, LIT: kept.lit, BLACK: kept.black, CAMERA: at.camera}
@@ -81,7 +92,7 @@ def record(walk: Walk, at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: 
     flags = kept.lobe << LOBE_SHIFT
     for bit, value in bits.items():
         flags |= dr.select(value, mi.UInt32(bit), 0)
-    Record = record_type(walk)
+    Record = record_type(walk, attached)
     fields = {
         "o": at.ray.o,
         "d": at.ray.d,
@@ -95,6 +106,9 @@ def record(walk: Walk, at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: 
         "β": β,
         "rr_weight": rr_weight,
         "light": u.light,
+        "glow": kept.glow,
+        "light_d": kept.light_d,
+        "light_w": kept.light_w,
         "flags": flags,
         "lobe": u.lobe,
         "direction": u.direction,
@@ -176,7 +190,8 @@ def _numbers(walk: Walk, read: Any) -> Numbers:
     """The random numbers that later passes need."""
     again = walk.resamples or walk.media is not None
     lobe, direction = (read.lobe, read.direction) if again else (mi.Float(0), mi.Point2f(0))
-    return Numbers(light=read.light, lobe=lobe, direction=direction, roulette=mi.Float(0))
+    light = getattr(read, "light", mi.Point2f(0))
+    return Numbers(light=light, lobe=lobe, direction=direction, roulette=mi.Float(0))
 
 
 def _continuation(walk: Walk, read: Any, onward: Arrival) -> Kept:
@@ -189,6 +204,8 @@ def _continuation(walk: Walk, read: Any, onward: Arrival) -> Kept:
         lobe=read.flags >> LOBE_SHIFT,
         lit=(read.flags & LIT) != 0,
     )
+    if hasattr(read, "glow"):
+        kept.glow, kept.light_d, kept.light_w = read.glow, read.light_d, read.light_w
     if walk.media is None:
         return kept
     kept.null = (read.flags & NULL) != 0

@@ -57,8 +57,6 @@ def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostP
 
     # ------------------ First pass: record the path -----------------
 
-    room = _records(walk)
-    tape = dr.alloc_local(record_type(walk), room)
     β = mi.Spectrum(1)  # throughput
     β_alive = mi.Spectrum(1)  # throughput with one zero weight left out: what keeps the path going
     η = mi.Float(1)  # relative index of refraction since the camera
@@ -67,6 +65,8 @@ def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostP
     active = mi.Bool(active) & (walk.max_depth > 0)
     at = first_arrival(walk, ray, active)
     attached = path_moves(walk, ray, at)
+    room = _records(walk)
+    tape = dr.alloc_local(record_type(walk, attached), room)
     camera_ray = dr.detach(ray)
     branch = Branch.none()
 
@@ -77,7 +77,7 @@ def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostP
         β_alive = sustain(β_alive, β, step)
         η *= step.kept.eta
         rr_weight, survives = survival(β_alive, η, depth, u.roulette, walk, step)
-        tape[records] = record(walk, at, u, step, β, rr_weight)
+        tape[records] = record(walk, attached, at, u, step, β, rr_weight)
         if dr.hint(walk.branch, mode="scalar"):
             branch = branch.offer(at, step, β, depth, η, active)
 

@@ -40,15 +40,24 @@ def surface_step(
     with dr.suspend_grad(when=not attached):
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
     bsdf = si.bsdf(at.ray)
+    go_on = active & go_on & si.is_valid()
+
+    # ----------- Light that is known and does not change -----------
+
+    if kept is not None and kept.glow is not None and not attached:
+        f = bsdf.eval(ctx, si, si.to_local(kept.light_d), kept.lit)
+        e = kept.glow + dr.select(kept.lit, f * kept.light_w, 0)
+        w, d, pdf = scatter(walk, bsdf, si, u, kept, attached, hit_next, go_on)
+        return Step(e=e, w=w, ray_next=si.spawn_ray(d), pdf=pdf, kept=kept, met=si.is_valid(), active=go_on)
 
     # ------------------------- Emission -------------------------
 
     seen = active & (~at.camera | si.is_valid()) if walk.hide_emitters else active
-    e = emission(walk.scene, at, si, attached, seen)
+    glow = emission(walk.scene, at, si, attached, seen)
 
     # ---------- Next-event estimation and continuation ----------
 
-    go_on = active & go_on & si.is_valid()
+    first = kept is None
     if kept is None:
         lit = go_on & is_smooth(bsdf)
         light, Le = draw_emitter(walk.scene, si, u.light, lit)
@@ -73,6 +82,9 @@ def surface_step(
         w, d, pdf = scatter(walk, bsdf, si, u, kept, attached, hit_next, go_on)
 
     mis = dr.select(light.delta, 1, mis_weight(light.pdf, pdf_light))
-    e += dr.select(lit, f * Le * (mis if attached else dr.detach(mis)), 0)
+    light_w = Le * (mis if attached else dr.detach(mis))
+    e = glow + dr.select(lit, f * light_w, 0)
+    if first and not walk.traits.lights_vary:
+        kept.glow, kept.light_d, kept.light_w = glow, light.d, light_w
 
     return Step(e=e, w=w, ray_next=si.spawn_ray(d), pdf=pdf, kept=kept, met=si.is_valid(), active=go_on)

@@ -23,7 +23,8 @@ class Traits:
     other BSDFs with smooth lobes. ``lights_deform`` says that an emitting mesh has vertex positions with gradients,
     ``instances_move`` that an instance's ``to_world`` has, ``area_lights`` that there are emitters with an edge,
     ``two_sides`` that a surface may have another BSDF on its back, ``masks_mirrors`` that a mask lies over delta lobes,
-    ``opacity_moves`` that the opacity of a mask has gradients.
+    ``opacity_moves`` that the opacity of a mask has gradients, ``lights_vary`` that
+    something about emitters has, or about the shapes that emit.
     """
 
     mirrors: tuple[Any, ...]
@@ -37,6 +38,7 @@ class Traits:
     two_sides: bool
     masks_mirrors: bool
     opacity_moves: bool
+    lights_vary: bool
 
 
 def scene_traits(nodes: set[Any], scene: Any, media: bool) -> Traits:
@@ -64,6 +66,7 @@ def scene_traits(nodes: set[Any], scene: Any, media: bool) -> Traits:
         two_sides=any(bsdf.class_name() == "TwoSidedBRDF" for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(mask)) for mask in masks),
         opacity_moves=any(with_gradients(mask, "opacity") for mask in masks),
+        lights_vary=any(map(_varies, [*scene.emitters(), *(shape for shape in shapes if shape.is_emitter())])),
     )
 
 
@@ -95,6 +98,13 @@ def _is_attachable(bsdf: Any) -> bool:
     if name in FRAMES:
         return all(_is_attachable(nested) for nested in nodes_of(bsdf) if isinstance(nested, mi.BSDF))
     return name in ATTACHABLE
+
+
+def _varies(root: Any) -> bool:
+    """Whether any parameter of an object, or of one below it, has gradients."""
+    params = mi.traverse(root)
+    with dr.resume_grad():
+        return any(dr.grad_enabled(params[key]) for key in params.keys())
 
 
 def _mask_by_index(bsdfs: list[Any]) -> Any:

@@ -98,6 +98,10 @@ class Kept:
     # With media only, else None:
     flight: Any = None  # Flight on the way to the vertex
     shadow: Any = None  # Shadow between the vertex and its emitter sample
+    # On surfaces, if nothing about emitters is differentiated: what later passes need not find out again. Else None.
+    glow: Any = None  # Spectrum: emission, a part of e
+    light_d: Any = None  # Vector3f: direction of the emitter sample
+    light_w: Any = None  # Spectrum: its radiance over its density, MIS weighted
     # Only the first walk needs these; they are None in a record that is read back.
     light: Any = None  # DirectionSample3f of the emitter sample
     eta: Any = None  # Float: relative index of refraction that it crosses
