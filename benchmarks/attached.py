@@ -6,7 +6,8 @@ from .job import Job, Point, Record
 from .tables import comparison, groups, markdown, method_cell
 
 TITLE = "attached"
-TAKES = (12, 100)
+TAKES = (12, 75)
+SCENE = "glass-and-diffuse"  # in which it is timed
 TEXTURE = "back.bsdf.reflectance.data"
 BALL = "ball.to_world"
 BOX = "small-box.vertex_positions"
@@ -16,14 +17,14 @@ def jobs(quick: bool) -> list[Job]:
     """What moves x depth, in turn; then memory in a process of its own, against depth and against paths."""
     timed = [
         Job(
-            scene="glass-and-diffuse",
+            scene=SCENE,
             parameters=parameters,
             methods=("prb", "sweep"),
             max_depth=depth,
             rr_depth=5,
             resolution=64 if quick else 128,
             spp=16,
-            rounds=4 if quick else 15,
+            rounds=4 if quick else 10,
         )
         for parameters in (((BALL,),) if quick else ((BALL,), (BOX,), (BALL, TEXTURE)))
         for depth in ((6,) if quick else (6, 16))
@@ -51,7 +52,7 @@ def jobs(quick: bool) -> list[Job]:
 
 def table(record: Record) -> str:
     """Time next to `prb`, which leaves out most of this gradient; then peak memory."""
-    timed = [point for point in record.points if point.scene == "glass-and-diffuse"]
+    timed = [point for point in record.points if point.scene == SCENE]
     rows = [
         [", ".join(p.parameters), str(p.max_depth), method_cell(p), *comparison(p, methods.get("prb"))[:2]]
         for methods in groups(timed).values()

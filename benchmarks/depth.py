@@ -11,7 +11,7 @@ from .media_scenes import DENSITY
 from .tables import markdown
 
 TITLE = "depth"
-TAKES = (25, 300)
+TAKES = (25, 220)
 WALLS = ("box.bsdf.reflectance.data",)
 
 #: Scene, parameter, and for each method its greatest depth and the factor from one depth to the next. Where a claim
@@ -62,7 +62,7 @@ def jobs(quick: bool) -> list[Job]:
             rr_depth=depth + 1,
             resolution=16,
             spp=4,
-            rounds=3 if quick else 7,
+            rounds=3 if quick else 5,
             warm_up=2
             if scene == MEDIA
             else 1,  # a method that learns may have another kernel for when it knows nothing

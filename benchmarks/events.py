@@ -9,7 +9,7 @@ from .media_scenes import DENSITY
 from .tables import markdown
 
 TITLE = "events"
-TAKES = (12, 200)
+TAKES = (12, 140)
 METHODS = ("prbvolpath", "score", "listing")
 COUNTED = "sealed-fog, counted"
 

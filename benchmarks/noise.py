@@ -17,7 +17,7 @@ from .job import Job, Point, Record
 from .tables import groups, markdown
 
 TITLE = "noise"
-TAKES = (7, 150)
+TAKES = (7, 130)
 KEY = "low.vertex_positions"
 SWEEP = "sweep"
 

@@ -10,7 +10,7 @@ from . import records
 from .drafts import ROOT
 from .job import Record
 from .summaries import SUMMARIES
-from .tables import footnote
+from .tables import brief_footnote, footnote
 
 MARKED = re.compile(r"(<!-- begin (?P<name>[\w-]+) -->\n).*?(<!-- end (?P=name) -->)", re.DOTALL)
 NOT_MEASURED = "*Not measured yet.*"
@@ -48,7 +48,7 @@ def fill(tables: Mapping[str, Callable[[Record], str]], among: Sequence[Path]) -
             missing.add(task)
             return f"{match[1]}{NOT_MEASURED}\n{match[3]}"
         pictures = [f"![{told}](images/{file}.svg)" for file, told in PICTURES.get(name, {}).items()]
-        parts = "\n\n".join([*pictures, table(record), footnote(record)])
+        parts = "\n\n".join([*pictures, table(record), (brief_footnote if name in SUMMARIES else footnote)(record)])
         return f"{match[1]}{parts}\n{match[3]}"
 
     for page in among:

@@ -8,7 +8,7 @@ from .job import Job, Record
 from .tables import groups, markdown
 
 TITLE = "startup"
-TAKES = (15, 50)
+TAKES = (15, 20)
 STAGES = ("import", "first gradient", "second gradient")
 METHODS = ("prb", "sweep")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 
-from . import depth, iteration, media, surface, truth
+from . import attached, depth, iteration, media, surface, truth
 from .estimates import cost_ratio, efficiency, time_ratio, variance_ratio
 from .job import Point, Record
 from .tables import groups, markdown
@@ -22,11 +22,21 @@ def _surface(record: Record) -> str:
     return markdown(["gradient of a texture, sweep / prb", "time", "variance"], rows)
 
 
+def _attached(record: Record) -> str:
+    """The sweep next to `prb`, which leaves out most of these gradients."""
+    rows = []
+    for (scene, parameters, max_depth, *_), found in groups(record.points).items():
+        if scene == attached.SCENE and (pair := _pair(found, "sweep", "prb")):
+            times = time_ratio(*(point.seconds for point in pair))
+            rows.append([", ".join(parameters), str(max_depth), str(times)])  # type: ignore[arg-type]
+    return markdown(["gradient of what moves, sweep / prb", "depth", "time"], rows)
+
+
 def _iteration(record: Record) -> str:
     """Our own loop next to the usual one with Mitsuba's integrator."""
     rows = []
     for (scene, *_), found in groups(record.points).items():
-        for theirs, _, own in (iteration.SURFACE, iteration.MEDIA):
+        for theirs, *_, own in (iteration.SURFACE, iteration.MEDIA):
             if pair := _pair(found, own, theirs):
                 ours, rival = pair
                 times, errors = (ours.seconds, rival.seconds), (ours.squared_errors, rival.squared_errors)
@@ -71,6 +81,16 @@ def _truth(record: Record) -> str:
     return markdown(["gradient against finite differences", "cells", *verdicts], rows)
 
 
+def _wrong(record: Record) -> str:
+    """Gradients of media that `prbvolpath` has wrong, next to ours."""
+    rows = []
+    for (scene, *_), found in groups(record.points).items():
+        theirs = found.get(media.RIVAL)
+        if theirs is not None and theirs.verdict == "fail":
+            rows.append([str(scene), *(truth.told(found.get(name)) for name in (truth.STEPS[1], "score", media.RIVAL))])
+    return markdown(["gradient by", "finite differences of `volpath`", "`pathreplay`", "`prbvolpath`"], rows)
+
+
 def _pair(found: Mapping[str, Point], ours: str, theirs: str) -> tuple[Point, Point] | None:
     """Both methods, if both have come to an end with finite gradients."""
     a, b = found.get(ours), found.get(theirs)
@@ -83,10 +103,11 @@ def _pair(found: Mapping[str, Point], ours: str, theirs: str) -> tuple[Point, Po
 SUMMARIES: dict[str, tuple[str, Callable[[Record], str]]] = {
     f"{task}-summary": (task, summary)
     for task, summary in (
+        (attached.TITLE, _attached),
         (surface.TITLE, _surface),
         (iteration.TITLE, _iteration),
         (media.TITLE, _media),
         (depth.TITLE, _depth),
         (truth.TITLE, _truth),
     )
-}
+} | {"wrong-summary": (truth.TITLE, _wrong)}

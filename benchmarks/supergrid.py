@@ -10,7 +10,7 @@ from .media_scenes import DENSITY
 from .tables import markdown, median_seconds, pooled
 
 TITLE = "supergrid"
-TAKES = (20, 200)
+TAKES = (20, 165)
 WITHOUT = "one majorant"
 GRIDS = {"sparse": ("supergrid", "auto"), "thin sparse": ("auto",), "uniform": ("supergrid", "auto")}
 PASSES: tuple[Kind, ...] = ("gradient", "image")
@@ -29,7 +29,7 @@ def jobs(quick: bool) -> list[Job]:
             rr_depth=5,
             resolution=32 if quick else 64,
             spp=16 if quick else 64,  # enough that tracing the kernels does not count
-            rounds=4 if quick else 8,
+            rounds=4 if quick else 5,
             warm_up=3,
             measure=measure,
             weights="wave",

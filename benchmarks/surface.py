@@ -6,7 +6,7 @@ from .job import Job, Record
 from .tables import comparison, groups, markdown, method_cell
 
 TITLE = "surface"
-TAKES = (12, 75)  # seconds on two quiet cores: quick, full
+TAKES = (12, 40)  # seconds on two quiet cores: quick, full
 BACK_WALL = ("back.bsdf.reflectance.data",)
 FLOOR = ("floor.bsdf.base_color.data",)
 METHODS = ("prb", "sweep", "replay")

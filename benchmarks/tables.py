@@ -62,6 +62,11 @@ def comparison(point: Point, rival: Point | None) -> list[str]:
     return [seconds, str(time_ratio(*times)), str(variance_ratio(*errors)), str(cost_ratio(times, errors))]
 
 
+def brief_footnote(record: Record) -> str:
+    """The command, for summaries: the pages with the full tables tell the rest."""
+    return f"`{record.command}`, {record.date[:10]}."
+
+
 def footnote(record: Record) -> str:
     """Where, when and with what the numbers were taken."""
     machine = record.machines[0]

@@ -11,7 +11,7 @@ from .job import Job, Point, Record
 from .tables import groups, markdown
 
 TITLE = "truth"
-TAKES = (18, 240)
+TAKES = (18, 290)
 
 STEPS = ("finite differences", "half steps")
 SURFACE = ("sweep", "replay", "forward", "prb", "prb_basic")
@@ -104,7 +104,7 @@ def table(record: Record) -> str:
     parts = []
     for room, methods in (("surfaces", SURFACE), ("media", MEDIA)):
         rows = [
-            [str(scene), *(_cell(found.get(method)) for method in (STEPS[1], *methods))]
+            [str(scene), *(told(found.get(method)) for method in (STEPS[1], *methods))]
             for (scene, *_), found in groups(record.points).items()
             if CELLS[str(scene)].room == room
         ]
@@ -113,7 +113,8 @@ def table(record: Record) -> str:
     return "\n\n".join(parts)
 
 
-def _cell(point: Point | None) -> str:
+def told(point: Point | None) -> str:
+    """A derivative, and its verdict where it is not that it passes."""
     if point is None:
         return ""
     if point.error:
@@ -121,8 +122,8 @@ def _cell(point: Point | None) -> str:
     values = np.asarray(point.values)
     if not np.isfinite(values).all():
         return f"**{np.count_nonzero(~np.isfinite(values))} of {values.size} not finite**"
-    told = f"{values.mean():+.4f}"
+    text = f"{values.mean():+.4f}"
     if point.z is None:
-        return f"{told} ± {values.std(ddof=1) / np.sqrt(values.size):.4f}"
-    told += f" (z {point.z:+.1f})"
-    return told if point.verdict in ("pass", "zero") else f"{told} **{point.verdict}**"
+        return f"{text} ± {values.std(ddof=1) / np.sqrt(values.size):.4f}"
+    text += f" (z {point.z:+.1f})"
+    return text if point.verdict in ("pass", "zero") else f"{text} **{point.verdict}**"

@@ -19,6 +19,9 @@ from pathreplay.inverse.problem import Problem
 from pathreplay.path_integrator import mendable
 from pathreplay.transport.traits import nodes_of
 
+#: Integrators that look at nothing on the host while they render, by class.
+RECORDABLE = frozenset({"PathReplayIntegrator", "PRBIntegrator", "BasicPRBIntegrator"})
+
 
 class Passes:
     """The mean over the views of the loss, by one integrator, and its gradient."""
@@ -27,7 +30,9 @@ class Passes:
         self.problem, self.integrator = problem, integrator
         self.targets = [mi.TensorXf(view.target) for view in problem.views]
         # What an integrator learns of media from pass to pass is read and written between kernels.
-        self.freezes = not any(isinstance(node, mi.Medium) for node in nodes_of(problem.scene))
+        media = any(isinstance(node, mi.Medium) for node in nodes_of(problem.scene))
+        self.freezes = type(integrator).__name__ in RECORDABLE and not media
+        self.swept: tuple[bool, ...] = ()  # views whose pixels can be swept
         self.began = False
         self.frozen: dict[Any, Callable[..., Any]] = {}  # recorded functions, by the shapes of the parameters
 
@@ -37,16 +42,15 @@ class Passes:
         Unbiased for the losses in `QUADRATIC`; the value itself carries the variance of the pictures on top. Raises
         what the integrator raises; warns as it does, of the paths of all views together.
         """
-        keys = tuple(self.problem.params.keys())
         sensors = tuple(view.sensor for view in self.problem.views)
         numbers = [dr.opaque(mi.UInt32, seed) for seed in seeds]
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
-        differentiate = self._recorded(keys) if self.freezes and self.began else _differentiate
-        self.began = True
+        differentiate = self._recorded() if self.freezes and self.began else self._traced
+        if not self.began:
+            self.began, self.swept = True, tuple(self._sweeps(sensor, spp) for sensor in sensors)
+        scene, loss = self.problem.scene, self.problem.loss
         try:
-            value, lost = differentiate(
-                self.problem.scene, self.integrator, self.targets, numbers, sensors, keys, self.problem.loss, spp
-            )
+            value, lost = differentiate(scene, self.integrator, self.targets, numbers, sensors, self.swept, loss, spp)
         except RuntimeError as error:
             raise mendable(error) from None
         if lost is not None:
@@ -54,35 +58,53 @@ class Passes:
             self.integrator.tell_lost(lost, paths)
         return float(value[0]) if dr.width(value) else float("nan")
 
-    def _recorded(self, keys: tuple[str, ...]) -> Callable[..., Any]:
+    def _sweeps(self, sensor: int, spp: int) -> bool:
+        if self.problem.loss not in QUADRATIC or not hasattr(self.integrator, "sweeps_pixels"):
+            return False
+        scene = self.problem.scene
+        return bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))
+
+    def _traced(self, *args: Any) -> tuple[Any, Any]:
+        return _differentiate(self.problem.params, *args)
+
+    def _recorded(self) -> Callable[..., Any]:
+        keys = list(self.problem.params.keys())
         shapes = tuple(dr.shape(self.problem.params[key]) for key in keys)
         if shapes not in self.frozen:
             gc.collect()  # scenes of the past would be traced, too
-            # A plain function, so that neither holds this object nor the scene when the run is over.
-            self.frozen[shapes] = dr.freeze(_differentiate)
+            self.frozen[shapes] = _recording(keys)
         return self.frozen[shapes]
 
 
+def _recording(keys: list[str]) -> Callable[..., Any]:
+    """`_differentiate` as a frozen function, which holds neither scene nor problem when the run is over."""
+
+    def differentiate(scene: Any, *args: Any) -> tuple[Any, Any]:
+        params = mi.traverse(scene)
+        params.keep(keys)
+        return _differentiate(params, scene, *args)
+
+    return dr.freeze(differentiate)
+
+
 def _differentiate(
+    params: Any,
     scene: Any,
     integrator: Any,
     targets: list[Any],
     seeds: list[Any],
     sensors: tuple[int, ...],
-    keys: tuple[str, ...],
+    swept: tuple[bool, ...],
     loss: Loss,
     spp: int,
 ) -> tuple[Any, Any]:
     """The loss, and how many paths lost a part of their gradient (None if nobody counts, or it has been told)."""
-    params = mi.traverse(scene)
-    params.keep(list(keys))
     total, attached = mi.Float(0), mi.Float(0)
-    for index, target, seed in zip(sensors, targets, seeds, strict=True):
-        sensor = scene.sensors()[index]
-        if loss in QUADRATIC and hasattr(integrator, "sweeps_pixels") and integrator.sweeps_pixels(scene, sensor, spp):
+    for index, sweeps, target, seed in zip(sensors, swept, targets, seeds, strict=True):
+        if sweeps:
             offset = _derivative(loss, dr.zeros(mi.TensorXf, target.shape), target) / len(sensors)
             slope = _derivative(loss, dr.ones(mi.TensorXf, target.shape), target) / len(sensors) - offset
-            image = integrator.render_and_backward(scene, offset, slope, sensor, seed, spp)
+            image = integrator.render_and_backward(scene, offset, slope, scene.sensors()[index], seed, spp)
             total += loss(image, target).array / len(sensors)
         else:
             image = mi.render(scene, params, sensor=index, integrator=integrator, spp=spp, seed=seed)
