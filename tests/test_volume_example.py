@@ -32,12 +32,12 @@ def test_the_example_is_valid_and_uses_five_views_or_more() -> None:
 def test_a_small_cloud_is_recovered_shown_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     job = shrunk(
-        scene_parameters={"resolution": 12, "grid": 8, "views": 3}, iterations=20, spp=8, picture_spp=8, rival=None,
+        scene_parameters={"resolution": 12, "grid": 8, "views": 3}, iterations=40, spp=8, picture_spp=8, rival=None,
         resolutions=[4, 8], refine_at=[8], learning_rate=0.6, target={"spp": 64},
     )  # fmt: skip
     result = optimize(make_config(job), progress=False)
     first = result.history[0].errors[KEY]
-    assert result.errors[KEY] < 0.9 * first  # it starts at 1.6, most of the empty space is found at once
+    assert result.errors[KEY] < 0.9 * first  # it starts at 1.6; five seeds ended between 0.75 and 0.82 of that
     saved = load_volume(result.folder / f"volumes/{KEY}.vol")
     assert saved.data.shape == (8, 8, 8, 1)
     assert np.array_equal(saved.data, result.parameters[KEY])

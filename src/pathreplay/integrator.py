@@ -88,6 +88,8 @@ def _make_class() -> type:
             **_: Any,
         ) -> tuple[Any, Any, list[Any], Any]:
             """Radiance, its tangent, or nothing (after back-propagating ``δL``): see Mitsuba's ADIntegrator."""
+            if mode == dr.ADMode.Primal and self.goes_back:
+                return mi.Spectrum(0), mi.Bool(True), [], None
             walk = self._walk(scene, mode != dr.ADMode.Primal)
             if mode == dr.ADMode.Primal:
                 L, valid = primal(walk, sampler, dr.detach(ray), active)

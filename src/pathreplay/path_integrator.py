@@ -62,6 +62,9 @@ def path_integrator() -> type:
             super().__init__(props)
             self.hide_emitters = props.get("hide_emitters", False)
             self.sensor: Any = None  # that is rendered
+            # Mitsuba asks for radiance before it goes back, for integrators that replay it. Ours find it themselves and
+            # nobody looks at this one; but tracing it takes time.
+            self.goes_back = False
             self.of_pass: Any = None  # what tells passes apart: seed, samples per pixel, sensor
 
         def render_backward(
@@ -70,7 +73,11 @@ def path_integrator() -> type:
             """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator."""
             # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
             with self._looking_through(scene, sensor, seed, spp), dr.isolate_grad():
-                super().render_backward(scene, params, grad_in, sensor, seed, spp)
+                self.goes_back = True
+                try:
+                    super().render_backward(scene, params, grad_in, sensor, seed, spp)
+                finally:
+                    self.goes_back = False
 
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator."""

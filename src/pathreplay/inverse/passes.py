@@ -43,7 +43,8 @@ class Passes:
         what the integrator raises; warns as it does, of the paths of all views together.
         """
         sensors = tuple(view.sensor for view in self.problem.views)
-        numbers = [dr.opaque(mi.UInt32, seed) for seed in seeds]
+        # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
+        numbers = [dr.opaque(mi.UInt32, seed) for seed in seeds] if self.freezes else seeds
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
         differentiate = self._recorded() if self.freezes and self.began else self._traced
         if not self.began:
