@@ -169,22 +169,25 @@ JOB = {
 }
 
 
-def steps(problem, config, passes: str) -> list[np.ndarray]:
-    """Gradients of three steps, recorded or traced anew each time."""
+def steps(problem, config, passes: str) -> np.ndarray:
+    """Loss and norm of the gradient of four steps, recorded (from the second on) or traced anew each time."""
     run = new_run(problem, problem.integrator)
     run.passes.freezes = passes == "recorded"
-    seen = []
-    key = problem.variables[0].key
-    for i in range(3):
+    for i in range(4):
         take_step(problem, config, run, i)
-        seen.append(np.array(run.adam[key]))
-    return seen
+    return np.array([[entry.loss, *entry.gradient_norms.values()] for entry in run.history])
 
 
 BOXED = {"scene": "cornell-box-photo", "scene_parameters": {"resolution": 32}}
 POSE = {
     "parameters": [{"key": "large-box.vertex_positions", "pose": "translation", "start": {"translation": [0.1] * 3}}],
     "target": {"scene": "cornell-box", "spp": 16},
+}
+GLASS = {
+    "scene": "glass-pane",
+    "scene_parameters": {"resolution": 24},
+    "parameters": [{"key": "glass.eta", "learning_rate": 0.02}],
+    "target": {"values": {"glass.eta": 1.4}, "spp": 16, "integrator": {"type": "path", "max_depth": 6}},
 }
 BOXED_POSE = BOXED | POSE | {"target": BOXED | {"spp": 16}}
 
@@ -216,6 +219,7 @@ def test_two_swept_views_add_up(changes: dict, tmp_path) -> None:
         pytest.param({"integrator": {"type": "prb", "max_depth": 3}}, False, id="prb"),
         pytest.param({"integrator": {"type": "prb_basic", "max_depth": 3}}, False, id="prb_basic"),
         pytest.param(POSE, False, id="moving"),
+        pytest.param(GLASS, True, id="index of a plugin in Python"),
         pytest.param(BOXED, True, id="box filter"),
         pytest.param(BOXED | {"loss": "log"}, False, id="box filter, log"),
         pytest.param(BOXED | {"integrator": {"type": "prb", "max_depth": 3}}, False, id="box filter, prb"),
@@ -231,7 +235,7 @@ def test_steps_that_were_recorded_are_those_that_are_traced(
         inner = problem.integrator.render_and_backward
         monkeypatch.setattr(problem.integrator, "render_and_backward", lambda *a: calls.append(1) or inner(*a))
     recorded, traced = steps(problem, config, "recorded"), steps(problem, config, "traced")
-    for a, b in zip(recorded, traced, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3 * np.abs(b).max())
-    assert np.abs(recorded[0] - recorded[2]).max() > 1e-3  # they go somewhere
+    np.testing.assert_allclose(recorded, traced, rtol=1e-4)
+    # Every step has seeds and values of its own: one that was launched with those of another would show.
+    assert (np.abs(np.diff(traced, axis=0)) / traced.max(axis=0)).min() > 1e-3
     assert bool(calls) == swept
