@@ -70,7 +70,8 @@ def brief_footnote(record: Record) -> str:
 def footnote(record: Record) -> str:
     """Where, when and with what the numbers were taken."""
     machine = record.machines[0]
-    rounds = max((len(point.seconds) for point in record.points), default=0)
+    counts = sorted({len(point.seconds) for point in record.points if not point.error}) or [0]
+    rounds = str(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     threads = " and ".join(str(m.threads) for m in record.machines)
     sittings = f"; in {record.sittings} sittings" if record.sittings > 1 else ""
     return (

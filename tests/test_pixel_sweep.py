@@ -10,10 +10,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.gradient.pixel_sweep import paths_per_lane
+from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import make_config
 from pathreplay.inverse.job import build_problem
 from pathreplay.inverse.loop import new_run, put_values, take_step
+from pathreplay.inverse.losses import QUADRATIC, RELATIVE_FLOOR, l2
+from pathreplay.inverse.passes import _linear_derivative
 from pathreplay.inverse.problem import ITERATION, seeds
 from truth import (
     RESOLVED,
@@ -50,7 +52,7 @@ FLOOR = "floor.bsdf.reflectance.data"
 CASES = [
     Case("painted floor", painted_floor, FLOOR, random(1.0), spp=4, seeds=48),
     Case("painted floor, two samples", painted_floor, FLOOR, random(1.0), spp=2, seeds=64),
-    Case("painted floor, two lanes a pixel", painted_floor, FLOOR, random(1.0), spp=24, seeds=24),
+    Case("painted floor, many samples", painted_floor, FLOOR, random(1.0), spp=64, seeds=16),
     Case("painted floor, hidden lamps", painted_floor, FLOOR, random(1.0), spp=4, seeds=48,
          options={"hide_emitters": True}),
     Case("painted floor through a lens", through_a_lens, FLOOR, random(1.0), spp=4, seeds=48),
@@ -133,7 +135,10 @@ def test_the_same_seed_gives_the_same_gradient_in_one_thread_and_many(opened) ->
     assert abs(other - one) > 1e-3 * abs(one)
 
 
-@pytest.mark.parametrize("why", ["gaussian filter", "alpha", "stratified", "moving camera", "too deep", "one sample"])
+REASONS = ["gaussian filter", "alpha", "xyz", "stratified", "moving camera", "too deep", "one sample"]
+
+
+@pytest.mark.parametrize("why", REASONS)
 def test_what_cannot_be_swept_by_pixels_is_told(why: str, opened) -> None:
     def scene() -> dict:
         room = painted_floor()
@@ -141,6 +146,8 @@ def test_what_cannot_be_swept_by_pixels_is_told(why: str, opened) -> None:
             room["camera"]["film"]["rfilter"] = {"type": "gaussian"}
         if why == "alpha":
             room["camera"]["film"]["pixel_format"] = "rgba"
+        if why == "xyz":
+            room["camera"]["film"]["pixel_format"] = "xyz"
         if why == "stratified":
             room["camera"]["sampler"] = {"type": "stratified", "sample_count": 4}
         return room
@@ -154,9 +161,24 @@ def test_what_cannot_be_swept_by_pixels_is_told(why: str, opened) -> None:
     assert not integrator.sweeps_pixels(bench.scene, bench.scene.sensors()[0], 1 if why == "one sample" else 4)
 
 
-@pytest.mark.parametrize(("depth", "spp", "paths"), [(8, 16, 16), (8, 48, 16), (8, 34, 2), (200, 64, 8), (8, 1, 1)])
-def test_paths_of_a_lane_divide_the_samples_and_fit_its_record(depth: int, spp: int, paths: int) -> None:
-    assert paths_per_lane(depth, spp) == paths
+def test_what_cannot_be_swept_by_pixels_is_refused(opened) -> None:
+    bench = opened(CASES[0])
+    integrator, adjoint = bench.integrator(), mi.TensorXf(bench.weights)
+    for spp, message in ((1, "1 samples per pixel"), (1024, "at most 2048 vertices")):
+        with pytest.raises(PathreplayError, match=message):
+            integrator.render_and_backward(bench.scene, adjoint, adjoint, spp=spp)
+    with pytest.raises(PathreplayError, match="shape"):
+        integrator.render_and_backward(bench.scene, adjoint[:, :, :1], adjoint, spp=4)
+
+
+def test_the_derivative_of_a_quadratic_loss_is_found_at_any_brightness() -> None:
+    target = mi.TensorXf(np.float32([0, 0.1, 10, 1e4, 1e6]))
+    for loss in QUADRATIC:
+        offset, slope = (np.array(term, dtype=np.float64) for term in _linear_derivative(loss, target))
+        T = np.array(target, dtype=np.float64)
+        weight = 2 / T.size if loss is l2 else 2 / T.size / (T + RELATIVE_FLOOR) ** 2
+        np.testing.assert_allclose(slope, weight, rtol=1e-5)
+        np.testing.assert_allclose(offset, -weight * T, rtol=1e-5)
 
 
 JOB = {

@@ -13,7 +13,7 @@ from .gradient.adjoint import LostPaths
 from .gradient.baseline import FIRST_BRANCHING, Baseline
 from .gradient.forward import forward
 from .gradient.listing import listing
-from .gradient.pixel_sweep import PixelLoss, paths_per_lane, pixel_camera, pixel_sweep, sweepable
+from .gradient.pixel_sweep import PixelLoss, pixel_camera, pixel_sweep, sweepable
 from .gradient.primal import primal
 from .gradient.ray_jacobian import Recovery
 from .gradient.replay import replay
@@ -128,46 +128,64 @@ def _make_class() -> type:
 
             Warns when a part of the gradient was not finite and had to be left out.
             """
-            self.learner = None
-            super().render_backward(scene, params, grad_in, sensor, seed, spp)
-            self._tell_lost()
-            if self.learner is not None:
-                self.learner.absorb()
+            self._forget_lost()
+            try:
+                super().render_backward(scene, params, grad_in, sensor, seed, spp)
+                self._tell_lost()
+                if self.learner is not None:
+                    self.learner.absorb()
+            finally:
+                self.learner = None
 
-        def sweeps_pixels(self, scene: Any, sensor: Any, spp: int) -> bool:
+        def sweeps_pixels(self, scene: Any, sensor: Any = 0, spp: int = 0) -> bool:
             """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
+            sensor, spp = self._resolved(scene, sensor, spp)
             if self.driver != "sweep" or not sweepable(sensor, self.max_depth, spp):
                 return False
             return not any(isinstance(node, mi.Medium) for node in nodes_of(scene))
 
         def render_and_backward(
-            self, scene: Any, offset: Any, slope: Any, sensor: Any, seed: Any = 0, spp: int = 0
+            self, scene: Any, offset: Any, slope: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
         ) -> Any:
             """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
 
             ``offset`` and ``slope`` are tensors like the image (height x width x 3); the loss adds up over its values.
             Each path is judged by the others of its pixel: see `pixel_sweep`. What is not differentiated: see `sweep`.
-            Warns as `render_backward` does. Use it where `sweeps_pixels` allows it.
+            Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
+            number of samples does not, or a tensor has another shape.
             """
+            sensor, spp = self._resolved(scene, sensor, spp)
             width, height = sensor.film().crop_size()
-            paths = paths_per_lane(self.max_depth, spp)
-            lanes = spp // paths  # of each pixel
+            if not 1 < spp <= MAX_DEPTH // max(self.max_depth, 1):
+                raise PathreplayError(
+                    f"pathreplay: {spp} samples per pixel, of {self.max_depth} vertices, cannot be swept: use "
+                    f"2 or more, and at most {MAX_DEPTH} vertices in all, or mi.render"
+                )
+            for tensor in (offset, slope):
+                if tensor.shape != (height, width, 3):
+                    raise PathreplayError(
+                        f"pathreplay: derivative of the loss has shape {tensor.shape}: use {(height, width, 3)}"
+                    )
+            self._forget_lost()
             with self._looking_through(scene, sensor, seed, spp), dr.suspend_grad(), dr.isolate_grad():
                 sampler = sensor.sampler().clone()
-                sampler.seed(seed, width * height * lanes)
-                pixel = dr.arange(mi.UInt32, width * height * lanes) // lanes
+                sampler.seed(seed, width * height)
+                pixel = dr.arange(mi.UInt32, width * height)
                 o, k = (dr.gather(mi.Color3f, tensor.array, pixel) for tensor in (offset, slope))
-                wanted = PixelLoss(o, k, 1 / spp)
                 walk, lost = self._walk(scene, True), LostPaths()
                 self._check(walk)
-                moves, L = pixel_sweep(walk, sampler, pixel_camera(sensor, pixel), paths, wanted, lost)
+                moves, L = pixel_sweep(walk, sampler, pixel_camera(sensor, pixel), spp, PixelLoss(o, k), lost)
                 if moves:
                     self._tell_edges(walk.traits)
                     self.lost.append((lost, width * height * spp))
                 dr.eval(L)  # in one kernel with the gradients
-                image = mi.TensorXf(dr.ravel(dr.block_sum(L, lanes) / spp), (height, width, 3))
+                image = mi.TensorXf(dr.ravel(L), (height, width, 3))
             self._tell_lost()
             return image
+
+        def _resolved(self, scene: Any, sensor: Any, spp: int) -> tuple[Any, int]:
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            return sensor, spp or sensor.sampler().sample_count()
 
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
@@ -175,6 +193,7 @@ def _make_class() -> type:
             The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
             from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
             """
+            self._forget_lost()
             tangent = super().render_forward(scene, params, sensor, seed, spp)
             if self.lost:
                 dr.eval(tangent)  # in one kernel with the count of lost paths
@@ -247,6 +266,11 @@ def _make_class() -> type:
             if message not in self.told:
                 self.told.add(message)
                 mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
+
+        def _forget_lost(self) -> None:
+            """Before a pass; but in a frozen function the passes before are still to be told of: see `take_lost`."""
+            if not dr.flag(dr.JitFlag.FreezingScope):
+                self.lost.clear()
 
         def _tell_lost(self) -> None:
             if self.lost and not dr.flag(dr.JitFlag.FreezingScope):

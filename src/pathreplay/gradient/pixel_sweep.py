@@ -1,14 +1,15 @@
 """The pixel sweep: an image and the gradient of a quadratic loss, from one set of paths that are walked once.
 
-What a loss wants of a path is known only when its pixel is. So a lane walks several paths of one pixel and records
-them one behind the other, as `sweep` does for one path; then it goes back through all of them. With I the mean of N
+What a loss wants of a path is known only when its pixel is. So a lane walks all N paths of a pixel and records them
+one behind the other, as `sweep` does for one path; then it goes back through all of them. With I the mean of their
 radiances L_s, a loss with derivative f'(I) must not judge a path by itself, or the gradient would be biased by the
 covariance of L_s and its derivative. Each is judged by the others:
 
     δL_s = f'(I_{-s}) / N,    I_{-s} = (N I - L_s) / (N - 1),    f'(I) = offset + slope · I.
 
-The gradient's mean is that with an image of other paths. Its variance differs by the covariance of L_s f'(I) and the
-derivative of L_s: to the better where a brighter path is what the loss asks for, to the worse where it is not.
+The gradient's mean is that with an image of other paths. Its variance differs by the covariance of f'(I) dL_s and the
+change of f' with L_s: to the better where the loss asks for more light, to the worse where it asks for less; and, of
+second order in 1/N, by what the noise of the image and that of the derivative make together.
 """
 
 from __future__ import annotations
@@ -27,31 +28,24 @@ from .adjoint import LostPaths, RayDerivative, backward_step
 from .record import end_type, read_back, record, record_type
 from .sweep import MAX_DEPTH
 
-# Paths of one lane: with more, few lanes are left to share the work.
-MAX_PATHS = 16
-
-
-def paths_per_lane(max_depth: int, spp: int) -> int:
-    """The largest number of paths that divides ``spp`` and fits into a lane's record. A pixel sweep needs two."""
-    most = min(MAX_PATHS, MAX_DEPTH // max(max_depth, 1))
-    return max((n for n in range(1, most + 1) if spp % n == 0), default=1)
-
 
 def sweepable(sensor: Any, max_depth: int, spp: int) -> bool:
     """Whether pixels of a sensor can be swept: a box filter, so that each path belongs to one pixel; colours (rgb) and
-    no alpha; an independent sampler; a camera that stands still and takes no time; and two paths or more in a lane."""
+    no alpha; an independent sampler; a camera that stands still and takes no time; two paths or more (``spp``), all of
+    which fit into the record of a lane."""
     film = sensor.film()
+    film.prepare([])
     with dr.resume_grad():
         ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
     return bool(
         film.rfilter().is_box_filter()
         and mi.is_rgb
-        and not mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
         and not mi.has_flag(film.flags(), mi.FilmFlags.Special)
+        and film.bitmap().pixel_format() == mi.Bitmap.PixelFormat.RGB
         and sensor.sampler().class_name() == "IndependentSampler"
         and sensor.shutter_open_time() == 0
         and not dr.grad_enabled(ray.o, ray.d)
-        and paths_per_lane(max_depth, spp) > 1
+        and 1 < spp <= MAX_DEPTH // max(max_depth, 1)
     )
 
 
@@ -73,20 +67,19 @@ def pixel_camera(sensor: Any, pixel: Any) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class PixelLoss:
-    """Derivative of a loss by each lane's pixel, offset + slope · I, and the share of a path in it."""
+    """Derivative of a loss by each lane's pixel: offset + slope · I (Spectrum each)."""
 
-    offset: Any  # Spectrum
-    slope: Any  # Spectrum
-    share: float  # 1/N
+    offset: Any
+    slope: Any
 
 
 @dr.syntax
 def pixel_sweep(
     walk: Walk, sampler: Any, camera: Callable[..., Any], paths: int, loss: PixelLoss, lost: LostPaths
 ) -> tuple[bool, Any]:
-    """Walk ``paths`` paths in every lane and back-propagate the loss.
+    """Walk ``paths`` paths (two or more) in every lane and back-propagate the loss.
 
-    Returns whether the paths move with the parameters, and the sum of their radiances (Spectrum). ``camera`` is a
+    Returns whether the paths move with the parameters, and the mean of their radiances (Spectrum). ``camera`` is a
     `pixel_camera`. For scenes without media. What is not differentiated, what is counted as ``lost`` and what is
     raised: see `sweep`.
     """
@@ -137,7 +130,7 @@ def pixel_sweep(
     while dr.hint(s > 0, exclude=[walk, ray0, lost, loss], label="pathreplay: paths of a pixel, backwards"):
         s -= 1
         end = ends[s]
-        δL = (loss.offset + loss.slope * ((total - end.L) / (paths - 1))) * loss.share
+        δL = (loss.offset + loss.slope * ((total - end.L) / (paths - 1))) / paths
         L = mi.Spectrum(0)  # radiance along the ray that leaves the vertex
         q = RayDerivative.zero()  # adjoint of that ray
         broken = mi.Bool(False)  # a part of the adjoint was not finite
@@ -151,4 +144,4 @@ def pixel_sweep(
                 lost.add(breaks & ~broken)
                 broken |= breaks
 
-    return attached, total
+    return attached, total / paths

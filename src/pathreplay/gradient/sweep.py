@@ -19,7 +19,7 @@ from .adjoint import LostPaths, RayDerivative, backward, backward_step
 from .branch import Branch, branch_backward
 from .record import read_back, record, record_type
 
-# Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x about 100 bytes are 3.3 MB, and a
+# Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x up to 136 bytes are 4.5 MB, and a
 # thread's stack is 8 MB. Beyond the stack the process would die without a word.
 MAX_DEPTH = 2048
 # With media a vertex takes up to 210 bytes, and null boundaries have records of their own.

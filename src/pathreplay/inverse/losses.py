@@ -1,8 +1,8 @@
 """Loss functions: how far a rendered picture is from its target, as one number with a derivative.
 
 Every loss is the mean over pixels and channels of f(I, T), with I the rendered picture (noisy, differentiable) and T
-the target. The picture and its derivative are rendered with independent seeds, hence a loss whose f' is linear in I
-has an unbiased gradient: ``l2`` and ``relative-l2``. The gradients of ``l1`` and ``log`` are biased by the noise in I
+the target. No path is judged by itself (see `Passes`), hence a loss whose f' is linear in I has an unbiased gradient:
+``l2`` and ``relative-l2``. The gradients of ``l1`` and ``log`` are biased by the noise in I
 (less with more samples); they pay where outliers would rule ``l2``.
 """
 

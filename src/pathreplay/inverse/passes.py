@@ -40,7 +40,7 @@ class Passes:
         """The loss, with ``spp`` samples per pixel and a seed for every view; adds its gradient to the parameters.
 
         Unbiased for the losses in `QUADRATIC`; the value itself carries the variance of the pictures on top. Raises
-        what the integrator raises; warns as it does, of the paths of all views together.
+        what the integrator raises; warns as it does.
         """
         sensors = tuple(view.sensor for view in self.problem.views)
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
@@ -53,7 +53,10 @@ class Passes:
         try:
             value, lost = differentiate(scene, self.integrator, self.targets, numbers, sensors, self.swept, loss, spp)
         except RuntimeError as error:
-            raise mendable(error) from None
+            mended = mendable(error)
+            if mended is error:
+                raise
+            raise mended from None
         if lost is not None:
             paths = sum(target.shape[0] * target.shape[1] for target in self.targets) * spp
             self.integrator.tell_lost(lost, paths)
@@ -103,8 +106,7 @@ def _differentiate(
     total, attached = mi.Float(0), mi.Float(0)
     for index, sweeps, target, seed in zip(sensors, swept, targets, seeds, strict=True):
         if sweeps:
-            offset = _derivative(loss, dr.zeros(mi.TensorXf, target.shape), target) / len(sensors)
-            slope = _derivative(loss, dr.ones(mi.TensorXf, target.shape), target) / len(sensors) - offset
+            offset, slope = (term / len(sensors) for term in _linear_derivative(loss, target))
             image = integrator.render_and_backward(scene, offset, slope, scene.sensors()[index], seed, spp)
             total += loss(image, target).array / len(sensors)
         else:
@@ -113,6 +115,13 @@ def _differentiate(
     if dr.grad_enabled(attached):
         dr.backward(attached)
     return total + dr.detach(attached), integrator.take_lost() if hasattr(integrator, "take_lost") else None
+
+
+def _linear_derivative(loss: Loss, target: Any) -> tuple[Any, Any]:
+    """Offset and slope of the derivative of a quadratic loss by the image, from two images far apart."""
+    bright = 1 + dr.abs(target)
+    offset = _derivative(loss, dr.zeros(mi.TensorXf, target.shape), target)
+    return offset, (_derivative(loss, mi.TensorXf(bright), target) - offset) / bright
 
 
 def _derivative(loss: Loss, image: Any, target: Any) -> Any:

@@ -76,7 +76,7 @@ ITERATION, TARGET, PICTURE, JUDGEMENT = 0, 1, 2, 3
 
 
 def seeds(seed: int, stream: int, index: int, view: int) -> tuple[int, int]:
-    """Two independent 32-bit seeds (rendering, derivative) for this job's seed, stream, iteration and view."""
+    """Two independent 32-bit seeds for this job's seed, stream, iteration and view."""
     first, second = np.random.SeedSequence([seed, stream, index, view]).generate_state(2)
     return int(first), int(second)
 
