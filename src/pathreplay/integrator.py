@@ -13,7 +13,7 @@ from .gradient.adjoint import LostPaths
 from .gradient.baseline import FIRST_BRANCHING, Baseline
 from .gradient.forward import forward
 from .gradient.listing import listing
-from .gradient.pixel_sweep import PixelLoss, pixel_camera, pixel_sweep, sweepable
+from .gradient.pixel_sweep import PixelLoss, fits, pixel_camera, pixel_sweep, sweepable
 from .gradient.primal import primal
 from .gradient.ray_jacobian import Recovery
 from .gradient.replay import replay
@@ -156,7 +156,7 @@ def _make_class() -> type:
             """
             sensor, spp = self._resolved(scene, sensor, spp)
             width, height = sensor.film().crop_size()
-            if not 1 < spp <= MAX_DEPTH // max(self.max_depth, 1):
+            if not fits(self.max_depth, spp):
                 raise PathreplayError(
                     f"pathreplay: {spp} samples per pixel, of {self.max_depth} vertices, cannot be swept: use "
                     f"2 or more, and at most {MAX_DEPTH} vertices in all, or mi.render"

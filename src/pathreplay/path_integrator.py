@@ -26,7 +26,19 @@ def choice(props: Any, plugin: str, name: str, default: Any, choices: tuple[Any,
     return value
 
 
-def mendable(error: BaseException) -> BaseException:
+@contextmanager
+def plain_errors() -> Iterator[None]:
+    """Within this block a PathreplayError that Dr.Jit wrapped in others comes out as itself."""
+    try:
+        yield
+    except RuntimeError as error:
+        mended = _mendable(error)
+        if mended is error:
+            raise
+        raise mended from None
+
+
+def _mendable(error: BaseException) -> BaseException:
     """The PathreplayError that Dr.Jit wrapped in errors of its own on the way out of a loop; else the error itself."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, PathreplayError):
@@ -109,12 +121,8 @@ def path_integrator() -> type:
             collecting = gc.isenabled()
             gc.disable()
             try:
-                yield
-            except RuntimeError as error:
-                mended = mendable(error)
-                if mended is error:
-                    raise
-                raise mended from None
+                with plain_errors():
+                    yield
             finally:
                 self.sensor = self.of_pass = None
                 if collecting:

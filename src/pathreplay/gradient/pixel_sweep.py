@@ -29,6 +29,11 @@ from .record import end_type, read_back, record, record_type
 from .sweep import MAX_DEPTH
 
 
+def fits(max_depth: int, spp: int) -> bool:
+    """Whether there are two paths or more, and the record of a lane can hold all of them."""
+    return 1 < spp <= MAX_DEPTH // max(max_depth, 1)
+
+
 def sweepable(sensor: Any, max_depth: int, spp: int) -> bool:
     """Whether pixels of a sensor can be swept: a box filter, so that each path belongs to one pixel; colours (rgb) and
     no alpha; an independent sampler; a camera that stands still and takes no time; two paths or more (``spp``), all of
@@ -45,7 +50,7 @@ def sweepable(sensor: Any, max_depth: int, spp: int) -> bool:
         and sensor.sampler().class_name() == "IndependentSampler"
         and sensor.shutter_open_time() == 0
         and not dr.grad_enabled(ray.o, ray.d)
-        and 1 < spp <= MAX_DEPTH // max(max_depth, 1)
+        and fits(max_depth, spp)
     )
 
 

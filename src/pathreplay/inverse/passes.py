@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from pathreplay.inverse.losses import QUADRATIC, Loss
 from pathreplay.inverse.problem import Problem
-from pathreplay.path_integrator import mendable
+from pathreplay.path_integrator import plain_errors
 from pathreplay.transport.traits import nodes_of
 
 #: Integrators that look at nothing on the host while they render, by class.
@@ -32,8 +32,7 @@ class Passes:
         # What an integrator learns of media from pass to pass is read and written between kernels.
         media = any(isinstance(node, mi.Medium) for node in nodes_of(problem.scene))
         self.freezes = type(integrator).__name__ in RECORDABLE and not media
-        self.swept: tuple[bool, ...] = ()  # views whose pixels can be swept
-        self.began = False
+        self.swept: tuple[bool, ...] = ()  # views whose pixels can be swept; empty before the first call
         self.frozen: dict[Any, Callable[..., Any]] = {}  # recorded functions, by the shapes of the parameters
 
     def __call__(self, seeds: list[int], spp: int) -> float:
@@ -46,17 +45,12 @@ class Passes:
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         numbers = [dr.opaque(mi.UInt32, seed) for seed in seeds] if self.freezes else seeds
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
-        differentiate = self._recorded() if self.freezes and self.began else self._traced
-        if not self.began:
-            self.began, self.swept = True, tuple(self._sweeps(sensor, spp) for sensor in sensors)
+        differentiate = self._recorded() if self.freezes and self.swept else self._traced
+        if not self.swept:
+            self.swept = tuple(self._sweeps(sensor, spp) for sensor in sensors)
         scene, loss = self.problem.scene, self.problem.loss
-        try:
+        with plain_errors():
             value, lost = differentiate(scene, self.integrator, self.targets, numbers, sensors, self.swept, loss, spp)
-        except RuntimeError as error:
-            mended = mendable(error)
-            if mended is error:
-                raise
-            raise mended from None
         if lost is not None:
             paths = sum(target.shape[0] * target.shape[1] for target in self.targets) * spp
             self.integrator.tell_lost(lost, paths)
