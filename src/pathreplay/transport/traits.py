@@ -66,7 +66,7 @@ def scene_traits(nodes: set[Any], scene: Any, media: bool) -> Traits:
         two_sides=any(bsdf.class_name() == "TwoSidedBRDF" for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(mask)) for mask in masks),
         opacity_moves=any(with_gradients(mask, "opacity") for mask in masks),
-        lights_vary=any(map(_varies, [*scene.emitters(), *(shape for shape in shapes if shape.is_emitter())])),
+        lights_vary=any(map(with_gradients, [*scene.emitters(), *(shape for shape in shapes if shape.is_emitter())])),
     )
 
 
@@ -100,13 +100,6 @@ def _is_attachable(bsdf: Any) -> bool:
     return name in ATTACHABLE
 
 
-def _varies(root: Any) -> bool:
-    """Whether any parameter of an object, or of one below it, has gradients."""
-    params = mi.traverse(root)
-    with dr.resume_grad():
-        return any(dr.grad_enabled(params[key]) for key in params.keys())
-
-
 def _mask_by_index(bsdfs: list[Any]) -> Any:
     index = [dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0] for bsdf in bsdfs]
     mask = [False] * (max(index) + 1)
@@ -116,8 +109,11 @@ def _mask_by_index(bsdfs: list[Any]) -> Any:
 
 
 def with_gradients(node: Any, *names: str) -> list[Any]:
-    """The parameters of a node that have gradients and one of these names, or one that goes on after it with a dot."""
+    """The parameters of a node, and of those below it, that have gradients; with names, those that are called so.
+
+    What goes on after a name with a dot is called so, too.
+    """
     params = mi.traverse(node)
-    found = [params[key] for key in params.keys() if any(key == name or key.startswith(name + ".") for name in names)]
+    found = [params[key] for key in params.keys() if not names or any(f"{key}.".startswith(f"{n}.") for n in names)]
     with dr.resume_grad():
         return [value for value in found if dr.grad_enabled(value)]
