@@ -66,5 +66,5 @@ def _mesh_growth(scene: Any, si: Any, light: Any, lit: Any) -> Any:
     ray.maxt = dr.largest(mi.Float)
     hit = scene.ray_intersect_preliminary(ray, active=lit)
     on_mesh = lit & hit.is_valid() & hit.shape.is_mesh() & (hit.shape.emitter() == light.emitter)
-    area = dr.norm(held_point(hit, ray, on_mesh)[1])
+    area = dr.norm(held_point(hit, ray, on_mesh).A)
     return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)

@@ -1,8 +1,9 @@
 """Scattering that follows a choice already made: the weight of the continuation, its direction, and their derivatives.
 
-A smooth lobe is differentiated as f/p at a held place: either the point where the continuation hit the next surface,
-which moves with that surface, or, where nothing was hit, the direction. A delta lobe is differentiated through its
-direction. With ``attach='all'`` so are the smooth lobes of BSDFs for which that is right.
+A smooth lobe is differentiated as f/p at a held place: the point where the continuation hit the next surface, which
+moves with that surface, or its direction (see `velocity`). A delta lobe is differentiated through its direction. With
+``attach='all'`` so are the smooth lobes of BSDFs for which that is right, and where nothing has an outline the narrow
+ones in any case.
 """
 
 from __future__ import annotations
@@ -12,13 +13,17 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .surface import held_point
+from .velocity import moved_direction
 from .vertex import Kept, Numbers, Walk, reciprocal
 
 # Share by which the weight of a lobe sampled alone may differ from the weight that was drawn (and squared distance of
 # their directions) and still belong to the same lobe: float32 rounding is far below it, BSDFs without support for
 # restricted sampling (`mask`) far above.
 SAME_LOBE = 1e-3
+
+# Density in its centre above which a lobe is narrow: that of a diffuse lobe. A held lobe has noise in proportion to the
+# slope of its logarithm, a followed one to that of the light; docs/gradients.md has the variances by roughness.
+NARROW = 1 / dr.pi
 
 
 def scatter(
@@ -32,18 +37,13 @@ def scatter(
     smooth = active & ~kept.delta
     d, J = kept.d, mi.Float(1)
     if attached:
-        d, J = held_at_hit(si, kept.d, hit_next, smooth)
+        d, J = moved_direction(walk.traits.blend_lengths, si, kept.d, hit_next, smooth)
 
     if walk.resamples:
         sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
         if attached:
-            follows = active & kept.delta
-            free = mi.Bool(False)  # smooth lobes that are sampled attached
-            if walk.attach == "all":
-                index = dr.reinterpret_array(mi.UInt32, bsdf)
-                table = walk.traits.attachable
-                free = smooth & dr.gather(mi.Bool, table, index, smooth & (index < dr.width(table)))
-                follows |= free
+            free = _followed(walk, bsdf, si, u, smooth)
+            follows = free | (active & kept.delta)
             d = dr.select(follows, dr.replace_grad(kept.d, si.to_world(sample.wo)), d)
             J = dr.select(follows, 1, J)
 
@@ -66,26 +66,17 @@ def scatter(
     return w, d, pdf
 
 
-def held_at_hit(si: Any, d: Any, hit: Any, active: Any) -> tuple[Any, Any]:
-    """Direction towards the point that a ray from ``si`` along ``d`` hit, and the density of that point's place.
-
-    The point stays where it is on its surface and moves with it. J = |A · d| / dist², with A the area element there, is
-    the solid angle that a piece of the surface takes up, relative to its present value: 1, with the derivative of
-    log J. Holding the point and not the direction keeps edges of emitters and seams between materials where they are
-    in the integrand; held directions would see them move, and that boundary term would be missing. Rays that left the
-    scene hold ``d``.
-    """
-    found = active & hit.is_valid()
-    ray = dr.detach(si.spawn_ray(d))
-    y, A = held_point(hit, ray, found)
-    x = si.spawn_ray(dr.detach(d)).o
-    towards = y - x
-    facing = dr.abs(dr.dot(A, towards))
-    ok = found & (facing > 0)
-    dist2 = dr.select(ok, dr.squared_norm(towards), 1)
-    # In corners distances are tiny: the derivative of a logarithm holds where those of powers would overflow.
-    log_J = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)
-    return dr.select(ok, dr.replace_grad(d, towards * dr.rsqrt(dist2)), d), dr.replace_grad(mi.Float(1), log_J)
+def _followed(walk: Walk, bsdf: Any, si: Any, u: Numbers, active: Any) -> Any:
+    """Which smooth lobes are sampled attached (Bool): decided by what the lobe is, never by the direction drawn."""
+    if not walk.follows:
+        return mi.Bool(False)
+    index = dr.reinterpret_array(mi.UInt32, bsdf)
+    table = walk.traits.attachable
+    free = active & dr.gather(mi.Bool, table, index, active & (index < dr.width(table)))
+    if walk.attach == "all":
+        return free
+    centre, _ = bsdf.sample(mi.BSDFContext(), dr.detach(si), u.lobe, mi.Point2f(0.5), free)
+    return free & (dr.detach(centre.pdf) > NARROW)
 
 
 def _delta_weight(walk: Walk, bsdf: Any, si: Any, u: Numbers, kept: Kept, w: Any, active: Any) -> Any:

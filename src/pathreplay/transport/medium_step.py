@@ -13,9 +13,10 @@ import mitsuba as mi
 
 from .emitters import draw_emitter, emission, redraw_emitter
 from .flight import Flight, fly, fly_again
-from .lobes import held_at_hit, scatter
+from .lobes import scatter
 from .media import interaction
 from .shadow import shadow, shadow_again
+from .velocity import moved_direction
 from .vertex import Arrival, Kept, Numbers, Step, Walk, is_smooth, mis_weight, reciprocal
 
 
@@ -128,7 +129,9 @@ def medium_step(
         f, pdf_light = bsdf.eval_pdf(ctx, si, si.to_local(light.d), lit & surface)
         f_medium, pdf_medium = phase.eval_pdf(phase_ctx, mei, light.d, lit & event)
         w_surface, d, pdf = scatter(walk, bsdf, si, u, kept, attached, hit_next, go_on & surface)
-        w_medium, d_medium, pdf_phase = _scatter_in_medium(phase, mei, origin, kept, attached, hit_next, go_on & event)
+        w_medium, d_medium, pdf_phase = _scatter_in_medium(
+            walk, phase, mei, origin, kept, attached, hit_next, go_on & event
+        )
         d = dr.select(event, d_medium, dr.select(through, ray.d, d))
         pdf = dr.select(event, pdf_phase, dr.select(kept.null, at.pdf, pdf))
 
@@ -161,20 +164,19 @@ def _is_null(bsdf: Any) -> Any:
 
 
 def _scatter_in_medium(
-    phase: Any, mei: Any, origin: Any, kept: Kept, attached: bool, hit_next: Any, active: Any
+    walk: Walk, phase: Any, mei: Any, origin: Any, kept: Kept, attached: bool, hit_next: Any, active: Any
 ) -> tuple[Any, Any, Any]:
     """Weight (Spectrum), direction and density of the kept continuation at a particle, differentiably.
 
     Its direction is held as on surfaces, towards the next surface point, but only where that matters: where the surface
-    scatters or emits, and so may have seams and edges. Otherwise it is fixed in space. (A particle may be arbitrarily
-    near to the surface around its medium: a held point there has a derivative of infinite variance.)
+    scatters or emits, and so may have seams and edges. Otherwise it is fixed in space, which is less noisy.
     """
     ctx = mi.PhaseFunctionContext(None)
     d, J = kept.d, mi.Float(1)
     if attached:
         shape = hit_next.shape
         seen = is_smooth(shape.bsdf()) | (shape.emitter() != None)  # noqa: E711 (an array of pointers)
-        d, J = held_at_hit(origin, kept.d, hit_next, active & hit_next.is_valid() & seen)
+        d, J = moved_direction(walk.traits.blend_lengths, origin, kept.d, hit_next, active & hit_next.is_valid() & seen)
     f, pdf = phase.eval_pdf(ctx, mei, d, active)
     pdf = dr.replace_grad(kept.pdf, dr.select(active, pdf, 0)) if attached else kept.pdf
     return f * J * dr.detach(reciprocal(kept.pdf)), d, pdf

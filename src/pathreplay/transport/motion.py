@@ -23,7 +23,7 @@ def path_moves(walk: Walk, ray: Any, at: Arrival) -> bool:
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All)
         moving = [ray.o, ray.d, si.p, si.n, si.sh_frame.n, si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
-        for bsdf in walk.traits.mirrors + (walk.traits.attachables if walk.attach == "all" else ()):
+        for bsdf in walk.traits.mirrors + (walk.traits.attachables if walk.follows else ()):
             sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))
             moving.append(sample.wo)
         light, _ = walk.scene.sample_emitter_direction(still, mi.Point2f(0.5), False)

@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+# Share by which a surface may differ from a sphere (derivatives of its normal) and still be taken for one.
+UMBILIC = 1e-4
 
-def held_point(hit: Any, ray: Any, active: Any) -> tuple[Any, Any]:
-    """The point that was hit, glued to its surface, and an area element around it.
 
-    Returns p (Point3f) and A (Vector3f), whose length is proportional to the area of a piece of surface at p and whose
-    direction is its normal. Only relative changes of A mean something. On meshes A is taken from the triangle itself:
-    derivatives by texture coordinates would lose it where these are degenerate, and follow them where they move.
+@dataclass
+class HeldPoint:
+    """A point that is glued to its surface."""
+
+    p: Any  # Point3f
+    A: Any  # Vector3f: area element, along the normal; only relative changes of its length mean something
+    n: Any  # Normal3f: the side from which κ is seen; detached
+    κ: Any  # Float: curvature of a sphere (> 0: convex), 0 of a plane, infinite of what is neither; detached
+
+
+def held_point(hit: Any, ray: Any, active: Any) -> HeldPoint:
+    """The point that ``ray`` hit, glued to its surface.
+
+    On meshes A is taken from the triangle itself: derivatives by texture coordinates would lose it where these are
+    degenerate, and follow them where they move.
     """
     flags = mi.RayFlags.FollowShape
     on_mesh = active & hit.shape.is_mesh()
-    y = hit.compute_surface_interaction(ray, mi.RayFlags.All | flags, active)
+    y = hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNGdUV | flags, active)
     triangle = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal | flags, on_mesh)
     A = dr.select(on_mesh, dr.cross(triangle.dp_du, triangle.dp_dv), dr.cross(y.dp_du, y.dp_dv))
-    return y.p, A
+    return HeldPoint(y.p, A, dr.detach(y.n), dr.select(on_mesh, 0, _curvature(dr.detach(y))))
+
+
+def _curvature(y: Any) -> Any:
+    """κ with dn = κ dp for all tangents, infinite where there is none (Float)."""
+    turn = dr.squared_norm(y.dn_du) + dr.squared_norm(y.dn_dv)
+    κ = dr.dot(y.dn_du, y.dp_du) / dr.squared_norm(y.dp_du)
+    rest = dr.squared_norm(y.dn_du - κ * y.dp_du) + dr.squared_norm(y.dn_dv - κ * y.dp_dv)
+    return dr.select(turn == 0, 0, dr.select(rest < UMBILIC * turn, κ, dr.inf))

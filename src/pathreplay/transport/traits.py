@@ -8,8 +8,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .velocity import blend_lengths
+
 # Sampling is a smooth function of the random numbers, and no choice among lobes depends on a parameter.
 ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
+FLAT = frozenset({"Rectangle", "Disk"})
 FRAMES = frozenset({"NormalMap", "BumpMap", "TwoSidedBRDF"})
 
 
@@ -24,7 +27,8 @@ class Traits:
     ``instances_move`` that an instance's ``to_world`` has, ``area_lights`` that there are emitters with an edge,
     ``two_sides`` that a surface may have another BSDF on its back, ``masks_mirrors`` that a mask lies over delta lobes,
     ``opacity_moves`` that the opacity of a mask has gradients, ``lights_vary`` that
-    something about emitters has, or about the shapes that emit.
+    something about emitters has, or about the shapes that emit. ``blend_lengths`` are those of `velocity`; ``outlines``
+    says that a point of a surface may see where a shape, a lamp or a texture ends.
     """
 
     mirrors: tuple[Any, ...]
@@ -39,6 +43,8 @@ class Traits:
     masks_mirrors: bool
     opacity_moves: bool
     lights_vary: bool
+    blend_lengths: Any
+    outlines: bool
 
 
 def scene_traits(nodes: set[Any], scene: Any, media: bool) -> Traits:
@@ -66,6 +72,8 @@ def scene_traits(nodes: set[Any], scene: Any, media: bool) -> Traits:
         two_sides=any(bsdf.class_name() == "TwoSidedBRDF" for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(mask)) for mask in masks),
         opacity_moves=any(with_gradients(mask, "opacity") for mask in masks),
+        blend_lengths=blend_lengths(shapes),
+        outlines=not _seamless(shapes, nodes),
         lights_vary=any(map(with_gradients, [*scene.emitters(), *(shape for shape in shapes if shape.is_emitter())])),
     )
 
@@ -82,6 +90,18 @@ def nodes_of(root: Any) -> set[Any]:
 
     root.traverse(Collector())
     return seen
+
+
+def _seamless(shapes: list[Any], nodes: set[Any]) -> bool:
+    """Whether no point of a surface sees an end of anything: there is one shape only, which sees no end of itself.
+
+    A flat shape does not see itself at all. A sphere does from the inside, where a texture would have a seam.
+    """
+    if len(shapes) != 1 or shapes[0].is_emitter():
+        return False
+    textured = any(isinstance(node, mi.Texture) and node.is_spatially_varying() for node in nodes)
+    kind = shapes[0].class_name()
+    return kind in FLAT or (kind == "Sphere" and not textured)
 
 
 def _nested(bsdf: Any) -> Any:

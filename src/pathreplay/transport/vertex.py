@@ -42,7 +42,13 @@ class Walk:
     @property
     def resamples(self) -> bool:
         """Whether a later pass samples BSDFs once more, with the random numbers of the first walk."""
-        return self.traits.lobes > 0 or self.attach == "all"
+        return self.traits.lobes > 0 or self.follows
+
+    @property
+    def follows(self) -> bool:
+        """Whether smooth lobes may be sampled attached: all that can be, or where nothing has an outline the narrow."""
+        narrow = self.attach == "delta" and not self.traits.outlines
+        return self.traits.attachable is not None and (narrow or self.attach == "all")
 
     @property
     def branch(self) -> bool:

@@ -1,0 +1,82 @@
+"""What a smooth continuation holds while things move: the point that it hit or, close to that surface, its direction.
+
+Let x be a vertex, y what its continuation along d hit, and r = |y - x|. An integral over directions does not depend on
+how it is parametrised: d may move with any velocity V(d), if the weight takes its divergence along, (log J)' = div V.
+Two are at hand:
+
+    V_H    follows y, which stays where it is on its surface: J_H = |A·d| / r², with A an area element at y
+    0      keeps d
+
+V_H holds the edges of lamps and the seams between materials where they are in the integrand; otherwise their motion
+is a boundary term, and missing. But where x slides past the surface of y at a distance h, (log J_H)' grows like 1/h,
+so that its variance is infinite wherever two surfaces touch. So V = φ V_H, with φ = 1 - exp(-m) and m = h r / h0²:
+
+    (log J)' = φ (log J_H)' + ∇φ·V_H,        ∇φ·V_H = -m exp(-m) (n·d_H') / (n·d)
+
+since h is the same for all d that meet the plane of y, and r is not. m grows with r, too, because the few directions
+that graze a near plane meet it far away: holding those costs little, and edges are there. For a sphere h is the
+distance of x to it, which is constant as well and does not vanish at its limb. On other curved shapes V = V_H.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .surface import HeldPoint, held_point
+
+# h0 over the size of the shape that was hit. A larger one is less noisy and gives up more of the edges that are close
+# by; docs/gradients.md has both for 0.003 to 0.03.
+BLEND = 0.01
+
+
+def blend_lengths(shapes: list[Any]) -> Any:
+    """h0 of each shape (Float, by registry index): BLEND times the diagonal of its bounding box."""
+    lengths = {0: 0.0}
+    for shape in shapes:
+        size = sum(float(x) ** 2 for x in shape.bbox().extents()) ** 0.5
+        if math.isfinite(size):  # an empty group has none
+            lengths[dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]] = BLEND * size
+    return mi.Float([lengths.get(i, 0.0) for i in range(max(lengths) + 1)])
+
+
+def moved_direction(lengths: Any, si: Any, d: Any, hit: Any, active: Any) -> tuple[Any, Any]:
+    """The kept direction ``d`` and J (Float), as V moves them: their values are ``d`` and 1.
+
+    ``lengths`` are the `blend_lengths` of the scene and ``hit`` is what the continuation from ``si`` along ``d`` hit;
+    rays that left the scene keep their direction. Differentiable in ``si`` and in the shape that was hit.
+    """
+    found = active & hit.is_valid()
+    y = held_point(hit, dr.detach(si.spawn_ray(d)), found)
+    towards = y.p - si.spawn_ray(dr.detach(d)).o
+    facing = dr.abs(dr.dot(y.A, towards))
+    ok = found & (facing > 0)
+    dist2 = dr.select(ok, dr.squared_norm(towards), 1)
+    d_H = towards * dr.rsqrt(dist2)
+    # In corners distances are tiny: the derivative of a logarithm holds where those of powers would overflow.
+    log_J_H = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)
+
+    h0 = dr.gather(mi.Float, lengths, dr.reinterpret_array(mi.UInt32, hit.shape), ok)
+    φ, slope = _share(h0, dr.detach(y), dr.detach(towards), ok)
+    log_J = φ * log_J_H + dr.dot(slope, d_H)
+    return dr.select(ok, dr.replace_grad(d, φ * d_H), d), dr.replace_grad(mi.Float(1), log_J)
+
+
+def _share(h0: Any, y: HeldPoint, towards: Any, active: Any) -> tuple[Any, Any]:
+    """φ (Float), and the slope (Vector3f) that makes ∇φ·V_H = slope·d_H'; nothing here is attached."""
+    r = dr.norm(towards)
+    n = dr.normalize(y.A)
+    turned = dr.dot(n, towards) > 0
+    n = dr.select(turned, -n, n)
+    κ = dr.select(turned ^ (dr.dot(y.A, y.n) < 0), -y.κ, y.κ)
+    blends = active & (h0 > 0) & dr.isfinite(κ)
+    # Distance to the sphere of curvature κ through y, ||x - centre| - 1/|κ||, without the cancellation in it; to the
+    # plane for κ = 0.
+    h = (κ * r * r - 2 * dr.dot(n, towards)) / (1 + dr.norm(n - κ * towards))
+    m = dr.maximum(h, 0) * r / dr.square(h0)
+    steep = m * dr.exp(-m) * r / dr.dot(n, towards)
+    slope = dr.select(blends & dr.isfinite(steep), -steep * n, 0)
+    return dr.select(blends, 1 - dr.exp(-m), 1), slope
