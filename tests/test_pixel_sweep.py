@@ -241,6 +241,7 @@ def test_two_swept_views_add_up(changes: dict, tmp_path) -> None:
         pytest.param({"integrator": {"type": "prb", "max_depth": 3}}, False, id="prb"),
         pytest.param({"integrator": {"type": "prb_basic", "max_depth": 3}}, False, id="prb_basic"),
         pytest.param(POSE, False, id="moving"),
+        pytest.param(POSE | {"integrator": {"type": "pathreplay", "attach": "all"}}, False, id="moving, all attached"),
         pytest.param(GLASS, True, id="index of a plugin in Python"),
         pytest.param(BOXED, True, id="box filter"),
         pytest.param(BOXED | {"loss": "log"}, False, id="box filter, log"),

@@ -246,7 +246,7 @@ def _make_class() -> type:
                 self._tell_attachable(traits)
 
         def _tell_attachable(self, traits: Traits) -> None:
-            if traits.attachable is None:
+            if not traits.attachables:
                 raise PathreplayError(
                     "pathreplay: attach = 'all', but no BSDF of the scene can be sampled attached (diffuse, "
                     "roughconductor, roughdielectric, normal and bump maps over them can): use attach = 'delta'"

@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from .errors import PathreplayError
 from .transport.media import scene_media
-from .transport.traits import nodes_of, scene_traits
+from .transport.traits import Tables, nodes_of, scene_traits
 from .transport.vertex import Walk
 
 UNBOUNDED = 0xFFFFFFFF
@@ -77,6 +77,7 @@ def path_integrator() -> type:
             # Mitsuba asks for radiance before it goes back, for integrators that replay it. Ours find it themselves and
             # nobody looks at this one; but tracing it takes time.
             self.goes_back = False
+            self.tables: Tables | None = None  # of the scene, in a frozen function, which cannot make them
             self.of_pass: Any = None  # what tells passes apart: seed, samples per pixel, sensor
 
         def render_backward(
@@ -141,7 +142,7 @@ def path_integrator() -> type:
             media = scene_media(nodes, self.sensor)
             return Walk(
                 scene=scene,
-                traits=scene_traits(nodes, scene, media is not None),
+                traits=scene_traits(nodes, scene, media is not None, self.tables),
                 media=media,
                 attach=self.attach,
                 hide_emitters=self.hide_emitters,

@@ -92,7 +92,7 @@ class Local:
 
 def has_smooth_lobes(walk: Walk) -> bool:
     """Whether any BSDF of the scene has a lobe other than delta lobes."""
-    return bool(walk.traits.detached_names) or walk.traits.attachable is not None
+    return bool(walk.traits.detached_names or walk.traits.attachables)
 
 
 def length_scale(scene: Any) -> float:

@@ -8,7 +8,8 @@ as a frozen function, later calls launch its kernels without tracing them again.
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
@@ -17,7 +18,7 @@ import mitsuba as mi
 from pathreplay.inverse.losses import QUADRATIC, Loss
 from pathreplay.inverse.problem import Problem
 from pathreplay.path_integrator import plain_errors
-from pathreplay.transport.traits import nodes_of
+from pathreplay.transport.traits import Tables, nodes_of, scene_tables
 
 #: Integrators that look at nothing on the host while they render, by class.
 RECORDABLE = frozenset({"PathReplayIntegrator", "PRBIntegrator", "BasicPRBIntegrator"})
@@ -34,6 +35,7 @@ class Passes:
         self.freezes = type(integrator).__name__ in RECORDABLE and not media
         self.swept: tuple[bool, ...] = ()  # views whose pixels can be swept; empty before the first call
         self.frozen: dict[Any, Callable[..., Any]] = {}  # recorded functions, by the shapes of the parameters
+        self.tables = scene_tables(nodes_of(problem.scene))
 
     def __call__(self, seeds: list[int], spp: int) -> float:
         """The loss, with ``spp`` samples per pixel and a seed for every view; adds its gradient to the parameters.
@@ -50,7 +52,9 @@ class Passes:
             self.swept = tuple(self._sweeps(sensor, spp) for sensor in sensors)
         scene, loss = self.problem.scene, self.problem.loss
         with plain_errors():
-            value, lost = differentiate(scene, self.integrator, self.targets, numbers, sensors, self.swept, loss, spp)
+            value, lost = differentiate(
+                scene, self.integrator, self.targets, numbers, sensors, self.swept, loss, spp, self.tables
+            )
         if lost is not None:
             paths = sum(target.shape[0] * target.shape[1] for target in self.targets) * spp
             self.integrator.tell_lost(lost, paths)
@@ -95,20 +99,35 @@ def _differentiate(
     swept: tuple[bool, ...],
     loss: Loss,
     spp: int,
+    tables: Tables,
 ) -> tuple[Any, Any]:
     """The loss, and how many paths lost a part of their gradient (None if nobody counts, or it has been told)."""
     total, attached = mi.Float(0), mi.Float(0)
-    for index, sweeps, target, seed in zip(sensors, swept, targets, seeds, strict=True):
-        if sweeps:
-            offset, slope = (term / len(sensors) for term in _linear_derivative(loss, target))
-            image = integrator.render_and_backward(scene, offset, slope, scene.sensors()[index], seed, spp)
-            total += loss(image, target).array / len(sensors)
-        else:
-            image = mi.render(scene, params, sensor=index, integrator=integrator, spp=spp, seed=seed)
-            attached += loss(image, target).array / len(sensors)
-    if dr.grad_enabled(attached):
-        dr.backward(attached)
+    with _handed(integrator, tables):
+        for index, sweeps, target, seed in zip(sensors, swept, targets, seeds, strict=True):
+            if sweeps:
+                offset, slope = (term / len(sensors) for term in _linear_derivative(loss, target))
+                image = integrator.render_and_backward(scene, offset, slope, scene.sensors()[index], seed, spp)
+                total += loss(image, target).array / len(sensors)
+            else:
+                image = mi.render(scene, params, sensor=index, integrator=integrator, spp=spp, seed=seed)
+                attached += loss(image, target).array / len(sensors)
+        if dr.grad_enabled(attached):
+            dr.backward(attached)
     return total + dr.detach(attached), integrator.take_lost() if hasattr(integrator, "take_lost") else None
+
+
+@contextmanager
+def _handed(integrator: Any, tables: Tables) -> Iterator[None]:
+    """Within this block an integrator of ours has the tables: inputs of a frozen function, which cannot make them."""
+    if not hasattr(integrator, "tables"):
+        yield
+        return
+    integrator.tables = tables
+    try:
+        yield
+    finally:
+        integrator.tables = None
 
 
 def _linear_derivative(loss: Loss, target: Any) -> tuple[Any, Any]:

@@ -37,7 +37,7 @@ def scatter(
     smooth = active & ~kept.delta
     d, J = kept.d, mi.Float(1)
     if attached:
-        d, J = moved_direction(walk.traits.blend_lengths, si, kept.d, hit_next, smooth)
+        d, J = moved_direction(walk.traits.tables.blend_lengths, si, kept.d, hit_next, smooth)
 
     if walk.resamples:
         sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
@@ -71,7 +71,7 @@ def _followed(walk: Walk, bsdf: Any, si: Any, u: Numbers, active: Any) -> Any:
     if not walk.follows:
         return mi.Bool(False)
     index = dr.reinterpret_array(mi.UInt32, bsdf)
-    table = walk.traits.attachable
+    table = walk.traits.tables.attachable
     free = active & dr.gather(mi.Bool, table, index, active & (index < dr.width(table)))
     if walk.attach == "all":
         return free

@@ -176,7 +176,8 @@ def _scatter_in_medium(
     if attached:
         shape = hit_next.shape
         seen = is_smooth(shape.bsdf()) | (shape.emitter() != None)  # noqa: E711 (an array of pointers)
-        d, J = moved_direction(walk.traits.blend_lengths, origin, kept.d, hit_next, active & hit_next.is_valid() & seen)
+        found = active & hit_next.is_valid() & seen
+        d, J = moved_direction(walk.traits.tables.blend_lengths, origin, kept.d, hit_next, found)
     f, pdf = phase.eval_pdf(ctx, mei, d, active)
     pdf = dr.replace_grad(kept.pdf, dr.select(active, pdf, 0)) if attached else kept.pdf
     return f * J * dr.detach(reciprocal(kept.pdf)), d, pdf

@@ -16,25 +16,34 @@ FLAT = frozenset({"Rectangle", "Disk"})
 FRAMES = frozenset({"NormalMap", "BumpMap", "TwoSidedBRDF"})
 
 
+@dataclass
+class Tables:
+    """Facts about BSDFs and shapes by registry index, in arrays for kernels to look them up.
+
+    A frozen function cannot make such arrays: it has to be handed them.
+    """
+
+    attachable: Any  # Bool: the smooth lobes of this BSDF may be sampled attached (None: nowhere)
+    blend_lengths: Any  # Float: those of `velocity`, by shape
+
+
 @dataclass(frozen=True)
 class Traits:
     """What the drivers want to know about a scene.
 
     ``mirrors`` are the BSDFs with delta lobes, and ``lobes`` is one more than the largest component index of such a
-    lobe, 0 if there is none. ``attachables`` are the BSDFs whose smooth lobes may be sampled attached, and
-    ``attachable`` tells so by BSDF registry index (Bool; None if nowhere); ``detached_names`` are the classes of the
-    other BSDFs with smooth lobes. ``lights_deform`` says that an emitting mesh has vertex positions with gradients,
-    ``instances_move`` that an instance's ``to_world`` has, ``area_lights`` that there are emitters with an edge,
-    ``two_sides`` that a surface may have another BSDF on its back, ``masks_mirrors`` that a mask lies over delta lobes,
-    ``opacity_moves`` that the opacity of a mask has gradients, ``lights_vary`` that
-    something about emitters has, or about the shapes that emit. ``blend_lengths`` are those of `velocity`; ``outlines``
-    says that a point of a surface may see where a shape, a lamp or a texture ends.
+    lobe, 0 if there is none. ``attachables`` are the BSDFs whose smooth lobes may be sampled attached;
+    ``detached_names`` are the classes of the other BSDFs with smooth lobes. ``lights_deform`` says that an emitting
+    mesh has vertex positions with gradients, ``instances_move`` that an instance's ``to_world`` has, ``area_lights``
+    that there are emitters with an edge, ``two_sides`` that a surface may have another BSDF on its back, ``masks_mirrors``
+    that a mask lies over delta lobes, ``opacity_moves`` that the opacity of a mask has gradients, ``lights_vary`` that
+    something about emitters has, or about the shapes that emit. ``outlines`` says that a point of a surface may see
+    where a shape, a lamp or a texture ends. ``tables`` tell of single BSDFs and shapes.
     """
 
     mirrors: tuple[Any, ...]
     lobes: int
     attachables: tuple[Any, ...]
-    attachable: Any
     detached_names: tuple[str, ...]
     lights_deform: bool
     instances_move: bool
@@ -43,28 +52,25 @@ class Traits:
     masks_mirrors: bool
     opacity_moves: bool
     lights_vary: bool
-    blend_lengths: Any
     outlines: bool
+    tables: Tables
 
 
-def scene_traits(nodes: set[Any], scene: Any, media: bool) -> Traits:
+def scene_traits(nodes: set[Any], scene: Any, media: bool, tables: Tables | None = None) -> Traits:
     """Look at all BSDFs and meshes of a scene, those nested in other BSDFs and in instanced shapes included.
 
-    With media, null boundaries are not mirrors: the step sends light straight through them.
+    With media, null boundaries are not mirrors: the step sends light straight through them. ``tables`` are those of
+    this scene, if they are at hand.
     """
     bsdfs = [node for node in nodes if isinstance(node, mi.BSDF) and not (media and node.class_name() == "Null")]
     shapes = [node for node in nodes if isinstance(node, mi.Shape)]
-    # A lamp for which the scene names no BSDF has a diffuse one all the same: nobody asked to have that attached.
-    of_lamps = {shape.bsdf() for shape in shapes if shape.is_emitter()}
-    seen = {shape.bsdf() for shape in shapes if not shape.is_emitter()}
-    attachable = [bsdf for bsdf in bsdfs if _is_attachable(bsdf) and bsdf not in of_lamps - seen]
+    attachables = _attachables(nodes)
     others = [bsdf for bsdf in bsdfs if not _is_attachable(bsdf) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
     masks = [bsdf for bsdf in bsdfs if bsdf.class_name() == "MaskBSDF"]
     return Traits(
         mirrors=tuple(bsdf for bsdf in bsdfs if _delta_lobes(bsdf)),
         lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs), default=0),
-        attachables=tuple(attachable),
-        attachable=_mask_by_index(attachable) if attachable else None,
+        attachables=tuple(attachables),
         detached_names=tuple(sorted({bsdf.class_name() for bsdf in others})),
         lights_deform=any(with_gradients(s, "vertex_positions") for s in shapes if s.is_mesh() and s.is_emitter()),
         instances_move=any(with_gradients(s, "to_world") for s in shapes if s.class_name() == "Instance"),
@@ -72,10 +78,28 @@ def scene_traits(nodes: set[Any], scene: Any, media: bool) -> Traits:
         two_sides=any(bsdf.class_name() == "TwoSidedBRDF" for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(mask)) for mask in masks),
         opacity_moves=any(with_gradients(mask, "opacity") for mask in masks),
-        blend_lengths=blend_lengths(shapes),
         outlines=not _seamless(shapes, nodes),
         lights_vary=any(map(with_gradients, [*scene.emitters(), *(shape for shape in shapes if shape.is_emitter())])),
+        tables=scene_tables(nodes) if tables is None else tables,
     )
+
+
+def scene_tables(nodes: set[Any]) -> Tables:
+    """The tables of a scene, by its nodes."""
+    attachables = _attachables(nodes)
+    return Tables(
+        attachable=_mask_by_index(attachables) if attachables else None,
+        blend_lengths=blend_lengths([node for node in nodes if isinstance(node, mi.Shape)]),
+    )
+
+
+def _attachables(nodes: set[Any]) -> list[Any]:
+    shapes = [node for node in nodes if isinstance(node, mi.Shape)]
+    # A lamp for which the scene names no BSDF has a diffuse one all the same: nobody asked to have that attached.
+    of_lamps = {shape.bsdf() for shape in shapes if shape.is_emitter()}
+    seen = {shape.bsdf() for shape in shapes if not shape.is_emitter()}
+    bsdfs = {node for node in nodes if isinstance(node, mi.BSDF)} - (of_lamps - seen)
+    return [bsdf for bsdf in bsdfs if _is_attachable(bsdf)]
 
 
 def nodes_of(root: Any) -> set[Any]:

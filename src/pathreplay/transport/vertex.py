@@ -17,7 +17,7 @@ class Walk:
     """The scene that is walked through and how: Python values, fixed when the kernel is traced.
 
     ``attach`` says what the path follows when parameters move: ``none`` nothing, ``delta`` hit points and directions
-    sampled from delta lobes, ``all`` also directions from the BSDFs marked in ``traits.attachable``. ``hide_emitters``
+    sampled from delta lobes, ``all`` also directions from the BSDFs in ``traits.attachables``. ``hide_emitters``
     leaves out emitters that the camera sees directly. ``max_depth`` and ``rr_depth`` are Mitsuba's; an unbounded depth
     is 2^32 - 1. ``media`` is None in a scene without media, which then walks as Mitsuba's `path` does; with media all
     conventions are those of `volpath`: null boundaries are no vertices. ``baseline`` (MediumInteraction3f, extinction,
@@ -48,7 +48,7 @@ class Walk:
     def follows(self) -> bool:
         """Whether smooth lobes may be sampled attached: all that can be, or where nothing has an outline the narrow."""
         narrow = self.attach == "delta" and not self.traits.outlines
-        return self.traits.attachable is not None and (narrow or self.attach == "all")
+        return bool(self.traits.attachables) and (narrow or self.attach == "all")
 
     @property
     def branch(self) -> bool:
