@@ -35,10 +35,10 @@ class Traits:
     lobe, 0 if there is none. ``attachables`` are the BSDFs whose smooth lobes may be sampled attached;
     ``detached_names`` are the classes of the other BSDFs with smooth lobes. ``lights_deform`` says that an emitting
     mesh has vertex positions with gradients, ``instances_move`` that an instance's ``to_world`` has, ``area_lights``
-    that there are emitters with an edge, ``two_sides`` that a surface may have another BSDF on its back, ``masks_mirrors``
-    that a mask lies over delta lobes, ``opacity_moves`` that the opacity of a mask has gradients, ``lights_vary`` that
-    something about emitters has, or about the shapes that emit. ``outlines`` says that a point of a surface may see
-    where a shape, a lamp or a texture ends. ``tables`` tell of single BSDFs and shapes.
+    that there are emitters with an edge, ``two_sides`` that a surface may have another BSDF on its back,
+    ``masks_mirrors`` that a mask lies over delta lobes, ``opacity_moves`` that the opacity of a mask has gradients,
+    ``lights_vary`` that something about emitters has, or about the shapes that emit. ``outlines`` says that a point
+    of a surface may see where a shape, a lamp or a texture ends. ``tables`` tell of single BSDFs and shapes.
     """
 
     mirrors: tuple[Any, ...]
