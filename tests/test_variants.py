@@ -1,4 +1,4 @@
-"""Every variant with derivatives that Mitsuba's wheel has: our plugins and the main job in it, also one after another."""
+"""Every variant with derivatives in Mitsuba's wheel: our plugins and the main job in it, also one after another."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ for variant in sys.argv[1:]:
     paint, eta = "ball.bsdf.reflectance.value", "glass.bsdf.eta"
     density = "cloud.interior_medium.sigma_t.data"
     for plugin, made, key in [
-        ("pathreplay", glassy_scene, eta), ("pathreplay", cloudy_scene, density), ("pathreplay_tape", glassy_scene, eta),
-        ("pathreplay_rb", glassy_scene, paint), ("prb", glassy_scene, paint), ("pathreplay", glassy_scene, paint),
+        ("pathreplay", glassy_scene, eta), ("pathreplay", cloudy_scene, density), ("pathreplay", glassy_scene, paint),
+        ("pathreplay_tape", glassy_scene, eta), ("pathreplay_rb", glassy_scene, paint), ("prb", glassy_scene, paint),
     ]:
         integrator = mi.load_dict({"type": plugin, "max_depth": 4})
         assert isinstance(integrator, mi.Integrator), (variant, plugin)

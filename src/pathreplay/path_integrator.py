@@ -41,8 +41,8 @@ def _mendable(error: BaseException) -> BaseException:
 
 def path_integrator() -> type:
     """The base class of our integrators, for the active variant, which must be an AD variant."""
-    # By the name under which Mitsuba runs its Python modules anew for every variant. Under `mitsuba.ad`, its public name,
-    # an import statement makes a copy, which stays what it was in the first variant.
+    # The name under which Mitsuba runs its Python modules anew for every variant. Of `mitsuba.ad`, the public name, an
+    # import statement makes a copy, which stays what it was in the first variant.
     from mitsuba.python.ad.integrators.common import RBIntegrator
 
     class PathIntegrator(RBIntegrator):  # type: ignore[misc]

@@ -37,7 +37,7 @@ def has_derivatives(variant: str) -> bool:
 
 
 def register(variant: str) -> None:
-    """Register all plugins for the active variant, whose name is `variant`, or stand-ins where it has no derivatives."""
+    """Register all plugins for the active variant, whose name is `variant`; stand-ins where it has no derivatives."""
     if not has_derivatives(variant):
         _register_stand_ins(variant)
         return
