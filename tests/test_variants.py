@@ -39,11 +39,10 @@ def derivative(scene, integrator, key):
     params = mi.traverse(scene)
     dr.enable_grad(params[key])
     params.update()
+    before = float(np.sum(np.array(dr.grad(params[key]))))
     image = mi.render(scene, params, integrator=integrator, spp=16, seed=1)
     dr.backward(dr.mean(image, axis=None))
-    gradient = float(np.sum(np.array(dr.grad(params[key]))))
-    dr.set_grad(params[key], 0)
-    return float(np.mean(np.array(image))), gradient
+    return float(np.mean(np.array(image))), float(np.sum(np.array(dr.grad(params[key])))) - before
 
 alive = []
 for variant in sys.argv[1:]:
@@ -99,3 +98,110 @@ def test_plugins_work_in_every_order_of_variants(run_python, name: str) -> None:
             # On the same random numbers, but `pathreplay_rb` walks paths of its own, too.
             assert len(same) > 1 and all(v == pytest.approx(same[0], rel=5e-3) for v in same), (variant, key, same)
         assert of["pathreplay", "cloud.interior_medium.sigma_t.data"][1] < 0
+
+
+# Optimises for five iterations in each of the variants on the command line, and checks three kinds of parameters.
+MAIN_JOB = """
+import json, sys
+from pathlib import Path
+import numpy as np
+import pathreplay
+from pathreplay import check_gradient, optimize
+from pathreplay.inverse.images import exr_bytes
+from pathreplay.scenes import load_scene
+
+folder, *variants = sys.argv[1:]
+folder = Path(folder)
+(folder / "colours.exr").write_bytes(exr_bytes(np.random.default_rng(1).uniform(0.2, 0.8, (3, 4, 3)).astype("f4")))
+(folder / "room.xml").write_text('''<scene version="3.0.0"><default name="grey" value="0.3"/>
+  <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="6"/></film></sensor>
+  <integrator type="path"><integer name="max_depth" value="3"/></integrator>
+  <shape type="sphere" id="ball"><bsdf type="diffuse"><spectrum name="reflectance" value="$grey"/></bsdf></shape>
+  <shape type="sphere" id="red"><point name="center" x="-1" y="1" z="0"/>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.3, 0.2"/></bsdf></shape>
+  <shape type="rectangle" id="floor"><transform name="to_world"><scale value="4"/><translate z="-1"/></transform>
+    <bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="colours.exr"/>
+    </texture></bsdf></shape>
+  <shape type="sphere" id="lamp"><point name="center" x="1" y="1.5" z="2"/><float name="radius" value="0.3"/>
+    <emitter type="area"><rgb name="radiance" value="6, 5, 4"/></emitter></shape>
+  <emitter type="constant"><rgb name="radiance" value="0.4, 0.5, 0.6"/></emitter>
+</scene>''')
+job = '''scene = "room.xml"
+variant = "VARIANT"
+iterations = 5
+spp = 16
+picture_spp = 4
+learning_rate = 0.08
+integrator = { type = "pathreplay", max_depth = 3 }
+parameters = [ { key = "ball.bsdf.reflectance.value", lower = 0, upper = 1 } ]
+[target]
+scene = "room.xml"
+scene_parameters = { grey = 0.7 }
+spp = 64
+integrator = { type = "path", max_depth = 3 }
+'''
+for variant in variants:
+    (folder / f"{variant}.toml").write_text(job.replace("VARIANT", variant))
+    result = optimize(folder / f"{variant}.toml", output=folder / "out", progress=False)
+    print()  # ends what Mitsuba's log may have begun
+    print(json.dumps([variant, "loss", *(entry.loss for entry in result.history)]))
+    scene = load_scene(folder / "room.xml")
+    keys = ("red.bsdf.reflectance.value", "floor.bsdf.reflectance.data", "lamp.emitter.radiance.value")
+    for key in keys if len(variants) == 1 else keys[:1]:
+        check = check_gradient(scene, key, seeds=6, spp=48, max_depth=3)
+        print()
+        print(json.dumps([variant, key, check.verdict, str(check)]))
+"""
+
+JOBS = {
+    "mono": ("llvm_ad_mono",),
+    "spectral": ("llvm_ad_spectral",),
+    "in turn": ("llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono", "llvm_ad_rgb"),
+}
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "in turn" else n for n in JOBS])
+def test_the_main_job_runs_in_every_variant(run_python, tmp_path, name: str) -> None:
+    done = run_python(MAIN_JOB, args=(str(tmp_path), *JOBS[name]))
+    assert done.returncode == 0, done.stderr[-3000:]
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
+    losses = [line[2:] for line in lines if line[1] == "loss"]
+    assert len(losses) == len(JOBS[name]) and all(len(history) == 5 for history in losses)
+    assert all(history[-1] < 0.8 * history[0] for history in losses), losses
+    checks = [line for line in lines if line[1] != "loss"]
+    assert len(checks) == (3 if len(JOBS[name]) == 1 else len(JOBS[name]))
+    assert all(verdict == "pass" for _, _, verdict, _ in checks), checks
+
+
+def test_the_variants_here_are_all_that_there_are() -> None:
+    import mitsuba as mi
+
+    from pathreplay.backend import is_usable_variant
+
+    usable = {name for name in mi.variants() if is_usable_variant(name) and name.startswith("llvm")}
+    assert usable == {variant for sequence in JOBS.values() for variant in sequence}
+
+
+def test_what_belongs_to_another_variant_is_told(run_python) -> None:
+    done = run_python("""
+import pathreplay, mitsuba as mi
+from pathreplay.backend import ensure_llvm
+ensure_llvm()
+mi.set_variant("llvm_ad_rgb")
+scene, integrator = mi.load_dict(mi.cornell_box()), mi.load_dict({"type": "pathreplay"})
+mi.set_variant("llvm_ad_mono")
+other = mi.load_dict(mi.cornell_box())
+for work in (
+    lambda: integrator.render(other, 0, spp=1),
+    lambda: mi.load_dict({"type": "pathreplay"}).render(scene, 0, spp=1),
+    lambda: pathreplay.check_gradient(scene, "green.reflectance.value"),
+):
+    try:
+        work()
+    except pathreplay.PathreplayError as error:
+        print("\\ntold:", error)
+""")
+    assert done.returncode == 0, done.stderr[-2000:]
+    told = [line for line in done.stdout.splitlines() if line.startswith("told:")]
+    assert len(told) == 3 and all("another variant than the active one, 'llvm_ad_mono'" in line for line in told), told

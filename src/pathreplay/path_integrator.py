@@ -61,11 +61,12 @@ def path_integrator() -> type:
                     f"{self.name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
                     f"use {mi.variant().replace('_polarized', '')!r}"
                 )
-            # Both are Mitsuba's, which takes what it is given.
+            # All three are Mitsuba's, too, which takes what it is given or says less.
             whole_number(props, self.name, "max_depth", 6, lowest=0, unbounded=True)
             whole_number(props, self.name, "rr_depth", 5, lowest=1)
+            hide_emitters = flag(props, self.name, "hide_emitters", False)
             super().__init__(props)
-            self.hide_emitters = flag(props, self.name, "hide_emitters", False)
+            self.hide_emitters = hide_emitters
             self.sensor: Any = None  # that is rendered
             # Mitsuba asks for radiance before it goes back, for integrators that replay it. Ours find it themselves and
             # nobody looks at this one; but tracing it takes time.
@@ -109,6 +110,11 @@ def path_integrator() -> type:
             No garbage is collected on the way: should an old scene vanish between two virtual calls, Dr.Jit counts
             their instances differently and writes functions that both call twice ("invalid redefinition").
             """
+            if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
+                raise PathreplayError(
+                    f"{self.name}: scene or integrator belongs to another variant than the active one, "
+                    f"{mi.variant()!r}: load it anew, or set its variant"
+                )
             self.sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             self.of_pass = seed, spp, self.sensor.ptr
             collecting = gc.isenabled()

@@ -205,6 +205,11 @@ def _require_arguments(scene: Any, sensor: int, seeds: int, spp: int, fd_spp: in
             f"Variant '{mi.variant()}' has no derivatives; call mi.set_variant('llvm_ad_rgb') before loading the scene"
         )
     if not isinstance(scene, mi.Scene):
+        if type(scene).__name__ == "Scene" and isinstance(scene, mi.Object):
+            raise PathreplayError(
+                f"scene belongs to another variant than the active one, '{mi.variant()}': load it anew, or set its "
+                "variant"
+            )
         raise PathreplayError(
             f"scene is a {type(scene).__name__}, not a mitsuba.Scene; load it with mi.load_file or load_dict"
         )
