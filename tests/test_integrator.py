@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import gc
+import math
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay import PathreplayError
+from pathreplay import PathreplayError, check_gradient
+from pathreplay.bsdfs.substitute import load_dict_with
+from pathreplay.inverse.config import Plugin
+from pathreplay.inverse.problem import load_integrator
 from truth import bitmap, lit_room, noise, random, rgb, translate, under_sky
 
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}
@@ -29,12 +33,58 @@ def plugin(**properties):
         ({"driver": "sweep", "max_depth": 5000}, ["max_depth = 5000", "2048", "'replay'"]),
         ({"driver": "sweep", "max_depth": -1}, ["unbounded", "'replay'"]),
         ({"noise": -1.0}, ["noise = -1"]),
+        ({"noise": math.nan}, ["noise = nan", "finite"]),
+        ({"noise": "0.1"}, ["noise = '0.1'", ">= 0"]),
+        ({"noise": True}, ["noise = True", ">= 0"]),
+        ({"hide_emitters": 1}, ["hide_emitters = 1", "true or false"]),
+        ({"hide_emitters": "yes"}, ["hide_emitters = 'yes'", "true or false"]),
+        ({"branch": 1}, ["branch = 1", "'auto'"]),
+        *(
+            ({name: value}, [f"pathreplay: {name} = {shown}: use ", "whole number"])
+            for name in ("max_depth", "rr_depth")
+            for value, shown in (
+                ("6", "'6'"),
+                (math.nan, "nan"),
+                (1.5, "1.5"),
+                (10**12, "1000000000000"),
+                (10**20, "1e+20"),
+                (True, "True"),
+            )
+        ),
     ],
 )
 def test_bad_properties_are_named_with_the_way_out(properties, words) -> None:
     with pytest.raises(Exception) as error:  # Mitsuba wraps what a plugin raises
         plugin(**properties)
     assert all(word in str(error.value) for word in words), str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('<string name="max_depth" value="6"/>', "max_depth = '6': use -1 (unbounded) or a depth >= 0"),
+        ('<float name="max_depth" value="6"/>', "max_depth = 6.0: use -1 (unbounded) or a depth >= 0"),
+        ('<boolean name="rr_depth" value="true"/>', "rr_depth = True: use a depth >= 1"),
+        ('<string name="hide_emitters" value="no"/>', "hide_emitters = 'no': use true or false"),
+        ('<rgb name="noise" value="1, 2, 3"/>', "noise = "),
+    ],
+)
+def test_properties_of_wrong_types_in_a_file_are_named(line: str, words: str) -> None:
+    xml = f'<scene version="3.0.0"><integrator type="pathreplay">{line}</integrator></scene>'
+    with pytest.raises(RuntimeError) as error:
+        mi.load_string(xml)
+    assert f"pathreplay: {words}" in str(error.value)
+
+
+def test_none_is_told_where_mitsuba_would_die() -> None:
+    scene = mi.load_dict(lit_room(DIFFUSE, "rectangle"))
+    expected = "'max_depth' of 'pathreplay' is None; give it a value, or leave it out"
+    with pytest.raises(PathreplayError, match=expected):
+        check_gradient(scene, "light.emitter.radiance.value", integrator={"type": "pathreplay", "max_depth": None})
+    with pytest.raises(PathreplayError, match=expected):
+        load_integrator(Plugin(type="pathreplay", max_depth=None))
+    with pytest.raises(PathreplayError, match="'reflectance' of 'diffuse' is None"):
+        load_dict_with({"type": "scene", "paint": {"type": "diffuse", "reflectance": None}}, {})
 
 
 def test_auto_sweeps_where_the_record_fits() -> None:

@@ -18,7 +18,8 @@ from .gradient.primal import primal
 from .gradient.ray_jacobian import Recovery
 from .gradient.replay import replay
 from .gradient.sweep import MAX_DEPTH, deepest, sweep
-from .path_integrator import UNBOUNDED, choice, path_integrator
+from .path_integrator import UNBOUNDED, path_integrator
+from .properties import choice, deviation
 from .transport.traits import Traits, nodes_of
 from .transport.vertex import Walk
 
@@ -67,10 +68,7 @@ def _make_class() -> type:
             self.driver = driver
             self.volume_gradient = choice(props, self.name, "volume_gradient", "score", VOLUME_GRADIENTS)
             self.branch = choice(props, self.name, "branch", "auto", BRANCH)
-            noise = props.get("noise", Recovery.noise)
-            if noise < 0:
-                raise PathreplayError(f"pathreplay: noise = {noise}: use a standard deviation >= 0 (0 = off)")
-            self.recovery = Recovery(noise=noise)
+            self.recovery = Recovery(noise=deviation(props, self.name, "noise", Recovery.noise))
             self.told: set[str] = set()  # what has been said in the log
             self.lost: list[tuple[LostPaths, int]] = []  # of how many paths each, not told yet
             self.baseline: tuple[int, Baseline] | None = None  # and the scene that it belongs to

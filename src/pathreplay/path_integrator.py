@@ -11,19 +11,12 @@ import drjit as dr
 import mitsuba as mi
 
 from .errors import PathreplayError
+from .properties import flag, whole_number
 from .transport.media import scene_media
 from .transport.traits import Tables, nodes_of, scene_traits
 from .transport.vertex import Walk
 
 UNBOUNDED = 0xFFFFFFFF
-
-
-def choice(props: Any, plugin: str, name: str, default: Any, choices: tuple[Any, ...]) -> Any:
-    """A property of ``plugin`` that has to be one of the choices. Raises PathreplayError for another."""
-    value = props.get(name, default)
-    if value not in choices:
-        raise PathreplayError(f"{plugin}: {name} = {value!r} is unknown: use one of {', '.join(map(repr, choices))}")
-    return value
 
 
 @contextmanager
@@ -48,7 +41,9 @@ def _mendable(error: BaseException) -> BaseException:
 
 def path_integrator() -> type:
     """The base class of our integrators, for the active variant, which must be an AD variant."""
-    from mitsuba.ad.integrators.common import RBIntegrator
+    # The name under which Mitsuba runs its Python modules anew for every variant. Of `mitsuba.ad`, the public name, an
+    # import statement makes a copy, which stays what it was in the first variant.
+    from mitsuba.python.ad.integrators.common import RBIntegrator
 
     class PathIntegrator(RBIntegrator):  # type: ignore[misc]
         """Properties ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5) and ``hide_emitters`` (False).
@@ -66,13 +61,12 @@ def path_integrator() -> type:
                     f"{self.name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
                     f"use {mi.variant().replace('_polarized', '')!r}"
                 )
-            max_depth, rr_depth = props.get("max_depth", 6), props.get("rr_depth", 5)
-            if max_depth < -1:
-                raise PathreplayError(f"{self.name}: max_depth = {max_depth}: use -1 (unbounded) or a depth >= 0")
-            if rr_depth < 1:
-                raise PathreplayError(f"{self.name}: rr_depth = {rr_depth}: use a depth >= 1")
+            # All three are Mitsuba's, too, which takes what it is given or says less.
+            whole_number(props, self.name, "max_depth", 6, lowest=0, unbounded=True)
+            whole_number(props, self.name, "rr_depth", 5, lowest=1)
+            hide_emitters = flag(props, self.name, "hide_emitters", False)
             super().__init__(props)
-            self.hide_emitters = props.get("hide_emitters", False)
+            self.hide_emitters = hide_emitters
             self.sensor: Any = None  # that is rendered
             # Mitsuba asks for radiance before it goes back, for integrators that replay it. Ours find it themselves and
             # nobody looks at this one; but tracing it takes time.
@@ -117,6 +111,11 @@ def path_integrator() -> type:
             No garbage is collected on the way: should an old scene vanish between two virtual calls, Dr.Jit counts
             their instances differently and writes functions that both call twice ("invalid redefinition").
             """
+            if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
+                raise PathreplayError(
+                    f"{self.name}: scene or integrator belongs to another variant than the active one, "
+                    f"{mi.variant()!r}: load it anew, or set its variant"
+                )
             self.sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             self.of_pass = seed, spp, self.sensor.ptr
             collecting = gc.isenabled()

@@ -1,13 +1,17 @@
-"""Registers our plugins for the active variant of Mitsuba and for every later one with automatic differentiation.
+"""Registers our plugins for the active variant of Mitsuba and for every later one.
 
 A Python plugin is known to Mitsuba in the variant it was registered in, and a variant callback is called only for
-variants set after it was added. Scalar variants get no plugins: nothing in them can be differentiated. Polarised ones
-do, so that loading a plugin there says clearly that it is not supported.
+variants set after it was added. Where nothing can be differentiated, as in scalar variants, stand-ins say so and name
+the variant to use. Polarised variants get the plugins themselves, which say that they are not supported.
 """
 
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
+from typing import Any
+
+from pathreplay.errors import PathreplayError
 
 #: Each has `register() -> None`, which registers its plugins for the active variant; doing so again is harmless.
 PLUGIN_MODULES = (
@@ -17,22 +21,51 @@ PLUGIN_MODULES = (
     "pathreplay.media.gridmedium",
 )
 
+#: All that they register: name -> the function of Mitsuba's that does it.
+PLUGINS = {
+    "pathreplay": "register_integrator",
+    "pathreplay_tape": "register_integrator",
+    "pathreplay_rb": "register_integrator",
+    "smoothdielectric": "register_bsdf",
+    "gridmedium": "register_medium",
+}
 
-def has_derivatives(variant: str | None) -> bool:
+
+def has_derivatives(variant: str) -> bool:
     """Whether a variant of Mitsuba can differentiate at all."""
-    return variant is not None and "_ad_" in variant
+    return "_ad_" in variant
 
 
-def register(variant: str | None) -> None:
-    """Register all plugins for the active variant, whose name is `variant`; does nothing without derivatives."""
+def register(variant: str) -> None:
+    """Register all plugins for the active variant, whose name is `variant`; stand-ins where it has no derivatives."""
     if not has_derivatives(variant):
+        _register_stand_ins(variant)
         return
-    if str(variant).startswith("llvm"):
+    if variant.startswith("llvm"):
         from pathreplay.backend import warn_of_bad_llvm
 
         warn_of_bad_llvm()
     for module in PLUGIN_MODULES:
         importlib.import_module(module).register()
+
+
+def _register_stand_ins(variant: str) -> None:
+    import mitsuba as mi
+
+    from pathreplay.backend import is_usable_variant
+
+    usable = [name for name in mi.variants() if is_usable_variant(name)]
+    colours = variant.removesuffix("_polarized").rsplit("_", 1)[-1]
+    alike = [name for name in usable if name.endswith(colours)] or usable
+
+    def stand_in(plugin: str) -> Callable[[Any], Any]:
+        def refuse(props: Any) -> Any:
+            raise PathreplayError(f"{plugin}: variant {variant!r} has no derivatives: use {' or '.join(alike)}")
+
+        return refuse
+
+    for plugin, how in PLUGINS.items():
+        getattr(mi, how)(plugin, stand_in(plugin))
 
 
 def _on_variant(_old: str | None, new: str) -> None:
@@ -44,4 +77,5 @@ def install() -> None:
     import mitsuba as mi
 
     mi.detail.add_variant_callback(_on_variant)
-    register(mi.variant())
+    if (active := mi.variant()) is not None:
+        register(active)

@@ -15,7 +15,8 @@ from .errors import PathreplayError
 from .gradient.primal import primal
 from .gradient.radiative import radiative
 from .gradient.tape import tape_backward, tape_forward
-from .path_integrator import choice, path_integrator
+from .path_integrator import path_integrator
+from .properties import choice, flag
 from .transport.vertex import Walk
 
 ATTACH = ("delta", "none")
@@ -78,7 +79,7 @@ def _make_classes() -> tuple[type, type]:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            self.linear = props.get("linear", False)
+            self.linear = flag(props, self.name, "linear", False)
 
         def propagate(self, walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
             """Back-propagate ``δL``: see `radiative`."""

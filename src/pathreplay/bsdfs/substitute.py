@@ -8,6 +8,8 @@ from typing import Any
 
 import mitsuba as mi
 
+from pathreplay.descriptions import require_values
+
 
 def load_file_with(
     path: str | Path, plugins: Mapping[str, str], *, optimize: bool = False, **parameters: Any
@@ -39,8 +41,9 @@ def load_dict_with(
 ) -> tuple[Any, list[str]]:
     """`mi.load_dict(scene, optimize=optimize)` with plugins exchanged; otherwise as `load_file_with`.
 
-    Objects that stand in the dictionary already loaded stay what they are.
+    Objects that stand in the dictionary already loaded stay what they are. Raises PathreplayError for a None.
     """
+    require_values(scene)
     config = _config(optimize)
     outer = mi.file_resolver()
     mi.set_file_resolver(mi.FileResolver(outer))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.spectra import coefficients, values_of_p
 
 RELATIVE_STEP = 1e-2
 """h over the size of the parameter: truncation (h² after division) near 1e-4, float32 rounding of images near 1e-5."""
@@ -60,13 +61,15 @@ def choose_line(
     seed: int = 0,
     *,
     far: bool = False,
+    spectra: bool = False,
 ) -> Line:
     """The line through ``value`` along ``direction``, or along a random direction whose largest entry is 1.
 
     The default step moves the entry that moves most by a hundredth of the parameter's size. Where a parameter that is
     nowhere negative would become so (a black texel), the differences are one-sided: a negative reflectance is no
     harm to a linear texture, but a negative roughness or density is. Transforms move by a random translation, those
-    of things infinitely ``far`` away (sun, sky), which no translation moves, turn about a random axis.
+    of things infinitely ``far`` away (sun, sky), which no translation moves, turn about a random axis. Coefficients of
+    ``spectra`` move so that what they stand for changes by such steps: see :mod:`pathreplay.spectra`.
 
     Raises:
         PathreplayError: the direction has the wrong shape, is zero or is not finite; the step is not a positive number.
@@ -83,24 +86,37 @@ def choose_line(
             raise PathreplayError(f"Direction of shape {v.shape} given for '{key}', whose shape is {value.shape}")
         if not np.isfinite(v).all() or not v.any():
             raise PathreplayError(f"Direction for '{key}' is zero, NaN or infinite; give finite numbers, not all zero")
-    elif value.size == 1:
-        v, description = np.ones(value.shape), "scalar"
-    elif transform and far:
-        v, description = np.zeros(value.shape), f"random rotation, seed {seed}"
-        v[:3, :3] = np.cross(_random_entries((3,), seed), value[:3, :3], axisb=0, axisc=0)
-    elif transform:
-        v, description = np.zeros(value.shape), f"random translation, seed {seed}"
-        v[:3, 3] = _random_entries((3,), seed)
     else:
-        v, description = _random_entries(value.shape, seed), f"random, seed {seed}"
-    size = max(1.0, float(np.abs(value[v != 0]).max()))
+        v, description = _random_direction(value, transform, far, spectra, seed)
+    # Black is p = -8192: the size of such texels must not decide how far the others move.
+    size = 1.0 if spectra else max(1.0, float(np.abs(value[v != 0]).max()))
     if step is None:
-        step = RELATIVE_STEP * size
+        step = RELATIVE_STEP * size / ((float(np.abs(values_of_p(v)[..., :3]).max()) if spectra else 0) or 1)
     elif not (np.isfinite(step) and step > 0):
         raise PathreplayError(
             f"Step {step} for '{key}' is not a positive number; leave it out, or give one such as 0.01"
         )
     return Line(value, v, description, size, float(step), _choose_stencil(key, value, v * step))
+
+
+def _random_direction(
+    value: np.ndarray, transform: bool, far: bool, spectra: bool, seed: int
+) -> tuple[np.ndarray, str]:
+    """A direction in the shape of ``value``, and how it was chosen: see `choose_line`."""
+    if value.size == 1:
+        return np.ones(value.shape), "scalar"
+    v = np.zeros(value.shape)
+    if transform and far:
+        v[:3, :3] = np.cross(_random_entries((3,), seed), value[:3, :3], axisb=0, axisc=0)
+        return v, f"random rotation, seed {seed}"
+    if transform:
+        v[:3, 3] = _random_entries((3,), seed)
+        return v, f"random translation, seed {seed}"
+    v = _random_entries(value.shape, seed)
+    if spectra:
+        v[..., 3:] *= max(1.0, float(np.abs(value[..., 3:]).max(initial=0)))
+        v = coefficients(v)
+    return v, f"random, seed {seed}"
 
 
 def _random_entries(shape: tuple[int, ...], seed: int) -> np.ndarray:

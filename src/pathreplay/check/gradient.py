@@ -19,6 +19,7 @@ from pathreplay.check.reference import integrator_under_test, reference_integrat
 from pathreplay.check.verdict import NEGLIGIBLE, Verdict, judge
 from pathreplay.errors import PathreplayError
 from pathreplay.parameters import get_array, require_differentiable, require_finite
+from pathreplay.spectra import holds_coefficients
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,8 @@ def check_gradient(
             "option format='variant'"
         )
     value = get_array(params[key]).astype(np.float64)
-    line = choose_line(key, value, direction, step, seed, far=_is_far(params.properties[key][2]))
+    far, spectra = _is_far(params.properties[key][2]), holds_coefficients(params, key)
+    line = choose_line(key, value, direction, step, seed, far=far, spectra=spectra)
     plain = reference_integrator(reference, scene, tested)
     fd_spp = spp if fd_spp is None else fd_spp
     # Distinct 32-bit words: seeds of the gradient's primal image, of its derivative, of the reference, of the weights.
@@ -203,6 +205,11 @@ def _require_arguments(scene: Any, sensor: int, seeds: int, spp: int, fd_spp: in
             f"Variant '{mi.variant()}' has no derivatives; call mi.set_variant('llvm_ad_rgb') before loading the scene"
         )
     if not isinstance(scene, mi.Scene):
+        if type(scene).__name__ == "Scene" and isinstance(scene, mi.Object):
+            raise PathreplayError(
+                f"scene belongs to another variant than the active one, '{mi.variant()}': load it anew, or set its "
+                "variant"
+            )
         raise PathreplayError(
             f"scene is a {type(scene).__name__}, not a mitsuba.Scene; load it with mi.load_file or load_dict"
         )

@@ -13,6 +13,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from pathreplay.descriptions import load_description
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes import one_line
 
@@ -56,8 +57,8 @@ def integrator_under_test(spec: Any, scene: Any, max_depth: int | None = None) -
     Raises:
         PathreplayError: Mitsuba cannot make it, or ``max_depth`` makes no sense or is given along with a finished one.
     """
-    if max_depth is not None and max_depth < 1 and max_depth != -1:
-        raise PathreplayError(f"max_depth is {max_depth}; give a path length of at least 1, or -1 for no bound")
+    if max_depth is not None and (type(max_depth) is not int or (max_depth < 1 and max_depth != -1)):
+        raise PathreplayError(f"max_depth is {max_depth!r}; give a path length of at least 1, or -1 for no bound")
     own = scene.integrator()
     if spec is None and max_depth is None and isinstance(own, mi.CppADIntegrator):
         return own
@@ -112,7 +113,9 @@ def has_media(scene: Any) -> bool:
 
 def _load(description: dict[str, Any]) -> Any:
     try:
-        integrator = mi.load_dict(description)
+        integrator = load_description(description)
+    except PathreplayError:
+        raise
     except Exception as error:  # Mitsuba raises RuntimeError, plugins in Python whatever they like
         # Mitsuba writes the whole traceback of a Python plugin into its message; its last line says what is wrong.
         told = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else one_line(error)

@@ -123,6 +123,8 @@ def backward(target: Any) -> None:
     Raises PathreplayError when no parameter with gradients reaches it: the gradient would silently be zero.
     """
     if not dr.grad_enabled(target):
+        if not dr.flag(dr.JitFlag.SymbolicLoops) and not dr.flag(dr.JitFlag.SymbolicCalls):
+            return  # only what these very paths meet is called: others, or other vertices, may meet the parameter
         raise PathreplayError(
             "no parameter with gradients reaches the light paths: check that the key is differentiable "
             "(mi.traverse(scene)), that params.update() was called after dr.enable_grad, and that attach is not "

@@ -32,7 +32,9 @@ class Passes:
         self.targets = [mi.TensorXf(view.target) for view in problem.views]
         # What an integrator learns of media from pass to pass is read and written between kernels.
         media = any(isinstance(node, mi.Medium) for node in nodes_of(problem.scene))
-        self.freezes = type(integrator).__name__ in RECORDABLE and not media
+        # Spectral variants look up the eye's response in tables of Mitsuba's library: no input of ours, as a recorded
+        # function must have them, leads there.
+        self.freezes = type(integrator).__name__ in RECORDABLE and not media and not mi.is_spectral
         self.swept: tuple[bool, ...] = ()  # views whose pixels can be swept; empty before the first call
         self.frozen: dict[Any, Callable[..., Any]] = {}  # recorded functions, by the shapes of the parameters
         self.tables = scene_tables(nodes_of(problem.scene))

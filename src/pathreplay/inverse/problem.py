@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay import parameters
+from pathreplay.descriptions import load_description
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import Config, Parameter, Plugin
 from pathreplay.inverse.grids import Levels, comparable, make_levels, resampled
@@ -139,7 +140,7 @@ def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
 def load_integrator(plugin: Plugin) -> mi.Integrator:
     """The integrator that the job names; an unknown type or option becomes one line."""
     try:
-        return mi.load_dict(plugin.as_dict())
+        return load_description(plugin.as_dict())
     except (RuntimeError, TypeError, ValueError) as error:
         raise PathreplayError(f"Integrator '{plugin.type}' cannot be made: {one_line(error)}") from None
 

@@ -73,18 +73,28 @@ def make_cells(bounds: Bounds, values: list[Any]) -> Cells:
 # ----------------------------------------------------- the walk -----------------------------------------------------
 
 
-def clip(box: Any, ray: Any) -> tuple[Any, Any]:
-    """The part [a, b] of the ray that lies in a box (a = 0, b = -1 if there is none). Never NaN for a finite ray."""
-    a, b = mi.Float(0), mi.Float(ray.maxt)
+def through(box: Any, ray: Any) -> tuple[Any, Any]:
+    """Distances at which the line of a ray enters and leaves a box; the first is larger where it misses. Attached.
+
+    What Mitsuba's `ray_intersect` of boxes finds: that one knows only the rays of the first variant of the process.
+    """
+    near, far = mi.Float(-dr.inf), mi.Float(dr.inf)
     for k in range(3):
         o, d = ray.o[k], ray.d[k]
         low, high = float(box.min[k]), float(box.max[k])
         along = d == 0
-        inverse = dr.rcp(d)
+        inverse = dr.rcp(dr.select(along, 1, d))
         t0, t1 = (low - o) * inverse, (high - o) * inverse
         beside = along & ((o < low) | (o > high))
-        a = dr.select(along, a, dr.fmax(a, dr.fmin(t0, t1)))
-        b = dr.select(along, dr.select(beside, -1, b), dr.fmin(b, dr.fmax(t0, t1)))
+        near = dr.select(along, near, dr.fmax(near, dr.fmin(t0, t1)))
+        far = dr.select(along, dr.select(beside, -dr.inf, far), dr.fmin(far, dr.fmax(t0, t1)))
+    return near, far
+
+
+def clip(box: Any, ray: Any) -> tuple[Any, Any]:
+    """The part [a, b] of the ray that lies in a box (a = 0, b = -1 if there is none). Never NaN for a finite ray."""
+    near, far = through(box, ray)
+    a, b = dr.fmax(near, 0), dr.fmin(far, ray.maxt)
     met = a < b
     return dr.select(met, a, 0), dr.select(met, b, -1)
 

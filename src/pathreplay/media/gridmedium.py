@@ -129,7 +129,8 @@ def _plugin_class() -> type:
             return σ_t * self.albedo.eval(mei, active), self.majorant - σ_t, σ_t
 
         def intersect_aabb(self, ray: Any) -> tuple[Any, Any, Any]:
-            return self.box.ray_intersect(ray)
+            near, far = cellwalk.through(self.box, ray)
+            return near <= far, near, far
 
         # -------------------------------------------- what our own calls ---------------------------------------------
 

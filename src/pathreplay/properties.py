@@ -1,0 +1,54 @@
+"""The properties of our plugins, read so that what cannot be is refused in one line with the way out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .errors import PathreplayError
+
+#: What Mitsuba's own integrators can hold.
+LARGEST = 2**31 - 1
+
+
+def choice(props: Any, plugin: str, name: str, default: Any, choices: tuple[Any, ...]) -> Any:
+    """A property of ``plugin`` that has to be one of the choices. Raises PathreplayError for another."""
+    value = _value(props, name, default)
+    # By type, too: 1 == True.
+    if not any(type(value) is type(allowed) and value == allowed for allowed in choices):
+        raise PathreplayError(f"{plugin}: {name} = {value!r} is unknown: use one of {', '.join(map(repr, choices))}")
+    return value
+
+
+def whole_number(props: Any, plugin: str, name: str, default: int, lowest: int, unbounded: bool = False) -> int:
+    """A whole number from ``lowest`` to `LARGEST`, or -1 where it may be unbounded. Raises PathreplayError else."""
+    value = _value(props, name, default)
+    if type(value) is int and (lowest <= value <= LARGEST or (unbounded and value == -1)):
+        return value
+    besides = "-1 (unbounded) or " if unbounded else ""
+    raise PathreplayError(
+        f"{plugin}: {name} = {_shown(value)}: use {besides}a depth >= {lowest}, a whole number of at most {LARGEST}"
+    )
+
+
+def deviation(props: Any, plugin: str, name: str, default: float) -> float:
+    """A finite standard deviation, at least 0. Raises PathreplayError for anything else."""
+    value = _value(props, name, default)
+    if type(value) not in (int, float) or not 0 <= value < float("inf"):
+        raise PathreplayError(f"{plugin}: {name} = {_shown(value)}: use a finite standard deviation >= 0 (0 = off)")
+    return float(value)
+
+
+def flag(props: Any, plugin: str, name: str, default: bool) -> bool:
+    """True or False. Raises PathreplayError for anything else."""
+    value = _value(props, name, default)
+    if type(value) is not bool:
+        raise PathreplayError(f"{plugin}: {name} = {_shown(value)}: use true or false")
+    return value
+
+
+def _value(props: Any, name: str, default: Any) -> Any:
+    return props[name] if name in props else default
+
+
+def _shown(value: Any) -> str:
+    return f"{value!r:.60}" if isinstance(value, (str, bool)) else f"{value!s:.60}"
