@@ -1,25 +1,51 @@
 """The commands, thin: each one reads its arguments, calls the room that does the work, and prints what came back.
 
 Exit status: 0 when the command did what it was asked and liked what it saw, 1 when it did but did not like it (a
-gradient that fails its check, a machine on which nothing runs), 2 when the user has to mend something first. Heavy
+gradient that fails its check, a machine on which nothing runs), 2 when the user has to mend something first, 128 plus
+the signal's number when a signal ended it (130 for Ctrl-C; `optimize` writes everything and ends with 0). Heavy
 modules are imported inside the commands, so that `pathreplay --help` answers at once.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
+import typer.core
 
+from pathreplay import interrupts
 from pathreplay.errors import PathreplayError
+
+
+class _Commands(typer.core.TyperGroup):
+    """Commands whose interruption reaches `main`: typer has its own ideas of what to print and return then."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as interrupt:
+            _end(interrupt)
+
+
+def _end(interrupt: KeyboardInterrupt) -> NoReturn:
+    interrupts.ignored()  # a second signal finds the process on its way out
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        print(
+            f"pathreplay: {interrupt}" if str(interrupt) else "pathreplay: ended by Ctrl-C", file=sys.stderr, flush=True
+        )
+    raise SystemExit(128 + getattr(interrupt, "number", signal.SIGINT))
+
 
 app = typer.Typer(
     name="pathreplay",
+    cls=_Commands,
     help="Differentiable light transport on Mitsuba 3: check gradients, recover scenes from pictures.",
     no_args_is_help=True,
     add_completion=False,
@@ -105,7 +131,7 @@ def optimize(
     output: Annotated[Path | None, typer.Option(help="Run folder to make; default: runs/<name of the config>.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
-    """Recover scene parameters from pictures; Ctrl-C ends early with everything written."""
+    """Recover scene parameters from pictures; Ctrl-C or SIGTERM ends early with everything written."""
     from pathreplay.inverse import optimize as run_job
 
     result = run_job(config, resume=resume, output=output, progress=not quiet)
@@ -138,7 +164,10 @@ def _fail(message: str) -> NoReturn:
 def main() -> None:
     """Run the command line; the entry point `pathreplay`."""
     try:
-        app()
+        with interrupts.raised():
+            app()
+    except KeyboardInterrupt as interrupt:
+        _end(interrupt)
     except PathreplayError as error:
         _fail(str(error))
     except MemoryError:

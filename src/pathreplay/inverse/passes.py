@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.errors import PathreplayError
 from pathreplay.inverse.losses import QUADRATIC, Loss
 from pathreplay.inverse.problem import Problem
 from pathreplay.path_integrator import plain_errors
@@ -55,6 +56,21 @@ class Passes:
             paths = sum(target.shape[0] * target.shape[1] for target in self.targets) * spp
             self.integrator.tell_lost(lost, paths)
         return float(value[0]) if dr.width(value) else float("nan")
+
+    def learned(self) -> dict[str, Any]:
+        """What the integrator has learned from its passes, as arrays by name, for a checkpoint."""
+        return self.integrator.learned() if hasattr(self.integrator, "learned") else {}
+
+    def restore_learned(self, learned: dict[str, Any]) -> None:
+        """Go on with what `learned` told. Raises PathreplayError if it is none of this integrator's."""
+        if not learned:
+            return
+        if not hasattr(self.integrator, "restore_learned"):
+            raise PathreplayError(
+                "The checkpoint holds what another integrator has learned of media; set the config's 'integrator' "
+                "back, or start a new run"
+            )
+        self.integrator.restore_learned(self.problem.scene, learned)
 
     def _sweeps(self, sensor: int, spp: int) -> bool:
         if self.problem.loss not in QUADRATIC or not hasattr(self.integrator, "sweeps_pixels"):
