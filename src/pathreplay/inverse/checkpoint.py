@@ -129,7 +129,7 @@ def _read(path: Path, adam: Adam, levels: Mapping[str, Levels]) -> _Saved:
             # Adam begins anew on a grid that was refined.
             if step > len(history) or (step < len(history) and key not in levels):
                 raise ValueError(f"{step} steps of '{key}' in {len(history)} iterations")
-            _require_shapes(file, key, get_array(adam[key]).shape, levels.get(key))
+            _require_shapes(file, key, adam, levels.get(key))
         tensors = {name: file.get_tensor(name) for name in file.keys()}
     for name, value in tensors.items():
         if not np.isfinite(value).all():
@@ -139,14 +139,15 @@ def _read(path: Path, adam: Adam, levels: Mapping[str, Levels]) -> _Saved:
     return _Saved(steps, history, tensors)
 
 
-def _require_shapes(file: Any, key: str, shape: tuple[int, ...], levels: Levels | None) -> None:
-    """Value and moments of one variable: float32, all of its shape, or of one that it goes through."""
-    names = [prefix + key for prefix in (_VALUE, _FIRST, _SECOND)]
-    found = {name: file.get_slice(name) for name in names}
-    first = tuple(found[names[0]].get_shape())
-    possible = {shape} if levels is None else set(levels.shapes)
+def _require_shapes(file: Any, key: str, adam: Adam, levels: Levels | None) -> None:
+    """Value and moments of one variable: float32, in the shapes that Adam has, or in those that a grid goes through."""
+    values = [get_array(adam[key]).shape] if levels is None else list(levels.shapes)
+    moments = [get_array(adam.state[key][3][1]).shape] if levels is None else [(int(np.prod(s)),) for s in values]
+    found = {name: file.get_slice(name) for name in (_VALUE + key, _FIRST + key, _SECOND + key)}
+    shapes = {name: tuple(part.get_shape()) for name, part in found.items()}
     for name, part in found.items():
         if part.get_dtype() != "F32":
             raise ValueError(f"'{name}' is {part.get_dtype()}, not F32")
-        if tuple(part.get_shape()) != first or first not in possible:
-            raise ValueError(f"'{name}' has shape {tuple(part.get_shape())}, the job's is {shape}")
+    possible = [dict(zip(found, (v, m, m), strict=True)) for v, m in zip(values, moments, strict=True)]
+    if shapes not in possible:
+        raise ValueError(f"value and moments of '{key}' have the shapes {list(shapes.values())}, the job's {values}")

@@ -112,8 +112,9 @@ def optimize(
         problem = build_problem(start.config, start.base, start.targets())
         for note in problem.notes:
             bar.note(note)
-        run = new_run(problem, problem.integrator)
-        rival = None if problem.rival is None else new_run(problem, problem.rival)
+        record = not start.config.deterministic
+        run = new_run(problem, problem.integrator, record)
+        rival = None if problem.rival is None else new_run(problem, problem.rival, record)
         if start.folder is None:
             before, folder = _begun(start, problem, run, rival)
             stack.callback(folder.close)

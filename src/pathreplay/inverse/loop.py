@@ -41,12 +41,12 @@ class Run:
         return sum(entry.seconds for entry in self.history)
 
 
-def new_run(problem: Problem, integrator: mi.Integrator) -> Run:
+def new_run(problem: Problem, integrator: mi.Integrator, record: bool = True) -> Run:
     """A run at the problem's start values."""
     adam = Adam(lr=1.0, beta_1=BETA_1, beta_2=BETA_2)
     for variable in problem.variables:
         adam[variable.key] = to_value(variable.like, variable.start)
-    return Run(Passes(problem, integrator), adam, [])
+    return Run(Passes(problem, integrator, record), adam, [])
 
 
 def put_values(problem: Problem, adam: Adam) -> None:

@@ -27,12 +27,13 @@ RECORDABLE = frozenset({"PathReplayIntegrator", "PRBIntegrator", "BasicPRBIntegr
 class Passes:
     """The mean over the views of the loss, by one integrator, and its gradient."""
 
-    def __init__(self, problem: Problem, integrator: mi.Integrator) -> None:
+    def __init__(self, problem: Problem, integrator: mi.Integrator, record: bool = True) -> None:
         self.problem, self.integrator = problem, integrator
         self.targets = [mi.TensorXf(view.target) for view in problem.views]
         # What an integrator learns of media from pass to pass is read and written between kernels.
         media = any(isinstance(node, mi.Medium) for node in nodes_of(problem.scene))
-        self.freezes = type(integrator).__name__ in RECORDABLE and not media
+        # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
+        self.freezes = record and type(integrator).__name__ in RECORDABLE and not media
         self.swept: tuple[bool, ...] = ()  # views whose pixels can be swept; empty before the first call
         self.frozen: dict[Any, Callable[..., Any]] = {}  # recorded functions, by the shapes of the parameters
 
