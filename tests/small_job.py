@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_inverse_run import JOB, SCENE
 
 from pathreplay.inverse import make_config
+from test_inverse_run import JOB, SCENE
 
 #: Far above what a small job takes on a loaded machine.
 TIMEOUT_S = 120

@@ -10,10 +10,10 @@ from typing import Any
 import drjit as dr
 import pytest
 import safetensors.numpy
-from small_job import ended, kill_at_checkpoint, start, write_job
-from test_inverse_run import TEXTURE
 
 from pathreplay.inverse import optimize
+from small_job import ended, kill_at_checkpoint, start, write_job
+from test_inverse_run import TEXTURE
 
 PATHREPLAY = {"integrator": {"type": "pathreplay", "max_depth": 3}}
 CLOUD = {

@@ -24,6 +24,10 @@ from pathreplay import interrupts
 from pathreplay.errors import PathreplayError
 
 
+class _Ended(BaseException):
+    """A KeyboardInterrupt on its way to `main`."""
+
+
 class _Commands(typer.core.TyperGroup):
     """Commands whose interruption reaches `main`: typer has its own ideas of what to print and return then."""
 
@@ -31,10 +35,10 @@ class _Commands(typer.core.TyperGroup):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as interrupt:
-            _end(interrupt)
+            raise _Ended from interrupt
 
 
-def _end(interrupt: KeyboardInterrupt) -> NoReturn:
+def _end(interrupt: BaseException) -> NoReturn:
     interrupts.ignored()  # a second signal finds the process on its way out
     with contextlib.suppress(OSError):  # the terminal may be gone
         print(
@@ -75,7 +79,8 @@ def doctor() -> None:
     """Say what runs on this machine, and the way out for what does not."""
     from rich.console import Console
 
-    from pathreplay.doctor import examine
+    with interrupts.undisturbed():  # as in `optimize`
+        from pathreplay.doctor import examine
 
     with Console(stderr=True).status("Trying every libLLVM and every variant ..."):
         report = examine()
@@ -102,13 +107,15 @@ def check(
     json: Annotated[Path | None, typer.Option(help="Also write the results, samples included, to this file.")] = None,
 ) -> None:
     """Compare gradients with finite differences of Mitsuba's path tracer; exit status 1 if one does not pass."""
-    from pathreplay import backend
-    from pathreplay.check import report
-    from pathreplay.scenes import load_scene_for
+    with interrupts.undisturbed():  # as in `optimize`
+        from pathreplay import backend
+        from pathreplay.check import report
+        from pathreplay.scenes import load_scene_for
 
     if json is not None:
         report.require_writable(json)
-    backend.set_variant(variant)
+    with interrupts.undisturbed():
+        backend.set_variant(variant)
     loaded, notes = load_scene_for(scene, param)
     for note in notes:
         typer.echo(f"pathreplay: {note}", err=True)
@@ -132,7 +139,8 @@ def optimize(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
     """Recover scene parameters from pictures; Ctrl-C or SIGTERM ends early with everything written."""
-    from pathreplay.inverse import optimize as run_job
+    with interrupts.undisturbed():  # what is half imported can bring the process down at its end
+        from pathreplay.inverse import optimize as run_job
 
     result = run_job(config, resume=resume, output=output, progress=not quiet)
     typer.echo(result.describe())
@@ -166,8 +174,8 @@ def main() -> None:
     try:
         with interrupts.raised():
             app()
-    except KeyboardInterrupt as interrupt:
-        _end(interrupt)
+    except (KeyboardInterrupt, _Ended) as ended:
+        _end(ended.__cause__ or ended)
     except PathreplayError as error:
         _fail(str(error))
     except MemoryError:

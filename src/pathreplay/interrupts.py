@@ -18,6 +18,18 @@ ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP")
 ONE_WISH_S = 1.0
 
 
+_raised_at: list[float] = []  # when a signal last raised something
+
+
+def raise_once(error: BaseException) -> None:
+    """Raise ``error``, unless a signal has raised one a moment ago: that one is on its way out."""
+    now = time.monotonic()
+    if _raised_at and now - _raised_at[-1] < ONE_WISH_S:
+        return
+    _raised_at[:] = [now]
+    raise error
+
+
 class Interrupted(KeyboardInterrupt):
     """A signal ended the command. ``number`` is the signal's."""
 
@@ -32,10 +44,11 @@ def name_of(number: int) -> str:
 
 
 @contextmanager
-def handled(handle: Handler) -> Iterator[None]:
+def handled(handle: Handler, keep: Callable[[], bool] = lambda: False) -> Iterator[None]:
     """Within this block ``handle`` gets the signals of `ENDING`; in threads other than the main one nothing happens.
 
-    SIGTERM and SIGHUP stay ignored where the parent process ignores them (nohup).
+    SIGTERM and SIGHUP stay ignored where the parent process ignores them (nohup). Handlers come back at the end,
+    unless ``keep`` says that it is the end of the process.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # signals belong to the main thread
@@ -47,27 +60,27 @@ def handled(handle: Handler) -> Iterator[None]:
             signal.signal(number, handle)
         yield
     finally:
-        for number in ours:
-            signal.signal(number, before[number])
+        if not keep():
+            for number in ours:
+                signal.signal(number, before[number])
 
 
 @contextmanager
 def raised() -> Iterator[None]:
-    """Within this block each of the signals raises `Interrupted`, also where a library made another error of it."""
-    first: list[float] = []
+    """Around a command: each of the signals raises `Interrupted`, also where a library made another error of it.
+
+    Once that has happened the signals keep their handlers: the process is about to end, in peace.
+    """
+    numbers: list[int] = []
 
     def handle(number: int, frame: FrameType | None) -> None:
-        if first and time.monotonic() - first[-1] < ONE_WISH_S:
-            return
-        first.append(time.monotonic())
         numbers.append(number)
-        raise Interrupted(number)
+        raise_once(Interrupted(number))
 
-    numbers: list[int] = []
-    with handled(handle):
+    with handled(handle, keep=lambda: bool(numbers)):
         try:
             yield
-        except RuntimeError:
+        except (RuntimeError, ImportError, SystemError):
             if numbers:  # Dr.Jit turns what is raised while it traces into errors of its own
                 raise Interrupted(numbers[0]) from None
             raise

@@ -14,6 +14,7 @@ import safetensors.numpy
 
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
+from pathreplay.interrupts import undisturbed
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes, read_image
@@ -104,7 +105,8 @@ def optimize(
         start = _resumed(resume, config, output) if resume is not None else _fresh(config, output)
         if start.folder is not None:
             stack.callback(start.folder.close)
-        variant = backend.set_variant(start.config.variant)
+        with undisturbed():
+            variant = backend.set_variant(start.config.variant)
         if start.config.deterministic:
             require_one_thread_possible()
         bar = stack.enter_context(Progress(progress))

@@ -170,7 +170,8 @@ def require_writable_name(path: Path, option: str) -> None:
     """Raise PathreplayError if the path cannot be written into reports, or is none at all."""
     try:
         str(path).encode()
-        path.exists()
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            os.lstat(path)
     except UnicodeEncodeError:
         raise PathreplayError(f"Run folder {str(path)!a} is not UTF-8; give another {option}") from None
     except (OSError, ValueError) as error:  # too long; a null character

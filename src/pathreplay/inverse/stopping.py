@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import signal
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from pathreplay.interrupts import ONE_WISH_S, handled, name_of
+from pathreplay.interrupts import handled, name_of, raise_once
 
 
 class Stop:
@@ -16,7 +15,7 @@ class Stop:
 
     def __init__(self) -> None:
         self.number: int | None = None
-        self.aborted_at: float | None = None
+        self.aborted = False
 
     def wanted(self) -> bool:
         return self.number is not None
@@ -40,15 +39,13 @@ def stopping(say: Callable[[str], None], way_out: str) -> Iterator[Stop]:
             stop.number = number
             say(f"{name_of(number)}: stopping after this iteration (Ctrl-C aborts)")
         elif number == signal.SIGINT:
-            now = time.monotonic()
-            if stop.aborted_at is None or now - stop.aborted_at > ONE_WISH_S:
-                stop.aborted_at = now
-                raise KeyboardInterrupt(way_out)
+            stop.aborted = True
+            raise_once(KeyboardInterrupt(way_out))
 
     with handled(handle):
         try:
             yield stop
         except RuntimeError:
-            if stop.aborted_at is not None:  # Dr.Jit turns what is raised while it traces into errors of its own
+            if stop.aborted:  # Dr.Jit turns what is raised while it traces into errors of its own
                 raise KeyboardInterrupt(way_out) from None
             raise
