@@ -21,11 +21,12 @@ _LAZY = {"check_gradient": "pathreplay.check", "optimize": "pathreplay.inverse"}
 
 def _set_up() -> None:
     # Before the first import of mitsuba: Dr.Jit looks for libLLVM while it is imported.
-    from pathreplay import backend, plugins
+    from pathreplay import backend, interrupts, plugins
 
     backend.point_drjit()
     try:
-        import mitsuba  # noqa: F401
+        with interrupts.undisturbed():  # Ctrl-C in the middle of this brings the process down
+            import mitsuba  # noqa: F401
     except Exception:
         return  # missing or broken: set_variant and the doctor say so, with the way out
     plugins.install()

@@ -1,25 +1,55 @@
 """The commands, thin: each one reads its arguments, calls the room that does the work, and prints what came back.
 
 Exit status: 0 when the command did what it was asked and liked what it saw, 1 when it did but did not like it (a
-gradient that fails its check, a machine on which nothing runs), 2 when the user has to mend something first. Heavy
+gradient that fails its check, a machine on which nothing runs), 2 when the user has to mend something first, 128 plus
+the signal's number when a signal ended it (130 for Ctrl-C; `optimize` writes everything and ends with 0). Heavy
 modules are imported inside the commands, so that `pathreplay --help` answers at once.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
+import typer.core
 
+from pathreplay import interrupts
 from pathreplay.errors import PathreplayError
+
+
+class _Ended(BaseException):
+    """A KeyboardInterrupt on its way to `main`."""
+
+
+class _Commands(typer.core.TyperGroup):
+    """Commands whose interruption reaches `main`: typer has its own ideas of what to print and return then."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as interrupt:
+            raise _Ended from interrupt
+
+
+def _end(interrupt: BaseException) -> NoReturn:
+    interrupts.ignored()  # a second signal finds the process on its way out
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        print(
+            f"pathreplay: {interrupt}" if str(interrupt) else "pathreplay: ended by Ctrl-C", file=sys.stderr, flush=True
+        )
+    raise SystemExit(128 + getattr(interrupt, "number", signal.SIGINT))
+
 
 app = typer.Typer(
     name="pathreplay",
+    cls=_Commands,
     help="Differentiable light transport on Mitsuba 3: check gradients, recover scenes from pictures.",
     no_args_is_help=True,
     add_completion=False,
@@ -49,7 +79,8 @@ def doctor() -> None:
     """Say what runs on this machine, and the way out for what does not."""
     from rich.console import Console
 
-    from pathreplay.doctor import examine
+    with interrupts.undisturbed():  # as in `optimize`
+        from pathreplay.doctor import examine
 
     with Console(stderr=True).status("Trying every libLLVM and every variant ..."):
         report = examine()
@@ -76,13 +107,15 @@ def check(
     json: Annotated[Path | None, typer.Option(help="Also write the results, samples included, to this file.")] = None,
 ) -> None:
     """Compare gradients with finite differences of Mitsuba's path tracer; exit status 1 if one does not pass."""
-    from pathreplay import backend
-    from pathreplay.check import report
-    from pathreplay.scenes import load_scene_for
+    with interrupts.undisturbed():  # as in `optimize`
+        from pathreplay import backend
+        from pathreplay.check import report
+        from pathreplay.scenes import load_scene_for
 
     if json is not None:
         report.require_writable(json)
-    backend.set_variant(variant)
+    with interrupts.undisturbed():
+        backend.set_variant(variant)
     loaded, notes = load_scene_for(scene, param)
     for note in notes:
         typer.echo(f"pathreplay: {note}", err=True)
@@ -105,8 +138,9 @@ def optimize(
     output: Annotated[Path | None, typer.Option(help="Run folder to make; default: runs/<name of the config>.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
-    """Recover scene parameters from pictures; Ctrl-C ends early with everything written."""
-    from pathreplay.inverse import optimize as run_job
+    """Recover scene parameters from pictures; Ctrl-C or SIGTERM ends early with everything written."""
+    with interrupts.undisturbed():  # what is half imported can bring the process down at its end
+        from pathreplay.inverse import optimize as run_job
 
     result = run_job(config, resume=resume, output=output, progress=not quiet)
     typer.echo(result.describe())
@@ -138,7 +172,10 @@ def _fail(message: str) -> NoReturn:
 def main() -> None:
     """Run the command line; the entry point `pathreplay`."""
     try:
-        app()
+        with interrupts.raised():
+            app()
+    except (KeyboardInterrupt, _Ended) as ended:
+        _end(ended.__cause__ or ended)
     except PathreplayError as error:
         _fail(str(error))
     except MemoryError:

@@ -208,6 +208,17 @@ def _make_class() -> type:
                 branching = dr.opaque(mi.Float, FIRST_BRANCHING) if known is None else known.branching
             return replace(walk, baseline=None if known is None else known.look, branching=branching)
 
+        def learned(self) -> dict[str, Any]:
+            """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
+            return {} if self.baseline is None else self.baseline[1].learned()
+
+        def restore_learned(self, scene: Any, learned: Any) -> None:
+            """Go on with what `learned` told of the same scene, in another process. Raises PathreplayError."""
+            baseline = Baseline(scene.bbox())
+            baseline.restore(learned)
+            self.baseline = scene.ptr, baseline
+            self.known.clear()
+
         def _baseline(self, scene: Any) -> Baseline | None:
             """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
             if self.baseline is None or self.baseline[0] != scene.ptr:

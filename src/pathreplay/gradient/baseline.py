@@ -8,11 +8,14 @@ branches) null collisions are asked everywhere: a bad guess is noise, not bias. 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from ..errors import PathreplayError
 from ..transport.media import interaction, majorant, span
 
 # Cells along each axis of space, and along each side of the octahedron of directions. 8³ x 4² cells of two averages
@@ -101,6 +104,29 @@ class Baseline:
         """Let later passes know what the last one saw."""
         self.sums = MEMORY * self.sums + self.seen
         self.seen = dr.zeros(mi.Float, 4 * self.count)
+        if self.paths:
+            self.branching = self.paths / (self.paths + dr.sum(self.nulls))
+        self.nulls, self.paths = dr.zeros(mi.Float, SLOTS), 0
+        self._conclude()
+
+    def learned(self) -> dict[str, Any]:
+        """All that it knows, as float32 arrays by name, from which `restore` makes the same again."""
+        return {"sums": self.sums.numpy(), "branching": self.branching.numpy()}
+
+    def restore(self, learned: Mapping[str, Any]) -> None:
+        """Know what `learned` told of another one. Raises PathreplayError if that cannot be."""
+        shapes = {name: np.shape(value) for name, value in learned.items()}
+        wanted = {"sums": (4 * self.count,), "branching": (1,)}
+        if shapes != wanted or not 0 < learned["branching"][0] <= 1:
+            raise PathreplayError(
+                f"What was learned of the media has the shapes {shapes}, not {wanted}, or branching beyond 0 to 1; "
+                "start the job from its config"
+            )
+        self.sums, self.branching = (mi.Float(np.array(learned[n], np.float32)) for n in ("sums", "branching"))
+        self._conclude()
+
+    def _conclude(self) -> None:
+        """The averages that follow from the sums."""
         i = dr.arange(mi.UInt32, self.count)
         is_y = i % 2 == 1
         weight = dr.gather(mi.Float, self.sums, 4 * i + 3)
@@ -112,7 +138,4 @@ class Baseline:
             value = (sums + PRIOR * dr.select(is_y, mean[1], mean[0])) / (weight + PRIOR)
             dr.scatter(known, value, 4 * i + k)
         self.known = known
-        if self.paths:
-            self.branching = self.paths / (self.paths + dr.sum(self.nulls))
-        self.nulls, self.paths = dr.zeros(mi.Float, SLOTS), 0
         dr.make_opaque(self.known, self.sums, self.seen, self.branching, self.nulls)

@@ -169,6 +169,7 @@ class Config(_Table):
     learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.02
     learning_rate_decay: Annotated[float, Field(gt=0, le=1)] = 0.1
     checkpoint_every: Count = 25
+    deterministic: bool = False
     output: str | None = None
 
     @model_validator(mode="after")

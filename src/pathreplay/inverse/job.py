@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,11 @@ import safetensors.numpy
 
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
+from pathreplay.interrupts import undisturbed
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes, read_image
-from pathreplay.inverse.loop import Run, ctrl_c_stops, iterate, new_run, put_values, render_views, scene_values
+from pathreplay.inverse.loop import Run, iterate, new_run, put_values, render_views, scene_values
 from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
@@ -29,7 +31,11 @@ from pathreplay.inverse.run_folder import (
     create_run_folder,
     default_output,
     open_run_folder,
+    require_output,
 )
+from pathreplay.inverse.saved_pictures import regular_file, require_pictures
+from pathreplay.inverse.stopping import Stop, stopping
+from pathreplay.inverse.threads import one_thread, require_one_thread_possible
 from pathreplay.inverse.values import Array
 from pathreplay.media.volume_files import vol_bytes
 from pathreplay.parameters import get_array, to_value
@@ -44,7 +50,9 @@ class RunResult:
     iterations: int
     """Completed iterations; fewer than the job's when it was stopped."""
     stopped: bool
-    """True when Ctrl-C ended the run early; it can be resumed."""
+    """True when a signal ended the run early; it can be resumed."""
+    stopped_by: str | None
+    """'Ctrl-C', 'SIGTERM' or 'SIGHUP'."""
     history: tuple[checkpoint.Entry, ...]
     parameters: dict[str, Array]
     errors: dict[str, float]
@@ -65,7 +73,7 @@ class RunResult:
         lines += [f"{key}: {error}" for key, error in self.poses.items()]
         lines.append(f"report: {self.report}")
         if self.stopped:
-            lines.append(f"stopped early; go on with: pathreplay optimize --resume {shlex.quote(str(self.folder))}")
+            lines.append(f"stopped early by {self.stopped_by}; go on with: {_resume_command(self.folder)}")
         return "\n".join(lines)
 
 
@@ -85,51 +93,96 @@ def optimize(
             exists, a number is appended: an earlier run is never touched.
         progress: draw a progress bar on stderr.
 
-    The first Ctrl-C ends the run after the current iteration with everything written; the second one aborts.
+    The first Ctrl-C, SIGTERM or SIGHUP ends the run after the current iteration with everything written; a Ctrl-C after
+    that aborts (KeyboardInterrupt). Until the run folder is there, signals do what they did before. With
+    ``deterministic`` all that is computed is computed by one thread, whatever was set; that comes back afterwards.
 
     Raises:
-        PathreplayError: anything in the job that cannot work, told before the first iteration; a full disk.
+        PathreplayError: anything in the job that cannot work, told before the first iteration; a full disk; a run
+            folder that is in use, damaged, or vanishes.
     """
-    start = _resumed(Path(resume), config, output) if resume is not None else _fresh(config, output)
-    variant = backend.set_variant(start.config.variant)
-    with Progress(progress) as bar:
+    with ExitStack() as stack:
+        start = _resumed(resume, config, output) if resume is not None else _fresh(config, output)
+        if start.folder is not None:
+            stack.callback(start.folder.close)
+        with undisturbed():
+            variant = backend.set_variant(start.config.variant)
+        if start.config.deterministic:
+            require_one_thread_possible()
+        bar = stack.enter_context(Progress(progress))
         bar.say("preparing")
         problem = build_problem(start.config, start.base, start.targets())
         for note in problem.notes:
             bar.note(note)
-        run = new_run(problem, problem.integrator)
-        rival = None if problem.rival is None else new_run(problem, problem.rival)
+        record = not start.config.deterministic
+        run = new_run(problem, problem.integrator, record)
+        rival = None if problem.rival is None else new_run(problem, problem.rival, record)
         if start.folder is None:
-            put_values(problem, run.adam)
-            before = render_views(problem, start.config)
-            folder = create_run_folder(start.output, start.config, start.source, start.base)
-            folder.write({**_first_files(problem, before), **_checkpoints(run, rival)})
+            before, folder = _begun(start, problem, run, rival)
+            stack.callback(folder.close)
         else:
             folder = start.folder
-            refined = [v.key for v in problem.variables if v.levels is not None]
-            run.history.extend(checkpoint.restore(folder.path / CHECKPOINT, run.adam, refined))
-            if rival is not None:
-                rival.history.extend(checkpoint.restore(folder.path / RIVAL_CHECKPOINT, rival.adam, refined))
-            # All iterations but no report: the disk was full at the end. Then only the end is done again.
-            if len(run.history) >= start.config.iterations and (folder.path / "report.html").exists():
-                raise PathreplayError(
-                    f"Run {folder.path} has all its {len(run.history)} iterations; raise 'iterations' in its config"
-                )
-            before = {view.name: read_image(folder.path / f"images/start-{view.name}.exr") for view in problem.views}
-        bar.start(len(run.history), start.config.iterations)
-
-        def after(entry: checkpoint.Entry) -> None:
-            bar.advance(entry.loss)
-            if (entry.iteration + 1) % start.config.checkpoint_every == 0:
-                folder.write(_checkpoints(run, rival))
-
-        with ctrl_c_stops() as stop:
-            iterate(problem, start.config, run, rival, stop, after)
-            bar.say("writing")
+            before = _went_on(folder, start.config, problem, run, rival)
+        way_out = f"aborted; go on from the last checkpoint with: {_resume_command(folder.path)}"
+        stop = stack.enter_context(stopping(bar.say, way_out))
+        _iterate(start.config, folder, problem, run, rival, stop, bar)
+        bar.say("writing")
+        with one_thread(start.config.deterministic):
             result = render_views(problem, start.config)
             theirs = None if rival is None else finished(problem, start.config, rival)
+        return _finish(start, folder, problem, run, before, result, theirs, variant, stop.by())
+
+
+def _begun(start: _Start, problem: Problem, run: Run, rival: Run | None) -> tuple[dict[str, Image], RunFolder]:
+    """A new folder for a run at its start; and the pictures there."""
+    with one_thread(start.config.deterministic):
+        put_values(problem, run.adam)
+        before = render_views(problem, start.config)
+    files = {**_first_files(problem, before), **_checkpoints(run, rival)}
+    return before, create_run_folder(start.output, start.config, start.source, start.base, files)
+
+
+def _went_on(folder: RunFolder, config: Config, problem: Problem, run: Run, rival: Run | None) -> dict[str, Image]:
+    """Bring a run to where the folder's checkpoint was; returns the pictures of its start."""
+    require_pictures(folder.path, "target", problem.scene, problem.views, {v.name: v.target for v in problem.views})
+    before = {
+        view.name: read_image(regular_file(folder.path / f"images/start-{view.name}.exr")) for view in problem.views
+    }
+    require_pictures(folder.path, "start", problem.scene, problem.views, before)
+    levels = {v.key: v.levels for v in problem.variables if v.levels is not None}
+    for each, name in ((run, CHECKPOINT), (rival, RIVAL_CHECKPOINT)):
+        if each is not None:
+            history, learned = checkpoint.restore(folder.path / name, each.adam, levels)
+            each.history.extend(history)
+            each.passes.restore_learned(learned)
+    # All iterations but no report: the disk was full at the end. Then only the end is done again.
+    if len(run.history) >= config.iterations and (folder.path / "report.html").exists():
+        raise PathreplayError(
+            f"Run {folder.path} has all its {len(run.history)} iterations; raise 'iterations' in its config"
+        )
+    return before
+
+
+def _iterate(
+    config: Config, folder: RunFolder, problem: Problem, run: Run, rival: Run | None, stop: Stop, bar: Progress
+) -> None:
+    """Do the iterations that are left, with a checkpoint now and then and one at the end."""
+    bar.start(len(run.history), config.iterations)
+    saved = len(run.history)
+
+    def after(entry: checkpoint.Entry) -> None:
+        nonlocal saved
+        bar.advance(entry.loss)
+        done = entry.iteration + 1
+        folder.require_in_place(f"iterations {saved + 1} to {done} are")
+        if done % config.checkpoint_every == 0:
             folder.write(_checkpoints(run, rival))
-            return _finish(start, folder, problem, run, before, result, theirs, variant)
+            saved = done
+
+    with one_thread(config.deterministic):
+        iterate(problem, config, run, rival, stop, after)
+    if saved < len(run.history):
+        folder.write(_checkpoints(run, rival))
 
 
 @dataclass(frozen=True)
@@ -144,7 +197,7 @@ class _Start:
         if self.folder is None:
             return None
         pictures = sorted((self.folder.path / "images").glob("target-*.exr"))
-        return {path.stem.removeprefix("target-"): read_image(path) for path in pictures}
+        return {path.stem.removeprefix("target-"): read_image(regular_file(path)) for path in pictures}
 
 
 def _fresh(config: str | Path | Config | None, output: str | Path | None) -> _Start:
@@ -153,15 +206,15 @@ def _fresh(config: str | Path | Config | None, output: str | Path | None) -> _St
     source = None if isinstance(config, Config) else Path(config)
     job = config if isinstance(config, Config) else load_config(Path(config))
     base = Path.cwd() if source is None else source.parent
-    wanted = output or job.output
-    return _Start(job, source, base, Path(wanted) if wanted else default_output(source), None)
+    wanted = job.output if output is None else output
+    return _Start(job, source, base, default_output(source) if wanted is None else require_output(wanted), None)
 
 
-def _resumed(path: Path, config: object, output: object) -> _Start:
+def _resumed(resume: str | Path, config: object, output: object) -> _Start:
     if config is not None or output is not None:
         raise PathreplayError("--resume takes config and output from the run folder; leave CONFIG and --output out")
-    folder, job, source = open_run_folder(path)
-    return _Start(job, None if source is None else Path(source), folder.origin, path, folder)
+    folder, job, source = open_run_folder(Path(resume))
+    return _Start(job, None if source is None else Path(source), folder.origin, folder.path, folder)
 
 
 def _first_files(problem: Problem, before: dict[str, Image]) -> dict[str, bytes]:
@@ -170,8 +223,12 @@ def _first_files(problem: Problem, before: dict[str, Image]) -> dict[str, bytes]
 
 
 def _checkpoints(run: Run, rival: Run | None) -> dict[str, bytes]:
-    files = {CHECKPOINT: checkpoint.save(run.adam, run.history)}
-    return files if rival is None else {**files, RIVAL_CHECKPOINT: checkpoint.save(rival.adam, rival.history)}
+    runs = {CHECKPOINT: run} if rival is None else {CHECKPOINT: run, RIVAL_CHECKPOINT: rival}
+    return {name: checkpoint.save(each.adam, each.history, each.passes.learned()) for name, each in runs.items()}
+
+
+def _resume_command(folder: Path) -> str:
+    return f"pathreplay optimize --resume {shlex.quote(str(folder))}"
 
 
 def _finish(
@@ -183,6 +240,7 @@ def _finish(
     result: dict[str, Image],
     rival: Rival | None,
     variant: str,
+    stopped_by: str | None,
 ) -> RunResult:
     config = start.config
     adam, history, theirs = run.adam, run.history, rival.values if rival else {}
@@ -228,6 +286,7 @@ def _finish(
         report=folder.path / "report.html",
         iterations=len(history),
         stopped=len(history) < config.iterations,
+        stopped_by=stopped_by if len(history) < config.iterations else None,
         history=tuple(history),
         parameters=values,
         errors={item.key: error for item in recovered if (error := item.error()) is not None},

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from types import FrameType
 from typing import Any
 
 import drjit as dr
@@ -23,6 +19,7 @@ from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.passes import Passes
 from pathreplay.inverse.problem import ITERATION, JUDGEMENT, PICTURE, Problem, seeds
+from pathreplay.inverse.stopping import Stop
 from pathreplay.parameters import get_array, to_value
 
 # Adam's second moment remembers about 1 / (1 - beta_2) steps. Its usual 0.999 outlasts a whole run of a few hundred.
@@ -44,42 +41,12 @@ class Run:
         return sum(entry.seconds for entry in self.history)
 
 
-@dataclass(frozen=True)
-class Stop:
-    """Tells the loop to end after the iteration that is under way (Ctrl-C)."""
-
-    event: threading.Event
-
-    def wanted(self) -> bool:
-        return self.event.is_set()
-
-
-@contextmanager
-def ctrl_c_stops() -> Iterator[Stop]:
-    """Within this block the first Ctrl-C asks for a stop, the second one interrupts at once."""
-    stop = Stop(threading.Event())
-    if threading.current_thread() is not threading.main_thread():
-        yield stop  # signals belong to the main thread
-        return
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        if stop.wanted():
-            raise KeyboardInterrupt
-        stop.event.set()
-
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def new_run(problem: Problem, integrator: mi.Integrator) -> Run:
+def new_run(problem: Problem, integrator: mi.Integrator, record: bool = True) -> Run:
     """A run at the problem's start values."""
     adam = Adam(lr=1.0, beta_1=BETA_1, beta_2=BETA_2)
     for variable in problem.variables:
         adam[variable.key] = to_value(variable.like, variable.start)
-    return Run(Passes(problem, integrator), adam, [])
+    return Run(Passes(problem, integrator, record), adam, [])
 
 
 def put_values(problem: Problem, adam: Adam) -> None:

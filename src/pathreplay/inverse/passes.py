@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.errors import PathreplayError
 from pathreplay.inverse.losses import QUADRATIC, Loss
 from pathreplay.inverse.problem import Problem
 from pathreplay.path_integrator import plain_errors
@@ -27,14 +28,16 @@ RECORDABLE = frozenset({"PathReplayIntegrator", "PRBIntegrator", "BasicPRBIntegr
 class Passes:
     """The mean over the views of the loss, by one integrator, and its gradient."""
 
-    def __init__(self, problem: Problem, integrator: mi.Integrator) -> None:
+    def __init__(self, problem: Problem, integrator: mi.Integrator, record: bool = True) -> None:
         self.problem, self.integrator = problem, integrator
         self.targets = [mi.TensorXf(view.target) for view in problem.views]
         # What an integrator learns of media from pass to pass is read and written between kernels.
         media = any(isinstance(node, mi.Medium) for node in nodes_of(problem.scene))
         # Spectral variants look up the eye's response in tables of Mitsuba's library: no input of ours, as a recorded
-        # function must have them, leads there.
-        self.freezes = type(integrator).__name__ in RECORDABLE and not media and not mi.is_spectral
+        # function must have them, leads there. Recorded kernels are cut otherwise than traced ones, and round otherwise
+        # in the last bit.
+        recordable = type(integrator).__name__ in RECORDABLE and not media and not mi.is_spectral
+        self.freezes = record and recordable
         self.swept: tuple[bool, ...] = ()  # views whose pixels can be swept; empty before the first call
         self.frozen: dict[Any, Callable[..., Any]] = {}  # recorded functions, by the shapes of the parameters
         self.tables = scene_tables(nodes_of(problem.scene))
@@ -61,6 +64,21 @@ class Passes:
             paths = sum(target.shape[0] * target.shape[1] for target in self.targets) * spp
             self.integrator.tell_lost(lost, paths)
         return float(value[0]) if dr.width(value) else float("nan")
+
+    def learned(self) -> dict[str, Any]:
+        """What the integrator has learned from its passes, as arrays by name, for a checkpoint."""
+        return self.integrator.learned() if hasattr(self.integrator, "learned") else {}
+
+    def restore_learned(self, learned: dict[str, Any]) -> None:
+        """Go on with what `learned` told. Raises PathreplayError if it is none of this integrator's."""
+        if not learned:
+            return
+        if not hasattr(self.integrator, "restore_learned"):
+            raise PathreplayError(
+                "The checkpoint holds what another integrator has learned of media; set the config's 'integrator' "
+                "back, or start a new run"
+            )
+        self.integrator.restore_learned(self.problem.scene, learned)
 
     def _sweeps(self, sensor: int, spp: int) -> bool:
         if self.problem.loss not in QUADRATIC or not hasattr(self.integrator, "sweeps_pixels"):

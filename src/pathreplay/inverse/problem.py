@@ -20,6 +20,7 @@ from pathreplay.inverse.grids import Levels, comparable, make_levels, resampled
 from pathreplay.inverse.images import Image, find_image, read_image, with_channels
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
+from pathreplay.inverse.threads import one_thread
 from pathreplay.inverse.values import Array, make_value, require_finite_array
 from pathreplay.scenes import load_scene, load_scene_for, one_line
 
@@ -110,7 +111,8 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
         target_scene = _target_scene(config, base)
         truth = _truth(target_scene, params, keys)
         if targets is None:
-            targets = _rendered_targets(config, target_scene, sensors)
+            with one_thread(config.deterministic):
+                targets = _rendered_targets(config, target_scene, sensors)
         # Dr.Jit traces calls through every instance alive: the target scene would be in all our kernels.
         del target_scene
         gc.collect()

@@ -2,10 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from types import TracebackType
+from typing import IO, Any, cast
 
 import rich.progress
 from rich.console import Console
+
+
+class _Forgiving:
+    """Stderr, or silence once it is gone: a terminal that closes may not end the writing of what was found."""
+
+    def __init__(self) -> None:
+        self._stream = sys.stderr
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            return self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 class Progress:
@@ -20,7 +42,7 @@ class Progress:
             rich.progress.TimeElapsedColumn(),
             rich.progress.TextColumn("left"),
             rich.progress.TimeRemainingColumn(),
-            console=Console(stderr=True),
+            console=Console(file=cast(IO[str], _Forgiving())),
             disable=not shown,
         )
         self._task = self._bar.add_task("optimize", total=None, loss="")

@@ -8,92 +8,144 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import BaseModel, ConfigDict, ValidationError
+
 from pathreplay.errors import PathreplayError
+from pathreplay.interrupts import undisturbed
 from pathreplay.inverse.config import Config, load_config
+from pathreplay.inverse.folder_lock import FolderLock
 
 PART = ".part"
 CHECKPOINT = "checkpoint.safetensors"
 RIVAL_CHECKPOINT = "rival/checkpoint.safetensors"
 
 
-@dataclass(frozen=True)
 class RunFolder:
-    """A folder that belongs to one run. ``origin`` is where relative paths of its config start."""
+    """A folder that belongs to one run, and is locked until `close`. ``origin`` is where paths of its config start."""
 
-    path: Path
-    origin: Path
+    def __init__(self, path: Path, origin: Path) -> None:
+        self.path, self.origin = path, origin
+        self.lock = FolderLock(path)
+        self.identity = _identity(path)
+
+    def close(self) -> None:
+        """Unlock it."""
+        self.lock.close()
+
+    def require_in_place(self, lost: str) -> None:
+        """Raise PathreplayError if the folder is no longer where it was; ``lost`` names what was not saved."""
+        if _identity(self.path) != self.identity:
+            raise PathreplayError(
+                f"Run folder {self.path} was removed or renamed during the run, which ends here: {lost} lost; if it "
+                "was renamed, go on with: pathreplay optimize --resume NEW_NAME, else start the job again"
+            )
 
     def write(self, files: Mapping[str, bytes]) -> None:
         """Write all files or none: each goes to a temporary name first, and all are renamed once all are on the disk.
 
+        Links are not followed: a link in the place of a file is replaced.
+
         Raises:
-            PathreplayError: the disk is full or the folder cannot be written. Temporary files are removed; a folder
-                that holds no checkpoint yet is removed as a whole.
+            PathreplayError: the disk is full, the folder is gone or cannot be written, or a folder in it is a link that
+                leads elsewhere. Temporary files are removed, and so are folders that were made for them.
         """
         parts: list[tuple[Path, Path]] = []
+        made: list[Path] = []
+        self.require_in_place("what was not yet written is")
         try:
             for name, data in files.items():
                 final = self.path / name
-                final.parent.mkdir(exist_ok=True)
+                self._make_parent(final.parent, made)
                 part = final.with_name(final.name + PART)
                 parts.append((part, final))
                 _write_through(part, data)
-            for part, final in parts:
-                os.replace(part, final)
+            with undisturbed():  # all or none: a second Ctrl-C waits
+                for part, final in parts:
+                    os.replace(part, final)
         except OSError as error:
-            _remove(parts)
+            _remove(parts, made)
             raise PathreplayError(self._failure(error)) from error
         except BaseException:  # a second Ctrl-C
-            _remove(parts)
+            _remove(parts, made)
             raise
+
+    def _make_parent(self, folder: Path, made: list[Path]) -> None:
+        if folder == self.path:
+            return
+        if folder.is_symlink():
+            raise PathreplayError(
+                f"{folder} is a link that may lead out of the run folder; replace it by the folder that it leads to"
+            )
+        if not folder.exists():
+            folder.mkdir()
+            made.append(folder)
 
     def _failure(self, error: OSError) -> str:
         if (self.path / CHECKPOINT).exists():
             rescue = f"then go on with: pathreplay optimize --resume {self.path}"
-            for folder in self.path.iterdir():
-                if folder.is_dir():
-                    with contextlib.suppress(OSError):
-                        folder.rmdir()  # succeeds on an empty one only: what this failed write has made
         else:
-            shutil.rmtree(self.path, ignore_errors=True)
             rescue = "or give --output elsewhere, then start again (this folder was removed)"
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             return f"No space left on the disk for run folder {self.path}: free some space, {rescue}"
         return f"Run folder {self.path} cannot be written ({error.strerror}): mend that, {rescue}"
 
 
-def create_run_folder(output: Path, config: Config, source: Path | None, base: Path) -> RunFolder:
-    """Make ``output``, or ``output-2``, ``-3``, … where that exists, and put the job into it.
+def create_run_folder(
+    output: Path, config: Config, source: Path | None, base: Path, files: Mapping[str, bytes]
+) -> RunFolder:
+    """Make ``output``, or ``output-2``, ``-3``, … where that exists, and put the job and its first files into it.
 
-    The config is copied as it was written (``config.toml``), or as JSON where it came from Python.
+    The config is copied as it was written (``config.toml``), or as JSON where it came from Python. What fails leaves no
+    folder behind. Raises PathreplayError where the folder cannot be made or written.
     """
-    folder = _make_new(output)
-    run = RunFolder(folder, base.resolve())
     if source is not None and source.suffix != ".json":
         copy = {"config.toml": source.read_bytes()}
     else:
         copy = {"config.json": config.model_dump_json(indent=2, exclude_unset=True).encode()}
-    origin = {"base": str(run.origin), "config": None if source is None else str(source)}
-    run.write({**copy, "run.json": json.dumps(origin, indent=2).encode()})
+    origin = {"base": str(base.resolve()), "config": None if source is None else str(source)}
+    with undisturbed():
+        path = _make_new(output)
+        try:
+            run = RunFolder(path, base.resolve())
+            run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
+        except BaseException:
+            shutil.rmtree(path, ignore_errors=True)
+            raise
     return run
 
 
+class _Origin(BaseModel):
+    """run.json: where relative paths of the config start, and the config that the run was started with."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    base: str
+    config: str | None
+
+
 def open_run_folder(path: Path) -> tuple[RunFolder, Config, str | None]:
-    """An existing run folder, its job, and the config path that it was started with.
+    """An existing run folder, locked; its job, and the config path that it was started with.
 
     Raises:
-        PathreplayError: it is no run folder, or holds no checkpoint to go on from.
+        PathreplayError: it is no run folder, holds no checkpoint to go on from, is damaged, or is in use.
     """
+    require_writable_name(path, "--resume")
     copy = next((path / name for name in ("config.toml", "config.json") if (path / name).is_file()), None)
     if copy is None or not (path / "run.json").is_file():
         raise PathreplayError(f"{path} is no run folder (no config, no run.json); give a folder that optimize has made")
     if not (path / CHECKPOINT).is_file():
         raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start the job from its config")
-    origin = json.loads((path / "run.json").read_text())
-    return RunFolder(path, Path(origin["base"])), load_config(copy), origin["config"]
+    try:
+        origin = _Origin.model_validate_json((path / "run.json").read_bytes())
+        if "\0" in origin.base + (origin.config or ""):
+            raise ValueError("a path with a null character")
+    except (OSError, ValueError) as error:
+        what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise PathreplayError(f"{path / 'run.json'} cannot be used ({what}); start the job from its config") from None
+    config = load_config(copy)
+    return RunFolder(path, Path(origin.base)), config, origin.config
 
 
 def default_output(source: Path | None) -> Path:
@@ -101,6 +153,30 @@ def default_output(source: Path | None) -> Path:
     if source is None:
         return Path("runs/optimize")
     return Path("runs") / (source.resolve().parent.name if source.stem == "config" else source.stem)
+
+
+def require_output(output: str | Path) -> Path:
+    """``output`` as a path that a new folder can have; raises PathreplayError if it cannot, and says why."""
+    path = Path(output)
+    require_writable_name(path, "--output")
+    if not str(output) or path.name in ("", ".."):
+        raise PathreplayError(f"Run folder '{output}' has no name of its own; give --output a new folder, as runs/mine")
+    if os.path.lexists(path) and not path.is_dir():
+        raise PathreplayError(f"Run folder {path} cannot be made: there is a file of that name; give another --output")
+    return path
+
+
+def require_writable_name(path: Path, option: str) -> None:
+    """Raise PathreplayError if the path cannot be written into reports, or is none at all."""
+    try:
+        str(path).encode()
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            os.lstat(path)
+    except UnicodeEncodeError:
+        raise PathreplayError(f"Run folder {str(path)!a} is not UTF-8; give another {option}") from None
+    except (OSError, ValueError) as error:  # too long; a null character
+        name = ascii(str(path))
+        raise PathreplayError(f"Run folder {name} cannot be used ({error}); give another {option}") from None
 
 
 def _make_new(output: Path) -> Path:
@@ -120,15 +196,29 @@ def _make_new(output: Path) -> Path:
         ) from error
 
 
-def _remove(parts: list[tuple[Path, Path]]) -> None:
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What tells a folder from another one of the same name; None if there is none."""
+    try:
+        about = os.stat(path)
+    except OSError:
+        return None
+    return about.st_dev, about.st_ino
+
+
+def _remove(parts: list[tuple[Path, Path]], made: list[Path]) -> None:
     for part, _ in parts:
         with contextlib.suppress(OSError):
             part.unlink()
+    for folder in made:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def _write_through(path: Path, data: bytes) -> None:
-    # fsync: some file systems report a full disk only when the data are written out.
-    with open(path, "wb") as file:
+    # What a killed run has left is removed, and a link by that name is not followed.
+    with contextlib.suppress(FileNotFoundError):
+        path.unlink()
+    with open(path, "xb") as file:
         file.write(data)
         file.flush()
-        os.fsync(file.fileno())
+        os.fsync(file.fileno())  # some file systems report a full disk only when the data are written out

@@ -1,0 +1,102 @@
+"""Signals that ask a command to end: Ctrl-C, a scheduler's SIGTERM, the SIGHUP of a terminal that closes."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+Handler = Callable[[int, FrameType | None], Any]
+
+ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+# Two signals that are closer than this are one wish to end: the second may not disturb what the first one set going.
+ONE_WISH_S = 1.0
+
+
+_raised_at: list[float] = []  # when a signal last raised something
+
+
+def raise_once(error: BaseException) -> None:
+    """Raise ``error``, unless a signal has raised one a moment ago: that one is on its way out."""
+    now = time.monotonic()
+    if _raised_at and now - _raised_at[-1] < ONE_WISH_S:
+        return
+    _raised_at[:] = [now]
+    raise error
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal ended the command. ``number`` is the signal's."""
+
+    def __init__(self, number: int, message: str = "") -> None:
+        super().__init__(message or f"ended by {name_of(number)}")
+        self.number = number
+
+
+def name_of(number: int) -> str:
+    """The signal as users know it."""
+    return "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+
+
+@contextmanager
+def handled(handle: Handler, keep: Callable[[], bool] = lambda: False) -> Iterator[None]:
+    """Within this block ``handle`` gets the signals of `ENDING`; in threads other than the main one nothing happens.
+
+    SIGTERM and SIGHUP stay ignored where the parent process ignores them (nohup). Handlers come back at the end,
+    unless ``keep`` says that it is the end of the process.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals belong to the main thread
+        return
+    before = {number: signal.getsignal(number) for number in ENDING}
+    ours = [n for n, old in before.items() if old is not None and (n == signal.SIGINT or old != signal.SIG_IGN)]
+    try:
+        for number in ours:
+            signal.signal(number, handle)
+        yield
+    finally:
+        if not keep():
+            for number in ours:
+                signal.signal(number, before[number])
+
+
+@contextmanager
+def raised() -> Iterator[None]:
+    """Around a command: each of the signals raises `Interrupted`, also where a library made another error of it.
+
+    Once that has happened the signals keep their handlers: the process is about to end, in peace.
+    """
+    numbers: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        numbers.append(number)
+        raise_once(Interrupted(number))
+
+    with handled(handle, keep=lambda: bool(numbers)):
+        try:
+            yield
+        except (RuntimeError, ImportError, SystemError):
+            if numbers:  # Dr.Jit turns what is raised while it traces into errors of its own
+                raise Interrupted(numbers[0]) from None
+            raise
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Within this short block signals wait for its end; they come then, each as often as it was sent."""
+    late: list[int] = []
+    with handled(lambda number, frame: late.append(number)):
+        yield
+    for number in late:
+        signal.raise_signal(number)
+
+
+def ignored() -> None:
+    """From now on the signals do nothing: the process is at its end."""
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)

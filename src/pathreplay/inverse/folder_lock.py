@@ -1,0 +1,75 @@
+"""The lock of a run folder: one process at a time writes into it; the system lets go of it when that process ends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import socket
+import stat
+from pathlib import Path
+
+from pathreplay.errors import PathreplayError
+
+try:
+    import fcntl
+except ImportError:  # Windows: no lock; see docs/optimize.md
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = "lock"
+
+
+class FolderLock:
+    """Holds the lock file of ``folder`` from construction to `close`.
+
+    The file stays when nobody holds it; what counts is the lock on it (flock), which the end of the process, however
+    violent, takes away. Where the file system or the operating system has no such locks, nothing is locked.
+
+    Raises:
+        PathreplayError: another process (or thread) holds it; or the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        path = folder / LOCK
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+        try:
+            self.file = os.open(path, flags, 0o644)
+        except OSError as error:
+            raise PathreplayError(
+                f"Lock file {path} cannot be opened ({error.strerror}); make the folder writable, or remove that file"
+            ) from None
+        try:
+            self._take(folder, path)
+        except BaseException:
+            self.close()
+            raise
+
+    def _take(self, folder: Path, path: Path) -> None:
+        about = os.fstat(self.file)
+        if not stat.S_ISREG(about.st_mode) or about.st_nlink != 1:
+            raise PathreplayError(f"Lock file {path} is no file of its own; remove it")
+        if fcntl is None:
+            return
+        try:
+            fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise PathreplayError(
+                f"Run folder {folder} is in use by {self._holder()}; wait for its end, or stop it with Ctrl-C or "
+                "SIGTERM, then resume"
+            ) from None
+        except OSError:
+            return  # a file system without locks
+        with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
+            os.ftruncate(self.file, 0)
+            os.pwrite(self.file, f"{os.getpid()} {socket.gethostname()}\n".encode(), 0)
+
+    def _holder(self) -> str:
+        text = os.pread(self.file, 200, 0).decode("ascii", "replace")
+        match = re.fullmatch(r"(\d+) ([\w.-]+)\s*", text)
+        return f"process {match[1]} on {match[2]}" if match else "another process"
+
+    def close(self) -> None:
+        """Let go; a second call does nothing."""
+        if self.file >= 0:
+            os.close(self.file)
+            self.file = -1

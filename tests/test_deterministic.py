@@ -1,0 +1,88 @@
+"""deterministic = true: runs that were killed and resumed are those that nobody disturbed, bit for bit."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import pytest
+import safetensors.numpy
+
+from pathreplay.inverse import optimize
+from small_job import ended, kill_at_checkpoint, start, write_job
+from test_inverse_run import TEXTURE
+
+PATHREPLAY = {"integrator": {"type": "pathreplay", "max_depth": 3}}
+CLOUD = {
+    "scene": "cloud",
+    "scene_parameters": {"resolution": 12, "grid": 6, "views": 1},
+    "integrator": {"type": "pathreplay", "max_depth": 4},
+    "parameters": [{"key": "*.sigma_t.data", "initial": 1.0, "lower": 0.0}],
+    "target": {"values": {"*.sigma_t.data": 2.0}, "spp": 8, "integrator": {"type": "volpath", "max_depth": 4}},
+}
+REFINED = {"parameters": [{"key": TEXTURE, "initial": 0.5, "lower": 0.0, "resolutions": [2, 8], "refine_at": [3]}]}
+JOBS: dict[str, dict[str, Any]] = {
+    "sweep": PATHREPLAY,
+    "prb": {},
+    "coarse to fine": {**PATHREPLAY, **REFINED},
+    "medium": CLOUD,
+}
+SLOW = pytest.mark.slow
+
+
+def outcome(folder: Path) -> tuple[dict[str, bytes], list[Any]]:
+    """All bits of the result, and the history without its seconds."""
+    values = safetensors.numpy.load_file(folder / "parameters.safetensors")
+    lines = [json.loads(line) for line in (folder / "history.jsonl").read_text().splitlines()]
+    return {key: value.tobytes() for key, value in values.items()}, [{**line, "seconds": 0} for line in lines]
+
+
+def adam(folder: Path) -> dict[str, bytes]:
+    state = safetensors.numpy.load_file(folder / "checkpoint.safetensors")
+    return {key: value.tobytes() for key, value in state.items()}
+
+
+@pytest.mark.parametrize(
+    ("job", "number"),
+    [
+        ("sweep", signal.SIGKILL),
+        ("medium", signal.SIGTERM),
+        *(
+            pytest.param(job, number, marks=SLOW)
+            for job in JOBS
+            for number in (signal.SIGKILL, signal.SIGTERM)
+            if (job, number) not in {("sweep", signal.SIGKILL), ("medium", signal.SIGTERM)}
+        ),
+    ],
+)
+def test_killed_and_resumed_is_undisturbed_to_the_bit(job: str, number: signal.Signals, tmp_path: Path) -> None:
+    config = {**JOBS[job], "iterations": 8, "checkpoint_every": 1, "deterministic": True}
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    for folder in (whole, cut):
+        folder.mkdir()
+        write_job(folder, **config)
+    status, _, err = ended(start(whole, "job.json", "--quiet"))
+    assert status == 0, err
+    process = start(cut, "job.json", "--quiet")
+    kill_at_checkpoint(cut, process, 2, number)
+    ended(process)
+    assert not (cut / "run/report.html").exists() or number == signal.SIGTERM
+    status, out, err = ended(start(cut, "--resume", "run", "--quiet"))
+    assert status == 0, err
+    assert "in 8 iterations" in out
+    assert outcome(cut / "run") == outcome(whole / "run")
+    assert adam(cut / "run") == adam(whole / "run")
+
+
+def test_threads_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = dr.thread_count()
+    dr.set_thread_count(2)
+    try:
+        optimize(write_job(tmp_path, iterations=1, deterministic=True), progress=False)
+        assert dr.thread_count() == 2
+    finally:
+        dr.set_thread_count(before)

@@ -1,0 +1,125 @@
+"""Signals to a run in a process of its own: the first stops it with everything written, a second Ctrl-C aborts it."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from pathreplay import interrupts
+from pathreplay.inverse import optimize
+from pathreplay.inverse.stopping import stopping
+from small_job import ended, kill_at_checkpoint, start, wait_for, write_job
+
+ENDLESS = {"iterations": 100_000, "checkpoint_every": 1}
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+def test_first_signal_stops_with_everything_written(number: signal.Signals, tmp_path: Path) -> None:
+    process = start(tmp_path, str(write_job(tmp_path, **ENDLESS)), "--quiet")
+    kill_at_checkpoint(tmp_path, process, 2, number)
+    status, out, err = ended(process)
+    name = "Ctrl-C" if number == signal.SIGINT else number.name
+    assert (status, err) == (0, "")
+    assert f"stopped early by {name}; go on with: pathreplay optimize --resume run" in out
+    assert (tmp_path / "run/report.html").is_file()
+
+
+def test_two_ctrl_c_at_once_abort_in_one_line(tmp_path: Path) -> None:
+    process = start(tmp_path, str(write_job(tmp_path, **ENDLESS)), "--quiet")
+    kill_at_checkpoint(tmp_path, process, 2, signal.SIGINT)
+    for _ in range(2):
+        time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+    status, out, err = ended(process)
+    assert (status, out) == (130, "")
+    assert err == "pathreplay: aborted; go on from the last checkpoint with: pathreplay optimize --resume run\n"
+    assert not list((tmp_path / "run").rglob("*.part"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_before_the_run_folder_a_signal_ends_in_one_line(number: signal.Signals, tmp_path: Path) -> None:
+    # Preparation lasts: so many samples for the targets.
+    target = {"scene": "room.xml", "spp": 400_000, "integrator": {"type": "path", "max_depth": 3}}
+    process = start(tmp_path, str(write_job(tmp_path, target=target)), "--quiet")
+    wait_for(Path(f"/proc/{process.pid}/task"), process)
+    while "/llvm_ad_rgb." not in Path(f"/proc/{process.pid}/maps").read_text():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(number)
+    time.sleep(0.02)
+    process.send_signal(number)
+    status, out, err = ended(process)
+    assert (status, out) == (128 + number, "")
+    assert err == f"pathreplay: ended by {interrupts.name_of(number)}\n"
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_closed_terminal_does_not_stop_the_writing(tmp_path: Path) -> None:
+    write_job(tmp_path, **ENDLESS)
+    pid, terminal = pty.fork()
+    if pid == 0:  # with a progress bar, on a terminal of its own
+        os.chdir(tmp_path)
+        os.execvp("python", ["python", "-m", "pathreplay.cli", "optimize", "job.json"])
+    path, end = tmp_path / "run/history.jsonl", time.monotonic() + 100
+    os.set_blocking(terminal, False)
+    while not (tmp_path / "run/checkpoint.safetensors").exists() and time.monotonic() < end:
+        time.sleep(0.01)
+        try:
+            os.read(terminal, 100_000)
+        except BlockingIOError:
+            pass
+    os.close(terminal)  # the kernel sends SIGHUP
+    _, status = os.waitpid(pid, 0)
+    assert os.WIFEXITED(status)
+    assert path.is_file() and (tmp_path / "run/report.html").is_file()
+
+
+def test_handlers_come_back_and_scheduler_signals_may_come_twice() -> None:
+    before = {number: signal.getsignal(number) for number in interrupts.ENDING}
+    said: list[str] = []
+    with stopping(said.append, "out") as stop:
+        assert not stop.wanted()
+        for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGHUP):
+            signal.raise_signal(number)
+        assert stop.by() == "SIGTERM" and len(said) == 1
+        with pytest.raises(KeyboardInterrupt, match="out"):
+            signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)  # at once after the other: one wish
+    assert before == {number: signal.getsignal(number) for number in interrupts.ENDING}
+
+
+def test_what_is_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    try:
+        with stopping(lambda text: None, "") as stop:
+            signal.raise_signal(signal.SIGHUP)
+        assert not stop.wanted()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_signals_wait_for_the_end_of_a_write() -> None:
+    seen: list[int] = []
+    with interrupts.handled(lambda number, frame: seen.append(number)):
+        with interrupts.undisturbed():
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
+            assert seen == []
+        assert seen == [signal.SIGINT, signal.SIGTERM]
+
+
+def test_other_threads_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import threading
+
+    monkeypatch.chdir(tmp_path)
+    config = write_job(tmp_path, iterations=1)
+    results = []
+    thread = threading.Thread(target=lambda: results.append(optimize(config, progress=False)))
+    thread.start()
+    thread.join()
+    assert results[0].iterations == 1
