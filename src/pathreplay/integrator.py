@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .edges import edges_note, keys_that_move_edges
 from .errors import PathreplayError
 from .gradient.adjoint import LostPaths
 from .gradient.baseline import FIRST_BRANCHING, Baseline
@@ -27,6 +28,8 @@ DRIVERS = ("auto", "sweep", "replay")
 ATTACH = ("delta", "all", "none")
 VOLUME_GRADIENTS = ("score", "listing")
 BRANCH = ("auto", True, False)
+EDGES = "edges"
+"""In `told`: that edges move has been said."""
 
 
 def _make_class() -> type:
@@ -97,7 +100,7 @@ def _make_class() -> type:
             if mode == dr.ADMode.Forward:
                 tangent, valid, moves = forward(walk, sampler, ray, active, lost)
                 if moves:
-                    self._tell_edges(walk.traits)
+                    self._tell_edges(walk)
                     self.lost.append((lost, dr.width(ray)))
                 return tangent, valid, [], None
             driver = self.driver
@@ -114,7 +117,7 @@ def _make_class() -> type:
             else:
                 moves = replay(replace(walk, baseline=None), sampler, ray, δL, active, lost, self.recovery)
             if moves:
-                self._tell_edges(walk.traits)
+                self._tell_edges(walk)
             if moves or walk.media is not None:
                 self.lost.append((lost, dr.width(ray)))
             return mi.Spectrum(0), mi.Bool(True), [], None
@@ -174,7 +177,7 @@ def _make_class() -> type:
                 self._check(walk)
                 moves, L = pixel_sweep(walk, sampler, pixel_camera(sensor, pixel), spp, PixelLoss(o, k), lost)
                 if moves:
-                    self._tell_edges(walk.traits)
+                    self._tell_edges(walk)
                     self.lost.append((lost, width * height * spp))
                 dr.eval(L)  # in one kernel with the gradients
                 image = mi.TensorXf(dr.ravel(L), (height, width, 3))
@@ -264,8 +267,15 @@ def _make_class() -> type:
                 names = ", ".join(traits.detached_names)
                 self._tell_once(f"attach = 'all' keeps the directions of {names} fixed")
 
-        def _tell_edges(self, traits: Traits) -> None:
-            if traits.lobes and traits.area_lights:
+        def _tell_edges(self, walk: Walk) -> None:
+            if EDGES in self.told:
+                return
+            seen_from = [] if self.sensor is None else keys_that_move_edges(mi.traverse(self.sensor))
+            moving = keys_that_move_edges(mi.traverse(walk.scene)) or seen_from
+            if moving:
+                self.told.add(EDGES)
+                self._tell_once(edges_note(moving))
+            elif walk.traits.lobes and walk.traits.area_lights:
                 self._tell_once(
                     "something moves in a scene with delta lobes and area lights: where the edge of a light or a "
                     "silhouette is seen through glass or mirrors, its motion is missing from the gradient"

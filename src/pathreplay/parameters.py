@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import fnmatch
 import math
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -50,6 +51,7 @@ def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> li
     """The keys that ``patterns`` name, in the order of the patterns, then of the scene; each key once.
 
     A pattern is an exact key or a shell-like glob (``*``, ``?``, ``[abc]``); globs match whole keys, dots included.
+    Names may hold brackets themselves: where a glob matches nothing, its brackets are taken as they are.
     ``params`` is what ``mi.traverse(scene)`` returns.
 
     Raises:
@@ -58,11 +60,21 @@ def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> li
     known = list(params.keys())
     found: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        matches = [pattern] if pattern in known else fnmatch.filter(known, pattern)
+        matches = [pattern] if pattern in known else _globbed(known, pattern)
         if not matches:
             raise PathreplayError(_no_match(known, pattern))
         found.update(dict.fromkeys(matches))
     return list(found)
+
+
+def _globbed(known: list[str], pattern: str) -> list[str]:
+    # '[[]' is how a glob says '['.
+    return fnmatch.filter(known, pattern) or fnmatch.filter(known, pattern.replace("[", "[[]"))
+
+
+def keep_only(params: Any, keys: Iterable[str]) -> None:
+    """Reduce ``mi.traverse(scene)`` to exactly these keys; Mitsuba's own ``keep`` takes them as regular expressions."""
+    params.keep([rf"{re.escape(key)}\Z" for key in keys])
 
 
 def _no_match(known: list[str], pattern: str) -> str:
@@ -107,6 +119,10 @@ def require_differentiable(params: Any, key: str, integrator: Any = None) -> Non
             f"Parameter '{key}' carries no derivative through this integrator: only 'pathreplay' differentiates "
             "cameras and the motion of lights; use it, with attach = 'delta' (its default) or 'all'"
         )
+    if _is_float(value) and is_empty(value):
+        raise PathreplayError(
+            f"Parameter '{key}' is empty: its {owner} has none of these; give the file some, or leave the key out"
+        )
     if isinstance(value, (bool, int, float)):
         why = f"its {owner} keeps it as a plain number ({value!r})"
     elif not _is_float(value):
@@ -114,6 +130,20 @@ def require_differentiable(params: Any, key: str, integrator: Any = None) -> Non
     else:
         why = f"Mitsuba marks this parameter of {owner} as not differentiable"
     raise PathreplayError(f"Parameter '{key}' carries no derivative: {why}; choose one that mi.traverse marks with ∂")
+
+
+def require_settable(params: Any, key: str) -> None:
+    """Return quietly if a parameter can be given a value: floating-point numbers, one or many.
+
+    Raises:
+        PathreplayError: the parameter holds integers, text or a matrix of plain numbers; names the way out, if any.
+    """
+    value = params[key]
+    if isinstance(value, float) or _is_float(value):
+        return
+    known = _WAY_OUT.get((owner_class(params, key), key.rsplit(".", 1)[-1]))
+    why = known or f"it is a {type(value).__name__}; set it in the scene file"
+    raise PathreplayError(f"Parameter '{key}' cannot be given a value: {why}")
 
 
 def resolve_differentiable(params: Any, patterns: str | Iterable[str], integrator: Any = None) -> list[str]:
@@ -133,11 +163,11 @@ def resolve_differentiable(params: Any, patterns: str | Iterable[str], integrato
 
 
 def carries_derivative(params: Any, key: str, integrator: Any = None) -> bool:
-    """Whether a derivative reaches a parameter: Dr.Jit floats that Mitsuba does not mark as excluded.
+    """Whether a derivative reaches a parameter: Dr.Jit floats, at least one, that Mitsuba does not mark as excluded.
 
     Of those that it does mark, ``pathreplay`` (unless ``attach`` is 'none') reaches cameras and the motion of lights.
     """
-    if not _is_float(params[key]):
+    if not _is_float(params[key]) or is_empty(params[key]):
         return False
     if not params.flags(key) & mi.ParamFlags.NonDifferentiable:
         return True
@@ -178,6 +208,11 @@ def _is_float(value: Any) -> bool:
     return bool(dr.is_array_v(inner) and dr.is_float_v(inner) and dr.is_diff_v(inner))
 
 
+def is_empty(value: Any) -> bool:
+    """Whether an array holds no entry, such as the texture coordinates of a mesh that has none."""
+    return 0 in dr.shape(value.matrix if is_transform(value) else value)
+
+
 def require_finite(params: Any) -> None:
     """Return quietly if no parameter of the scene holds a NaN or an infinity; one reduction per array.
 
@@ -191,7 +226,7 @@ def require_finite(params: Any) -> None:
         value = params[key]
         if isinstance(value, float) and math.isnan(value):
             raise PathreplayError(f"Parameter '{key}' is NaN; give it a number in the scene file")
-        if _is_float(value):
+        if _is_float(value) and not is_empty(value):
             counts[key] = dr.count(~dr.isfinite(_flat(value)))
     dr.eval(*counts.values())
     for key, count in counts.items():
@@ -280,6 +315,8 @@ def displaced(value: Any, direction: np.ndarray, t: Any) -> Any:
     if is_transform(value):
         return type(value)(value.matrix + to_value(value.matrix, direction) * t)
     step = to_value(value, direction)
+    if is_empty(value):
+        return step
     if dr.is_tensor_v(value):
         return type(value)(value.array + step.array * dr.array_t(value)(t), value.shape)
     return value + step * t

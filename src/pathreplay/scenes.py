@@ -16,6 +16,7 @@ from pathreplay import parameters as scene_parameters
 from pathreplay.bsdfs.substitute import load_dict_with, load_file_with
 from pathreplay.builtin_scenes import BUILTINS, SceneDict
 from pathreplay.errors import PathreplayError
+from pathreplay.scene_files import require_shallow
 
 
 def load_scene(spec: str | Path, base: Path | None = None, **parameters: Any) -> mi.Scene:
@@ -44,6 +45,7 @@ def load_scene_with(
         raise PathreplayError(_unknown(str(spec), path))
     arguments: dict[str, Any] = {name: str(value) for name, value in parameters.items()}
     try:
+        require_shallow(path)
         # Equal objects are not merged: that would lose the names by which parameters are addressed.
         scene, exchanged = load_file_with(path, plugins, **arguments)
     except (RuntimeError, ValueError, TypeError) as error:

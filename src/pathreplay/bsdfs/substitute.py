@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 
 from pathreplay.descriptions import require_values
+from pathreplay.scene_files import require_sound_files
 
 
 def load_file_with(
@@ -21,7 +22,8 @@ def load_file_with(
     keys stay what they were (with `optimize=False`; Mitsuba's merging of equal objects renames things).
 
     Returns the scene (or object) and one line per exchanged plugin, its id and where it stands in the file.
-    Raises RuntimeError (Mitsuba's) for a file that cannot be read or holds a property unknown to the new plugin.
+    Raises RuntimeError (Mitsuba's) for a file that cannot be read or holds a property unknown to the new plugin, and
+    PathreplayError for a file that would end the process: see `require_sound_files`.
     """
     path = Path(path)
     config = _config(optimize)
@@ -66,5 +68,6 @@ def _instantiate(config: Any, state: Any, plugins: Mapping[str, str]) -> tuple[A
         if new is not None:
             exchanged.append(f"{node.props.id() or 'unnamed'} ({mi.parser.file_location(state, node)})")
             node.props.set_plugin_name(new)
+    require_sound_files(state)
     mi.parser.transform_all(config, state)
     return mi.parser.instantiate(config, state), exchanged

@@ -66,6 +66,21 @@ def with_channels(image: Image, channels: int) -> Image | None:
     return None
 
 
+def over_black(image: Image, path: Path) -> Image:
+    """What is seen of an image with alpha over black, which is what renderers show where nothing is; alpha stays.
+
+    EXR files hold their colours like that already; others hold them as if they were opaque.
+    """
+    if image.shape[2] not in (2, 4) or path.suffix.lower() == ".exr":
+        return image
+    return np.concatenate([image[:, :, :-1] * image[:, :, -1:], image[:, :, -1:]], axis=2)
+
+
+def transparent_share(image: Image) -> float:
+    """The share of pixels through which a background would be seen; 0 without alpha."""
+    return float((image[:, :, -1] < 1).mean()) if image.shape[2] in (2, 4) else 0.0
+
+
 # Rec. 709 luminance of linear RGB.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 

@@ -17,6 +17,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.interrupts import undisturbed
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.config import Config, load_config
+from pathreplay.inverse.file_names import file_names
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes, read_image
 from pathreplay.inverse.loop import Run, iterate, new_run, put_values, render_views, scene_values
 from pathreplay.inverse.pose import Pose, PoseError
@@ -244,8 +245,8 @@ def _finish(
 ) -> RunResult:
     config = start.config
     adam, history, theirs = run.adam, run.history, rival.values if rival else {}
-    # The variables (translations, rotation vectors) and what they make of the scene (transforms).
-    values = {key: get_array(value) for key, value in {**adam, **scene_values(problem, adam)}.items()}
+    # The variables (translations, rotation vectors), as people see them, and what poses make of the scene (transforms).
+    values = {key: get_array(value) for key, value in {**scene_values(problem, adam), **adam}.items()}
     views = tuple(
         ViewPictures(
             v.name, v.target, before[v.name], result[v.name], exposure_for(v.target),
@@ -255,8 +256,9 @@ def _finish(
     )  # fmt: skip
     poses = tuple(_recovered_pose(problem, pose, values) for pose in problem.poses)
     parts = {name for pose in problem.poses for name in pose.parts().values()}
+    files_of = file_names(v.key for v in problem.variables)
     recovered = tuple(
-        Recovered(v.key, v.start, values[v.key], v.truth, theirs.get(v.key))
+        Recovered(v.key, files_of[v.key], v.start, values[v.key], v.truth, theirs.get(v.key))
         for v in problem.variables
         if v.key not in parts
     )
@@ -275,11 +277,11 @@ def _finish(
             files[f"images/{kind}-{view.name}.png"] = png_bytes(image, view.exposure)
     for item in recovered:
         for kind, image in item.textures().items():
-            files[f"images/texture-{kind}-{item.file_name()}.png"] = png_bytes(image)
+            files[f"images/texture-{kind}-{item.file_name}.png"] = png_bytes(image)
         for kind, image in item.volumes().items():
-            files[f"images/volume-{kind}-{item.file_name()}.png"] = png_bytes(image)
+            files[f"images/volume-{kind}-{item.file_name}.png"] = png_bytes(image)
         if item.result.ndim == 4:
-            files[f"volumes/{item.file_name()}.vol"] = vol_bytes(item.result)
+            files[f"volumes/{item.file_name}.vol"] = vol_bytes(item.result)
     folder.write({**files, **report_files(outcome)})
     return RunResult(
         folder=folder.path,

@@ -57,9 +57,9 @@ def put_values(problem: Problem, adam: Adam) -> None:
 
 
 def scene_values(problem: Problem, adam: Adam) -> dict[str, Any]:
-    """The scene's parameters, by key, for the variables that Adam holds; poses become transforms."""
+    """The scene's parameters, by key and as Mitsuba stores them, for what Adam holds; poses become transforms."""
     names = {name for pose in problem.poses for name in pose.parts().values()}
-    plain = {variable.key: adam[variable.key] for variable in problem.variables if variable.key not in names}
+    plain = {v.key: v.form.store(adam[v.key]) for v in problem.variables if v.key not in names}
     return plain | {pose.key: pose.value(adam) for pose in problem.poses}
 
 

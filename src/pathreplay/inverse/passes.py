@@ -18,6 +18,7 @@ import mitsuba as mi
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.losses import QUADRATIC, Loss
 from pathreplay.inverse.problem import Problem
+from pathreplay.parameters import keep_only
 from pathreplay.path_integrator import plain_errors
 from pathreplay.transport.traits import Tables, nodes_of, scene_tables
 
@@ -103,7 +104,7 @@ def _recording(keys: list[str]) -> Callable[..., Any]:
 
     def differentiate(scene: Any, *args: Any) -> tuple[Any, Any]:
         params = mi.traverse(scene)
-        params.keep(keys)
+        keep_only(params, keys)
         return _differentiate(params, scene, *args)
 
     return dr.freeze(differentiate)

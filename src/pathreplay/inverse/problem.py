@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,19 @@ import numpy as np
 
 from pathreplay import parameters
 from pathreplay.descriptions import load_description
+from pathreplay.edges import edges_note, moves_edges
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config import Config, Parameter, Plugin
+from pathreplay.integrator import EDGES
+from pathreplay.inverse.config import Config, Parameter, Plugin, Value
+from pathreplay.inverse.file_names import file_names
 from pathreplay.inverse.grids import Levels, comparable, make_levels, resampled
-from pathreplay.inverse.images import Image, find_image, read_image, with_channels
+from pathreplay.inverse.images import Image, find_image, over_black, read_image, transparent_share, with_channels
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.threads import one_thread
 from pathreplay.inverse.values import Array, make_value, require_finite_array
 from pathreplay.scenes import load_scene, load_scene_for, one_line
+from pathreplay.stored import AS_STORED, Form, form_of
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,8 @@ class Variable:
     """In the shape of ``start``, or for a grid in another resolution."""
     levels: Levels | None = None
     """Of a grid that is refined on the way."""
+    form: Form = AS_STORED
+    """How Mitsuba stores it; everything here is what people see."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +105,11 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     parameters.require_finite(params)
     integrator = _gradient_integrator(config.integrator)
     keys = _keys(params, config.parameters, integrator)
+    notes += _edges(params, keys, integrator)
     rival = None if config.rival is None else _gradient_integrator(config.rival)
     if rival is not None:
         _keys(params, config.parameters, rival)
+        _edges(params, keys, rival)  # for its log: one note is enough
     judge = integrator if config.target.images is not None else load_integrator(config.target.integrator)
     # Before any target is rendered: the cheap mistakes first.
     unsolved, moved = _variables(params, keys, config, base)
@@ -117,7 +126,8 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
         del target_scene
         gc.collect()
     elif targets is None:
-        targets = _target_files(config.target.images, scene, sensors, base)
+        targets, transparent = _target_files(config.target.images, scene, sensors, base)
+        notes += transparent
 
     if missing := set(sensors) - set(targets):
         raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
@@ -125,7 +135,7 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in moved)
     # Traversed anew: an object from which values were read expects all its keys at the next update().
     params = mi.traverse(scene)
-    params.keep(list(keys))
+    parameters.keep_only(params, keys)
     views = tuple(View(name, index, targets[name]) for name, index in sensors.items())
     return Problem(scene, params, integrator, rival, judge, variables, poses, views, loss, notes)
 
@@ -160,6 +170,17 @@ def _keys(params: mi.SceneParameters, entries: list[Parameter], integrator: mi.I
     return keys
 
 
+def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
+    """What is to be said of edges that move. An integrator of ours need not say it once more."""
+    moving = [key for key in keys if moves_edges(params, key)]
+    # By name: Mitsuba's projective integrators sample edges.
+    if not moving or "Projective" in type(integrator).__name__:
+        return ()
+    if hasattr(integrator, "told"):
+        integrator.told.add(EDGES)
+    return (edges_note(moving),)
+
+
 def _variables(
     params: mi.SceneParameters, keys: dict[str, Parameter], config: Config, base: Path
 ) -> tuple[list[Variable], list[Pose]]:
@@ -168,12 +189,14 @@ def _variables(
     for key, entry in keys.items():
         rate = entry.learning_rate or config.learning_rate
         if entry.pose is None:
-            start = _start(params, key, entry, base)
-            like, levels = params[key], _levels(key, entry, start)
+            form = form_of(params, key)
+            like = _seen(params, key)
+            start = _start(key, like, form, entry, base)
+            levels = _levels(key, entry, start)
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
                 like = type(like)(start)
-            variables.append(Variable(key, like, entry.lower, entry.upper, rate, start, None, levels))
+            variables.append(Variable(key, like, entry.lower, entry.upper, rate, start, None, levels, form))
             continue
         pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
         poses.append(pose)
@@ -199,14 +222,20 @@ def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:
     return make_levels(start.shape, entry.resolutions, entry.refine_at or [])
 
 
-def _start(params: mi.SceneParameters, key: str, entry: Parameter, base: Path) -> Array:
-    like = params[key]
+def _seen(params: mi.SceneParameters, key: str) -> Any:
+    return form_of(params, key).see(params[key])
+
+
+def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path) -> Array:
     if not dr.is_array_v(like):
         raise PathreplayError(
             f"Parameter '{key}' is a matrix, whose 16 numbers do not stay a motion; give it "
             "pose = 'translation', 'rotation' or 'rigid'"
         )
-    start = parameters.get_array(like) if entry.initial is None else make_value(key, like, entry.initial, base)
+    if entry.initial is None:
+        start = parameters.get_array(like)
+    else:
+        start = form.of_colours(key, make_value(key, like, entry.initial, base))
     for bound, name, wrong in ((entry.lower, "lower", np.less), (entry.upper, "upper", np.greater)):
         if bound is not None and wrong(start, np.float32(bound)).any():
             extreme = start.min() if name == "lower" else start.max()
@@ -217,20 +246,20 @@ def _start(params: mi.SceneParameters, key: str, entry: Parameter, base: Path) -
 
 
 def _sensors(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int]:
-    """The wanted sensors of the scene: readable unique name -> index."""
+    """The wanted sensors of the scene: readable unique name, fit for a file -> index."""
     available = scene.sensors()
     if not available:
         raise PathreplayError("The scene has no sensor; add one")
-    names = [
-        s.id() if re.fullmatch(r"[A-Za-z0-9][\w-]*", s.id() or "") else f"view-{i}" for i, s in enumerate(available)
-    ]
+    ids = [sensor.id() for sensor in available]
+    names = [s if re.fullmatch(r"[A-Za-z0-9][\w-]*", s or "") else f"view-{i}" for i, s in enumerate(ids)]
     if len(set(names)) < len(names):
         names = [f"view-{i}" for i in range(len(available))]
+    names = list(file_names(names).values())
     if wanted is None:
         return {name: i for i, name in enumerate(names)}
     chosen: dict[str, int] = {}
     for item in wanted:
-        index = names.index(item) if item in names else item
+        index = next((each.index(item) for each in (ids, names) if item in each), item)
         if not isinstance(index, int) or not 0 <= index < len(names):
             raise PathreplayError(f"No sensor {item!r} in the scene; it has {', '.join(names)} (0 to {len(names) - 1})")
         chosen[names[index]] = index
@@ -246,22 +275,28 @@ def _target_scene(config: Config, base: Path) -> mi.Scene:
     scene = load_scene(spec, base, **arguments)
     params = mi.traverse(scene)
     parameters.require_finite(params)
-    parameters.set_arrays(
-        params,
-        {
-            key: make_value(key, params[key], value, base)
-            for pattern, value in target.values.items()
-            for key in parameters.resolve_keys(params, pattern)
-        },
-    )
+    values = {
+        key: _target_value(params, key, value, base)
+        for pattern, value in target.values.items()
+        for key in parameters.resolve_keys(params, pattern)
+    }
+    for key, value in values.items():
+        params[key] = value
+    params.update()
     return scene
+
+
+def _target_value(params: mi.SceneParameters, key: str, value: Value, base: Path) -> Any:
+    parameters.require_settable(params, key)
+    form, like = form_of(params, key), _seen(params, key)
+    return form.store(parameters.to_value(like, form.of_colours(key, make_value(key, like, value, base))))
 
 
 def _truth(scene: mi.Scene, own: mi.SceneParameters, keys: dict[str, Parameter]) -> dict[str, Array]:
     """Values of the wanted parameters in the target scene, where it has them in the same shape or as such a grid."""
     params = mi.traverse(scene)
-    found = {key: parameters.get_array(params[key]) for key in keys if key in params}
-    shapes = {key: parameters.get_array(own[key]).shape for key in found}
+    found = {key: parameters.get_array(_seen(params, key)) for key in keys if key in params}
+    shapes = {key: parameters.get_array(_seen(own, key)).shape for key in found}
     return {key: value for key, value in found.items() if comparable(value.shape, shapes[key])}
 
 
@@ -280,15 +315,20 @@ def _rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) 
     return targets
 
 
-def _target_files(files: list[str], scene: mi.Scene, sensors: dict[str, int], base: Path) -> dict[str, Image]:
+def _target_files(
+    files: list[str], scene: mi.Scene, sensors: dict[str, int], base: Path
+) -> tuple[dict[str, Image], tuple[str, ...]]:
+    """The target pictures by view, and what is to be said about them."""
     if len(files) != len(sensors):
         raise PathreplayError(
             f"{len(files)} target images for {len(sensors)} sensors ({', '.join(sensors)}); "
             "name one per sensor, in this order"
         )
     targets: dict[str, Image] = {}
+    notes: list[str] = []
     for (name, index), file in zip(sensors.items(), files, strict=True):
-        image = read_image(find_image(file, base))
+        path = find_image(file, base)
+        image = over_black(read_image(path), path)
         film = scene.sensors()[index].film()
         width, height = (int(n) for n in film.crop_size())
         if image.shape[:2] != (height, width):
@@ -304,5 +344,11 @@ def _target_files(files: list[str], scene: mi.Scene, sensors: dict[str, int], ba
                 f"Target image '{file}' has {image.shape[2]} channels, sensor '{name}' renders {channels}; convert it"
             )
         require_finite_array(f"Target image '{file}'", adapted)
+        share = transparent_share(image)
+        if share and channels in (1, 3):
+            notes.append(
+                f"target image '{file}' is transparent in {share:.1%} of its pixels: black is fitted there; put the "
+                "picture before the background of your scene if that is another"
+            )
         targets[name] = adapted
-    return targets
+    return targets, tuple(notes)

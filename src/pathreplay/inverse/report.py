@@ -6,7 +6,6 @@ import base64
 import io
 import os
 import platform
-import re
 import shlex
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -63,6 +62,8 @@ class Recovered:
     """One parameter: start, result, truth where it is known, and the rival's result where there was one."""
 
     key: str
+    file_name: str
+    """What of the key is in the names of its files."""
     start: Array
     result: Array
     truth: Array | None
@@ -110,9 +111,6 @@ class Recovered:
 
     def rival_error(self) -> float | None:
         return None if self.truth is None or self.rival is None else rmse(self.rival, self.truth)
-
-    def file_name(self) -> str:
-        return re.sub(r"[^\w.-]", "_", self.key)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ over the bounding box of its active voxels; what is inactive in there takes the 
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
+from pathreplay.media.nanovdb_header import require_whole_nanovdb
 
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 
@@ -109,6 +111,25 @@ def grid_volume(path: str | Path, grid: str | None = None, **options: Any) -> di
 # ------------------------------------------------------------------------------
 
 
+def require_whole_vol(path: Path) -> None:
+    """Return quietly if a `.vol` file is as long as its header says; only the header is read.
+
+    Raises:
+        PathreplayError: it is too short or of impossible size. Mitsuba reports whatever else may be wrong.
+    """
+    with path.open("rb") as file:
+        header = file.read(_VOL_HEADER.size)
+    if header[:4] != _VOL_MAGIC or len(header) < _VOL_HEADER.size:
+        return
+    _, encoding, *shape = _VOL_HEADER.unpack(header)[:6]
+    if encoding == _FLOAT32 and (min(shape) < 1 or path.stat().st_size < _VOL_HEADER.size + 4 * math.prod(shape)):
+        x, y, z, channels = shape
+        raise PathreplayError(
+            f"Volume {path} should hold {x} x {y} x {z} x {channels} numbers and has {path.stat().st_size} bytes; "
+            "it is damaged, get it anew"
+        )
+
+
 def _read_vol(path: Path, grid: str | None) -> Volume:
     if grid is not None:
         raise PathreplayError(f"Volume {path} is asked for its grid '{grid}', but a .vol file holds one without name")
@@ -182,6 +203,7 @@ def _read_nvdb(path: Path, grid: str | None) -> Volume:
     with _vdb_reader(path):
         from tinyvdb._tinyvdb_nanovdb import NanoVDBFile
 
+        require_whole_nanovdb(path)
         file = NanoVDBFile(str(path))
         index = _chosen(path, grid, [file.grid_name(i) for i in range(file.grid_count())])
         where = f"Grid '{file.grid_name(index)}' of {path}"
@@ -217,7 +239,7 @@ def _vdb_reader(path: Path) -> Iterator[Any]:
         ) from None
     try:
         yield tinyvdb
-    except (tinyvdb.VDBError, OSError) as error:
+    except (tinyvdb.VDBError, OSError, UnicodeDecodeError) as error:
         raise PathreplayError(f"Volume {path} cannot be read: {error}; get it anew, or save it with zip") from None
 
 

@@ -1,0 +1,111 @@
+"""Does a NanoVDB file hold what its header says? Asked before a reader gets it that would die of one that does not.
+
+A file is a row of segments, each 16 bytes (magic, version, number of grids, compression), what is to be known of every
+grid (176 bytes and a name), and the grids. A grid begins with a header of 672 bytes, which tells where its tree is.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from pathreplay.errors import PathreplayError
+
+MAGICS = (b"NanoVDB0", b"NanoVDB2")
+MAJOR = 32
+"""Of the version of the format, which is in the upper 11 bits of the number in the file."""
+NONE, ZIP = 0, 1
+
+# No zip is smaller than 1 in 1032.
+_MOST_PACKED = 1032
+
+_SEGMENT = struct.Struct("<8sIHH")
+# Size in memory and in the file, hash of the name, voxels, type, class; two boxes and the voxel's size are passed over,
+# then the length of the name.
+_GRID = struct.Struct("<4Q2I96xI36x")
+_GRID_HEADER = 672
+# Where leaves, lower and upper nodes and the root begin, counted from here, and how many there are of the first three.
+_TREE = struct.Struct("<4Q3I")
+_FLOAT, _FLOAT_SIZES = 1, (2144, 33856, 270400)
+
+
+@dataclass(frozen=True)
+class _Place:
+    grid_size: int
+    file_size: int
+    kind: int
+    begin: int
+    codec: int
+
+
+def require_whole_nanovdb(path: Path) -> None:
+    """Return quietly if headers, sizes and the places of the trees in a NanoVDB file agree with each other.
+
+    Grids that are compressed by zip are unpacked, which tells whether their bytes are what was written. Values and the
+    links inside of an uncompressed tree are not looked at.
+
+    Raises:
+        PathreplayError: it is no such file, of an unknown version, or damaged.
+    """
+    content = path.read_bytes()
+    try:
+        for place in _places(path, content):
+            _require_grid(path, content, place)
+    except (struct.error, UnicodeDecodeError):
+        raise _damaged(path, "a header is cut off or holds no text where a name should be") from None
+
+
+def _places(path: Path, content: bytes) -> list[_Place]:
+    places: list[_Place] = []
+    at = 0
+    while at < len(content) or not places:
+        magic, version, grids, codec = _SEGMENT.unpack_from(content, at)
+        if magic not in MAGICS:
+            raise PathreplayError(f"Volume {path} is no NanoVDB file (no 'NanoVDB' at byte {at}); save it as one")
+        if version >> 21 != MAJOR:
+            raise PathreplayError(f"Volume {path} is of NanoVDB version {version >> 21}; save it as version {MAJOR}")
+        if not grids:
+            raise _damaged(path, "it says that it has no grid")
+        at += _SEGMENT.size
+        found = []
+        for _ in range(grids):
+            grid_size, file_size, _, _, kind, _, name = _GRID.unpack_from(content, at)
+            content[at + _GRID.size : at + _GRID.size + name].rstrip(b"\0").decode()
+            at += _GRID.size + name
+            found.append((grid_size, file_size, kind))
+        for grid_size, file_size, kind in found:
+            places.append(_Place(grid_size, file_size, kind, at, codec))
+            at += file_size
+        if at > len(content):
+            raise _damaged(path, f"its header speaks of {at} bytes, it has {len(content)}")
+    return places
+
+
+def _require_grid(path: Path, content: bytes, place: _Place) -> None:
+    data = content[place.begin : place.begin + place.file_size]
+    if place.grid_size > _MOST_PACKED * place.file_size:
+        raise _damaged(path, f"{place.file_size} bytes cannot unpack to {place.grid_size}")
+    if place.codec == ZIP:
+        unpacker = zlib.decompressobj()
+        try:
+            data = unpacker.decompress(data[8:], place.grid_size + 1)
+        except zlib.error as error:
+            raise _damaged(path, str(error)) from None
+    elif place.codec != NONE:
+        return  # the reader refuses those itself
+    if len(data) != place.grid_size or len(data) < _GRID_HEADER + _TREE.size or data[:7] != b"NanoVDB":
+        raise _damaged(path, f"a grid of {place.grid_size} bytes is not there as a whole")
+    *begins, root, leaves, lowers, uppers = _TREE.unpack_from(data, _GRID_HEADER)
+    room = len(data) - _GRID_HEADER
+    ends = [root + 96]
+    if place.kind == _FLOAT:
+        counts = (leaves, lowers, uppers)
+        ends += [b + n * size for b, n, size in zip(begins, counts, _FLOAT_SIZES, strict=True) if n]
+    if max(ends) > room or any(value < _TREE.size for value in (root, *(b for b in begins if b))):
+        raise _damaged(path, "its tree reaches beyond its end")
+
+
+def _damaged(path: Path, why: str) -> PathreplayError:
+    return PathreplayError(f"Volume {path} cannot be read: it is damaged ({why}); get it anew")

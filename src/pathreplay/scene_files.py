@@ -1,0 +1,182 @@
+"""Cheap looks into the files of a scene, before a library reads them that would die of what is in there.
+
+What Mitsuba itself refuses with a message (OBJ indices, truncated meshes, unknown formats) is left to Mitsuba.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from pathreplay.errors import PathreplayError
+from pathreplay.media.volume_files import require_whole_vol
+
+DEEPEST = 64
+"""Elements inside each other in a scene file. Real ones have ten; Mitsuba's parser runs out of stack at some 10 000."""
+
+
+def require_shallow(path: Path) -> None:
+    """Return quietly if no element of a scene file, or of the files that it includes, is nested too deep.
+
+    Raises:
+        PathreplayError: names the file and the line.
+    """
+    waiting, seen = [path], set()
+    while waiting:
+        file = waiting.pop()
+        if file.resolve() in seen or not file.is_file():
+            continue  # Mitsuba tells of circles and of what is missing
+        seen.add(file.resolve())
+        waiting += [path.parent / name for name in _included(file)]
+
+
+def _included(path: Path) -> list[str]:
+    names: list[str] = []
+    depth = 0
+    parser = expat.ParserCreate()
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > DEEPEST:
+            raise PathreplayError(
+                f"Scene {path} has more than {DEEPEST} elements inside each other (line {parser.CurrentLineNumber}); "
+                "flatten it with <ref id=…/>"
+            )
+        if tag == "include" and "filename" in attributes:
+            names.append(attributes["filename"])
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    try:
+        with path.open("rb") as file:
+            parser.ParseFile(file)
+    except (expat.ExpatError, OSError):
+        pass  # Mitsuba says where it is no XML
+    return names
+
+
+def require_sound_files(state: Any) -> None:
+    """Return quietly if the files that a parsed scene names (`mi.parser`) can be given to Mitsuba.
+
+    Looks at the indices of PLY meshes and at the sizes of volumes.
+
+    Raises:
+        PathreplayError: names the file, what is wrong, and the way out.
+    """
+    looks: dict[str, Callable[[Path], None]] = {"ply": _require_sound_ply, "gridvolume": require_whole_vol}
+    for node in state.nodes:
+        look, name = looks.get(node.props.plugin_name()), node.props.get("filename", None)
+        if look is not None and isinstance(name, str):
+            path = Path(str(mi.file_resolver().resolve(name)))
+            if path.is_file():
+                look(path)
+
+
+# ------------------------------------------------------------------------------
+#  PLY
+# ------------------------------------------------------------------------------
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    count: int
+    properties: list[tuple[str, ...]]
+
+    def triangles(self, order: str) -> np.dtype[Any]:
+        """The layout of one entry, where lists have three members."""
+        fields: list[Any] = []
+        for i, (*kinds, name) in enumerate(self.properties):
+            if kinds[0] == "list":
+                fields += [(f"count {i}", order + _TYPES[kinds[1]]), (name, order + _TYPES[kinds[2]], 3)]
+            else:
+                fields.append((name, order + _TYPES[kinds[0]]))
+        return np.dtype(fields)
+
+
+def _require_sound_ply(path: Path) -> None:
+    with path.open("rb") as file:
+        kind, elements = _ply_header(file)
+        begin = file.tell()
+    by_name = {element.name: element for element in elements}
+    if kind is None or [element.name for element in elements[:2]] != ["vertex", "face"]:
+        return
+    if any(kinds[0] == "list" for kinds in by_name["vertex"].properties):
+        return
+    vertices, faces = by_name["vertex"].count, by_name["face"].count
+    if not vertices or not faces:
+        raise PathreplayError(f"Mesh {path} has {vertices} vertices and {faces} faces; give it some, or leave it out")
+    try:
+        indices = (_ascii_indices if kind == "ascii" else _binary_indices)(path, begin, elements, kind)
+    except (KeyError, ValueError, IndexError):
+        return  # not what we know: Mitsuba may
+    if indices is None or not indices.size:
+        return
+    low, high = int(indices.min()), int(indices.max())
+    if low < 0 or high >= vertices:
+        raise PathreplayError(
+            f"Mesh {path} has a face with vertex {low if low < 0 else high}, but its {vertices} vertices count from 0 "
+            f"to {vertices - 1}; it is damaged, write it anew"
+        )
+
+
+def _ply_header(file: Any) -> tuple[str | None, list[_Element]]:
+    kind, elements = None, []
+    for _ in range(1000):
+        words = file.readline(4096).decode("latin-1").split()
+        if words[:1] == ["format"] and len(words) > 1:
+            kind = words[1]
+        elif words[:1] == ["element"] and len(words) == 3 and re.fullmatch(r"\d+", words[2]):
+            elements.append(_Element(words[1], int(words[2]), []))
+        elif words[:1] == ["property"] and len(words) > 2 and elements:
+            elements[-1].properties.append(tuple(words[1:]))
+        elif words[:1] == ["end_header"]:
+            return kind, elements
+    return None, []
+
+
+def _binary_indices(path: Path, begin: int, elements: list[_Element], kind: str) -> NDArray[Any] | None:
+    order = "<" if kind == "binary_little_endian" else ">"
+    vertex, face = (element.triangles(order) for element in elements[:2])
+    begin += vertex.itemsize * elements[0].count
+    if path.stat().st_size < begin + face.itemsize * elements[1].count:
+        return None
+    entries = np.memmap(path, face, "r", begin, elements[1].count)
+    return _triangle_indices(entries, elements[1])
+
+
+def _ascii_indices(path: Path, begin: int, elements: list[_Element], kind: str) -> NDArray[Any] | None:
+    with path.open("rb") as file:
+        file.seek(begin)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # where numbers end and text begins
+            numbers = np.fromstring(file.read().decode("latin-1"), np.float64, sep=" ")
+    begin = elements[0].count * len(elements[0].properties)
+    width = len(elements[1].properties) + 3
+    entries = numbers[begin : begin + width * elements[1].count].reshape(-1, width)
+    before = next(i for i, kinds in enumerate(elements[1].properties) if kinds[0] == "list")
+    return entries[:, before + 1 : before + 4] if (entries[:, before] == 3).all() else None
+
+
+def _triangle_indices(entries: NDArray[Any], face: _Element) -> NDArray[Any] | None:
+    at, name = next((i, kinds[-1]) for i, kinds in enumerate(face.properties) if kinds[0] == "list")
+    return entries[name] if (entries[f"count {at}"] == 3).all() else None  # Mitsuba refuses other faces

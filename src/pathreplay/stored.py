@@ -1,0 +1,181 @@
+"""Parameters that Mitsuba stores in another form than people see them: from the one to the other, and back.
+
+============================  ======================================  =================================================
+parameter                     what Mitsuba stores                     what people see
+============================  ======================================  =================================================
+``data`` of an ``envmap``     a column more on the left and on the    the columns of the picture; in mono variants one
+                              right, which repeat the other end; in   channel
+                              mono variants three channels alike
+textures of 16 bits           half precision                          single precision
+colours in spectral variants  c of a smooth spectrum S(λ) =           S at three wavelengths, red, green and blue; where
+                              ½ + v / (2 √(1 + v²)), v = c₀ λ² +      there is a factor (environment maps, volumes)
+                              c₁ λ + c₂, for some with a factor       multiplied by it
+============================  ======================================  =================================================
+
+Jobs optimise, save and compare what people see, so that bounds, learning rates and resolutions mean what they say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from pathreplay.errors import PathreplayError
+
+Array = NDArray[np.float32]
+
+WAVELENGTHS = (610.0, 545.0, 460.0)
+"""Where spectra are seen (nm): what Mitsuba makes of a moderate red, green or blue is nearly that there."""
+
+# S is kept so far from 0 and 1, where v is infinite.
+_MARGIN = 1e-4
+
+
+@dataclass(frozen=True)
+class Form:
+    """Most parameters: seen as they are stored."""
+
+    def see(self, stored: Any) -> Any:
+        """The Dr.Jit value that people see, without derivatives."""
+        return stored
+
+    def store(self, seen: Any) -> Any:
+        """The Dr.Jit value for Mitsuba; derivatives flow from it to what is seen."""
+        return seen
+
+    def of_colours(self, key: str, colours: Array) -> Array:
+        """What is seen of linear RGB colours (or grey numbers), in an array of the shape that is seen.
+
+        Raises:
+            PathreplayError: the parameter cannot hold them.
+        """
+        return colours
+
+
+AS_STORED = Form()
+
+
+@dataclass(frozen=True)
+class Half(Form):
+    """Textures in half precision."""
+
+    def see(self, stored: Any) -> Any:
+        return mi.TensorXf(dr.detach(stored))
+
+    def store(self, seen: Any) -> Any:
+        return mi.TensorXf16(seen)
+
+
+@dataclass(frozen=True)
+class Sky(Form):
+    """Environment maps: stored columns are the last, then all, then the first."""
+
+    mono: bool
+
+    def see(self, stored: Any) -> Any:
+        columns = np.array(dr.detach(stored))[:, 1:-1]
+        return mi.TensorXf(np.ascontiguousarray(columns[..., :1] if self.mono else columns))
+
+    def store(self, seen: Any) -> Any:
+        height, width, channels = seen.shape
+        rows, columns, of = np.arange(height), np.arange(-1, width + 1) % width, np.arange(3 if self.mono else channels)
+        entries = (rows[:, None, None] * width + columns[:, None]) * channels + of % channels
+        values = dr.gather(mi.Float, seen.array, mi.UInt32(entries.ravel().astype(np.uint32)))
+        return mi.TensorXf(values, entries.shape)
+
+
+@dataclass(frozen=True)
+class Spectra(Form):
+    """Coefficients of smooth spectra: a colour, a texture, or with a factor as fourth channel."""
+
+    scaled: bool = False
+    inner: Form = AS_STORED
+
+    def see(self, stored: Any) -> Any:
+        stored = self.inner.see(dr.detach(stored))
+        entries = _entries(stored, 4 if self.scaled else 3)
+        spectrum = mi.Vector3f(*(_spectrum(entries, wavelength) for wavelength in WAVELENGTHS))
+        return _like(stored, spectrum * entries[3] if self.scaled else spectrum)
+
+    def store(self, seen: Any) -> Any:
+        spectrum = mi.Vector3f(*_entries(seen, 3))
+        # As Mitsuba does: the largest entry becomes a half, where spectra are smooth.
+        factor = dr.maximum(2 * dr.max(spectrum), 1e-8) if self.scaled else mi.Float(1)
+        x = 2 * dr.clip(spectrum / factor, _MARGIN, 1 - _MARGIN) - 1
+        v = x * dr.rsqrt(1 - dr.square(x))
+        c = [sum(float(a) * v[i] for i, a in enumerate(row)) for row in _COEFFICIENTS]
+        stored = _like(seen, mi.Vector4f(*c, factor) if self.scaled else mi.Vector3f(*c))
+        return self.inner.store(stored)
+
+    def of_colours(self, key: str, colours: Array) -> Array:
+        if colours.min() < 0 or (not self.scaled and colours.max() > 1):
+            most = "" if self.scaled else " to 1"
+            raise PathreplayError(
+                f"Parameter '{key}' is a spectrum in variant {mi.variant()} and takes colours from 0{most}, not "
+                f"{colours.min():g} to {colours.max():g}; change them, or use an rgb variant"
+            )
+        channels = colours.reshape(3) if colours.ndim == 1 else colours.reshape(-1, 3)
+        rows = np.atleast_2d(channels).astype(np.float64)
+        factor = np.maximum(2 * rows.max(axis=1), 1e-8) if self.scaled else np.ones(len(rows))
+        fetched = [mi.srgb_model_fetch(mi.ScalarColor3f(*row)) for row in rows / factor[:, None]]
+        c = [mi.Float(np.array(column, np.float32)) for column in zip(*fetched, strict=True)]
+        seen = np.stack([np.array(_spectrum(c, wavelength)) for wavelength in WAVELENGTHS], axis=-1)
+        return (seen * factor[:, None]).reshape(colours.shape).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Lamp(Spectra):
+    """The radiance of a light, whose brightness is not among its coefficients."""
+
+    def of_colours(self, key: str, colours: Array) -> Array:
+        raise PathreplayError(
+            f"Parameter '{key}' holds the colour of a light without its brightness in variant {mi.variant()}, so that "
+            "it cannot be given a value; give the light its colour in the scene file, or use an rgb variant"
+        )
+
+
+def form_of(params: Any, key: str) -> Form:
+    """How the parameter ``key`` of ``mi.traverse(scene)`` is stored."""
+    value, owner = params[key], params.properties[key][2]
+    name, last = str(owner.class_name()), key.rsplit(".", 1)[-1]
+    if name == "EnvironmentMapEmitter" and last == "data":
+        sky = Sky(mono=mi.is_monochromatic)
+        return Spectra(scaled=True, inner=sky) if mi.is_spectral else sky
+    form: Form = Half() if isinstance(value, mi.TensorXf16) else AS_STORED
+    if not mi.is_spectral:
+        return form
+    if last == "value" and isinstance(value, mi.Color3f):
+        return Lamp() if name == "D65Spectrum" else Spectra() if name == "SRGBReflectanceSpectrum" else form
+    if last == "data" and name.startswith("BitmapTexture") and value.shape[2] == 3 and "raw = 0" in str(owner):
+        return Spectra(inner=form)
+    if last == "data" and name == "GridVolume" and value.shape[-1] == 4:
+        return Spectra(scaled=True)
+    return form
+
+
+def _spectrum(c: Any, wavelength: float) -> Any:
+    v = (c[0] * wavelength + c[1]) * wavelength + c[2]
+    return 0.5 + 0.5 * v * dr.rsqrt(1 + dr.square(v))
+
+
+# The coefficients (rows) of the parabola through three values of v.
+_COEFFICIENTS = np.linalg.inv(np.vander(WAVELENGTHS, 3))
+
+
+def _entries(value: Any, channels: int) -> Any:
+    """The channels of a colour or of a tensor, one flat array each."""
+    if not dr.is_tensor_v(value):
+        return value
+    return dr.unravel(mi.Vector3f if channels == 3 else mi.Vector4f, value.array)
+
+
+def _like(value: Any, entries: Any) -> Any:
+    """Channels as a colour or a tensor like ``value``, but for their number."""
+    if not dr.is_tensor_v(value):
+        return type(value)(entries)
+    return mi.TensorXf(dr.ravel(entries), (*value.shape[:-1], len(entries)))

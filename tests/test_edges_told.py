@@ -1,0 +1,144 @@
+"""Where edges move one line says that their part of the gradient is missing, once, and only there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import PIL.Image
+import pytest
+
+from pathreplay.edges import edges_note, moves_edges
+from pathreplay.inverse import make_config, optimize
+from pathreplay.inverse.images import over_black, read_image, transparent_share
+
+SKY = mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))
+FILM = {"type": "hdrfilm", "width": 4, "height": 4}
+
+
+def make_scene(**more: Any) -> Any:
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "cam": {"type": "perspective", "film": FILM, "to_world": mi.ScalarTransform4f().translate([0, 0, -4])},
+            "cube": {"type": "cube", "bsdf": {"type": "diffuse"}},
+            "lamp": {"type": "point", "position": [0, 3, -3]},
+            "sky": {"type": "envmap", "bitmap": SKY},
+            **more,
+        },
+        optimize=False,
+    )
+
+
+MOVE = {"cam.to_world", "cam.x_fov", "cube.vertex_positions", "ball.to_world", "glass.to_world", "lamp.position"}
+STAY = {"cube.bsdf.reflectance.value", "cube.vertex_normals", "cube.vertex_texcoords", "glass.bsdf.eta", "sky.data",
+        "sky.to_world", "lamp.intensity.value"}  # fmt: skip
+
+
+def test_what_moves_edges() -> None:
+    glass = {"type": "sphere", "bsdf": {"type": "roughdielectric"}}
+    params = mi.traverse(make_scene(ball={"type": "sphere"}, glass=glass))
+    assert {key for key in MOVE | STAY if moves_edges(params, key)} == MOVE
+    note = edges_note(["a.to_world", "b.to_world", "c.to_world"])
+    assert "'a.to_world' (and 2 more)" in note and "\n" not in note
+
+
+class Log(mi.Appender):  # type: ignore[misc]
+    """Keeps what Mitsuba logs."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+
+    def append(self, level: Any, text: str) -> None:
+        self.lines.append(text)
+
+    def log_progress(self, *_: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def log() -> Any:
+    logger, kept = mi.logger(), Log()
+    logger.add_appender(kept)
+    yield kept
+    logger.remove_appender(kept)
+
+
+@pytest.mark.parametrize("key", ["cube.vertex_positions", "lamp.position", "sky.to_world", "sky.data"])
+def test_a_script_is_told_once(key: str, log: Any) -> None:
+    scene = make_scene()
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    params = mi.traverse(scene)
+    value = type(params[key])(params[key])
+    dr.enable_grad(value)
+    params[key] = value
+    params.update()
+    for seed in (1, 2):
+        dr.backward(dr.mean(mi.render(scene, params, integrator=integrator, spp=2, seed=seed), axis=None))
+    told = [line for line in log.lines if "moving edges" in line]
+    assert len(told) == (key in MOVE)
+    assert all(key in line and "pathreplay check" in line for line in told)
+
+
+XML = """<scene version="3.0.0">
+  <sensor type="perspective" id="cam"><transform name="to_world"><translate z="-4"/></transform>
+    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/>
+    <string name="pixel_format" value="rgb"/></film></sensor>
+  <shape type="cube" id="head"><bsdf type="diffuse" id="skin"><rgb name="reflectance" value="0.5"/></bsdf></shape>
+  <emitter type="constant"/>
+</scene>"""
+MOVED = {"key": "head.vertex_positions", "pose": "translation", "start": {"translation": [0.1, 0, 0]}}
+PAINTED = {"key": "head.bsdf.reflectance.value"}
+
+
+def run(parameter: dict[str, Any], integrator: str = "pathreplay", **target: Any) -> Any:
+    config = {
+        "scene": "scene.xml", "iterations": 3, "spp": 2, "picture_spp": 2, "parameters": [parameter],
+        "integrator": {"type": integrator, "max_depth": 2}, "target": target or {"scene": "scene.xml", "spp": 2},
+    }  # fmt: skip
+    return optimize(make_config(config), progress=False)
+
+
+@pytest.mark.parametrize(("integrator", "parameter", "told"), [
+    ("pathreplay", MOVED, True), ("prb", MOVED, True), ("pathreplay", PAINTED, False),
+])  # fmt: skip
+def test_a_job_is_told_in_its_report_and_not_in_the_log_too(
+    integrator: str, parameter: dict[str, Any], told: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: Any,
+    capfd: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.xml").write_text(XML)
+    html = run(parameter, integrator).report.read_text()
+    assert html.count("moving edges") == told
+    assert not [line for line in log.lines if "moving edges" in line]
+
+
+def picture(folder: Path, alpha: int) -> None:
+    pixels = np.full((8, 8, 4), 255, np.uint8)
+    pixels[:, :4, 3] = alpha
+    PIL.Image.fromarray(pixels).save(folder / "target.png")
+
+
+def test_a_transparent_target_is_seen_over_black_and_that_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.xml").write_text(XML)
+    picture(tmp_path, 51)
+    result = run(PAINTED, images=["target.png"])
+    assert "&#39;target.png&#39; is transparent in 50.0% of its pixels" in result.report.read_text()
+    target = read_image(result.folder / "images/target-cam.exr")
+    assert target[:, :4] == pytest.approx(51 / 255, abs=1e-3) and target[:, 4:] == pytest.approx(1)
+    picture(tmp_path, 255)
+    assert "transparent" not in run(PAINTED, images=["target.png"]).report.read_text()
+
+
+def test_colours_of_exr_files_are_over_black_already() -> None:
+    image = np.full((1, 2, 4), 0.5, np.float32)
+    assert np.array_equal(over_black(image, Path("a.EXR")), image)
+    assert over_black(image, Path("a.png"))[0, 0] == pytest.approx([0.25, 0.25, 0.25, 0.5])
+    assert transparent_share(image) == 1 and transparent_share(image[..., :3]) == 0
