@@ -8,6 +8,7 @@ import pytest
 
 import pathreplay  # noqa: F401 (registers the plugins)
 from pathreplay.bsdfs.substitute import load_dict_with, load_file_with
+from pathreplay.inverse.images import exr_bytes
 
 SMOOTH = {"dielectric": "smoothdielectric"}
 SCENE = """<scene version="3.0.0">
@@ -43,7 +44,7 @@ def scene_file(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "materials.xml").write_text(MATERIALS)
     sky = np.random.default_rng(1).random((8, 16, 3), dtype=np.float32)
-    mi.Bitmap(sky).write(str(tmp_path / "sky.exr"))
+    (tmp_path / "sky.exr").write_bytes(exr_bytes(sky))
     return tmp_path / "scene.xml"
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import mitsuba as mi
 
+from pathreplay.threads import spare_thread
+
 
 def load_file_with(
     path: str | Path, plugins: Mapping[str, str], *, optimize: bool = False, **parameters: Any
@@ -64,4 +66,5 @@ def _instantiate(config: Any, state: Any, plugins: Mapping[str, str]) -> tuple[A
             exchanged.append(f"{node.props.id() or 'unnamed'} ({mi.parser.file_location(state, node)})")
             node.props.set_plugin_name(new)
     mi.parser.transform_all(config, state)
-    return mi.parser.instantiate(config, state), exchanged
+    with spare_thread():
+        return mi.parser.instantiate(config, state), exchanged
