@@ -50,7 +50,7 @@ def scene_file(tmp_path):
 
 def test_file_keeps_keys_and_image(scene_file):
     plain = mi.load_file(str(scene_file), optimize=False, index="1.7")
-    scene, exchanged = load_file_with(scene_file, SMOOTH, index=1.7)
+    scene, exchanged = load_file_with(scene_file, SMOOTH, {"index": "1.7"})
     assert [line.split()[0] for line in exchanged] == ["gem", "glass", "unnamed"]
     assert "materials.xml" in exchanged[0] and "scene.xml (line" in exchanged[1]
     params, plain_params = mi.traverse(scene), mi.traverse(plain)

@@ -22,7 +22,7 @@ app = typer.Typer(
     name="pathreplay",
     help="Differentiable light transport on Mitsuba 3: check gradients, recover scenes from pictures.",
     no_args_is_help=True,
-    add_completion=False,
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 

@@ -15,6 +15,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
+from pathreplay.files import file_problem
 from pathreplay.scenes import one_line
 from pathreplay.threads import spare_thread
 
@@ -33,8 +34,8 @@ def find_image(name: str, base: Path) -> Path:
         path = Path(cbook.get_sample_data(name[len(SAMPLE) :], asfileobj=False))
     else:
         path = base / name
-    if not path.is_file():
-        raise PathreplayError(f"No image file '{name}': {path} does not exist; correct the path or create the file")
+    if problem := file_problem(path):
+        raise PathreplayError(f"No image file '{name}': {path} {problem}; correct the path or create the file")
     return path
 
 
@@ -44,6 +45,8 @@ def read_image(path: Path, *, raw: bool = False) -> Image:
     Raises:
         PathreplayError: the file is no image that Mitsuba can read.
     """
+    if problem := file_problem(path):
+        raise PathreplayError(f"Image {path} {problem}; correct the path or create the file")
     try:
         with spare_thread():
             bitmap = mi.Bitmap(str(path))

@@ -16,6 +16,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes, read_image
+from pathreplay.inverse.limits import require_finite_loss
 from pathreplay.inverse.loop import Run, ctrl_c_stops, iterate, new_run, put_values, render_views, scene_values
 from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.problem import Problem, build_problem
@@ -102,6 +103,8 @@ def optimize(
         if start.folder is None:
             put_values(problem, run.adam)
             before = render_views(problem, start.config)
+            for view in problem.views:
+                require_finite_loss(problem.loss, view.name, view.target, before[view.name])
             folder = create_run_folder(start.output, start.config, start.source, start.base)
             folder.write({**_first_files(problem, before), **_checkpoints(run, rival)})
         else:
