@@ -36,7 +36,7 @@ from pathreplay.media.volume_files import vol_bytes
 from pathreplay.parameters import get_array, to_value
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RunResult:
     """What a run came to; everything in it is also in ``folder``."""
 
@@ -52,6 +52,13 @@ class RunResult:
     """Root mean square error of each parameter whose truth is known; poses are told apart."""
     poses: dict[str, PoseError]
     """How far each pose whose truth is known is from it."""
+
+    def __repr__(self) -> str:
+        """Short: a notebook prints it, and the history may have thousands of entries."""
+        loss = f", loss {self.history[-1].loss:.4g}" if self.history else ""
+        stopped = ", stopped early" if self.stopped else ""
+        count = f"{len(self.parameters)} parameters"
+        return f"<RunResult: {self.iterations} iterations{loss}{stopped}, {count}, {self.report}>"
 
     def describe(self) -> str:
         """A few lines for the terminal: loss, errors, where the report is, how to go on."""
@@ -84,7 +91,7 @@ def optimize(
         resume: run folder of an earlier, unfinished run, to go on with; excludes ``config`` and ``output``.
         output: run folder to make; the default is the config's ``output``, else ``runs/<name of the config>``. Where it
             exists, a number is appended: an earlier run is never touched.
-        progress: draw a progress bar on stderr.
+        progress: draw a progress bar on stderr (lines, now and then, where that is no terminal).
 
     The first Ctrl-C ends the run after the current iteration with everything written; the second one aborts.
 

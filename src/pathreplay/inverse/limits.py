@@ -12,13 +12,12 @@ import numpy as np
 
 from pathreplay import memory
 from pathreplay.errors import PathreplayError
+from pathreplay.films import MOST_SAMPLES, film_size, require_samples
 from pathreplay.inverse.images import Image
 
 if TYPE_CHECKING:
     from pathreplay.inverse.losses import Loss
 
-# Dr.Jit counts the samples of one kernel in 32 bits.
-MOST_SAMPLES = 2**32 - 1
 # Bytes, measured (peak of the process over 2048 x 2048 pixels, LLVM): a rendering, its derivative and their files take
 # 127 a pixel, at one view at a time; target, start and result of all views stay. Samples take next to none.
 _A_RENDERING, _A_VIEW = 128, 36
@@ -38,27 +37,12 @@ def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str,
     most, total = 0, 0
     for name, index in sensors.items():
         width, height = film_size(scene.sensors()[index])
-        pixels = width * height
-        what = f"sensor '{name}' of {width} x {height} pixels"
         for key, count in spp.items():
-            if pixels * count <= MOST_SAMPLES:
-                continue
-            way_out = f"'{key}' up to {MOST_SAMPLES // pixels}" if pixels <= MOST_SAMPLES else "a smaller film"
-            raise PathreplayError(
-                f"'{key}' is {count}: with {what} that is {pixels * count} samples, beyond the {MOST_SAMPLES} that "
-                f"Dr.Jit takes at once; take {way_out}"
-            )
-        most, total = max(most, pixels), total + pixels
+            require_samples(key, count, (width, height), f"sensor '{name}'")
+        most, total = max(most, width * height), total + width * height
         needed = most * _A_RENDERING + total * _A_VIEW
-        memory.require(needed, f"Rendering {what}", "take a smaller film or fewer sensors")
-
-
-def film_size(sensor: mi.Sensor) -> tuple[int, int]:
-    """Width and height of what is rendered: the crop window, and the film's border where it samples one."""
-    film = sensor.film()
-    border = 2 * int(film.rfilter().border_size()) if film.sample_border() else 0
-    width, height = (int(n) + border for n in film.crop_size())
-    return width, height
+        what = f"Rendering sensor '{name}' of {width} x {height} pixels"
+        memory.require(needed, what, "take a smaller film or fewer sensors")
 
 
 def require_visible(scene: mi.Scene, keys: Iterable[str]) -> None:
