@@ -37,6 +37,75 @@ def test_help_lists_the_commands(run) -> None:
     assert "doctor" in out
 
 
+@pytest.mark.parametrize("command", [(), ("doctor",), ("check",), ("optimize",)])
+def test_flags_take_no_value_in_the_help(run, command: tuple[str, ...]) -> None:
+    status, out, _ = run(*command, "--help")
+    assert status == 0 and "--help" in out
+    assert "<bool>" not in out
+    assert all(len(line) <= 80 for line in out.splitlines())
+
+
+def test_completion_can_be_installed_and_completes(run, run_python) -> None:
+    assert "--install-completion" in run("--help")[1]
+    words = {"COMP_WORDS": "pathreplay optimize --qu", "COMP_CWORD": "2", "_PATHREPLAY_COMPLETE": "complete_bash"}
+    code = "import sys; from pathreplay import cli; sys.argv = ['pathreplay']; cli.main()"
+    assert run_python(code, env=words).stdout.split() == ["--quiet"]
+
+
+def test_bench_of_a_wheel_is_hidden_and_says_what_it_needs(run_python) -> None:
+    """From a copy of the package without its repository."""
+    code = """
+import pathlib, shutil, sys
+import pathreplay
+here = pathlib.Path(sys.argv[1])
+shutil.copytree(pathlib.Path(pathreplay.__file__).parent, here / "pathreplay")
+for name in [name for name in sys.modules if name.split(".")[0] == "pathreplay"]:
+    del sys.modules[name]
+sys.path.insert(0, str(here))
+from pathreplay import cli
+for words in (["--help"], ["bench", "surface"]):
+    sys.argv = ["pathreplay", *words]
+    try:
+        cli.main()
+    except SystemExit as end:
+        print("status", end.code)
+"""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        done = run_python(code, args=(folder,))
+    assert done.stdout.split()[-1] == "2" and "bench" not in done.stdout
+    assert "clone it" in done.stderr and "make bench" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--seed", "-1"), ["seed is -1", "from 0 on"]),
+        (("--seeds", "1"), ["seeds is 1"]),
+        (("--seeds", "99999999999"), ["seeds is 99999999999", "up to"]),
+        (("--spp", "0"), ["spp is 0"]),
+        (("--spp", "100000"), ["'spp' is 100000", "up to 65535"]),
+        (("--fd-spp", "100000"), ["'fd_spp' is 100000", "up to 65535"]),
+        (("--step", "nan"), ["step is nan", "above 0"]),
+        (("--step", "-1"), ["step is -1.0", "above 0"]),
+        (("--step", "0"), ["step is 0.0", "above 0"]),
+        (("--sensor", "-1"), ["Sensor -1"]),
+        (("--json", "/"), ["--json"]),
+    ],
+)
+def test_a_number_that_check_cannot_use_is_named(run, options: tuple[str, ...], words: list[str]) -> None:
+    status, out, err = run("check", "cornell-box", "--param", "red.reflectance.value", *options)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1 and all(word in err for word in words), err
+
+
+def test_an_argument_that_is_not_utf8_is_named(run) -> None:
+    status, out, err = run("optimize", "job\udcff.toml")
+    assert (status, out) == (2, "")
+    assert r"job\udcff.toml" in err and "UTF-8" in err and err.count("\n") == 1
+
+
 @pytest.mark.parametrize("arguments", [("no-such-command",), ("doctor", "--no-such-option"), ("doctor", "surplus")])
 def test_wrong_usage_ends_with_2(run, arguments: tuple[str, ...]) -> None:
     status, _, err = run(*arguments)
@@ -47,6 +116,10 @@ def test_wrong_usage_ends_with_2(run, arguments: tuple[str, ...]) -> None:
 @pytest.mark.parametrize(
     ("error", "line"),
     [
+        (
+            PathreplayError("key \x1b[31m\0 " + "y" * 100_000 + " the way out"),
+            r"key \x1b[31m\x00 " + "y" * 50,
+        ),
         (
             PathreplayError("key 'a[0]' in\n [bold]/x/y[/bold] " + "z" * 200),
             "key 'a[0]' in [bold]/x/y[/bold] " + "z" * 200,
@@ -65,6 +138,7 @@ def test_a_mistake_that_can_be_mended_is_one_line_and_status_2(
     status, out, err = run("doctor")
     assert (status, out) == (2, "")
     assert err.startswith(f"pathreplay: error: {line}") and err.count("\n") == 1
+    assert len(err) < 1100
 
 
 def test_other_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:

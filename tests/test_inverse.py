@@ -61,6 +61,18 @@ def test_eight_bit_images_are_decoded_and_exr_is_exact(tmp_path: Path) -> None:
     assert np.abs(stored - linear).max() > 0.1
 
 
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 12])
+def test_written_exr_is_read_back_exactly(tmp_path: Path, channels: int) -> None:
+    image = np.random.default_rng(3).normal(0, 1e3, (6, 7, channels)).astype(np.float32)
+    image[0, 0] = 3e38  # beyond half precision
+    (tmp_path / "a.exr").write_bytes(images.exr_bytes(image))
+    assert np.array_equal(images.read_image(tmp_path / "a.exr"), image)
+    stored = mi.Bitmap(str(tmp_path / "a.exr"))
+    assert stored.component_format() == mi.Struct.Type.Float32
+    kinds = {1: "Y", 2: "YA", 3: "RGB", 4: "RGBA", 12: "MultiChannel"}
+    assert stored.pixel_format() == getattr(mi.Bitmap.PixelFormat, kinds[channels])
+
+
 def test_crop_keeps_the_middle_and_the_aspect() -> None:
     image = np.zeros((4, 8, 1), np.float32)
     image[:, 2:6] = 1

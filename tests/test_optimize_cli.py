@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -90,6 +92,44 @@ def small_target(room: Path) -> None:
     write_image(room / "target.exr", np.full((3, 5, 3), 0.5))
 
 
+def pipe(file: str) -> Callable[[Path], None]:
+    def change(room: Path) -> None:
+        (room / file).unlink()
+        os.mkfifo(room / file)
+
+    return change
+
+
+def film(width: int, height: int) -> Callable[[Path], None]:
+    def change(room: Path) -> None:
+        text = SCENE.replace('name="width" value="6"', f'name="width" value="{width}"')
+        (room / "ball.xml").write_text(text.replace('name="height" value="4"', f'name="height" value="{height}"'))
+
+    return change
+
+
+def bright_target(room: Path) -> None:
+    write_image(room / "target.exr", np.full((4, 6, 3), 3e38))
+
+
+def without_shapes(room: Path) -> None:
+    (room / "ball.xml").write_text(re.sub("<shape.*</shape>", "", SCENE))
+
+
+def posed(options: str) -> Callable[[Path], None]:
+    def change(room: Path) -> None:
+        replace(f"{KEY}, lower = 0, upper = 1", f'"eye.to_world", pose = "rigid", {options}')(room)
+        replace('"prb"', '"pathreplay"')(room)
+
+    return change
+
+
+def huge_config(room: Path) -> None:
+    with (room / "job.toml").open("wb") as file:
+        file.truncate(5 * 10**9)  # sparse: takes no space
+
+
+IMAGES = '{ images = ["target.exr"] }'
 KEY = '"paint.reflectance.data"'
 BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "key does not exist": (replace(KEY, '"paint.reflectance.dat"'), ["reflectance.dat'", "paint.reflectance.data"]),
@@ -134,6 +174,89 @@ BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
         replace('{ images = ["target.exr"] }', '{ values = { "paint.reflectance.data" = "photo.jpg" } }'),
         ["photo.jpg", "does not exist"],
     ),
+    # Sizes: told before anything of that size is made.
+    "spp beyond 32 bits": (replace("spp = 1\np", "spp = 200000000\np"), ["'spp' is 200000000", "up to 178956970"]),
+    "picture_spp beyond 32 bits": (
+        replace("picture_spp = 1", "picture_spp = 200000000"),
+        ["'picture_spp' is 200000000", "6 x 4", "up to 178956970"],
+    ),
+    "target.spp beyond 32 bits": (
+        replace(IMAGES, '{ values = { "sky.radiance.value" = 0.5 }, spp = 200000000 }'),
+        ["'target.spp' is 200000000", "up to 178956970"],
+    ),
+    "film beyond 32 bits": (film(100_000, 100_000), ["100000 x 100000", "a smaller film"]),
+    "film beyond the memory": (film(60_000, 60_000), ["60000 x 60000", "GB of memory", "smaller film"]),
+    "grid beyond the memory": (
+        replace(KEY, KEY + ", resolutions = [10000000]"),
+        ["has the resolution 10000000", "up to"],
+    ),
+    "grid beyond all numbers": (
+        replace(KEY, KEY + f", resolutions = [{10**30}]"),
+        ["parameters.0.resolutions.0", str(10**30)],
+    ),
+    "$res beyond all numbers": (
+        replace('"ball.xml"', f'"cornell-box-photo"\nscene_parameters = {{ resolution = {10**10} }}'),
+        ["cornell-box-photo", str(10**10)],
+    ),
+    "texture beyond the memory": (
+        replace('"ball.xml"', '"cornell-box-photo"\nscene_parameters = { texture = 1000000 }'),
+        ["'texture'", "1000000", "GB of memory"],
+    ),
+    "volume beyond the memory": (
+        replace('"ball.xml"', '"cloud"\nscene_parameters = { grid = 10000 }'),
+        ["'grid'", "10000", "GB of memory"],
+    ),
+    # What can only end in infinities.
+    "start beyond single precision": (replace(KEY, KEY + ", initial = 1e300"), ["initial", "1e+300", "3.4e+38"]),
+    "start whose loss is infinite": (
+        replace(f"{KEY}, lower = 0, upper = 1", f"{KEY}, initial = 3e38"),
+        ["Start picture of sensor 'eye'"],
+    ),
+    "learning rate of a parameter": (replace(KEY, KEY + ", learning_rate = 1e30"), ["paint", "1e+30", "learning_rate"]),
+    "learning rate of all": (replace("spp = 1\np", "learning_rate = 1e30\nspp = 1\np"), ["paint", "1e+30"]),
+    "target beyond its square": (bright_target, ["Target of sensor 'eye'", "3e+38"]),
+    "no shapes": (without_shapes, ["paint.reflectance.data", "no shapes"]),
+    "pivot out of the world": (
+        posed("pivot = [1e38, 1e38, 1e38]"),
+        ["eye.to_world", "'pivot'", "1e+38"],
+    ),
+    "start out of the world": (posed("start = { translation = [0, 1e38, 0] }"), ["'start.translation'", "1e+38"]),
+    "start turned too often": (posed("start = { rotation = [0, 1e38, 0] }"), ["eye.to_world", "between -360 and 360"]),
+    # Of another type, with what to write instead.
+    "spp = true": (replace("spp = 1\np", "spp = true\np"), ["'spp' is True", "such as 16"]),
+    "spp = 16.0": (replace("spp = 1\np", "spp = 16.0\np"), ["'spp' is 16.0", "such as 16"]),
+    "initial = true": (replace(KEY, KEY + ", initial = true"), ["initial' is True", "a list of numbers"]),
+    "a table for a text": (replace('"ball.xml"', "{ a = 1 }"), ["'scene' is {'a': 1}", "in quotes"]),
+    "target by no integrator": (
+        replace(IMAGES, '{ values = { "sky.radiance.value" = 0.5 }, integrator = { type = "diffuse" } }'),
+        ["'diffuse' is a BSDF", "'path' for targets"],
+    ),
+    "no integrator": (replace('type = "prb", max_depth = 3', 'type = "diffuse"'), ["'diffuse' is a BSDF"]),
+    "rival is no integrator": (
+        replace("spp = 1\np", 'rival = { type = "diffuse" }\nspp = 1\np'),
+        ["'diffuse' is a BSDF"],
+    ),
+    "option beyond 32 bits": (replace("max_depth = 3", "max_depth = 100000000000"), ["'max_depth' of 'prb'", "below"]),
+    "names that are ours": (
+        replace("spp = 1\np", "scene_parameters = { base = 1, spec = 1, path = 1, plugins = 1 }\nspp = 1\np"),
+        ["unused parameters", "$base=1"],
+    ),
+    "name that is Mitsuba's": (replace("spp = 1\np", "scene_parameters = { config = 1 }\nspp = 1\np"), ["$config"]),
+    "TOML nested deep": (replace("spp = 1\np", f"spp = {'[' * 3000}{']' * 3000}\np"), ["nested too deep"]),
+    "TOML of many digits": (replace("spp = 1\np", f"spp = {'1' * 10000}\np"), ["more digits"]),
+    "hexadecimal of many digits": (replace("spp = 1\np", f"spp = 0x{'f' * 10000}\np"), ["'spp' is", "4300 digits"]),
+    # Only regular files are opened.
+    "target is a pipe": (pipe("target.exr"), ["target.exr", "is a pipe"]),
+    "texture of the scene is a pipe": (pipe("texture.exr"), ["texture.exr", "is a pipe"]),
+    "scene is a pipe": (pipe("ball.xml"), ["ball.xml", "is a pipe"]),
+    "config is a pipe": (pipe("job.toml"), ["job.toml", "is a pipe"]),
+    "target is a device": (replace("target.exr", "/dev/zero"), ["/dev/zero", "is a device"]),
+    "target is a folder": (replace("target.exr", "."), ["is a folder"]),
+    "scene is a device": (replace("ball.xml", "/dev/zero"), ["/dev/zero", "is a device"]),
+    "name too long": (replace("target.exr", "x" * 300), ["File name too long"]),
+    "terminal codes in a name": (replace("target.exr", r"\u0000\u001b[31m"), [r"\x00\x1b[31m"]),
+    "very long name": (replace("prb", "x" * 100_000), ["Integrator 'xxx", " ... "]),
+    "config of 5 GB": (huge_config, ["job.toml", "5000000000 bytes"]),
     "value for an unknown key": (
         replace('{ images = ["target.exr"] }', '{ values = { "pain.reflectance.data" = 0.1 } }'),
         ["pain.reflectance.data", "paint.reflectance.data"],
@@ -147,12 +270,14 @@ def test_bad_input_gets_one_line_and_status_2(
 ) -> None:
     change, words = BAD[case]
     change(room)
+    monkeypatch.setattr("pathreplay.memory.available", lambda: 2 * 10**9)  # what is too large does not depend on us
     files = set(room.rglob("*"))
     assert command(monkeypatch, "job.toml", "--quiet") == 2
     out, err = capsys.readouterr()
     assert out == ""
     line = err.strip()
     assert "\n" not in line and "Traceback" not in line
+    assert line.isprintable() and len(line) < 1100
     assert all(word in line for word in words), line
     assert set(room.rglob("*")) == files
 

@@ -8,6 +8,7 @@ import pytest
 
 import pathreplay  # noqa: F401 (registers the plugins)
 from pathreplay.bsdfs.substitute import load_dict_with, load_file_with
+from pathreplay.inverse.images import exr_bytes
 
 SMOOTH = {"dielectric": "smoothdielectric"}
 SCENE = """<scene version="3.0.0">
@@ -43,13 +44,13 @@ def scene_file(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "materials.xml").write_text(MATERIALS)
     sky = np.random.default_rng(1).random((8, 16, 3), dtype=np.float32)
-    mi.Bitmap(sky).write(str(tmp_path / "sky.exr"))
+    (tmp_path / "sky.exr").write_bytes(exr_bytes(sky))
     return tmp_path / "scene.xml"
 
 
 def test_file_keeps_keys_and_image(scene_file):
     plain = mi.load_file(str(scene_file), optimize=False, index="1.7")
-    scene, exchanged = load_file_with(scene_file, SMOOTH, index=1.7)
+    scene, exchanged = load_file_with(scene_file, SMOOTH, {"index": "1.7"})
     assert [line.split()[0] for line in exchanged] == ["gem", "glass", "unnamed"]
     assert "materials.xml" in exchanged[0] and "scene.xml (line" in exchanged[1]
     params, plain_params = mi.traverse(scene), mi.traverse(plain)

@@ -13,6 +13,13 @@ SceneDict = dict[str, Any]
 BUILTINS: dict[str, Callable[..., SceneDict]] = {}
 """Built-in scenes: name -> function that returns a Mitsuba scene dictionary."""
 
+COSTS: dict[str, Callable[[int], int]] = {
+    "texture": lambda n: 64 * n**2,  # three numbers a texel, and copies in double precision
+    "grid": lambda n: 256 * n**3,  # a voxel: its noise is summed from 12 waves, all at once
+    "views": lambda n: 100_000 * n,  # a sensor with its film
+}
+"""Arguments of which a scene may get too large -> bytes that making it takes, roughly."""
+
 
 def builtin(name: str) -> Callable[[Callable[..., SceneDict]], Callable[..., SceneDict]]:
     """Decorator that makes a function's scene dictionary known under ``name``."""

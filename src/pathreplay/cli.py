@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
 import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import typer
 import typer.core
 
 from pathreplay import interrupts
-from pathreplay.errors import PathreplayError
+from pathreplay.errors import PathreplayError, plain_line
 
 
 class _Ended(BaseException):
@@ -52,7 +53,7 @@ app = typer.Typer(
     cls=_Commands,
     help="Differentiable light transport on Mitsuba 3: check gradients, recover scenes from pictures.",
     no_args_is_help=True,
-    add_completion=False,
+    rich_markup_mode=None,  # Typer's panels show a flag as if it took a value: "--quiet <bool>"
     pretty_exceptions_enable=False,
 )
 
@@ -74,7 +75,7 @@ def _global_options(
     """Options that hold for every command."""
 
 
-@app.command()
+@app.command(short_help="Say what runs on this machine.")
 def doctor() -> None:
     """Say what runs on this machine, and the way out for what does not."""
     from rich.console import Console
@@ -88,10 +89,10 @@ def doctor() -> None:
     raise typer.Exit(0 if report.works else 1)
 
 
-@app.command()
+@app.command(short_help="Compare gradients with finite differences.")
 def check(
     scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or a built-in scene such as cornell-box.")],
-    param: Annotated[list[str], typer.Option(help="Parameter key or glob; may be given several times.")],
+    param: Annotated[list[str], typer.Option(metavar="KEY", help="Parameter key or glob; may be given several times.")],
     integrator: Annotated[
         str | None, typer.Option(help="Plugin to test (default: the scene's, if made for gradients; else pathreplay).")
     ] = None,
@@ -100,7 +101,9 @@ def check(
     fd_spp: Annotated[int | None, typer.Option(help="Samples per pixel of a difference (default: --spp).")] = None,
     step: Annotated[float | None, typer.Option(help="Step of the differences (default: 1 % of the parameter).")] = None,
     max_depth: Annotated[int | None, typer.Option(help="Path length (default: the scene's).")] = None,
-    mode: Annotated[str, typer.Option(help="backward or forward.")] = "backward",
+    mode: Annotated[
+        Literal["backward", "forward"], typer.Option(help="Derivative of the loss, or of the picture.")
+    ] = "backward",
     sensor: Annotated[int, typer.Option(help="Index of the sensor.")] = 0,
     seed: Annotated[int, typer.Option(help="Chooses all random numbers.")] = 0,
     variant: Annotated[str | None, typer.Option(help="Mitsuba variant (default: the best that runs here).")] = None,
@@ -129,14 +132,14 @@ def check(
     raise typer.Exit(0 if all(result.passed for result in results) else 1)
 
 
-@app.command()
+@app.command(short_help="Recover scene parameters from pictures.")
 def optimize(
     config: Annotated[Path | None, typer.Argument(help="Job in TOML; see docs/optimize.md.")] = None,
     resume: Annotated[
         Path | None, typer.Option(metavar="RUN_FOLDER", help="Go on with an unfinished run instead.")
     ] = None,
     output: Annotated[Path | None, typer.Option(help="Run folder to make; default: runs/<name of the config>.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress on the screen.")] = False,
 ) -> None:
     """Recover scene parameters from pictures; Ctrl-C or SIGTERM ends early with everything written."""
     with interrupts.undisturbed():  # what is half imported can bring the process down at its end
@@ -146,33 +149,53 @@ def optimize(
     typer.echo(result.describe())
 
 
+_CHECKOUT = Path(__file__).resolve().parents[2]
+_HAS_BENCHMARKS = (_CHECKOUT / "benchmarks" / "__main__.py").is_file()
+
+
 # The options are those of `python -m benchmarks`, which prints its own help. It runs where the user is: files that are
-# named on the command line are found from there.
-@app.command(add_help_option=False, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+# named on the command line are found from there. The wheel holds no benchmarks, so its help does not show the command.
+@app.command(
+    short_help="Measure time, memory, noise and truth.",
+    hidden=not _HAS_BENCHMARKS,
+    add_help_option=False,
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+)
 def bench(context: typer.Context) -> None:
     """Measure time, memory, noise and truth next to Mitsuba's own integrators; needs a checkout."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / "benchmarks" / "__main__.py").is_file():
+    if not _HAS_BENCHMARKS:
         raise PathreplayError(
             "the benchmarks are not part of the installed package: they are the folder 'benchmarks' of the repository; "
             "clone it and run 'make bench' there"
         )
-    paths = [str(root), *filter(None, [os.environ.get("PYTHONPATH")])]
+    paths = [str(_CHECKOUT), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     command = [sys.executable, "-m", "benchmarks", *context.args]
     raise typer.Exit(subprocess.run(command, env=environment).returncode)
 
 
+def _require_text(argument: str) -> None:
+    try:
+        argument.encode()
+    except UnicodeEncodeError:  # Python's stand-ins for bytes that are no UTF-8, which no report or JSON can hold
+        raise PathreplayError(f"argument '{argument}' is not UTF-8; rename the file or folder") from None
+
+
 def _fail(message: str) -> NoReturn:
     # Plain stderr, one line: neither markup nor wrapping may touch a path or a parameter key.
-    print("pathreplay: error: " + " ".join(message.split()), file=sys.stderr)
+    print("pathreplay: error: " + plain_line(message), file=sys.stderr)
     raise SystemExit(2)
 
 
 def main() -> None:
     """Run the command line; the entry point `pathreplay`."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a terminal without ± should not end a run
     try:
         with interrupts.raised():
+            for argument in sys.argv[1:]:
+                _require_text(argument)
             app()
     except (KeyboardInterrupt, _Ended) as ended:
         _end(ended.__cause__ or ended)

@@ -12,14 +12,16 @@ from typing import Any
 
 import mitsuba as mi
 
+from pathreplay import memory
 from pathreplay import parameters as scene_parameters
 from pathreplay.bsdfs.substitute import load_dict_with, load_file_with
-from pathreplay.builtin_scenes import BUILTINS, SceneDict
-from pathreplay.errors import PathreplayError
+from pathreplay.builtin_scenes import BUILTINS, COSTS, SceneDict
+from pathreplay.errors import PathreplayError, shown
+from pathreplay.files import file_problem
 from pathreplay.scene_files import require_shallow
 
 
-def load_scene(spec: str | Path, base: Path | None = None, **parameters: Any) -> mi.Scene:
+def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any) -> mi.Scene:
     """Load a scene so that its parameter keys keep the names that the file gives.
 
     ``spec`` is the path of a Mitsuba XML file (relative paths start at ``base``, or else at the current folder) or the
@@ -33,21 +35,30 @@ def load_scene(spec: str | Path, base: Path | None = None, **parameters: Any) ->
 
 
 def load_scene_with(
-    spec: str | Path, plugins: Mapping[str, str], base: Path | None = None, **parameters: Any
+    spec: str | Path, plugins: Mapping[str, str], base: Path | None = None, /, **parameters: Any
 ) -> tuple[mi.Scene, list[str]]:
     """`load_scene` with plugins exchanged (old type -> new type), and one line for each that was: id and place."""
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
     if str(spec) in BUILTINS:
-        return load_dict_with(_builtin_dict(str(spec), parameters), plugins)
+        description = _builtin_dict(str(spec), parameters)
+        try:
+            return load_dict_with(description, plugins)
+        except RuntimeError as error:
+            made = f"Built-in scene '{spec}' cannot be made of {parameters}"
+            raise PathreplayError(f"{made}: {one_line(error)}") from error
     path = Path(spec) if base is None else Path(base) / spec
-    if not path.is_file():
+    problem = file_problem(path)
+    if problem == "does not exist":
         raise PathreplayError(_unknown(str(spec), path))
-    arguments: dict[str, Any] = {name: str(value) for name, value in parameters.items()}
+    if problem:
+        raise PathreplayError(f"Scene {path} {problem}; give the path of a Mitsuba XML file")
+    # As XML has them: true and not True.
+    arguments = {name: str(v).lower() if isinstance(v, bool) else str(v) for name, v in parameters.items()}
     try:
         require_shallow(path)
         # Equal objects are not merged: that would lose the names by which parameters are addressed.
-        scene, exchanged = load_file_with(path, plugins, **arguments)
+        scene, exchanged = load_file_with(path, plugins, arguments)
     except (RuntimeError, ValueError, TypeError) as error:
         raise PathreplayError(f"Scene {path} cannot be loaded: {one_line(error)}") from error
     if not isinstance(scene, mi.Scene):
@@ -60,7 +71,7 @@ SMOOTH_GLASS = {"dielectric": "smoothdielectric"}
 
 
 def load_scene_for(
-    spec: str | Path, wanted: Iterable[str], base: Path | None = None, **parameters: Any
+    spec: str | Path, wanted: Iterable[str], base: Path | None = None, /, **parameters: Any
 ) -> tuple[mi.Scene, tuple[str, ...]]:
     """Load a scene in which the ``wanted`` keys and globs carry derivatives, as far as exchanging plugins brings it.
 
@@ -100,8 +111,11 @@ def _builtin_dict(name: str, parameters: dict[str, Any]) -> SceneDict:
     for key, value in parameters.items():
         if key not in known:
             raise PathreplayError(f"Built-in scene '{name}' has no parameter '{key}'; it has: {', '.join(known)}")
+        what = f"Parameter '{key}' of scene '{name}' is {shown(value)}"
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise PathreplayError(f"Parameter '{key}' of scene '{name}' is {value!r}; give a whole number above 0")
+            raise PathreplayError(f"{what}; give a whole number above 0")
+        if key in COSTS:
+            memory.require(COSTS[key](value), f"{what} and", "take a smaller number")
     return make(**parameters)
 
 

@@ -9,11 +9,18 @@ from typing import Any
 import mitsuba as mi
 
 from pathreplay.descriptions import require_values
+from pathreplay.errors import PathreplayError
+from pathreplay.files import file_problem
 from pathreplay.scene_files import require_sound_files
+from pathreplay.threads import spare_thread
 
 
 def load_file_with(
-    path: str | Path, plugins: Mapping[str, str], *, optimize: bool = False, **parameters: Any
+    path: str | Path,
+    plugins: Mapping[str, str],
+    parameters: Mapping[str, str] | None = None,
+    *,
+    optimize: bool = False,
 ) -> tuple[Any, list[str]]:
     """`mi.load_file(path, optimize=optimize, **parameters)` with plugins exchanged, included files' plugins too.
 
@@ -32,7 +39,8 @@ def load_file_with(
     inner.prepend(mi.filesystem.path(str(path.parent)))
     mi.set_file_resolver(inner)
     try:
-        state = mi.parser.parse_file(config, str(path), **{name: str(value) for name, value in parameters.items()})
+        state = mi.parser.parse_file(config, str(path), **_arguments(parameters or {}))
+        _require_files(state)
         return _instantiate(config, state, plugins)
     finally:
         mi.set_file_resolver(outer)
@@ -55,6 +63,24 @@ def load_dict_with(
         mi.set_file_resolver(outer)
 
 
+def _arguments(parameters: Mapping[str, str]) -> dict[str, str]:
+    for name in ("config", "filename"):
+        if name in parameters:
+            raise PathreplayError(f"Scene parameter '{name}' has a name that Mitsuba's parser keeps; rename ${name}")
+    return dict(parameters)
+
+
+def _require_files(state: Any) -> None:
+    """Raise PathreplayError where a plugin is to read a pipe or a device: Mitsuba would wait or read for ever."""
+    resolver = mi.file_resolver()
+    for node in state.nodes:
+        name = node.props.get("filename")
+        if isinstance(name, str) and (problem := file_problem(str(resolver.resolve(name)))) != "does not exist":
+            if problem:
+                where = mi.parser.file_location(state, node)
+                raise PathreplayError(f"File '{name}' of the scene {problem}; name a regular file ({where})")
+
+
 def _config(optimize: bool) -> Any:
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = optimize
@@ -70,4 +96,5 @@ def _instantiate(config: Any, state: Any, plugins: Mapping[str, str]) -> tuple[A
             node.props.set_plugin_name(new)
     require_sound_files(state)
     mi.parser.transform_all(config, state)
-    return mi.parser.instantiate(config, state), exchanged
+    with spare_thread():
+        return mi.parser.instantiate(config, state), exchanged

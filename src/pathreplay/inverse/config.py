@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import difflib
+import math
 import sys
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from pathreplay.errors import PathreplayError
+from pathreplay.errors import PathreplayError, shown
+from pathreplay.files import file_problem
 from pathreplay.inverse.pose import PARTS, PoseKind
 
 if sys.version_info >= (3, 11):
@@ -17,8 +21,31 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-Count = Annotated[int, Field(ge=1)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+def _whole(value: Any) -> Any:
+    return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else value
+
+
+def _single(value: Any) -> Any:
+    """A number as a float; Mitsuba computes in single precision, so what that cannot hold is no number to it."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return value
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number that not even double precision holds
+        number = 2 * LARGEST
+    if math.isfinite(number) and abs(number) > LARGEST:
+        raise ValueError(f"{shown(value)} is beyond single precision; give a number up to {LARGEST:.3g}")
+    return number
+
+
+LARGEST = float(np.finfo(np.float32).max)
+# Strict: true is not 1, and "16" is not 16. NumPy's numbers are numbers.
+Whole = Annotated[int, Field(strict=True), BeforeValidator(_whole)]
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False), BeforeValidator(_single)]
+Positive = Annotated[Finite, Field(gt=0)]
+Switch = Annotated[bool, Field(strict=True)]
+Count = Annotated[Whole, Field(ge=1, le=2**31 - 1)]
 
 
 class _Table(BaseModel):
@@ -30,15 +57,17 @@ class Picture(_Table):
 
     image: str
     fit: Literal["stretch", "crop"] = "stretch"
-    raw: bool = False
+    raw: Switch = False
 
 
 Value = Finite | list[Finite] | str | Picture
 """A parameter's value: one number for every entry, a list such as a colour, or an image file for a texture."""
 
 
+Argument = Switch | Whole | Finite | str
+"""What replaces a ``$name`` in a scene file, or is an argument of a built-in scene."""
+
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class Displacement(_Table):
@@ -119,6 +148,13 @@ class Plugin(BaseModel):
 
     type: str
 
+    @model_validator(mode="after")
+    def _of_32_bits(self) -> Plugin:
+        for name, value in (self.model_extra or {}).items():
+            if isinstance(value, int) and abs(value) >= 2**31:
+                raise ValueError(f"'{name}' of '{self.type}' is {shown(value)}; give a whole number below {2**31}")
+        return self
+
     def as_dict(self) -> dict[str, Any]:
         return self.model_dump()
 
@@ -128,7 +164,7 @@ class Target(_Table):
 
     images: list[str] | None = None
     scene: str | None = None
-    scene_parameters: dict[str, Any] | None = None
+    scene_parameters: dict[str, Argument] | None = None
     values: dict[str, Value] = Field(default_factory=dict)
     integrator: Plugin = Plugin(type="path", max_depth=6)  # type: ignore[call-arg]
     spp: Count = 512
@@ -154,8 +190,8 @@ class Config(_Table):
     """One optimisation job. Every key is explained in docs/optimize.md."""
 
     scene: str
-    scene_parameters: dict[str, Any] = Field(default_factory=dict)
-    sensors: list[int | str] | None = None
+    scene_parameters: dict[str, Argument] = Field(default_factory=dict)
+    sensors: list[Whole | str] | None = None
     variant: str | None = None
     integrator: Plugin = Plugin(type="pathreplay")
     rival: Plugin | None = None
@@ -165,9 +201,9 @@ class Config(_Table):
     iterations: Count = 200
     spp: Count = 16
     picture_spp: Count = 128
-    seed: Annotated[int, Field(ge=0)] = 0
-    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.02
-    learning_rate_decay: Annotated[float, Field(gt=0, le=1)] = 0.1
+    seed: Annotated[Whole, Field(ge=0, le=10**18)] = 0
+    learning_rate: Positive = 0.02
+    learning_rate_decay: Annotated[Positive, Field(le=1)] = 0.1
     checkpoint_every: Count = 25
     deterministic: bool = False
     output: str | None = None
@@ -189,20 +225,36 @@ def load_config(path: Path) -> Config:
     Raises:
         PathreplayError: missing or unreadable file, unknown key (names the nearest), value out of its range.
     """
+    problem = file_problem(path, _LONGEST_FILE)
+    if problem == "does not exist":
+        raise PathreplayError(_no_file(path))
+    if problem:
+        raise PathreplayError(f"Config {path} {problem}; give the path of a TOML file")
     try:
         text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise PathreplayError(_no_file(path)) from None
     except (OSError, UnicodeDecodeError) as error:
-        raise PathreplayError(f"Config {path} cannot be read: {error}") from None
+        raise PathreplayError(f"Config {path} cannot be read ({error}); give a TOML file in UTF-8") from None
     try:
         if path.suffix == ".json":
             return Config.model_validate_json(text)
-        return Config.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise PathreplayError(f"Config {path} is not valid TOML: {error}") from None
+        return Config.model_validate(_toml(path, text))
     except ValidationError as error:
         raise PathreplayError(f"{path}: {_first(error)}") from None
+
+
+# No job is as long: what is larger is some other file.
+_LONGEST_FILE = 64 * 2**20
+
+
+def _toml(path: Path, text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise PathreplayError(f"Config {path} is nested too deep; write the job as in docs/optimize.md") from None
+    except tomllib.TOMLDecodeError as error:
+        raise PathreplayError(f"Config {path} is not valid TOML: {error}; mend it there") from None
+    except ValueError:
+        raise PathreplayError(f"Config {path} has a number of more digits than Python reads; shorten it") from None
 
 
 def make_config(values: dict[str, Any]) -> Config:
@@ -223,12 +275,33 @@ def _no_file(path: Path) -> str:
 _TABLES: dict[str, type[BaseModel]] = {"parameters": Parameter, "target": Target}
 
 
+# What to write instead, by pydantic's type of error; the other messages say it themselves.
+_INSTEAD = {
+    "int_type": "write a whole number such as 16",
+    "float_type": "write a number such as 0.5",
+    "bool_type": "write true or false",
+    "string_type": 'write it in quotes: "..."',
+    "list_type": "write a list: [...]",
+    "dict_type": "write a table: { ... }",
+    "model_type": "write a table: { ... }",
+    "finite_number": "write a finite number",
+    "json_invalid": "mend it there",
+}
+# The last key of a value that may be of several kinds -> what all of them are.
+_KINDS = {
+    "initial": "a number, a list of numbers, the name of an image or volume file, or { image = ... }",
+    "values": "a number, a list of numbers, the name of an image or volume file, or { image = ... }",
+    "scene_parameters": "a number, true, false or a text in quotes",
+    "sensors": "the names or numbers of sensors: [0, ...]",
+}
+
+
 def _first(error: ValidationError) -> str:
     """The first thing wrong, as one line: where it is, what it is, what would be right."""
     details = error.errors()
     # A value that may be a number, list, name or table fails once per alternative: an unknown key says the most.
     first = next((e for e in details if e["type"] == "extra_forbidden"), details[0])
-    where = ".".join(str(part) for part in first["loc"] if not str(part).startswith(("list[", "function-")))
+    where = ".".join(_path(first["loc"])) or "the job"
     if first["type"] == "extra_forbidden":
         key = str(first["loc"][-1])
         table = Config if len(first["loc"]) == 1 else _TABLES.get(str(first["loc"][0]), Config)
@@ -241,5 +314,18 @@ def _first(error: ValidationError) -> str:
     if first["type"] == "missing":
         return f"key '{where}' is missing; add it"
     if first["type"] == "value_error":
-        return str(first["ctx"]["error"])
-    return f"'{where}' is {first['input']!r}: {first['msg'].lower()}"
+        reason = str(first["ctx"]["error"])
+        # Ours name the table that they are about; a number's does not.
+        return f"'{where}': {reason}" if isinstance(first["input"], Real) else reason
+    # The value as it was written: alternatives are judged by their parts.
+    kinds = next((kinds for key, kinds in _KINDS.items() if key in _path(first["loc"])), None)
+    if kinds is not None and len(details) > 1:
+        return f"'{where}' is {shown(first['input'])}; write {kinds}"
+    instead = _INSTEAD.get(first["type"])
+    return f"'{where}' is {shown(first['input'])}: {first['msg'].lower()}" + (f"; {instead}" if instead else "")
+
+
+def _path(loc: tuple[int | str, ...]) -> list[str]:
+    """Where an error is, as a user would say it: without the names of the alternatives that were tried."""
+    tried = ("list[", "function-", "constrained-", "nullable[")
+    return [str(p) for p in loc if p not in ("int", "float", "bool", "str", "Picture") and not str(p).startswith(tried)]

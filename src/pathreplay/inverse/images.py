@@ -6,14 +6,18 @@ PNGs are sRGB encoded after multiplication with an exposure; written EXRs are li
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import OpenEXR
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
+from pathreplay.files import file_problem
 from pathreplay.scenes import one_line
+from pathreplay.threads import spare_thread
 
 Image = NDArray[np.float32]
 """Linear pixels, shape (height, width, channels)."""
@@ -30,8 +34,8 @@ def find_image(name: str, base: Path) -> Path:
         path = Path(cbook.get_sample_data(name[len(SAMPLE) :], asfileobj=False))
     else:
         path = base / name
-    if not path.is_file():
-        raise PathreplayError(f"No image file '{name}': {path} does not exist; correct the path or create the file")
+    if problem := file_problem(path):
+        raise PathreplayError(f"No image file '{name}': {path} {problem}; correct the path or create the file")
     return path
 
 
@@ -41,13 +45,17 @@ def read_image(path: Path, *, raw: bool = False) -> Image:
     Raises:
         PathreplayError: the file is no image that Mitsuba can read.
     """
+    if problem := file_problem(path):
+        raise PathreplayError(f"Image {path} {problem}; correct the path or create the file")
     try:
-        bitmap = mi.Bitmap(str(path))
+        with spare_thread():
+            bitmap = mi.Bitmap(str(path))
     except RuntimeError as error:
         raise PathreplayError(f"Image {path} cannot be read: {one_line(error)}") from None
     if raw:
         bitmap.set_srgb_gamma(False)
-    bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
+    if bitmap.pixel_format() != mi.Bitmap.PixelFormat.MultiChannel:  # whose channels it can only convert by their names
+        bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
     pixels = np.array(bitmap, dtype=np.float32)
     return pixels[:, :, None] if pixels.ndim == 2 else pixels
 
@@ -101,15 +109,30 @@ def resized(image: Image, height: int, width: int, *, crop: bool = False) -> Ima
 
 
 def exr_bytes(image: Image) -> bytes:
-    """The image as a float32 OpenEXR file."""
-    return _encoded(mi.Bitmap(np.ascontiguousarray(_displayable(image))), mi.Bitmap.FileFormat.OpenEXR)
+    """The image as a float32 OpenEXR file with the channels Y, YA, RGB or RGBA (more of them: 0000, 0001, …), zipped.
+
+    Not by Mitsuba, which waits for its pool of threads to write one: for ever, where that has a single thread.
+    """
+    count = image.shape[2]
+    names = {1: ["Y"], 2: ["Y", "A"], 3: ["R", "G", "B"], 4: ["R", "G", "B", "A"]}.get(
+        count, [f"{i:04d}" for i in range(count)]
+    )
+    channels = {name: np.ascontiguousarray(image[:, :, i], np.float32) for i, name in enumerate(names)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    buffer = io.BytesIO()
+    with OpenEXR.File(header, channels, num_threads=0) as file:
+        file.write(buffer)
+    return buffer.getvalue()
 
 
 def png_bytes(image: Image, exposure: float = 1.0) -> bytes:
     """The image times ``exposure`` as an 8-bit sRGB PNG file."""
     shown = np.clip(_displayable(image) * exposure, 0, 1).astype(np.float32)
     bitmap = mi.Bitmap(np.ascontiguousarray(shown))
-    return _encoded(bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True), mi.Bitmap.FileFormat.PNG)
+    # Through memory, so that the disk is touched in one place (run_folder), which handles a full one.
+    stream = mi.MemoryStream()
+    bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(stream, mi.Bitmap.FileFormat.PNG)
+    return bytes(stream.raw_buffer())
 
 
 def exposure_for(image: Image) -> float:
@@ -132,10 +155,3 @@ def _displayable(image: Image) -> Image:
     if image.shape[2] == 2:
         return image[:, :, :1]
     return image
-
-
-def _encoded(bitmap: mi.Bitmap, file_format: mi.Bitmap.FileFormat) -> bytes:
-    # Through memory, so that the disk is touched in one place (run_folder), which handles a full one.
-    stream = mi.MemoryStream()
-    bitmap.write(stream, file_format)
-    return bytes(stream.raw_buffer())

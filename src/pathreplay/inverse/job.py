@@ -19,6 +19,7 @@ from pathreplay.inverse import checkpoint
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.file_names import file_names
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes, read_image
+from pathreplay.inverse.limits import require_finite_loss
 from pathreplay.inverse.loop import Run, iterate, new_run, put_values, render_views, scene_values
 from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.problem import Problem, build_problem
@@ -42,7 +43,7 @@ from pathreplay.media.volume_files import vol_bytes
 from pathreplay.parameters import get_array, to_value
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RunResult:
     """What a run came to; everything in it is also in ``folder``."""
 
@@ -60,6 +61,13 @@ class RunResult:
     """Root mean square error of each parameter whose truth is known; poses are told apart."""
     poses: dict[str, PoseError]
     """How far each pose whose truth is known is from it."""
+
+    def __repr__(self) -> str:
+        """Short: a notebook prints it, and the history may have thousands of entries."""
+        loss = f", loss {self.history[-1].loss:.4g}" if self.history else ""
+        stopped = ", stopped early" if self.stopped else ""
+        count = f"{len(self.parameters)} parameters"
+        return f"<RunResult: {self.iterations} iterations{loss}{stopped}, {count}, {self.report}>"
 
     def describe(self) -> str:
         """A few lines for the terminal: loss, errors, where the report is, how to go on."""
@@ -92,7 +100,7 @@ def optimize(
         resume: run folder of an earlier, unfinished run, to go on with; excludes ``config`` and ``output``.
         output: run folder to make; the default is the config's ``output``, else ``runs/<name of the config>``. Where it
             exists, a number is appended: an earlier run is never touched.
-        progress: draw a progress bar on stderr.
+        progress: draw a progress bar on stderr (lines, now and then, where that is no terminal).
 
     The first Ctrl-C, SIGTERM or SIGHUP ends the run after the current iteration with everything written; a Ctrl-C after
     that aborts (KeyboardInterrupt). Until the run folder is there, signals do what they did before. With
@@ -139,6 +147,8 @@ def _begun(start: _Start, problem: Problem, run: Run, rival: Run | None) -> tupl
     with one_thread(start.config.deterministic):
         put_values(problem, run.adam)
         before = render_views(problem, start.config)
+    for view in problem.views:
+        require_finite_loss(problem.loss, view.name, view.target, before[view.name])
     files = {**_first_files(problem, before), **_checkpoints(run, rival)}
     return before, create_run_folder(start.output, start.config, start.source, start.base, files)
 

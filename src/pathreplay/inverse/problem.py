@@ -18,6 +18,7 @@ from pathreplay.descriptions import load_description
 from pathreplay.edges import edges_note, moves_edges
 from pathreplay.errors import PathreplayError
 from pathreplay.integrator import EDGES
+from pathreplay.inverse import limits
 from pathreplay.inverse.config import Config, Parameter, Plugin, Value
 from pathreplay.inverse.file_names import file_names
 from pathreplay.inverse.grids import Levels, comparable, make_levels, resampled
@@ -112,8 +113,10 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
         _edges(params, keys, rival)  # for its log: one note is enough
     judge = integrator if config.target.images is not None else load_integrator(config.target.integrator)
     # Before any target is rendered: the cheap mistakes first.
-    unsolved, moved = _variables(params, keys, config, base)
     sensors = _sensors(scene, config.sensors)
+    limits.require_visible(scene, keys)
+    limits.require_films(scene, sensors, {"spp": config.spp, "picture_spp": config.picture_spp})
+    unsolved, moved = _variables(scene, params, keys, config, base)
 
     truth: dict[str, Array] = {}
     if config.target.images is None:
@@ -131,6 +134,8 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
 
     if missing := set(sensors) - set(targets):
         raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
+    for name, target in targets.items():
+        limits.require_finite_loss(loss, name, target)
     variables = tuple(replace(variable, truth=truth.get(variable.key)) for variable in unsolved)
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in moved)
     # Traversed anew: an object from which values were read expects all its keys at the next update().
@@ -152,9 +157,15 @@ def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
 def load_integrator(plugin: Plugin) -> mi.Integrator:
     """The integrator that the job names; an unknown type or option becomes one line."""
     try:
-        return load_description(plugin.as_dict())
-    except (RuntimeError, TypeError, ValueError) as error:
+        integrator = load_description(plugin.as_dict())
+    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
         raise PathreplayError(f"Integrator '{plugin.type}' cannot be made: {one_line(error)}") from None
+    if not isinstance(integrator, mi.Integrator):
+        raise PathreplayError(
+            f"Integrator '{plugin.type}' is a {type(integrator).__name__}; name an integrator, such as 'pathreplay' "
+            "(or 'path' for targets)"
+        )
+    return integrator
 
 
 def _keys(params: mi.SceneParameters, entries: list[Parameter], integrator: mi.Integrator) -> dict[str, Parameter]:
@@ -182,7 +193,7 @@ def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integ
 
 
 def _variables(
-    params: mi.SceneParameters, keys: dict[str, Parameter], config: Config, base: Path
+    scene: mi.Scene, params: mi.SceneParameters, keys: dict[str, Parameter], config: Config, base: Path
 ) -> tuple[list[Variable], list[Pose]]:
     variables: list[Variable] = []
     poses: list[Pose] = []
@@ -192,12 +203,14 @@ def _variables(
             form = form_of(params, key)
             like = _seen(params, key)
             start = _start(key, like, form, entry, base)
+            limits.require_learning_rate(key, rate, start, (entry.lower, entry.upper))
             levels = _levels(key, entry, start)
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
                 like = type(like)(start)
             variables.append(Variable(key, like, entry.lower, entry.upper, rate, start, None, levels, form))
             continue
+        _require_near(scene, key, params[key], entry)
         pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
         poses.append(pose)
         for part, name in pose.parts().items():
@@ -208,8 +221,18 @@ def _variables(
                 start = np.radians(start)
                 degrees = entry.rotation_learning_rate
                 rate = rate if degrees is None else float(np.radians(degrees))
+            limits.require_learning_rate(name, rate, start)
             variables.append(Variable(name, mi.Vector3f(0), None, None, rate, start, None))
     return variables, poses
+
+
+def _require_near(scene: mi.Scene, key: str, value: Any, entry: Parameter) -> None:
+    array = parameters.get_array(value)
+    extent = limits.extent_of(scene, array[:3, 3] if array.shape == (4, 4) else array)
+    shift, turn = (None, None) if entry.start is None else (entry.start.translation, entry.start.rotation)
+    limits.require_near(key, extent, {"pivot": entry.pivot, "start.translation": shift})
+    if turn is not None and max(map(abs, turn)) > 360:
+        raise PathreplayError(f"Parameter '{key}' starts turned by {turn} degrees; give angles between -360 and 360")
 
 
 def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:
@@ -219,6 +242,7 @@ def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:
         raise PathreplayError(
             f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'resolutions' out"
         )
+    limits.require_grid(key, start.shape, entry.resolutions)
     return make_levels(start.shape, entry.resolutions, entry.refine_at or [])
 
 
@@ -306,6 +330,7 @@ def _rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) 
         raise PathreplayError(
             f"The target scene has {len(scene.sensors())} sensors, the job uses number {max(sensors.values())} (from 0)"
         )
+    limits.require_films(scene, sensors, {"target.spp": config.target.spp})
     targets: dict[str, Image] = {}
     for name, index in sensors.items():
         seed, _ = seeds(config.seed, TARGET, 0, index)

@@ -1,14 +1,20 @@
-"""What the user sees while a job runs: one bar with loss and remaining time, on stderr."""
+"""What the user sees while a job runs, on stderr: a bar on a terminal, plain lines now and then everywhere else."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
+import time
 from types import TracebackType
 from typing import IO, Any, cast
 
 import rich.progress
 from rich.console import Console
+
+from pathreplay.errors import plain_line
+
+# Between two lines, where there is no bar: a log of a long run stays readable.
+_SECONDS = 10.0
 
 
 class _Forgiving:
@@ -31,9 +37,16 @@ class _Forgiving:
 
 
 class Progress:
-    """A progress bar, or silence; use as a context manager."""
+    """Progress of a job, or silence; use as a context manager.
+
+    A notebook gets lines, too: rich's bar needs ipywidgets there, and shows nothing without them.
+    """
 
     def __init__(self, shown: bool) -> None:
+        self._stream = cast(IO[str], _Forgiving())
+        console = Console(file=self._stream, force_jupyter=False)
+        self._lines = shown and not console.is_terminal
+        self._told, self._begin, self._before = time.monotonic(), time.monotonic(), 0
         self._bar = rich.progress.Progress(
             rich.progress.TextColumn("{task.description}"),
             rich.progress.BarColumn(),
@@ -42,8 +55,8 @@ class Progress:
             rich.progress.TimeElapsedColumn(),
             rich.progress.TextColumn("left"),
             rich.progress.TimeRemainingColumn(),
-            console=Console(file=cast(IO[str], _Forgiving())),
-            disable=not shown,
+            console=console,
+            disable=not shown or self._lines,
         )
         self._task = self._bar.add_task("optimize", total=None, loss="")
 
@@ -59,15 +72,33 @@ class Progress:
     def say(self, text: str) -> None:
         """Name what is going on now."""
         self._bar.update(self._task, description=text)
+        if self._lines:
+            self._print(text)
 
     def note(self, text: str) -> None:
         """One line that stays, above the bar."""
-        self._bar.console.print(f"pathreplay: {text}", markup=False, highlight=False, soft_wrap=True)
+        self._bar.console.print(
+            f"pathreplay: {plain_line(text)}", markup=False, highlight=False, soft_wrap=True, emoji=False
+        )
 
     def start(self, done: int, total: int) -> None:
         """Begin to count iterations."""
         self._bar.reset(self._task, total=total, completed=done, description="optimizing", loss="")
+        self._begin, self._before = time.monotonic(), done
+        if self._lines:
+            self._print(f"optimizing, iterations {done} to {total}")
 
     def advance(self, loss: float) -> None:
         """One iteration is done."""
         self._bar.update(self._task, advance=1, loss=f"loss {loss:.4g}")
+        if not self._lines:
+            return
+        task = self._bar.tasks[0]
+        done, total = int(task.completed), int(task.total or 0)
+        if done == self._before + 1 or done == total or time.monotonic() - self._told >= _SECONDS:
+            left = (time.monotonic() - self._begin) / max(1, done - self._before) * (total - done)
+            self._print(f"iteration {done} of {total}, loss {loss:.4g}, about {left:.0f} s left")
+
+    def _print(self, text: str) -> None:
+        self._told = time.monotonic()
+        print(f"pathreplay: {text}", file=self._stream, flush=True)

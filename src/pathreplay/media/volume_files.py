@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
+from pathreplay.files import file_problem
 from pathreplay.media.nanovdb_header import require_whole_nanovdb
 
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -64,8 +65,8 @@ def load_volume(path: str | Path, grid: str | None = None) -> Volume:
     read = {".vol": _read_vol, ".vdb": _read_vdb, ".nvdb": _read_nvdb}.get(path.suffix.lower())
     if read is None:
         raise PathreplayError(f"Volume {path} has the unknown ending '{path.suffix}'; give a .vol, .vdb or .nvdb file")
-    if not path.is_file():
-        raise PathreplayError(f"No volume file {path}; correct the path")
+    if problem := file_problem(path):
+        raise PathreplayError(f"No volume file {path}: it {problem}; correct the path")
     volume = read(path, grid)
     if not np.isfinite(volume.data).all():
         raise PathreplayError(f"Volume {path} holds NaN or infinite values; repair it first")

@@ -1,0 +1,35 @@
+"""How many pixels a sensor renders, and how many samples of them Dr.Jit takes at once."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from pathreplay.errors import PathreplayError
+
+# Dr.Jit counts the samples of one kernel in 32 bits.
+MOST_SAMPLES = 2**32 - 1
+
+
+def film_size(sensor: mi.Sensor) -> tuple[int, int]:
+    """Width and height of what is rendered: the crop window, and the film's border where it samples one."""
+    film = sensor.film()
+    border = 2 * int(film.rfilter().border_size()) if film.sample_border() else 0
+    width, height = (int(n) + border for n in film.crop_size())
+    return width, height
+
+
+def require_samples(key: str, spp: int, size: tuple[int, int], sensor: str) -> None:
+    """Return quietly if Dr.Jit takes ``spp`` samples for each pixel of a film of that size at once.
+
+    Raises:
+        PathreplayError: it does not; names ``key``, what stands there, and the largest number that would do.
+    """
+    width, height = size
+    pixels = width * height
+    if pixels * spp <= MOST_SAMPLES:
+        return
+    way_out = f"'{key}' up to {MOST_SAMPLES // pixels}" if pixels <= MOST_SAMPLES else "a smaller film"
+    raise PathreplayError(
+        f"'{key}' is {spp}: with {sensor} of {width} x {height} pixels that is {pixels * spp} samples, beyond the "
+        f"{MOST_SAMPLES} that Dr.Jit takes at once; take {way_out}"
+    )

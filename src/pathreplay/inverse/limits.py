@@ -1,0 +1,147 @@
+"""What a job asks for, held against what Dr.Jit, single precision and memory can do, before anything is rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from math import prod
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from pathreplay import memory
+from pathreplay.errors import PathreplayError
+from pathreplay.films import MOST_SAMPLES, film_size, require_samples
+from pathreplay.inverse.images import Image
+
+if TYPE_CHECKING:
+    from pathreplay.inverse.losses import Loss
+
+# Bytes, measured (peak of the process over 2048 x 2048 pixels, LLVM): a rendering, its derivative and their files take
+# 127 a pixel, at one view at a time; target, start and result of all views stay. Samples take next to none.
+_A_RENDERING, _A_VIEW = 128, 36
+# A value of a grid: as NumPy and as Dr.Jit hold it, gradient, Adam's moments, interpolation in double precision.
+_A_VALUE = 64
+# A step of Adam's is about the learning rate: nothing is found by steps a million times the value.
+_LONGEST_STEP = 1e6
+_FARTHEST = 1e4
+
+
+def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str, int]) -> None:
+    """Return quietly if every sensor (name -> index) can be rendered with each of ``spp`` (key -> count).
+
+    Raises:
+        PathreplayError: there are too many samples for one kernel, or too many pixels for the memory.
+    """
+    most, total = 0, 0
+    for name, index in sensors.items():
+        width, height = film_size(scene.sensors()[index])
+        for key, count in spp.items():
+            require_samples(key, count, (width, height), f"sensor '{name}'")
+        most, total = max(most, width * height), total + width * height
+        needed = most * _A_RENDERING + total * _A_VIEW
+        what = f"Rendering sensor '{name}' of {width} x {height} pixels"
+        memory.require(needed, what, "take a smaller film or fewer sensors")
+
+
+def require_visible(scene: mi.Scene, keys: Iterable[str]) -> None:
+    """Return quietly if the scene has shapes, or else all ``keys`` belong to lights and sensors.
+
+    Raises:
+        PathreplayError: no picture can depend on one of them.
+    """
+    if scene.shapes():
+        return
+    seen = tuple(f"{thing.id()}." for thing in [*scene.emitters(), *scene.sensors()])
+    for key in keys:
+        if not key.startswith(seen):
+            raise PathreplayError(
+                f"Parameter '{key}' cannot be seen: the scene has no shapes; add some, or name a parameter of a light"
+            )
+
+
+def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> None:
+    """Return quietly if a grid of ``shape`` (axes, then channels) fits the memory in its largest resolution.
+
+    Raises:
+        PathreplayError: it does not; names the largest resolution that does.
+    """
+    *axes, channels = (int(n) for n in shape)
+    largest = max(axes)
+
+    def cells(size: int) -> int:
+        # In whole numbers, which do not overflow: what is asked for may be anything.
+        return channels * prod(max(min(n, 2), (n * size + largest // 2) // largest) for n in axes)
+
+    wanted = max(resolutions)
+    most = min(memory.available() // _A_VALUE, MOST_SAMPLES)
+    if cells(wanted) <= most:
+        return
+    fits, too_much = 0, wanted
+    while too_much - fits > 1:
+        middle = (fits + too_much) // 2
+        fits, too_much = (middle, too_much) if cells(middle) <= most else (fits, middle)
+    way_out = f"take up to {fits}" if fits else "free some memory"
+    raise PathreplayError(
+        f"Parameter '{key}' has the resolution {wanted}: {cells(wanted)} values, of which {most} fit the memory "
+        f"that is left; {way_out}"
+    )
+
+
+def require_learning_rate(key: str, rate: float, start: np.ndarray, bounds: Sequence[float | None] = ()) -> None:
+    """Return quietly unless a step of ``rate`` is a million times the largest value and bound of the parameter.
+
+    Raises:
+        PathreplayError: it is; the run could only end in infinities.
+    """
+    scale = max(1.0, float(np.abs(start).max(initial=0.0)), *(abs(bound) for bound in bounds if bound is not None))
+    if rate > _LONGEST_STEP * scale:
+        raise PathreplayError(
+            f"Parameter '{key}' has the learning rate {rate:g}, about the step that it takes per iteration, and values "
+            f"up to {scale:g}; lower 'learning_rate' (a hundredth of the values is a good start)"
+        )
+
+
+def require_near(key: str, extent: float, lengths: Mapping[str, Sequence[float] | None]) -> None:
+    """Return quietly if no number of ``lengths`` (config key -> vector) is ten thousand times the scene's ``extent``.
+
+    Beyond, the rounding of single precision (1e-7 of the number) is a thousandth of the scene and grows from there.
+
+    Raises:
+        PathreplayError: one is.
+    """
+    for name, vector in lengths.items():
+        largest = max(map(abs, vector or [0.0]))
+        if largest > _FARTHEST * extent:
+            raise PathreplayError(
+                f"Parameter '{key}': '{name}' goes to {largest:g}, and the scene to {extent:.3g}; give "
+                f"numbers up to {_FARTHEST * extent:.3g}"
+            )
+
+
+def extent_of(scene: mi.Scene, *points: np.ndarray) -> float:
+    """The largest coordinate of the scene's bounding box and ``points``; 1 where there is none."""
+    box = scene.bbox()
+    corners = [np.array(box.min), np.array(box.max)] if box.valid() else []
+    return max((float(np.abs(point).max(initial=0.0)) for point in [*corners, *points]), default=0.0) or 1.0
+
+
+def require_finite_loss(loss: Loss, name: str, target: Image, picture: Image | None = None) -> None:
+    """Return quietly if the loss of ``picture`` (default: black) against ``target``, and its derivative, are finite.
+
+    Raises:
+        PathreplayError: they are not; names the brightest value.
+    """
+    image: Any = mi.TensorXf(np.zeros_like(target) if picture is None else picture)
+    dr.enable_grad(image)
+    value = loss(image, mi.TensorXf(target))
+    dr.backward(value)
+    if np.isfinite(np.array(value)).all() and np.isfinite(np.array(dr.grad(image))).all():
+        return
+    what, shown = ("Target", target) if picture is None else ("Start picture", picture)
+    extreme = float(shown.flat[int(np.abs(shown).argmax())])
+    raise PathreplayError(
+        f"{what} of sensor '{name}' holds {extreme:g}: the loss is no finite number in single precision; scale lights "
+        "and pictures down, or start elsewhere"
+    )
