@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import struct
 import zipfile
@@ -96,12 +95,11 @@ def pfm(pixels: np.ndarray) -> bytes:
     return f"PF\n{width} {height}\n-1.0\n".encode() + np.ascontiguousarray(pixels[::-1], "<f4").tobytes()
 
 
-def make(folder: Path, vdb: Path) -> None:
-    """Write ``room`` and ``run`` into ``folder``. Runs the job once: needs a process of its own."""
-    from pathreplay.inverse import optimize
+def make_room(room: Path, vdb: Path) -> None:
+    """Write the files of a good room. Needs an active variant."""
+    from pathreplay.inverse.images import exr_bytes
     from pathreplay.media.volume_files import save_vol
 
-    room = folder / "room"
     room.mkdir()
     (room / "ball.xml").write_text(SCENE)
     (room / "job.toml").write_text(toml(JOB))
@@ -109,14 +107,18 @@ def make(folder: Path, vdb: Path) -> None:
     (room / "sheet.ply").write_text(coordinate_ply())
     (room / "tile.obj").write_text("vt 0 0\nvt 1 0\nvt 1 1\n" + obj().replace("f 1 2 3", "f 1/1 2/2 3/3"))
     (room / "mesh.serialized").write_bytes(serialized())
+    (room / "target.exr").write_bytes(exr_bytes(np.full((6, 8, 3), 0.5, np.float32)))
     save_vol(room / "cloud.vol", np.full((3, 4, 5, 1), 0.5, np.float32))
     with zipfile.ZipFile(vdb) as archive:
         archive.extractall(room)
-    os.chdir(room)
+
+
+def make(folder: Path, vdb: Path) -> None:
+    """Write the folders ``room`` and ``run`` into ``folder``. Runs the job once: needs a process of its own."""
     from pathreplay import backend
-    from pathreplay.inverse.images import exr_bytes
+    from pathreplay.inverse import optimize
 
     backend.set_variant("llvm_ad_rgb")
-    (room / "target.exr").write_bytes(exr_bytes(np.full((6, 8, 3), 0.5, np.float32)))
+    make_room(folder / "room", vdb)
+    os.chdir(folder / "room")
     optimize("job.toml", output=folder / "run", progress=False)
-    json.loads((folder / "run" / "run.json").read_text())

@@ -73,10 +73,7 @@ class Lane:
         """Make a fresh room, spoil it, run what meets it, and judge."""
         ground = self.scratch / "ground"
         shutil.rmtree(ground, ignore_errors=True)
-        room = Room(ground / "room", self.assets)
-        shutil.copytree(self.assets / "room", room.path)
-        room.outside.mkdir()
-        (room.outside / "precious").write_text("not to be touched")
+        room = Room.new(ground, self.assets)
         action = case.prepare(room)
         before = snapshot(ground)
         ended = self.run(action, room.path)

@@ -10,7 +10,8 @@ from .case import Action, Recipe
 from .server import MEMORY_LIMIT_MB
 from .snapshot import State, difference
 
-ERROR = "pathreplay: error: "
+#: `bench` hands over to a program of its own.
+ERRORS = ("pathreplay: error: ", "benchmarks: error: ")
 LONGEST = 2000
 
 # All but the ends of lines and tabs: what could move a terminal's cursor or rename its window.
@@ -66,14 +67,14 @@ def _of_the_words(action: Action, ended: Ended) -> list[str]:
         found.append("traceback")
     if CONTROL.search(words):
         found.append("control characters")
-    errors = [line for line in words.splitlines() if line.startswith(ERROR)]
+    errors = [line for line in words.splitlines() if line.startswith(ERRORS)]
     if ended.status == 2 and ended.killed == "" and not _nobody_reads(action):
         lines = ended.stderr.strip().split("\n")
-        if len(errors) != 1 or not lines[-1].startswith(ERROR):
+        if len(errors) != 1 or not lines[-1].startswith(ERRORS):
             found.append("no line that tells what is wrong" if not errors else "more than one line")
         elif len(errors[0]) > LONGEST:
             found.append("a message too long")
-        elif len(errors[0]) <= len(ERROR) + 3:
+        elif len(errors[0]) <= len(ERRORS[0]) + 3:
             found.append("a message that says nothing")
     elif ended.status in (0, 1) and errors:
         found.append("an error, and yet no status 2")
@@ -81,8 +82,8 @@ def _of_the_words(action: Action, ended: Ended) -> list[str]:
 
 
 def _nobody_reads(action: Action) -> bool:
-    """Whether a shell line sends errors elsewhere."""
-    return "2>" in action.shell
+    """Whether a shell line sends errors elsewhere, or the command line is empty, which shows the help."""
+    return "2>" in action.shell or action == Action()
 
 
 def _of_the_files(action: Action, ended: Ended, before: State, after: State) -> list[str]:

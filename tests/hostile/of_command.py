@@ -6,11 +6,11 @@ import numpy as np
 
 from .case import CHECK, Action, add, recipe
 from .room import ODD_FILES, Room
-from .values import NUMBERS, TEXTS, pick
+from .values import LOCAL, NUMBERS, TEXTS, pick
 
 KIND = "command"
 
-CHECK_TEXTS = ("--param", "--integrator", "--mode", "--variant", "--json")
+CHECK_TEXTS = ("--param", "--integrator", "--mode", "--variant")
 CHECK_NUMBERS = ("--seeds", "--spp", "--fd-spp", "--step", "--max-depth", "--sensor", "--seed")
 
 
@@ -20,14 +20,19 @@ def check_with_a_hostile_text(room: Room, rng: np.random.Generator) -> Action:
 
 
 @recipe(KIND, fuzz=True)
+def check_writes_to_a_hostile_name(room: Room, rng: np.random.Generator) -> Action:
+    name = pick(rng, LOCAL)
+    return Action(argv=(*CHECK, "--json", name), writes=(name,))
+
+
+@recipe(KIND, fuzz=True)
 def check_with_a_hostile_number(room: Room, rng: np.random.Generator) -> Action:
     return _with(*CHECK, pick(rng, CHECK_NUMBERS), pick(rng, NUMBERS))
 
 
 @recipe(KIND, fuzz=True)
 def optimize_with_a_hostile_text(room: Room, rng: np.random.Generator) -> Action:
-    # '..' and '/' as a folder to make runs/NAME-2 beside are writes that the user asked for.
-    text = pick(rng, tuple(text for text in TEXTS if text.strip("/.")))
+    text = pick(rng, LOCAL)
     return _with("optimize", *pick(rng, (("job.toml", "--output", text), ("--resume", text), (text,))), "--quiet")
 
 
@@ -35,15 +40,11 @@ def optimize_with_a_hostile_text(room: Room, rng: np.random.Generator) -> Action
 def words_in_any_order(room: Room, rng: np.random.Generator) -> Action:
     words = (*CHECK, "optimize", "job.toml", "--resume", "--quiet", "--version", "--", "--help", *TEXTS[:8])
     chosen = [pick(rng, words) for _ in range(int(rng.integers(1, 7)))]
-    return Action(argv=tuple(_argument(word) for word in chosen))
+    return Action(argv=tuple(chosen))
 
 
 def _with(*words: str) -> Action:
-    return Action(argv=tuple(_argument(word) for word in words))
-
-
-def _argument(text: str) -> str:
-    return text.replace("\x00", "")
+    return Action(argv=words)
 
 
 def _line(*words: str, refused: bool = True, writes: tuple[str, ...] = ()) -> None:
@@ -99,7 +100,6 @@ for _text in (
     ".",
     "..",
     "/",
-    "/dev/null",
     "/dev/full/run",
     "/proc/none/run",
     "job.toml/run",

@@ -73,8 +73,8 @@ for _value in ("'low'", "float('nan')", "-1", "None"):
 for _plugin in OPTIONS:
     for _variant in ("scalar_rgb", "scalar_spectral"):
         _code(f"{_plugin} in {_variant}", f"mi.load_dict({{'type': {_plugin!r}}})", variant=_variant)
-    _code(f"{_plugin} in a polarised variant", f"mi.load_dict({{'type': {_plugin!r}}})", variant="llvm_ad_rgb_polarized"
-    ) if _plugin != "gridmedium" else None  # fmt: skip
+    if _plugin != "gridmedium":  # media know no polarisation
+        _code(f"{_plugin}, polarised", f"mi.load_dict({{'type': {_plugin!r}}})", variant="llvm_ad_mono_polarized")
 
 
 # ------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ _code(
 _code("check_gradient of a loss that is NaN", CHECK.format(
     key="'paint.reflectance.data'", options="{'loss': lambda image: dr.sum(image) * float('nan')}"))  # fmt: skip
 
-OPTIMIZE = "from pathreplay.inverse import make_config, optimize, load_config\n"
+OPTIMIZE = "from pathreplay.inverse import make_config, optimize\n"
 for _call in (
     "optimize()",
     "optimize(3)",
@@ -140,21 +140,17 @@ for _call in (
     "make_config({3: 4})",
     "optimize(np.zeros(3))",
 ):
-    _code(_call[:60], (OPTIMIZE if "load_config" not in _call else OPTIMIZE) + _call)
+    _code(_call[:60], OPTIMIZE + _call)
 
 VOLUMES = "from pathreplay.media.volume_files import grid_volume, load_volume, save_vol, vol_bytes\n"
 for _call in (
     "load_volume('')",
-    "load_volume(None)",
     "load_volume('texture.png')",
     "load_volume('cloud.vol', 'density')",
     "load_volume('two.vdb')",
     "load_volume('two.vdb', 'dens')",
     "load_volume('two.nvdb', 3)",
-    "save_vol('no/such/folder.vol', np.zeros((2, 2, 2)))",
-    "save_vol('.', np.zeros((2, 2, 2)))",
     "vol_bytes(np.zeros(3))",
-    "vol_bytes(np.array([[['a']]]))",
     "vol_bytes(np.zeros((0, 2, 2)))",
     "grid_volume('cloud.vol', filter_typ='nearest') and mi.load_dict(grid_volume('cloud.vol', filter_typ='nearest'))",
     "mi.load_dict(grid_volume('cloud.vol', to_world=3))",
@@ -163,10 +159,9 @@ for _call in (
 
 RENDER = LOADED + "integrator = mi.load_dict({'type': 'pathreplay'})\n"
 for _call in (
-    "mi.render(scene, integrator=integrator, sensor=7)",
     "mi.render(scene, integrator=integrator, spp=2**31)",
     "integrator.render_and_backward(scene, 0, 0, scene.sensors()[0], 0, 1)",
-    "integrator.render_and_backward(scene, mi.TensorXf(0, (1, 1, 1)), mi.TensorXf(0, (1, 1, 1)), scene.sensors()[0], 0, 1)",
+    "integrator.render_and_backward(scene, *2 * [mi.TensorXf(0, (1, 1, 1))], scene.sensors()[0], 0, 1)",
 ):
     _code(_call[:80], RENDER + _call)
 _code(

@@ -68,8 +68,20 @@ _run("spoiled bytes", _spoil_file, refused=False, fuzz=True)
 #  run.json
 # ------------------------------------------------------------------------------
 
-for _text in ("", "{}", "[]", "null", "3", '{"base": 3, "config": []}', '{"base": "/nowhere"}', '{"base": null, "config": null}',
-              '{"base": "\\u0000", "config": "a"}', "[" * 100_000, '{"base": "' + "x" * 10_000 + '", "config": null}'):  # fmt: skip
+RUN_JSON = (
+    "",
+    "{}",
+    "[]",
+    "null",
+    "3",
+    '{"base": 3, "config": []}',
+    '{"base": "/nowhere"}',
+    '{"base": null, "config": null}',
+    '{"base": "\\u0000", "config": "a"}',
+    "[" * 100_000,
+    '{"base": "' + "x" * 10_000 + '", "config": null}',
+)
+for _text in RUN_JSON:
     _run(f"run.json: {_text[:40]}", lambda run, room, rng, text=_text: (run / "run.json").write_text(text))  # type: ignore[misc]
 
 
@@ -361,7 +373,8 @@ for _signals, _statuses in (
         sends = "; sleep 0.02; ".join(f"kill -{name} $process" for name in signals.split())
         wait = "while [ ! -e runs/job/checkpoint.safetensors ]; do sleep 0.1; done"
         return Action(
-            shell=f"set -m; python -m pathreplay.cli optimize job.toml --quiet & process=$!; {wait}; {sends}; wait $process",
+            shell="set -m; python -m pathreplay.cli optimize job.toml --quiet & process=$!; "
+            f"{wait}; {sends}; wait $process",
             statuses=statuses,
         )
 

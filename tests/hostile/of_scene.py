@@ -103,7 +103,7 @@ FILES: dict[str, Callable[[], bytes]] = {
         + b']><scene version="3.0.0"><string name="x" value="&j;"/></scene>'
     ),
     "an entity from a file": lambda: (
-        b'<!DOCTYPE s [<!ENTITY f SYSTEM "/etc/passwd">]><scene version="3.0.0"><string name="&f;" value="&f;"/></scene>'
+        b'<!DOCTYPE s [<!ENTITY f SYSTEM "/etc/passwd">]><scene version="3.0.0"><string name="f" value="&f;"/></scene>'
     ),
     "includes itself": lambda: b'<scene version="3.0.0"><include filename="ball.xml"/></scene>',
     "includes a folder": lambda: b'<scene version="3.0.0"><include filename="."/></scene>',
@@ -194,6 +194,7 @@ def two_sensors_of_one_name(room: Room, rng: np.random.Generator) -> None:
 # ------------------------------------------------------------------------------
 
 WIDE = '<integer name="width" value="8"/><integer name="height" value="6"/>'
+PAINTED = '<shape type="sphere"><bsdf type="{bsdf}">{inner}</bsdf></shape>'
 PIECES = {
     "a singular transform": '<shape type="sphere"><transform name="to_world"><scale value="0"/></transform></shape>',
     "a transform of NaN": '<shape type="sphere"><transform name="to_world"><scale value="nan"/></transform></shape>',
@@ -218,10 +219,10 @@ PIECES = {
     "a spectrum that is malformed": (
         '<shape type="sphere"><bsdf type="diffuse"><spectrum name="reflectance" value="400:1, x"/></bsdf></shape>'
     ),
-    "a colour of four": '<shape type="sphere"><bsdf type="diffuse"><rgb name="reflectance" value="1,2,3,4"/></bsdf></shape>',
+    "a colour of four": PAINTED.format(bsdf="diffuse", inner='<rgb name="reflectance" value="1,2,3,4"/>'),
     "a colour of NaN": '<shape type="sphere"><bsdf type="diffuse"><rgb name="reflectance" value="nan"/></bsdf></shape>',
-    "roughness of -1": '<shape type="sphere"><bsdf type="roughconductor"><float name="alpha" value="-1"/></bsdf></shape>',
-    "an unknown metal": '<shape type="sphere"><bsdf type="conductor"><string name="material" value="Xx"/></bsdf></shape>',
+    "roughness of -1": PAINTED.format(bsdf="roughconductor", inner='<float name="alpha" value="-1"/>'),
+    "an unknown metal": PAINTED.format(bsdf="conductor", inner='<string name="material" value="Xx"/>'),
     "an index of zero": '<shape type="sphere"><bsdf type="dielectric"><float name="int_ior" value="0"/></bsdf></shape>',
     "our glass with an index of NaN": (
         '<shape type="sphere"><bsdf type="smoothdielectric"><float name="int_ior" value="nan"/></bsdf></shape>'

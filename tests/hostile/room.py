@@ -42,6 +42,15 @@ class Room:
     assets: Path
     """Good files to copy from: see `assets.make`."""
 
+    @classmethod
+    def new(cls, ground: Path, assets: Path) -> Room:
+        """A fresh room in a folder, with what must not be touched beside it."""
+        room = cls(ground / "room", assets)
+        shutil.copytree(assets / "room", room.path)
+        room.outside.mkdir()
+        (room.outside / "precious").write_text("not to be touched")
+        return room
+
     @property
     def outside(self) -> Path:
         return self.path.parent / "outside"

@@ -14,6 +14,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -34,7 +35,7 @@ def serve() -> None:
         begin = time.perf_counter()
         process = os.fork()
         if process == 0:
-            _end_with(lambda: _child(request))
+            _end_with(partial(_child, request))
         ended = _watch(process, request["timeout"])
         print(json.dumps(ended | {"seconds": time.perf_counter() - begin}), file=answers, flush=True)
 
@@ -128,18 +129,19 @@ def _run_script(code: str) -> None:
         print(f"pathreplay: error: {error}", file=sys.stderr)
         sys.exit(2)
     except Exception as error:
-        if not _by_mitsuba(error):
+        if not _told_by_mitsuba(error):
             raise
         # Mitsuba wraps what a plugin raises and adds where; the last line is the plugin's, or all is Mitsuba's own.
-        print(f"pathreplay: error: {str(error).strip().splitlines()[-1]}", file=sys.stderr)
+        print("pathreplay: error: " + ascii(str(error).strip().splitlines()[-1])[:1000], file=sys.stderr)
         sys.exit(2)
 
 
-def _by_mitsuba(error: Exception) -> bool:
-    """Whether an error is one of ours in Mitsuba's wrapping, or was raised by Mitsuba without our part in it."""
+def _told_by_mitsuba(error: Exception) -> bool:
+    """Whether an error is one of ours in Mitsuba's wrapping, or one with which Mitsuba refuses a property."""
     text, frames = str(error), traceback.extract_tb(error.__traceback__)
-    ours = any("pathreplay" in frame.filename for frame in frames)
-    return "PathreplayError: " in text or not (ours or "Traceback" in text or not isinstance(error, RuntimeError))
+    ours = any("pathreplay" in frame.filename for frame in frames) or "Traceback" in text
+    refused = isinstance(error, RuntimeError) and (not ours or 'roperty "' in text.strip().splitlines()[-1])
+    return refused or "PathreplayError: " in text
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ TEXTS: tuple[str, ...] = (
     ESCAPE,
     "two\nlines",
     "x" * 100_000,
-    "../" * 40 + "etc/passwd",
+    "../" * 40 + "nowhere/at/all",
     "$(touch ../outside/hacked)",
     "; touch hacked",
     "%s%n%x",
@@ -99,6 +99,10 @@ VALUES: tuple[Any, ...] = (
     {"image": 3},
     {"a": {"b": {"c": []}}},
 )
+
+
+#: Of the texts, those that cannot name a place outside of the current folder: for what is to be written.
+LOCAL = tuple(text for text in TEXTS if "/" not in text and text not in (".", ".."))
 
 
 def pick(rng: np.random.Generator, among: tuple[Any, ...]) -> Any:
