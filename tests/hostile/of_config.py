@@ -23,8 +23,8 @@ KEYS: dict[str, Mapping[str, Any]] = {
             "integrator.rr_depth integrator.hide_emitters integrator.driver integrator.noise rival parameters "
             "parameters.0 parameters.0.key parameters.0.lower parameters.0.upper parameters.0.learning_rate "
             "parameters.0.initial parameters.0.initial.image parameters.0.resolutions parameters.0.refine_at "
-            "parameters.0.pose target target.images loss spp picture_spp seed learning_rate learning_rate_decay checkpoint_every "
-            "unknown"
+            "parameters.0.pose target target.images loss spp picture_spp seed learning_rate learning_rate_decay "
+            "checkpoint_every unknown"
         ).split(),
         JOB,
     ),
