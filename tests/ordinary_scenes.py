@@ -31,8 +31,8 @@ class Use:
     truth: Any
     start: Any
     variant: str = "llvm_ad_rgb"
-    options: tuple[str, ...] = ()
-    """For `check`, besides the key, seeds and samples."""
+    options: tuple[str, ...] = ("--seeds", "4", "--spp", "32")
+    """For `check`, besides the key and the variant."""
     target: str = "path"
     """The integrator that renders the targets."""
     views: tuple[tuple[int, int], ...] = ((12, 8),)
@@ -174,7 +174,8 @@ def three_cameras(folder: Path) -> Use:
         SKY,
     )
     return Use(
-        xml, "patch.bsdf.diffuse_reflectance.value", truth=[0.1, 0.3, 0.6], start=0.5, options=("--sensor", "1"),
+        xml, "patch.bsdf.diffuse_reflectance.value", truth=[0.1, 0.3, 0.6], start=0.5,
+        options=("--seeds", "4", "--spp", "32", "--sensor", "1"),
         views=((12, 8), (7, 5), (6, 6)),
     )  # fmt: skip
 
@@ -209,7 +210,7 @@ def mono_room(folder: Path) -> Use:
 
 
 def forest(folder: Path) -> Use:
-    """A group of shapes that stands in the scene three times."""
+    """A group of shapes that stands in the scene three times; the film is as Mitsuba has it by default."""
     write_ply(folder / "patch.ply", patch(3))
     places = "".join(
         f'<shape type="instance"><ref id="tree"/><transform name="to_world"><scale value="0.5"/>'
@@ -217,7 +218,7 @@ def forest(folder: Path) -> Use:
         for x, y in ((-1, 0.5), (1, 0.5), (0, -0.7))
     )
     xml = scene(
-        camera(),
+        camera('<film type="hdrfilm"><integer name="width" value="12"/><integer name="height" value="8"/></film>'),
         '<bsdf type="diffuse" id="leaves"><rgb name="reflectance" value="0.3, 0.6, 0.2"/></bsdf>',
         '<shape type="shapegroup" id="tree"><shape type="ply"><string name="filename" value="patch.ply"/>'
         '<ref id="leaves"/></shape><shape type="sphere"><float name="radius" value="0.4"/><ref id="leaves"/></shape>'
@@ -242,7 +243,10 @@ def smoke(folder: Path) -> Use:
         '<emitter type="directional" id="sun"><vector name="direction" x="0" y="-1" z="-1"/>'
         '<rgb name="irradiance" value="2"/></emitter>',
     ).replace('type="path"', 'type="volpath"')
-    return Use(xml, "smoke.interior_medium.sigma_t.data", truth=2.5, start=0.3, target="volpath")
+    return Use(
+        xml, "smoke.interior_medium.sigma_t.data", truth=2.5, start=0.3, target="volpath",
+        options=("--seeds", "8", "--spp", "128", "--fd-spp", "512"),
+    )  # fmt: skip
 
 
 def from_mitsuba(folder: Path) -> Use:

@@ -3,43 +3,61 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import safetensors.numpy
 
 from hostile.toml_text import toml
 from ordinary_scenes import SCENES, Use, Write
+from pathreplay import cli
 
 ITERATIONS = 5
+TIMEOUT_S = 120
 SLOW: set[str] = set()
 
-
-def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """`pathreplay` as a user calls it in a folder."""
-    return subprocess.run(
-        [sys.executable, "-m", "pathreplay.cli", *arguments],
-        cwd=folder, env=os.environ | {"DRJIT_LIBLLVM_PATH": ""}, stdin=subprocess.DEVNULL, capture_output=True,
-        text=True, timeout=120, check=False,
-    )  # fmt: skip
+Command = Callable[..., tuple[int, str]]
 
 
-def check(folder: Path, use: Use) -> None:
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
+    """`pathreplay ARGUMENTS` in the current folder; returns exit status and output.
+
+    Where another variant than that of the tests is asked for, in a Python of its own.
+    """
+
+    def run(variant: str, *arguments: str) -> tuple[int, str]:
+        if variant != mi.variant():
+            done = subprocess.run(
+                [sys.executable, "-m", "pathreplay.cli", *arguments],
+                stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+            )  # fmt: skip
+            return done.returncode, done.stdout + done.stderr
+        monkeypatch.setattr(sys, "argv", ["pathreplay", *arguments])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        return int(end.value.code or 0), "".join(capfd.readouterr())
+
+    return run
+
+
+def check(folder: Path, use: Use, command: Command) -> None:
     """Every parameter that the key names passes."""
-    result = command(
-        folder, "check", "scene.xml", "--param", use.key, "--seeds", "4", "--spp", "32", "--variant", use.variant,
+    status, words = command(
+        use.variant, "check", "scene.xml", "--param", use.key, "--variant", use.variant,
         "--json", "check.json", *use.options,
     )  # fmt: skip
-    assert result.returncode == 0, result.stdout + result.stderr
+    assert status == 0, words
     verdicts = [entry["verdict"] for entry in json.loads((folder / "check.json").read_text())]
     assert verdicts and set(verdicts) == {"pass"}
 
 
-def optimize(folder: Path, use: Use) -> None:
+def optimize(folder: Path, use: Use, command: Command) -> None:
     """Five iterations lower the loss, and everything that the run folder should hold is there."""
     job = {
         "scene": "scene.xml",
@@ -53,8 +71,8 @@ def optimize(folder: Path, use: Use) -> None:
         "target": {"values": {use.key: use.truth}, "spp": 64, "integrator": {"type": use.target, "max_depth": 4}},
     }
     (folder / "job.toml").write_text(toml(job), encoding="utf-8")
-    result = command(folder, "optimize", "job.toml", "--quiet")
-    assert result.returncode == 0, result.stdout + result.stderr
+    status, words = command(use.variant, "optimize", "job.toml", "--quiet")
+    assert status == 0, words
 
     run = folder / "runs" / "job"
     losses = [json.loads(line)["loss"] for line in (run / "history.jsonl").read_text().splitlines()]
@@ -73,8 +91,9 @@ def optimize(folder: Path, use: Use) -> None:
 @pytest.mark.parametrize(
     "write", [pytest.param(s, id=s.__name__, marks=[pytest.mark.slow] * (s.__name__ in SLOW)) for s in SCENES]
 )
-def test_check_and_optimize(write: Write, tmp_path: Path) -> None:
+def test_check_and_optimize(write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    monkeypatch.chdir(tmp_path)
     use = write(tmp_path)
     (tmp_path / "scene.xml").write_text(use.xml, encoding="utf-8")
-    check(tmp_path, use)
-    optimize(tmp_path, use)
+    check(tmp_path, use, command)
+    optimize(tmp_path, use, command)
