@@ -17,6 +17,9 @@ LONGEST = 2000
 # All but the ends of lines and tabs: what could move a terminal's cursor or rename its window.
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
 
+# Mitsuba's warnings are coloured, whatever they are written to.
+COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+
 ENDINGS = {0: "finished", 1: "finished, not liked", 2: "refused"}
 
 
@@ -62,14 +65,15 @@ def _of_the_end(recipe: Recipe, action: Action, ended: Ended) -> list[str]:
 
 
 def _of_the_words(action: Action, ended: Ended) -> list[str]:
-    found, words = [], ended.stdout + ended.stderr
+    stderr = COLOUR.sub("", ended.stderr)
+    found, words = [], COLOUR.sub("", ended.stdout) + "\n" + stderr
     if "Traceback (most recent call last)" in words:
         found.append("traceback")
     if CONTROL.search(words):
         found.append("control characters")
     errors = [line for line in words.splitlines() if line.startswith(ERRORS)]
     if ended.status == 2 and ended.killed == "" and not _nobody_reads(action):
-        lines = ended.stderr.strip().split("\n")
+        lines = stderr.strip().split("\n")
         if len(errors) != 1 or not lines[-1].startswith(ERRORS):
             found.append("no line that tells what is wrong" if not errors else "more than one line")
         elif len(errors[0]) > LONGEST:
