@@ -67,7 +67,8 @@ def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print what was measured: pictures, gradients, and the cells that are left out, with the reason."""
+    """Print what was measured: pictures, gradients, the cells that are left out, with the reason, and hostile cases."""
+    from test_hostile import TOLD
     from test_primal_media import PRIMALS
     from test_primal_media import table as pictures
     from test_truth_materials import EXCLUSIONS
@@ -81,3 +82,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_line(table())
         for name, reason in EXCLUSIONS.items():
             terminalreporter.write_line(f"left out: {name}: {reason}")
+    if TOLD:
+        terminalreporter.section("hostile cases")
+        terminalreporter.write_line("\n".join(TOLD))

@@ -125,7 +125,6 @@ CASES = [
 ]  # fmt: skip
 
 
-
 def look_down():
     return mi.ScalarTransform4f().look_at(origin=[0.5, 3, 1], target=[0, 0, 0], up=[0, 0, 1])
 

@@ -74,8 +74,7 @@ def table() -> str:
     for r in ROWS:
         lines.append(
             f"{r.name:44s} {r.driver:8s} {r.gradient:+11.5f} {r.reference:+11.5f} {r.error:10.5f} {r.z:+6.2f} "
-            f"{_number(r.lanes)} {_number(r.transpose)} "
-            + (f"{r.peer:+9.5f}" if np.isfinite(r.peer) else f"{'-':>9s}")
+            f"{_number(r.lanes)} {_number(r.transpose)} " + (f"{r.peer:+9.5f}" if np.isfinite(r.peer) else f"{'-':>9s}")
         )
     return "\n".join(lines)
 

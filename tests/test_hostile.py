@@ -1,0 +1,72 @@
+"""Hostile input ends with an answer: a handful of cases in this process, and hundreds in processes of their own."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from hostile.assets import make_room
+from hostile.battery import run_cases, table
+from hostile.case import RECIPES, Case
+from hostile.generate import COUNT, make_case
+from hostile.judge import Ended, judge
+from hostile.room import Room
+from hostile.snapshot import snapshot
+from pathreplay import cli
+
+DATA = Path(__file__).parent / "data" / "vdb.zip"
+
+#: Told at the end of the session: see conftest.py.
+TOLD: list[str] = []
+
+# One for each way in which a mistake is found, and none that needs a run.
+HANDFUL = (
+    "spp = True",
+    "spp = 1000000000",
+    "lists 3000 deep",
+    "quoted key of control characters",
+    "key of 100 kB",
+    "target.integrator.type = 'diffuse'",
+    "the config is fifo",
+    "no scene but a BSDF",
+    "PLY with a face of vertex 1000",
+    "PLY with a head of 1 MB",
+    "target: a pixel of nan",
+    "target: PNG of 100000 x 100000",
+    ".vol as a value: cut short",
+)
+
+
+@pytest.fixture(scope="module")
+def assets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("assets")
+    make_room(folder / "room", DATA)
+    return folder
+
+
+@pytest.mark.parametrize("name", HANDFUL)
+def test_a_handful_is_refused(
+    name: str, assets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    recipe = next(recipe for recipe in RECIPES if recipe.name == name)
+    room = Room.new(tmp_path, assets)
+    action = Case(0, 0, recipe).prepare(room)
+    before = snapshot(tmp_path)
+    monkeypatch.chdir(room.path)
+    monkeypatch.setattr(sys, "argv", ["pathreplay", *action.argv])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    ended = Ended(int(end.value.code or 0), "", 0.0, 0, *capfd.readouterr())
+    assert judge(recipe, action, ended, before, snapshot(tmp_path)).findings == (), ended.stderr
+    assert ended.status == 2
+
+
+@pytest.mark.slow
+def test_hostile_cases_end_with_an_answer() -> None:
+    """No traceback, no death by a signal, no hang, nothing written elsewhere, never more than 4 GB."""
+    results = run_cases([make_case(seed=0, number=number) for number in range(COUNT)])
+    TOLD.append(table(results))
+    assert len(results) >= 400
+    assert not (found := [str(result) for result in results if result.verdict.findings]), "\n".join(found)

@@ -1,0 +1,99 @@
+"""Ordinary use: scenes as people have them, each through `check` and through five iterations of `optimize`."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from hostile.toml_text import toml
+from ordinary_scenes import SCENES, Use, Write
+from pathreplay import cli
+
+ITERATIONS = 5
+TIMEOUT_S = 120
+SLOW: set[str] = set()
+
+Command = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
+    """`pathreplay ARGUMENTS` in the current folder; returns exit status and output.
+
+    Where another variant than that of the tests is asked for, in a Python of its own.
+    """
+
+    def run(variant: str, *arguments: str) -> tuple[int, str]:
+        if variant != mi.variant():
+            done = subprocess.run(
+                [sys.executable, "-m", "pathreplay.cli", *arguments],
+                stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+            )  # fmt: skip
+            return done.returncode, done.stdout + done.stderr
+        monkeypatch.setattr(sys, "argv", ["pathreplay", *arguments])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        return int(end.value.code or 0), "".join(capfd.readouterr())
+
+    return run
+
+
+def check(folder: Path, use: Use, command: Command) -> None:
+    """Every parameter that the key names passes."""
+    status, words = command(
+        use.variant, "check", "scene.xml", "--param", use.key, "--variant", use.variant,
+        "--json", "check.json", *use.options,
+    )  # fmt: skip
+    assert status == 0, words
+    verdicts = [entry["verdict"] for entry in json.loads((folder / "check.json").read_text())]
+    assert verdicts and set(verdicts) == {"pass"}
+
+
+def optimize(folder: Path, use: Use, command: Command) -> None:
+    """Five iterations lower the loss, and everything that the run folder should hold is there."""
+    job = {
+        "scene": "scene.xml",
+        "variant": use.variant,
+        "iterations": ITERATIONS,
+        "spp": 16,
+        "picture_spp": 16,
+        "learning_rate": 0.05,
+        "integrator": {"type": "pathreplay", "max_depth": 4},
+        "parameters": [{"key": use.key, "initial": use.start, "lower": 0.0}],
+        "target": {"values": {use.key: use.truth}, "spp": 64, "integrator": {"type": use.target, "max_depth": 4}},
+    }
+    (folder / "job.toml").write_text(toml(job), encoding="utf-8")
+    status, words = command(use.variant, "optimize", "job.toml", "--quiet")
+    assert status == 0, words
+
+    run = folder / "runs" / "job"
+    losses = [json.loads(line)["loss"] for line in (run / "history.jsonl").read_text().splitlines()]
+    assert len(losses) == ITERATIONS
+    assert np.isfinite(losses).all()
+    assert losses[-1] < losses[0]
+    for kind in ("target", "start", "result"):
+        assert len(list((run / "images").glob(f"{kind}-*.exr"))) == len(use.views)
+        assert len(list((run / "images").glob(f"{kind}-*.png"))) == len(use.views)
+    found = safetensors.numpy.load_file(run / "parameters.safetensors")
+    assert found and all(np.isfinite(value).all() for value in found.values())
+    assert (run / "report.html").stat().st_size > 10_000
+    assert not list(run.rglob("*.part"))
+
+
+@pytest.mark.parametrize(
+    "write", [pytest.param(s, id=s.__name__, marks=[pytest.mark.slow] * (s.__name__ in SLOW)) for s in SCENES]
+)
+def test_check_and_optimize(write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    monkeypatch.chdir(tmp_path)
+    use = write(tmp_path)
+    (tmp_path / "scene.xml").write_text(use.xml, encoding="utf-8")
+    check(tmp_path, use, command)
+    optimize(tmp_path, use, command)
