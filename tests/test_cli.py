@@ -87,11 +87,12 @@ for words in (["--help"], ["bench", "surface"]):
         (("--spp", "0"), ["spp is 0"]),
         (("--spp", "100000"), ["'spp' is 100000", "up to 65535"]),
         (("--fd-spp", "100000"), ["'fd_spp' is 100000", "up to 65535"]),
-        (("--step", "nan"), ["step is nan", "above 0"]),
-        (("--step", "-1"), ["step is -1.0", "above 0"]),
-        (("--step", "0"), ["step is 0.0", "above 0"]),
+        (("--step", "nan"), ["Step nan", "positive"]),
+        (("--step", "-1"), ["Step -1.0", "positive"]),
+        (("--step", "0"), ["Step 0.0", "positive"]),
         (("--sensor", "-1"), ["Sensor -1"]),
         (("--json", "/"), ["--json"]),
+        (("--json", "x" * 300), ["File name too long", "--json"]),
     ],
 )
 def test_a_number_that_check_cannot_use_is_named(run, options: tuple[str, ...], words: list[str]) -> None:

@@ -121,7 +121,7 @@ def check(
         backend.set_variant(variant)
     loaded, notes = load_scene_for(scene, param)
     for note in notes:
-        typer.echo(f"pathreplay: {note}", err=True)
+        typer.echo(f"pathreplay: {plain_line(note)}", err=True)
     results = report.check_all(
         loaded, param, integrator=integrator, seeds=seeds, spp=spp, fd_spp=fd_spp, step=step,
         max_depth=max_depth, mode=mode, sensor=sensor, seed=seed,

@@ -1,13 +1,17 @@
-"""How many pixels a sensor renders, and how many samples of them Dr.Jit takes at once."""
+"""How many pixels a sensor renders, how many samples of them Dr.Jit takes at once, and what memory they need."""
 
 from __future__ import annotations
 
 import mitsuba as mi
 
+from pathreplay import memory
 from pathreplay.errors import PathreplayError
 
 # Dr.Jit counts the samples of one kernel in 32 bits.
 MOST_SAMPLES = 2**32 - 1
+# Bytes, measured (peak of the process over 2048 x 2048 pixels, LLVM): a rendering, its derivative and their files take
+# 127 a pixel. Samples take next to none.
+_A_PIXEL = 128
 
 
 def film_size(sensor: mi.Sensor) -> tuple[int, int]:
@@ -33,3 +37,14 @@ def require_samples(key: str, spp: int, size: tuple[int, int], sensor: str) -> N
         f"'{key}' is {spp}: with {sensor} of {width} x {height} pixels that is {pixels * spp} samples, beyond the "
         f"{MOST_SAMPLES} that Dr.Jit takes at once; take {way_out}"
     )
+
+
+def require_memory(size: tuple[int, int], sensor: str, also: int = 0) -> None:
+    """Return quietly if a film of that size can be rendered and differentiated with the memory that is left.
+
+    Raises:
+        PathreplayError: it cannot, or not with ``also`` bytes for other things.
+    """
+    width, height = size
+    needed = width * height * _A_PIXEL + also
+    memory.require(needed, f"Rendering {sensor} of {width} x {height} pixels", "take a smaller film or fewer sensors")

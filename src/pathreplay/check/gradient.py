@@ -5,7 +5,6 @@ Two sets of independent samples of one directional derivative, their standard er
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +18,7 @@ from pathreplay.check.objective import Mode, View, alone, integrator_name
 from pathreplay.check.reference import integrator_under_test, reference_integrator
 from pathreplay.check.verdict import NEGLIGIBLE, Verdict, judge
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.films import film_size, require_samples
+from pathreplay.films import film_size, require_memory, require_samples
 from pathreplay.parameters import get_array, require_differentiable, require_finite
 from pathreplay.spectra import holds_coefficients
 
@@ -132,7 +131,7 @@ def check_gradient(
         PathreplayError: a bad argument, a parameter without derivative, NaN in the scene, an integrator that cannot
             differentiate this parameter.
     """
-    _require_arguments(scene, sensor, seeds, spp, fd_spp, step, seed, mode)
+    _require_arguments(scene, sensor, seeds, spp, fd_spp, seed, mode)
     params = mi.traverse(scene)
     tested = integrator_under_test(integrator, scene, max_depth)
     require_differentiable(params, key, tested)
@@ -203,9 +202,7 @@ def _is_far(owner: Any) -> bool:
     return isinstance(owner, mi.Emitter) and bool(mi.has_flag(owner.flags(), flags))
 
 
-def _require_arguments(
-    scene: Any, sensor: int, seeds: int, spp: int, fd_spp: int | None, step: float | None, seed: int, mode: str
-) -> None:
+def _require_arguments(scene: Any, sensor: int, seeds: int, spp: int, fd_spp: int | None, seed: int, mode: str) -> None:
     if mi.variant() is None or not dr.is_diff_v(mi.Float):
         raise PathreplayError(
             f"Variant '{mi.variant()}' has no derivatives; call mi.set_variant('llvm_ad_rgb') before loading the scene"
@@ -232,9 +229,8 @@ def _require_arguments(
     for name, count in (("spp", spp), ("fd_spp", fd_spp)):
         if count is not None:
             require_samples(name, count, film, f"sensor {sensor}")
+    require_memory(film, f"sensor {sensor}")
     if seed < 0:
         raise PathreplayError(f"seed is {seed}; give a whole number from 0 on")
-    if step is not None and not (0 < step < math.inf):
-        raise PathreplayError(f"step is {step}; give a finite number above 0")
     if mode not in ("backward", "forward"):
         raise PathreplayError(f"mode is '{mode}'; choose 'backward' or 'forward'")

@@ -19,6 +19,7 @@ from rich.text import Text
 from pathreplay.check.gradient import GradientCheck, check_gradient
 from pathreplay.check.reference import integrator_under_test
 from pathreplay.errors import PathreplayError
+from pathreplay.files import file_problem
 from pathreplay.parameters import resolve_differentiable
 
 _STYLES = {"pass": "green", "zero": "green", "fail": "bold red", "inconclusive": "yellow"}
@@ -94,10 +95,11 @@ def require_writable(path: Path) -> None:
     """Return quietly if ``path`` can be written later.
 
     Raises:
-        PathreplayError: it is a folder, or its folder does not exist.
+        PathreplayError: it is a folder, its name is no name of a file, or its folder does not exist.
     """
-    if path.is_dir():
-        raise PathreplayError(f"{path} is a folder; give --json the name of a file")
+    problem = file_problem(path)
+    if problem == "is a folder" or problem.startswith("cannot be reached"):
+        raise PathreplayError(f"{path} {problem}; give --json the name of a file")
     if not path.parent.is_dir():
         raise PathreplayError(f"Folder {path.parent} for {path.name} does not exist; make it first")
 

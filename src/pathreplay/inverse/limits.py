@@ -12,15 +12,14 @@ import numpy as np
 
 from pathreplay import memory
 from pathreplay.errors import PathreplayError
-from pathreplay.films import MOST_SAMPLES, film_size, require_samples
+from pathreplay.films import MOST_SAMPLES, film_size, require_memory, require_samples
 from pathreplay.inverse.images import Image
 
 if TYPE_CHECKING:
     from pathreplay.inverse.losses import Loss
 
-# Bytes, measured (peak of the process over 2048 x 2048 pixels, LLVM): a rendering, its derivative and their files take
-# 127 a pixel, at one view at a time; target, start and result of all views stay. Samples take next to none.
-_A_RENDERING, _A_VIEW = 128, 36
+# Bytes for each pixel of each view: its target, start and result stay.
+_A_VIEW = 36
 # A value of a grid: as NumPy and as Dr.Jit hold it, gradient, Adam's moments, interpolation in double precision.
 _A_VALUE = 64
 # A step of Adam's is about the learning rate: nothing is found by steps a million times the value.
@@ -34,15 +33,13 @@ def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str,
     Raises:
         PathreplayError: there are too many samples for one kernel, or too many pixels for the memory.
     """
-    most, total = 0, 0
+    total = 0
     for name, index in sensors.items():
-        width, height = film_size(scene.sensors()[index])
+        size = film_size(scene.sensors()[index])
         for key, count in spp.items():
-            require_samples(key, count, (width, height), f"sensor '{name}'")
-        most, total = max(most, width * height), total + width * height
-        needed = most * _A_RENDERING + total * _A_VIEW
-        what = f"Rendering sensor '{name}' of {width} x {height} pixels"
-        memory.require(needed, what, "take a smaller film or fewer sensors")
+            require_samples(key, count, size, f"sensor '{name}'")
+        total += size[0] * size[1]
+        require_memory(size, f"sensor '{name}'", total * _A_VIEW)
 
 
 def require_visible(scene: mi.Scene, keys: Iterable[str]) -> None:

@@ -1,0 +1,54 @@
+"""Sizes are refused by the numbers that are told: the largest one that is named does, the next one does not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pathreplay import memory
+from pathreplay.errors import PathreplayError
+from pathreplay.films import MOST_SAMPLES, require_samples
+from pathreplay.inverse.limits import require_grid, require_learning_rate
+
+
+def test_a_container_s_limit_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limit, used = tmp_path / "max", tmp_path / "current"
+    monkeypatch.setattr(memory, "_CONTAINERS", ((tmp_path / "none", used), (limit, used)))
+    used.write_text("1000000\n")
+    limit.write_text("max\n")
+    free = memory.available()
+    assert free > 1e8
+    limit.write_text("3000000\n")
+    assert memory.available() == 2_000_000
+    limit.write_text("1\n")
+    assert memory.available() == 0
+    with pytest.raises(PathreplayError, match=r"A film needs about 5 GB of memory, 0 GB are left; take less"):
+        memory.require(5 * 10**9, "A film", "take less")
+
+
+@pytest.mark.parametrize("shape", [(8, 4, 3), (4, 8, 8, 1), (1, 1, 2)])
+def test_the_named_resolution_is_the_largest_that_fits(shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available", lambda: 10**9)
+    with pytest.raises(PathreplayError) as error:
+        require_grid("k", shape, [4, 10**20])
+    largest = int(str(error.value).rsplit(" ", 1)[1])
+    require_grid("k", shape, [largest])
+    with pytest.raises(PathreplayError, match=f"take up to {largest}$"):
+        require_grid("k", shape, [largest + 1])
+
+
+def test_the_named_count_of_samples_is_the_largest_that_dr_jit_takes() -> None:
+    most = MOST_SAMPLES // 24
+    require_samples("spp", most, (6, 4), "sensor 'eye'")
+    with pytest.raises(PathreplayError, match=f"'spp' up to {most}$"):
+        require_samples("spp", most + 1, (6, 4), "sensor 'eye'")
+
+
+def test_learning_rates_are_held_against_values_and_bounds() -> None:
+    for start, bounds in ((0.0, ()), (1e8, ()), (0.0, (None, 1e8))):
+        scale = max(1.0, start, *(bound or 0 for bound in bounds))
+        require_learning_rate("k", 0.5e6 * scale, np.array([start]), bounds)
+        with pytest.raises(PathreplayError, match="learning rate"):
+            require_learning_rate("k", 2e6 * scale, np.array([start]), bounds)
