@@ -25,8 +25,8 @@ from pathreplay import interrupts
 from pathreplay.errors import PathreplayError, plain_line
 
 
-# What typer raises for a command line that is none. It exports one kind only, whose base they share.
 _UsageError: Any = typer.BadParameter.__base__
+"""What typer raises for a command line that is none; it exports one kind only, whose base they share."""
 
 
 class _Ended(BaseException):
