@@ -24,7 +24,6 @@ import typer.core
 from pathreplay import interrupts
 from pathreplay.errors import PathreplayError, plain_line
 
-
 _UsageError: Any = typer.BadParameter.__base__
 """What typer raises for a command line that is none; it exports one kind only, whose base they share."""
 
