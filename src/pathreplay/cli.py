@@ -24,6 +24,9 @@ import typer.core
 from pathreplay import interrupts
 from pathreplay.errors import PathreplayError, plain_line
 
+_UsageError: Any = typer.BadParameter.__base__
+"""What typer raises for a command line that is none; it exports one kind only, whose base they share."""
+
 
 class _Ended(BaseException):
     """A KeyboardInterrupt on its way to `main`."""
@@ -52,7 +55,6 @@ app = typer.Typer(
     name="pathreplay",
     cls=_Commands,
     help="Differentiable light transport on Mitsuba 3: check gradients, recover scenes from pictures.",
-    no_args_is_help=True,
     rich_markup_mode=None,  # Typer's panels show a flag as if it took a value: "--quiet <bool>"
     pretty_exceptions_enable=False,
 )
@@ -196,7 +198,10 @@ def main() -> None:
         with interrupts.raised():
             for argument in sys.argv[1:]:
                 _require_text(argument)
-            app()
+            status = app(sys.argv[1:] or ["--help"], prog_name="pathreplay", standalone_mode=False)
+    except _UsageError as error:
+        command = error.ctx.command_path if error.ctx else "pathreplay"
+        _fail(f"{error.format_message().rstrip('.')}; see: {command} --help")
     except (KeyboardInterrupt, _Ended) as ended:
         _end(ended.__cause__ or ended)
     except PathreplayError as error:
@@ -207,6 +212,7 @@ def main() -> None:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
         _fail(f"no space left on the disk for {error.filename or 'the output'}: free some space, or write elsewhere")
+    raise SystemExit(status)
 
 
 if __name__ == "__main__":

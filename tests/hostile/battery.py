@@ -83,7 +83,8 @@ class Lane:
         """End the server."""
         assert self._server.stdin is not None
         self._server.stdin.close()
-        self._server.wait(10)
+        self._server.kill()
+        self._server.wait()
 
 
 def make_assets(scratch: Path) -> Path:

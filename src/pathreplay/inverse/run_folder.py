@@ -13,6 +13,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pathreplay.errors import PathreplayError
+from pathreplay.files import file_problem
 from pathreplay.interrupts import undisturbed
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.folder_lock import FolderLock
@@ -116,6 +117,10 @@ def create_run_folder(
     return run
 
 
+_LONGEST_ORIGIN = 2**20
+"""Bytes of a run.json, far above what two paths take."""
+
+
 class _Origin(BaseModel):
     """run.json: where relative paths of the config start, and the config that the run was started with."""
 
@@ -138,6 +143,8 @@ def open_run_folder(path: Path) -> tuple[RunFolder, Config, str | None]:
     if not (path / CHECKPOINT).is_file():
         raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start the job from its config")
     try:
+        if problem := file_problem(path / "run.json", _LONGEST_ORIGIN):
+            raise ValueError(f"it {problem}")
         origin = _Origin.model_validate_json((path / "run.json").read_bytes())
         if "\0" in origin.base + (origin.config or ""):
             raise ValueError("a path with a null character")
