@@ -17,7 +17,7 @@ from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
-from pathreplay.inverse.passes import Passes
+from pathreplay.inverse.passes import NotRecordable, Passes
 from pathreplay.inverse.problem import ITERATION, JUDGEMENT, PICTURE, Problem, seeds
 from pathreplay.inverse.stopping import Stop
 from pathreplay.parameters import get_array, to_value
@@ -99,8 +99,8 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> None
     """
     begin, i, adam = time.perf_counter(), len(run.history), run.adam
     _refine(problem, adam, position)
-    put_values(problem, adam)
-    value = run.passes([seeds(config.seed, ITERATION, i, view.sensor)[0] for view in problem.views], config.spp)
+    numbers = [seeds(config.seed, ITERATION, i, view.sensor)[0] for view in problem.views]
+    value = _differentiated(problem, run, numbers, config.spp)
     norms, dropped = _gradients(adam)
     if not np.isfinite(value):
         raise PathreplayError(
@@ -110,6 +110,18 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> None
     adam.step()
     _project(problem, adam)
     run.history.append(Entry(i, value, time.perf_counter() - begin, norms, dropped, errors(problem, adam)))
+
+
+def _differentiated(problem: Problem, run: Run, numbers: list[int], spp: int) -> float:
+    """The loss at the values that Adam holds; its gradient is added to them."""
+    put_values(problem, run.adam)
+    try:
+        return run.passes(numbers, spp)
+    except NotRecordable:
+        for value in run.adam.values():
+            dr.clear_grad(value)
+        put_values(problem, run.adam)
+        return run.passes(numbers, spp)
 
 
 def render_views(problem: Problem, config: Config) -> dict[str, Image]:

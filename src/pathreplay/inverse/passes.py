@@ -26,6 +26,15 @@ from pathreplay.transport.traits import Tables, nodes_of, scene_tables
 RECORDABLE = frozenset({"PathReplayIntegrator", "PRBIntegrator", "BasicPRBIntegrator"})
 
 
+#: What Dr.Jit says, whatever the cause, where a function cannot be frozen. Plugins do not show beforehand whether they
+#: can: the arrays of some (Mitsuba 3.9.1: `orthographic`, `thinlens`) are hidden from it.
+RECORDING = "while recording a frozen function"
+
+
+class NotRecordable(Exception):
+    """A plugin of the scene keeps Dr.Jit from recording a pass."""
+
+
 class Passes:
     """The mean over the views of the loss, by one integrator, and its gradient."""
 
@@ -47,7 +56,8 @@ class Passes:
         """The loss, with ``spp`` samples per pixel and a seed for every view; adds its gradient to the parameters.
 
         Unbiased for the losses in `QUADRATIC`; the value itself carries the variance of the pictures on top. Raises
-        what the integrator raises; warns as it does.
+        what the integrator raises; warns as it does. Raises NotRecordable when the pass could not be recorded, once:
+        the parameters have to be put again, since a part of their gradient may be there, and the next call is traced.
         """
         sensors = tuple(view.sensor for view in self.problem.views)
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
@@ -57,10 +67,16 @@ class Passes:
         if not self.swept:
             self.swept = tuple(self._sweeps(sensor, spp) for sensor in sensors)
         scene, loss = self.problem.scene, self.problem.loss
-        with plain_errors():
-            value, lost = differentiate(
-                scene, self.integrator, self.targets, numbers, sensors, self.swept, loss, spp, self.tables
-            )
+        try:
+            with plain_errors():
+                value, lost = differentiate(
+                    scene, self.integrator, self.targets, numbers, sensors, self.swept, loss, spp, self.tables
+                )
+        except RuntimeError as error:
+            if not self.freezes or RECORDING not in str(error):
+                raise
+            self.freezes = False
+            raise NotRecordable from error
         if lost is not None:
             paths = sum(target.shape[0] * target.shape[1] for target in self.targets) * spp
             self.integrator.tell_lost(lost, paths)
