@@ -37,10 +37,10 @@ from pathreplay.inverse.run_folder import (
 )
 from pathreplay.inverse.saved_pictures import regular_file, require_pictures
 from pathreplay.inverse.stopping import Stop, stopping
-from pathreplay.inverse.threads import one_thread, require_one_thread_possible
 from pathreplay.inverse.values import Array
 from pathreplay.media.volume_files import vol_bytes
 from pathreplay.parameters import get_array, to_value
+from pathreplay.threads import one_thread, require_one_thread_possible
 
 
 @dataclass(frozen=True, repr=False)

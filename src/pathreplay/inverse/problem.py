@@ -25,10 +25,10 @@ from pathreplay.inverse.grids import Levels, comparable, make_levels, resampled
 from pathreplay.inverse.images import Image, find_image, over_black, read_image, transparent_share, with_channels
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
-from pathreplay.inverse.threads import one_thread
 from pathreplay.inverse.values import Array, make_value, require_finite_array
 from pathreplay.scenes import load_scene, load_scene_for, one_line
 from pathreplay.stored import AS_STORED, Form, form_of
+from pathreplay.threads import one_thread
 
 
 @dataclass(frozen=True)
