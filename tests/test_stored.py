@@ -154,7 +154,8 @@ from pathreplay.backend import set_variant
 set_variant("llvm_ad_spectral")
 from pathreplay.errors import PathreplayError
 from pathreplay.parameters import get_array
-from pathreplay.stored import WAVELENGTHS, form_of
+from pathreplay.spectra import WAVELENGTHS
+from pathreplay.stored import form_of
 
 rgb = np.random.default_rng(0).uniform(0.05, 0.95, (4, 8, 3)).astype(np.float32)
 def ball(**reflectance):

@@ -7,9 +7,9 @@ parameter                     what Mitsuba stores                     what peopl
                               right, which repeat the other end; in   channel
                               mono variants three channels alike
 textures of 16 bits           half precision                          single precision
-colours in spectral variants  c of a smooth spectrum S(λ) =           S at three wavelengths, red, green and blue; where
-                              ½ + v / (2 √(1 + v²)), v = c₀ λ² +      there is a factor (environment maps, volumes)
-                              c₁ λ + c₂, for some with a factor       multiplied by it
+colours in spectral variants  coefficients of a smooth spectrum S,    S at three wavelengths, red, green and blue; where
+                              see :mod:`pathreplay.spectra`; for      there is a factor (environment maps, volumes)
+                              some with a factor                      multiplied by it
 ============================  ======================================  =================================================
 
 Jobs optimise, save and compare what people see, so that bounds, learning rates and resolutions mean what they say.
@@ -26,13 +26,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
+from pathreplay.spectra import TO_COEFFICIENTS, WAVELENGTHS, coefficient_channels, spectrum
 
 Array = NDArray[np.float32]
 
-WAVELENGTHS = (610.0, 545.0, 460.0)
-"""Where spectra are seen (nm): what Mitsuba makes of a moderate red, green or blue is nearly that there."""
-
-# S is kept so far from 0 and 1, where v is infinite.
+# S is kept so far from 0 and 1, where p is infinite.
 _MARGIN = 1e-4
 
 
@@ -99,16 +97,16 @@ class Spectra(Form):
     def see(self, stored: Any) -> Any:
         stored = self.inner.see(dr.detach(stored))
         entries = _entries(stored, 4 if self.scaled else 3)
-        spectrum = mi.Vector3f(*(_spectrum(entries, wavelength) for wavelength in WAVELENGTHS))
-        return _like(stored, spectrum * entries[3] if self.scaled else spectrum)
+        S = mi.Vector3f(*(spectrum(entries, wavelength) for wavelength in WAVELENGTHS))
+        return _like(stored, S * entries[3] if self.scaled else S)
 
     def store(self, seen: Any) -> Any:
-        spectrum = mi.Vector3f(*_entries(seen, 3))
+        S = mi.Vector3f(*_entries(seen, 3))
         # As Mitsuba does: the largest entry becomes a half, where spectra are smooth.
-        factor = dr.maximum(2 * dr.max(spectrum), 1e-8) if self.scaled else mi.Float(1)
-        x = 2 * dr.clip(spectrum / factor, _MARGIN, 1 - _MARGIN) - 1
-        v = x * dr.rsqrt(1 - dr.square(x))
-        c = [sum(float(a) * v[i] for i, a in enumerate(row)) for row in _COEFFICIENTS]
+        factor = dr.maximum(2 * dr.max(S), 1e-8) if self.scaled else mi.Float(1)
+        x = 2 * dr.clip(S / factor, _MARGIN, 1 - _MARGIN) - 1
+        p = x * dr.rsqrt(1 - dr.square(x))
+        c = [sum(float(a) * p[i] for i, a in enumerate(row)) for row in TO_COEFFICIENTS]
         stored = _like(seen, mi.Vector4f(*c, factor) if self.scaled else mi.Vector3f(*c))
         return self.inner.store(stored)
 
@@ -124,7 +122,7 @@ class Spectra(Form):
         factor = np.maximum(2 * rows.max(axis=1), 1e-8) if self.scaled else np.ones(len(rows))
         fetched = [mi.srgb_model_fetch(mi.ScalarColor3f(*row)) for row in rows / factor[:, None]]
         c = [mi.Float(np.array(column, np.float32)) for column in zip(*fetched, strict=True)]
-        seen = np.stack([np.array(_spectrum(c, wavelength)) for wavelength in WAVELENGTHS], axis=-1)
+        seen = np.stack([np.array(spectrum(c, wavelength)) for wavelength in WAVELENGTHS], axis=-1)
         return (seen * factor[:, None]).reshape(colours.shape).astype(np.float32)
 
 
@@ -142,29 +140,14 @@ class Lamp(Spectra):
 def form_of(params: Any, key: str) -> Form:
     """How the parameter ``key`` of ``mi.traverse(scene)`` is stored."""
     value, owner = params[key], params.properties[key][2]
-    name, last = str(owner.class_name()), key.rsplit(".", 1)[-1]
-    if name == "EnvironmentMapEmitter" and last == "data":
-        sky = Sky(mono=mi.is_monochromatic)
-        return Spectra(scaled=True, inner=sky) if mi.is_spectral else sky
+    kind, name = str(owner.class_name()), key.rsplit(".", 1)[-1]
     form: Form = Half() if isinstance(value, mi.TensorXf16) else AS_STORED
-    if not mi.is_spectral:
+    if kind == "EnvironmentMapEmitter" and name == "data":
+        form = Sky(mono=mi.is_monochromatic)
+    channels = coefficient_channels(params, key)
+    if channels == 0:
         return form
-    if last == "value" and isinstance(value, mi.Color3f):
-        return Lamp() if name == "D65Spectrum" else Spectra() if name == "SRGBReflectanceSpectrum" else form
-    if last == "data" and name.startswith("BitmapTexture") and value.shape[2] == 3 and "raw = 0" in str(owner):
-        return Spectra(inner=form)
-    if last == "data" and name == "GridVolume" and value.shape[-1] == 4:
-        return Spectra(scaled=True)
-    return form
-
-
-def _spectrum(c: Any, wavelength: float) -> Any:
-    v = (c[0] * wavelength + c[1]) * wavelength + c[2]
-    return 0.5 + 0.5 * v * dr.rsqrt(1 + dr.square(v))
-
-
-# The coefficients (rows) of the parabola through three values of v.
-_COEFFICIENTS = np.linalg.inv(np.vander(WAVELENGTHS, 3))
+    return Lamp() if kind == "D65Spectrum" else Spectra(scaled=channels == 4, inner=form)
 
 
 def _entries(value: Any, channels: int) -> Any:

@@ -20,7 +20,7 @@ from pathreplay.check.verdict import NEGLIGIBLE, Verdict, judge
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.films import film_size, require_memory, require_samples
 from pathreplay.parameters import get_array, require_differentiable, require_finite
-from pathreplay.spectra import holds_coefficients
+from pathreplay.spectra import coefficient_channels
 
 _MOST_SEEDS = 1_000_000
 
@@ -142,7 +142,7 @@ def check_gradient(
             "option format='variant'"
         )
     value = get_array(params[key]).astype(np.float64)
-    far, spectra = _is_far(params.properties[key][2]), holds_coefficients(params, key)
+    far, spectra = _is_far(params.properties[key][2]), coefficient_channels(params, key) > 0
     line = choose_line(key, value, direction, step, seed, far=far, spectra=spectra)
     plain = reference_integrator(reference, scene, tested)
     fd_spp = spp if fd_spp is None else fd_spp
