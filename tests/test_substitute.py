@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
 import pathreplay  # noqa: F401 (registers the plugins)
 from pathreplay.bsdfs.substitute import load_dict_with, load_file_with
+from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images import exr_bytes
 
 SMOOTH = {"dielectric": "smoothdielectric"}
@@ -86,3 +89,12 @@ def test_failure_leaves_mitsubas_search_paths_alone(tmp_path):
     with pytest.raises(RuntimeError):
         load_file_with(tmp_path / "broken.xml", SMOOTH)
     assert str(mi.file_resolver()) == before
+
+
+def test_what_mitsuba_would_die_of_or_wait_for_is_told(tmp_path):
+    (tmp_path / "deep.xml").write_text('<scene version="3.0.0">' + "<bsdf>" * 50_000 + "</bsdf>" * 50_000 + "</scene>")
+    with pytest.raises(PathreplayError, match="elements inside each other"):
+        load_file_with(tmp_path / "deep.xml", SMOOTH)
+    os.mkfifo(tmp_path / "sky.exr")
+    with pytest.raises(PathreplayError, match="is a pipe"):
+        load_dict_with({"type": "scene", "sky": {"type": "envmap", "filename": str(tmp_path / "sky.exr")}}, SMOOTH)

@@ -6,6 +6,8 @@ import os
 import stat
 from pathlib import Path
 
+MISSING = "does not exist"
+
 _KINDS = {
     stat.S_IFDIR: "is a folder",
     stat.S_IFIFO: "is a pipe",
@@ -23,7 +25,7 @@ def file_problem(path: str | Path, most_bytes: int | None = None) -> str:
     try:
         found = os.stat(path)
     except (FileNotFoundError, NotADirectoryError):
-        return "does not exist"
+        return MISSING
     except (OSError, ValueError) as error:  # a name that is too long, a folder that may not be entered, a NUL
         return f"cannot be reached ({getattr(error, 'strerror', None) or error})"
     if not stat.S_ISREG(found.st_mode):

@@ -17,8 +17,7 @@ from pathreplay import parameters as scene_parameters
 from pathreplay.bsdfs.substitute import load_dict_with, load_file_with
 from pathreplay.builtin_scenes import BUILTINS, COSTS, SceneDict
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.files import file_problem
-from pathreplay.scene_files import require_shallow
+from pathreplay.files import MISSING, file_problem
 
 
 def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any) -> mi.Scene:
@@ -49,14 +48,13 @@ def load_scene_with(
             raise PathreplayError(f"{made}: {one_line(error)}") from error
     path = Path(spec) if base is None else Path(base) / spec
     problem = file_problem(path)
-    if problem == "does not exist":
+    if problem == MISSING:
         raise PathreplayError(_unknown(str(spec), path))
     if problem:
         raise PathreplayError(f"Scene {path} {problem}; give the path of a Mitsuba XML file")
     # As XML has them: true and not True.
     arguments = {name: str(v).lower() if isinstance(v, bool) else str(v) for name, v in parameters.items()}
     try:
-        require_shallow(path)
         # Equal objects are not merged: that would lose the names by which parameters are addressed.
         scene, exchanged = load_file_with(path, plugins, arguments)
     except (RuntimeError, ValueError, TypeError) as error:

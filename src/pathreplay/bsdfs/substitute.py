@@ -10,8 +10,8 @@ import mitsuba as mi
 
 from pathreplay.descriptions import require_values
 from pathreplay.errors import PathreplayError
-from pathreplay.files import file_problem
-from pathreplay.scene_files import require_sound_files
+from pathreplay.files import MISSING, file_problem
+from pathreplay.scene_files import require_shallow, require_sound_files
 from pathreplay.threads import spare_thread
 
 
@@ -30,9 +30,10 @@ def load_file_with(
 
     Returns the scene (or object) and one line per exchanged plugin, its id and where it stands in the file.
     Raises RuntimeError (Mitsuba's) for a file that cannot be read or holds a property unknown to the new plugin, and
-    PathreplayError for a file that would end the process: see `require_sound_files`.
+    PathreplayError for a file that would end the process: see `require_shallow` and `require_sound_files`.
     """
     path = Path(path)
+    require_shallow(path)
     config = _config(optimize)
     outer = mi.file_resolver()
     inner = mi.FileResolver(outer)
@@ -40,7 +41,6 @@ def load_file_with(
     mi.set_file_resolver(inner)
     try:
         state = mi.parser.parse_file(config, str(path), **_arguments(parameters or {}))
-        _require_files(state)
         return _instantiate(config, state, plugins)
     finally:
         mi.set_file_resolver(outer)
@@ -70,15 +70,14 @@ def _arguments(parameters: Mapping[str, str]) -> dict[str, str]:
     return dict(parameters)
 
 
-def _require_files(state: Any) -> None:
+def _require_regular_files(state: Any) -> None:
     """Raise PathreplayError where a plugin is to read a pipe or a device: Mitsuba would wait or read for ever."""
-    resolver = mi.file_resolver()
     for node in state.nodes:
         name = node.props.get("filename")
-        if isinstance(name, str) and (problem := file_problem(str(resolver.resolve(name)))) != "does not exist":
-            if problem:
-                where = mi.parser.file_location(state, node)
-                raise PathreplayError(f"File '{name}' of the scene {problem}; name a regular file ({where})")
+        problem = file_problem(str(mi.file_resolver().resolve(name))) if isinstance(name, str) else ""
+        if problem not in ("", MISSING):  # Mitsuba says what is missing
+            where = mi.parser.file_location(state, node)
+            raise PathreplayError(f"File '{name}' of the scene {problem}; name a regular file ({where})")
 
 
 def _config(optimize: bool) -> Any:
@@ -94,6 +93,7 @@ def _instantiate(config: Any, state: Any, plugins: Mapping[str, str]) -> tuple[A
         if new is not None:
             exchanged.append(f"{node.props.id() or 'unnamed'} ({mi.parser.file_location(state, node)})")
             node.props.set_plugin_name(new)
+    _require_regular_files(state)
     require_sound_files(state)
     mi.parser.transform_all(config, state)
     with spare_thread():

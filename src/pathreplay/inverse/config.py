@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.files import file_problem
+from pathreplay.files import MISSING, file_problem
 from pathreplay.inverse.pose import PARTS, PoseKind
 
 if sys.version_info >= (3, 11):
@@ -226,7 +226,7 @@ def load_config(path: Path) -> Config:
         PathreplayError: missing or unreadable file, unknown key (names the nearest), value out of its range.
     """
     problem = file_problem(path, _LONGEST_FILE)
-    if problem == "does not exist":
+    if problem == MISSING:
         raise PathreplayError(_no_file(path))
     if problem:
         raise PathreplayError(f"Config {path} {problem}; give the path of a TOML file")
