@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -17,7 +18,8 @@ import safetensors
 import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import RunResult, optimize
+from pathreplay.inverse import RunResult, optimize, run_folder
+from pathreplay.inverse.config import load_config
 from pathreplay.inverse.folder_lock import LOCK, FolderLock
 from pathreplay.inverse.images import exr_bytes, read_image
 from pathreplay.inverse.progress import Progress
@@ -96,6 +98,19 @@ def test_file_systems_without_locks_do_without(room: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(fcntl, "flock", flock)
     FolderLock(room).close()
+
+
+def test_a_folder_that_cannot_be_written_is_gone_and_let_go_of(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    job = write_job(room, **ONE)
+    monkeypatch.setattr(run_folder, "_write_through", full)
+    closed: list[FolderLock] = []
+    monkeypatch.setattr(FolderLock, "close", lambda lock: closed.append(lock))
+    with pytest.raises(PathreplayError, match="No space left"):
+        run_folder.create_run_folder(room / "full", load_config(room / job), room / job, room, {})
+    assert len(closed) == 1 and not (room / "full").exists()
 
 
 @pytest.mark.parametrize("how", ["link", "hard link", "pipe"])

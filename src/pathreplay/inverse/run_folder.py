@@ -106,14 +106,13 @@ def create_run_folder(
     else:
         copy = {"config.json": config.model_dump_json(indent=2, exclude_unset=True).encode()}
     origin = {"base": str(base.resolve()), "config": None if source is None else str(source)}
-    with undisturbed():
+    with undisturbed(), contextlib.ExitStack() as undo:
         path = _make_new(output)
-        try:
-            run = RunFolder(path, base.resolve())
-            run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
-        except BaseException:
-            shutil.rmtree(path, ignore_errors=True)
-            raise
+        undo.callback(shutil.rmtree, path, ignore_errors=True)
+        run = RunFolder(path, base.resolve())
+        undo.callback(run.close)
+        run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
+        undo.pop_all()
     return run
 
 
