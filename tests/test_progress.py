@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +49,7 @@ from pathreplay import backend
 backend.set_variant("llvm_ad_rgb")
 from pathreplay.inverse.progress import Progress
 print(Console().is_jupyter)
-with Progress(True) as bar:
+with progress.Progress(True) as bar:
     bar.start(0, 2); bar.advance(0.5); bar.advance(0.25)
 """
     done = run_python(code)
@@ -63,8 +65,18 @@ def test_silence_where_it_is_asked_for(capsys: pytest.CaptureFixture[str]) -> No
     assert capsys.readouterr() == ("", "")
 
 
+def test_a_signal_that_comes_while_a_line_is_printed_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Printing(io.StringIO):
+        def write(self, text: str) -> int:
+            raise RuntimeError("reentrant call inside <_io.BufferedWriter name='<stderr>'>")
+
+    monkeypatch.setattr(sys, "stderr", Printing())
+    with progress.Progress(True) as bar:
+        bar.say("SIGTERM: stopping after this iteration")
+
+
 def test_a_result_prints_short() -> None:
     history = tuple(Entry(i, 0.5, 1.0, {"a": 1.0}) for i in range(1000))
     values = {"a": np.zeros((100, 100, 3), np.float32)}
-    result = RunResult(Path("runs/x"), Path("runs/x/report.html"), 1000, False, history, values, {}, {})
+    result = RunResult(Path("runs/x"), Path("runs/x/report.html"), 1000, False, None, history, values, {}, {})
     assert repr(result) == "<RunResult: 1000 iterations, loss 0.5, 1 parameters, runs/x/report.html>"

@@ -18,18 +18,21 @@ _SECONDS = 10.0
 
 
 class _Forgiving:
-    """Stderr, or silence once it is gone: a terminal that closes may not end the writing of what was found."""
+    """Stderr, or silence once it is gone: a terminal that closes may not end the writing of what was found.
+
+    Silence, too, where a signal comes while something is printed, and its handler prints: Python raises RuntimeError.
+    """
 
     def __init__(self) -> None:
         self._stream = sys.stderr
 
     def write(self, text: str) -> int:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, RuntimeError):
             return self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, RuntimeError):
             self._stream.flush()
 
     def __getattr__(self, name: str) -> Any:
