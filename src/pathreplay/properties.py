@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .errors import PathreplayError
+from .errors import PathreplayError, shown
 
 #: What Mitsuba's own integrators can hold.
 LARGEST = 2**31 - 1
@@ -15,7 +15,8 @@ def choice(props: Any, plugin: str, name: str, default: Any, choices: tuple[Any,
     value = _value(props, name, default)
     # By type, too: 1 == True.
     if not any(type(value) is type(allowed) and value == allowed for allowed in choices):
-        raise PathreplayError(f"{plugin}: {name} = {value!r} is unknown: use one of {', '.join(map(repr, choices))}")
+        known = ", ".join(map(repr, choices))
+        raise PathreplayError(f"{plugin}: {name} = {shown(value)} is unknown: use one of {known}")
     return value
 
 
@@ -26,7 +27,7 @@ def whole_number(props: Any, plugin: str, name: str, default: int, lowest: int, 
         return value
     besides = "-1 (unbounded) or " if unbounded else ""
     raise PathreplayError(
-        f"{plugin}: {name} = {_shown(value)}: use {besides}a depth >= {lowest}, a whole number of at most {LARGEST}"
+        f"{plugin}: {name} = {shown(value)}: use {besides}a depth >= {lowest}, a whole number of at most {LARGEST}"
     )
 
 
@@ -34,7 +35,7 @@ def deviation(props: Any, plugin: str, name: str, default: float) -> float:
     """A finite standard deviation, at least 0. Raises PathreplayError for anything else."""
     value = _value(props, name, default)
     if type(value) not in (int, float) or not 0 <= value < float("inf"):
-        raise PathreplayError(f"{plugin}: {name} = {_shown(value)}: use a finite standard deviation >= 0 (0 = off)")
+        raise PathreplayError(f"{plugin}: {name} = {shown(value)}: use a finite standard deviation >= 0 (0 = off)")
     return float(value)
 
 
@@ -42,13 +43,9 @@ def flag(props: Any, plugin: str, name: str, default: bool) -> bool:
     """True or False. Raises PathreplayError for anything else."""
     value = _value(props, name, default)
     if type(value) is not bool:
-        raise PathreplayError(f"{plugin}: {name} = {_shown(value)}: use true or false")
+        raise PathreplayError(f"{plugin}: {name} = {shown(value)}: use true or false")
     return value
 
 
 def _value(props: Any, name: str, default: Any) -> Any:
     return props[name] if name in props else default
-
-
-def _shown(value: Any) -> str:
-    return f"{value!r:.60}" if isinstance(value, (str, bool)) else f"{value!s:.60}"
