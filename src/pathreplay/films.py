@@ -48,3 +48,11 @@ def require_memory(size: tuple[int, int], sensor: str, also: int = 0) -> None:
     width, height = size
     needed = width * height * _A_PIXEL + also
     memory.require(needed, f"Rendering {sensor} of {width} x {height} pixels", "take a smaller film or fewer sensors")
+
+
+def picture_shape(sensor: mi.Sensor) -> tuple[int, int, int]:
+    """Height, width and channels of the pictures that a sensor's film develops."""
+    film = sensor.film()
+    film.prepare([])  # without storage a film does not tell its channels
+    width, height = (int(n) for n in film.crop_size())
+    return height, width, film.bitmap().channel_count()

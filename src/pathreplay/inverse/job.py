@@ -18,7 +18,7 @@ from pathreplay.interrupts import undisturbed
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.file_names import file_names
-from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes, read_image
+from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes
 from pathreplay.inverse.limits import require_finite_loss
 from pathreplay.inverse.loop import Run, iterate, new_run, put_values, render_views, scene_values
 from pathreplay.inverse.pose import Pose, PoseError
@@ -35,7 +35,7 @@ from pathreplay.inverse.run_folder import (
     open_run_folder,
     require_output,
 )
-from pathreplay.inverse.saved_pictures import regular_file, require_pictures
+from pathreplay.inverse.saved_pictures import require_pictures, saved_picture
 from pathreplay.inverse.stopping import Stop, stopping
 from pathreplay.inverse.values import Array
 from pathreplay.media.volume_files import vol_bytes
@@ -156,9 +156,7 @@ def _begun(start: _Start, problem: Problem, run: Run, rival: Run | None) -> tupl
 def _went_on(folder: RunFolder, config: Config, problem: Problem, run: Run, rival: Run | None) -> dict[str, Image]:
     """Bring a run to where the folder's checkpoint was; returns the pictures of its start."""
     require_pictures(folder.path, "target", problem.scene, problem.views, {v.name: v.target for v in problem.views})
-    before = {
-        view.name: read_image(regular_file(folder.path / f"images/start-{view.name}.exr")) for view in problem.views
-    }
+    before = {view.name: saved_picture(folder.path / f"images/start-{view.name}.exr") for view in problem.views}
     require_pictures(folder.path, "start", problem.scene, problem.views, before)
     levels = {v.key: v.levels for v in problem.variables if v.levels is not None}
     for each, name in ((run, CHECKPOINT), (rival, RIVAL_CHECKPOINT)):
@@ -208,7 +206,7 @@ class _Start:
         if self.folder is None:
             return None
         pictures = sorted((self.folder.path / "images").glob("target-*.exr"))
-        return {path.stem.removeprefix("target-"): read_image(regular_file(path)) for path in pictures}
+        return {path.stem.removeprefix("target-"): saved_picture(path) for path in pictures}
 
 
 def _fresh(config: str | Path | Config | None, output: str | Path | None) -> _Start:

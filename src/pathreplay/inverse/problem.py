@@ -17,6 +17,7 @@ from pathreplay import parameters
 from pathreplay.descriptions import load_description
 from pathreplay.edges import edges_note, moves_edges
 from pathreplay.errors import PathreplayError
+from pathreplay.films import picture_shape
 from pathreplay.integrator import EDGES
 from pathreplay.inverse import limits
 from pathreplay.inverse.config import Config, Parameter, Plugin, Value
@@ -354,15 +355,12 @@ def _target_files(
     for (name, index), file in zip(sensors.items(), files, strict=True):
         path = find_image(file, base)
         image = over_black(read_image(path), path)
-        film = scene.sensors()[index].film()
-        width, height = (int(n) for n in film.crop_size())
+        height, width, channels = picture_shape(scene.sensors()[index])
         if image.shape[:2] != (height, width):
             raise PathreplayError(
                 f"Target image '{file}' is {image.shape[1]} x {image.shape[0]}, "
                 f"sensor '{name}' renders {width} x {height}; resize the image or the film"
             )
-        film.prepare([])  # without storage a film does not tell its channels
-        channels = film.bitmap().channel_count()
         adapted = with_channels(image, channels)
         if adapted is None:
             raise PathreplayError(

@@ -8,16 +8,18 @@ from pathlib import Path
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.images import Image
+from pathreplay.files import file_problem
+from pathreplay.films import picture_shape
+from pathreplay.inverse.images import Image, read_image
 from pathreplay.inverse.problem import View
 from pathreplay.inverse.values import require_finite_array
 
 
-def regular_file(path: Path) -> Path:
-    """The path itself; raises PathreplayError where there is no file, or a pipe or device in its place."""
-    if not path.is_file():
-        raise PathreplayError(f"{path} is missing or no file; start the job from its config")
-    return path
+def saved_picture(path: Path) -> Image:
+    """`read_image` of a picture that the run folder should hold; raises PathreplayError where it does not."""
+    if problem := file_problem(path):
+        raise PathreplayError(f"{path} {problem}; start the job from its config")
+    return read_image(path)
 
 
 def require_pictures(
@@ -25,10 +27,7 @@ def require_pictures(
 ) -> None:
     """Raise PathreplayError unless the pictures of that ``kind`` fit the films of the views and are finite."""
     for view in views:
-        film = scene.sensors()[view.sensor].film()
-        film.prepare([])  # without storage a film does not tell its channels
-        width, height = (int(n) for n in film.crop_size())
-        wanted = (height, width, film.bitmap().channel_count())
+        wanted = picture_shape(scene.sensors()[view.sensor])
         path = folder / f"images/{kind}-{view.name}.exr"
         if pictures[view.name].shape != wanted:
             raise PathreplayError(
