@@ -49,7 +49,7 @@ from pathreplay import backend
 backend.set_variant("llvm_ad_rgb")
 from pathreplay.inverse.progress import Progress
 print(Console().is_jupyter)
-with progress.Progress(True) as bar:
+with Progress(True) as bar:
     bar.start(0, 2); bar.advance(0.5); bar.advance(0.25)
 """
     done = run_python(code)

@@ -132,6 +132,16 @@ def test_a_sky_goes_through_a_job_column_by_column(folder: Path) -> None:
     assert pictures[1] == pytest.approx(pictures[0], abs=1e-5)
 
 
+def test_a_sky_without_name_is_seen_without_shapes(folder: Path) -> None:
+    bare = SCENE.replace(' id="env"', "").replace('<shape type="sphere" id="ball"><bsdf type="diffuse"/></shape>', "")
+    (folder / "scene.xml").write_text(bare)
+    target = {"images": ["other.exr"]}
+    (folder / "other.exr").write_bytes(exr_bytes(np.ones((8, 8, 3), np.float32)))
+    job = {**JOB, "parameters": [{"key": "*.data"}], "target": target, "iterations": 1}
+    result = optimize(make_config(job), progress=False)
+    assert [value.shape for value in result.parameters.values()] == [SKY.shape]
+
+
 def test_a_sky_is_refined_by_its_own_columns(folder: Path) -> None:
     levels = [{"key": "env.data", "initial": 0.5, "lower": 0.0, "resolutions": [4, 8], "refine_at": [2]}]
     result = optimize(make_config({**JOB, "parameters": levels}), progress=False)

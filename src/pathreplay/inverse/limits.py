@@ -14,6 +14,7 @@ from pathreplay import memory
 from pathreplay.errors import PathreplayError
 from pathreplay.films import MOST_SAMPLES, film_size, require_memory, require_samples
 from pathreplay.inverse.images import Image
+from pathreplay.transport.traits import nodes_of
 
 if TYPE_CHECKING:
     from pathreplay.inverse.losses import Loss
@@ -42,17 +43,17 @@ def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str,
         require_memory(size, f"sensor '{name}'", total * _A_VIEW)
 
 
-def require_visible(scene: mi.Scene, keys: Iterable[str]) -> None:
-    """Return quietly if the scene has shapes, or else all ``keys`` belong to lights and sensors.
+def require_visible(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:
+    """Return quietly if the scene has shapes, or else all ``keys`` of ``params`` belong to lights and sensors.
 
     Raises:
         PathreplayError: no picture can depend on one of them.
     """
     if scene.shapes():
         return
-    seen = tuple(f"{thing.id()}." for thing in [*scene.emitters(), *scene.sensors()])
+    seen = {node for thing in [*scene.emitters(), *scene.sensors()] for node in (thing, *nodes_of(thing))}
     for key in keys:
-        if not key.startswith(seen):
+        if params.properties[key][2] not in seen:
             raise PathreplayError(
                 f"Parameter '{key}' cannot be seen: the scene has no shapes; add some, or name a parameter of a light"
             )

@@ -115,7 +115,7 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     judge = integrator if config.target.images is not None else load_integrator(config.target.integrator)
     # Before any target is rendered: the cheap mistakes first.
     sensors = _sensors(scene, config.sensors)
-    limits.require_visible(scene, keys)
+    limits.require_visible(scene, params, keys)
     limits.require_films(scene, sensors, {"spp": config.spp, "picture_spp": config.picture_spp})
     unsolved, moved = _variables(scene, params, keys, config, base)
 
