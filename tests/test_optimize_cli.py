@@ -242,6 +242,10 @@ BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
         ["unused parameters", "$base=1"],
     ),
     "name that is Mitsuba's": (replace("spp = 1\np", "scene_parameters = { config = 1 }\nspp = 1\np"), ["$config"]),
+    "a word as a switch": (
+        replace("spp = 1\np", "spp = 1\ndeterministic = 'yes'\np"),
+        ["'deterministic'", "true or false"],
+    ),
     "TOML nested deep": (replace("spp = 1\np", f"spp = {'[' * 3000}{']' * 3000}\np"), ["nested too deep"]),
     "TOML of many digits": (replace("spp = 1\np", f"spp = {'1' * 10000}\np"), ["more digits"]),
     "hexadecimal of many digits": (replace("spp = 1\np", f"spp = 0x{'f' * 10000}\np"), ["'spp' is", "4300 digits"]),

@@ -205,7 +205,7 @@ class Config(_Table):
     learning_rate: Positive = 0.02
     learning_rate_decay: Annotated[Positive, Field(le=1)] = 0.1
     checkpoint_every: Count = 25
-    deterministic: bool = False
+    deterministic: Switch = False
     output: str | None = None
 
     @model_validator(mode="after")
