@@ -29,6 +29,15 @@ def test_first_signal_stops_with_everything_written(number: signal.Signals, tmp_
     assert (tmp_path / "run/report.html").is_file()
 
 
+def test_signals_that_wait_come_after_an_error_too() -> None:
+    came: list[int] = []
+    with interrupts.handled(lambda number, frame: came.append(number)), pytest.raises(ValueError):
+        with interrupts.undisturbed():
+            signal.raise_signal(signal.SIGTERM)
+            raise ValueError
+    assert came == [signal.SIGTERM]
+
+
 def test_two_ctrl_c_at_once_abort_in_one_line(tmp_path: Path) -> None:
     process = start(tmp_path, str(write_job(tmp_path, **ENDLESS)), "--quiet")
     kill_at_checkpoint(tmp_path, process, 2, signal.SIGINT)

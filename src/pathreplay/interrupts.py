@@ -88,12 +88,14 @@ def raised() -> Iterator[None]:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Within this short block signals wait for its end; they come then, each as often as it was sent."""
+    """Within this short block signals wait for its end, also that by an error; they come then, each as often as sent."""
     late: list[int] = []
-    with handled(lambda number, frame: late.append(number)):
-        yield
-    for number in late:
-        signal.raise_signal(number)
+    try:
+        with handled(lambda number, frame: late.append(number)):
+            yield
+    finally:
+        for number in late:
+            signal.raise_signal(number)
 
 
 def ignored() -> None:
