@@ -370,8 +370,8 @@ def _target_files(
         share = transparent_share(image)
         if share and channels in (1, 3):
             notes.append(
-                f"target image '{file}' is transparent in {share:.1%} of its pixels: black is fitted there; put the "
-                "picture before the background of your scene if that is another"
+                f"target image '{file}' is transparent in {share:.1%} of its pixels: black is fitted there; if "
+                "the background of your scene is not black, put it behind the picture first"
             )
         targets[name] = adapted
     return targets, tuple(notes)
