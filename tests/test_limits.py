@@ -14,14 +14,19 @@ from pathreplay.inverse.limits import require_grid, require_learning_rate
 
 
 def test_a_container_s_limit_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    limit, used = tmp_path / "max", tmp_path / "current"
-    monkeypatch.setattr(memory, "_CONTAINERS", ((tmp_path / "none", used), (limit, used)))
+    limit, used, statistics = (tmp_path / name for name in ("max", "current", "stat"))
+    statistics.write_text("anon 900000\n")
+    monkeypatch.setattr(memory, "_CONTAINERS", ((tmp_path / "none", used, statistics), (limit, used, statistics)))
     used.write_text("1000000\n")
     limit.write_text("max\n")
     free = memory.available()
     assert free > 1e8
     limit.write_text("3000000\n")
     assert memory.available() == 2_000_000
+    # Files that were read count as used, but are given up. The first version has totals of nested groups, too.
+    statistics.write_text("active_file 1\ninactive_file 2\ntotal_active_file 100000\ntotal_inactive_file 200000\n")
+    assert memory.available() == 2_300_000
+    statistics.write_text("")
     limit.write_text("1\n")
     assert memory.available() == 0
     with pytest.raises(PathreplayError, match=r"A film needs about 5 GB of memory, 0 GB are left; take less"):

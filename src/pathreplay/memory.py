@@ -2,31 +2,38 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import psutil
 
 from pathreplay.errors import PathreplayError
 
-# Limit and use of a container, in the two versions of Linux' control groups.
-_CONTAINERS = (
-    (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")),
-    (
-        Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
-        Path("/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-    ),
+# Limit, use and statistics of a container, in the two versions of Linux' control groups.
+_CONTAINERS = tuple(
+    tuple(Path("/sys/fs/cgroup", name) for name in names)
+    for names in (
+        ("memory.max", "memory.current", "memory.stat"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat"),
+    )
 )
 
 
 def available() -> int:
     """Bytes that this process can still get without swapping: of the machine, and of its container if it has one."""
     left = int(psutil.virtual_memory().available)
-    for limit, used in _CONTAINERS:
+    for limit, used, statistics in _CONTAINERS:
         try:
-            left = min(left, int(limit.read_text()) - int(used.read_text()))
+            left = min(left, int(limit.read_text()) - int(used.read_text()) + _cached(statistics.read_text()))
         except (OSError, ValueError):  # no such group, or 'max': no limit
             continue
     return max(left, 0)
+
+
+def _cached(statistics: str) -> int:
+    """Bytes of files that a container counts as used, and gives up when memory is wanted."""
+    sizes = dict(re.findall(r"^(?:total_)?((?:in)?active_file) (\d+)$", statistics, re.MULTILINE))
+    return sum(map(int, sizes.values()))
 
 
 def require(needed: int, thing: str, way_out: str) -> None:
