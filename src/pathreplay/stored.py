@@ -17,6 +17,7 @@ Jobs optimise, save and compare what people see, so that bounds, learning rates 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,10 +82,12 @@ class Sky(Form):
 
     def store(self, seen: Any) -> Any:
         height, width, channels = seen.shape
-        rows, columns, of = np.arange(height), np.arange(-1, width + 1) % width, np.arange(3 if self.mono else channels)
-        entries = (rows[:, None, None] * width + columns[:, None]) * channels + of % channels
-        values = dr.gather(mi.Float, seen.array, mi.UInt32(entries.ravel().astype(np.uint32)))
-        return mi.TensorXf(values, entries.shape)
+        shape = (height, width + 2, 3 if self.mono else channels)
+        entry = dr.arange(mi.UInt32, math.prod(shape))
+        texel, channel = entry // shape[2], entry % shape[2]
+        row, column = texel // shape[1], (texel % shape[1] + width - 1) % width
+        values = dr.gather(mi.Float, seen.array, (row * width + column) * channels + channel % channels)
+        return mi.TensorXf(values, shape)
 
 
 @dataclass(frozen=True)
