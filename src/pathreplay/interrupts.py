@@ -88,7 +88,7 @@ def raised() -> Iterator[None]:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Within this short block signals wait for its end, by an error too; they come then, each as often as it was sent."""
+    """Within this short block signals wait for its end, by an error too; then each comes as often as it was sent."""
     late: list[int] = []
     try:
         with handled(lambda number, frame: late.append(number)):
