@@ -82,11 +82,13 @@ def vol_bytes(data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -> bytes:
     """The `.vol` file of a grid; ``bounds`` is the box that it fills, used where `use_grid_bbox` is set.
 
     Raises:
-        PathreplayError: the data have neither three nor four dimensions.
+        PathreplayError: the data have neither three nor four dimensions, or no voxels.
     """
     grid = data[..., None] if data.ndim == 3 else data
-    if grid.ndim != 4:
-        raise PathreplayError(f"Volume of shape {data.shape}; a volume has the shape (z, y, x) or (z, y, x, channels)")
+    if grid.ndim != 4 or not grid.size:
+        raise PathreplayError(
+            f"Volume of shape {data.shape}; a volume has the shape (z, y, x) or (z, y, x, channels), none 0"
+        )
     z, y, x, channels = grid.shape
     header = _VOL_HEADER.pack(_VOL_MAGIC, _FLOAT32, x, y, z, channels, *bounds[0], *bounds[1])
     return header + np.ascontiguousarray(grid, "<f4").tobytes()
@@ -113,10 +115,10 @@ def grid_volume(path: str | Path, grid: str | None = None, **options: Any) -> di
 
 
 def require_whole_vol(path: Path) -> None:
-    """Return quietly if a `.vol` file is as long as its header says; only the header is read.
+    """Return quietly if a `.vol` file is as long as its header says, with channels for a scene; only that is read.
 
     Raises:
-        PathreplayError: it is too short or of impossible size. Mitsuba reports whatever else may be wrong.
+        PathreplayError: it is too short, of impossible size or with other channels. Mitsuba tells of other damage.
     """
     with path.open("rb") as file:
         header = file.read(_VOL_HEADER.size)
@@ -129,6 +131,12 @@ def require_whole_vol(path: Path) -> None:
             f"Volume {path} should hold {x} x {y} x {z} x {channels} numbers and has {path.stat().st_size} bytes; "
             "it is damaged, get it anew"
         )
+    if shape[3] not in _CHANNELS:
+        raise PathreplayError(f"Volume {path} has {shape[3]} channels, and scenes take 1, 3 or 6; convert it")
+
+
+_CHANNELS = (1, 3, 6)
+"""Numbers, colours, and what SGGX phase functions take."""
 
 
 def _read_vol(path: Path, grid: str | None) -> Volume:
