@@ -69,7 +69,7 @@ def read(path: Path) -> Record:
         PathreplayError: there is no such file, or it holds something else.
     """
     if problem := file_problem(path, _LONGEST):
-        raise PathreplayError(f"{path} {problem}; give a file that --save wrote")
+        raise PathreplayError(f"{path} cannot be read: it {problem}; give a file that --save wrote")
     try:
         return _JSON.validate_json(path.read_bytes())
     except OSError as error:

@@ -91,7 +91,10 @@ for words in (["--help"], ["bench", "surface"]):
         (("--step", "-1"), ["Step -1.0", "positive"]),
         (("--step", "0"), ["Step 0.0", "positive"]),
         (("--sensor", "-1"), ["Sensor -1"]),
+        (("--step", "1e300"), ["Step 1e+300", "too long", "0.01"]),
+        (("--step", "1e-320"), ["rounding of single precision", "0.01"]),
         (("--json", "/"), ["--json"]),
+        (("--json", "/dev/full"), ["/dev/full is a device", "--json"]),
         (("--json", "x" * 300), ["File name too long", "--json"]),
     ],
 )

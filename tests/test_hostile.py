@@ -36,6 +36,11 @@ HANDFUL = (
     "target: a pixel of nan",
     "target: PNG of 100000 x 100000",
     ".vol as a value: cut short",
+    ".vol in a scene: 5 channels",
+    "a film of zero (check)",
+    "a shapegroup of nothing",
+    "serialized: a face of vertex 1000",
+    "serialized: 1e6 shapes",
 )
 
 
