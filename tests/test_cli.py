@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -108,6 +109,15 @@ def test_an_argument_that_is_not_utf8_is_named(run) -> None:
     status, out, err = run("optimize", "job\udcff.toml")
     assert (status, out) == (2, "")
     assert r"job\udcff.toml" in err and "UTF-8" in err and err.count("\n") == 1
+
+
+def test_a_current_folder_that_was_removed_is_told(run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    status, out, err = run("check", "cornell-box", "--param", "x")
+    assert (status, out) == (2, "")
+    assert err == "pathreplay: error: the current folder was removed; change to another and start again\n"
 
 
 @pytest.mark.parametrize("arguments", [("no-such-command",), ("doctor", "--no-such-option"), ("doctor", "surplus")])
