@@ -334,13 +334,13 @@ def test_lost_adjoints_are_told_with_their_share(log, monkeypatch) -> None:
     """A direction held at a hit that is made infinite: its adjoint cannot be finite."""
     from pathreplay.transport import lobes
 
-    held = lobes.held_at_hit
+    held = lobes.moved_direction
 
     def broken(*args):
         d, J = held(*args)
         return d, J * dr.replace_grad(mi.Float(1), dr.sum(d) * dr.opaque(mi.Float, np.inf))
 
-    monkeypatch.setattr(lobes, "held_at_hit", broken)
+    monkeypatch.setattr(lobes, "moved_direction", broken)
     scene = mi.load_dict(lit_room(DIFFUSE), optimize=False)
     _differentiate(scene, "object.to_world", plugin())
     assert any("% of the paths lost a part of their gradient: a ray adjoint was not finite" in line for line in log)

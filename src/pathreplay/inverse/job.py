@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shlex
 from contextlib import ExitStack
@@ -111,6 +112,16 @@ def optimize(
         PathreplayError: anything in the job that cannot work, told before the first iteration; a full disk; a run
             folder that is in use, damaged, or vanishes.
     """
+    try:
+        return _run(config, resume, output, progress)
+    finally:
+        # Python finds the scene only by its collector, and Dr.Jit traces calls through every scene that is alive.
+        gc.collect()
+
+
+def _run(
+    config: str | Path | Config | None, resume: str | Path | None, output: str | Path | None, progress: bool
+) -> RunResult:
     with ExitStack() as stack:
         start = _resumed(resume, config, output) if resume is not None else _fresh(config, output)
         if start.folder is not None:
