@@ -220,6 +220,18 @@ def test_an_integrator_that_fails_is_told_and_leaves_no_folder(room: Path) -> No
     assert not list(room.glob("runs/*"))
 
 
+def test_a_target_that_cannot_be_rendered_is_told(room: Path) -> None:
+    class Blind(mi.ad.integrators.prb.PRBIntegrator):
+        def render(self, *arguments: object, **options: object) -> None:
+            raise RuntimeError("not today")
+
+    mi.register_integrator("blind", Blind)
+    target = {"scene": "room.xml", "integrator": {"type": "blind", "max_depth": 3}}
+    with pytest.raises(PathreplayError, match="Integrator 'blind' cannot render the target of .*: not today"):
+        run(target=target)
+    assert not list(room.glob("runs/*"))
+
+
 @pytest.mark.parametrize("config", [3, {"scene": "room.xml"}, None])
 def test_what_is_no_config_is_told(config: object) -> None:
     with pytest.raises(PathreplayError, match="config"):

@@ -148,7 +148,7 @@ def _run(
         stop = stack.enter_context(stopping(bar.say, way_out))
         _iterate(start.config, folder, problem, run, rival, stop, bar)
         bar.say("writing")
-        with one_thread(start.config.deterministic):
+        with one_thread(start.config.deterministic), told(_failing(start.config)):
             result = render_views(problem, start.config)
             theirs = None if rival is None else finished(problem, start.config, rival)
         return _finish(start, folder, problem, run, before, result, theirs, variant, stop.by())
