@@ -10,12 +10,14 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from pathreplay.errors import PathreplayError
+from pathreplay.files import file_problem
 
 from .drafts import ROOT, Draft
 from .job import Record
 from .runner import Measured
 
 RESULTS = ROOT / "benchmarks" / "results"
+_LONGEST = 2**28  # bytes, a hundred times the longest there is
 _JSON = TypeAdapter(Record)
 
 
@@ -66,6 +68,8 @@ def read(path: Path) -> Record:
     Raises:
         PathreplayError: there is no such file, or it holds something else.
     """
+    if problem := file_problem(path, _LONGEST):
+        raise PathreplayError(f"{path} cannot be read: it {problem}; give a file that --save wrote")
     try:
         return _JSON.validate_json(path.read_bytes())
     except OSError as error:

@@ -35,6 +35,8 @@ class Use:
     """For `check`, besides the key and the variant."""
     target: str = "path"
     """The integrator that renders the targets."""
+    rate: float = 0.05
+    """The learning rate: about a quarter of the way from start to truth."""
     views: tuple[tuple[int, int], ...] = ((12, 8),)
     """Width and height of the picture of each sensor."""
 
@@ -192,7 +194,7 @@ def spectral_room(folder: Path) -> Use:
         "</emitter></shape>",
         '<emitter type="constant" id="sky"><spectrum name="radiance" value="0.5"/></emitter>',
     )
-    return Use(xml, "lamp.emitter.radiance.values", truth=5.0, start=1.0, variant="llvm_ad_spectral")
+    return Use(xml, "lamp.emitter.radiance.values", truth=5.0, start=1.0, variant="llvm_ad_spectral", rate=1.0)
 
 
 def mono_room(folder: Path) -> Use:

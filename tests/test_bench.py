@@ -75,6 +75,11 @@ def test_a_run_that_is_as_fast_and_as_noisy_is_not_flagged() -> None:
     assert not comparison.worse and "2 of 2" in comparison.table()
 
 
+def test_what_is_no_file_is_no_record() -> None:
+    with pytest.raises(PathreplayError, match="/dev/zero cannot be read: it is a device"):
+        records.read(Path("/dev/zero"))
+
+
 def test_a_slower_method_is_flagged_relative_to_its_rival() -> None:
     old = record(point("prb", seed=1), point("sweep", 0.7, seed=1))
     new = record(point("prb", 3.0, seed=2), point("sweep", 0.7 * 3.0 * 1.3, seed=2))  # a machine three times slower

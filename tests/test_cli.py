@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -91,7 +92,10 @@ for words in (["--help"], ["bench", "surface"]):
         (("--step", "-1"), ["Step -1.0", "positive"]),
         (("--step", "0"), ["Step 0.0", "positive"]),
         (("--sensor", "-1"), ["Sensor -1"]),
+        (("--step", "1e300"), ["Step 1e+300", "too long", "0.01"]),
+        (("--step", "1e-320"), ["rounding of single precision", "0.01"]),
         (("--json", "/"), ["--json"]),
+        (("--json", "/dev/full"), ["/dev/full is a device", "--json"]),
         (("--json", "x" * 300), ["File name too long", "--json"]),
     ],
 )
@@ -105,6 +109,15 @@ def test_an_argument_that_is_not_utf8_is_named(run) -> None:
     status, out, err = run("optimize", "job\udcff.toml")
     assert (status, out) == (2, "")
     assert r"job\udcff.toml" in err and "UTF-8" in err and err.count("\n") == 1
+
+
+def test_a_current_folder_that_was_removed_is_told(run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    status, out, err = run("check", "cornell-box", "--param", "x")
+    assert (status, out) == (2, "")
+    assert err == "pathreplay: error: the current folder was removed; change to another and start again\n"
 
 
 @pytest.mark.parametrize("arguments", [("no-such-command",), ("doctor", "--no-such-option"), ("doctor", "surplus")])

@@ -9,6 +9,7 @@ import re
 import signal
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import safetensors.numpy
@@ -206,3 +207,32 @@ def test_sensors_can_be_chosen_by_name_and_number() -> None:
     result = run(iterations=1, sensors=["right"])
     assert {p.name for p in (result.folder / "images").glob("target-*.exr")} == {"target-right.exr"}
     assert run(iterations=1, sensors=[1]).history[0].loss == pytest.approx(result.history[0].loss, rel=1e-5)
+
+
+def test_an_integrator_that_fails_is_told_and_leaves_no_folder(room: Path) -> None:
+    class Broken(mi.ad.integrators.prb.PRBIntegrator):
+        def render_backward(self, *arguments: object, **options: object) -> None:
+            raise RuntimeError("not today")
+
+    mi.register_integrator("broken", Broken)
+    with pytest.raises(PathreplayError, match="Integrator 'broken' cannot do this job: not today"):
+        run(integrator={"type": "broken", "max_depth": 3})
+    assert not list(room.glob("runs/*"))
+
+
+def test_a_target_that_cannot_be_rendered_is_told(room: Path) -> None:
+    class Blind(mi.ad.integrators.prb.PRBIntegrator):
+        def render(self, *arguments: object, **options: object) -> None:
+            raise RuntimeError("not today")
+
+    mi.register_integrator("blind", Blind)
+    target = {"scene": "room.xml", "integrator": {"type": "blind", "max_depth": 3}}
+    with pytest.raises(PathreplayError, match="Integrator 'blind' cannot render the target of .*: not today"):
+        run(target=target)
+    assert not list(room.glob("runs/*"))
+
+
+@pytest.mark.parametrize("config", [3, {"scene": "room.xml"}, None])
+def test_what_is_no_config_is_told(config: object) -> None:
+    with pytest.raises(PathreplayError, match="config"):
+        optimize(config)

@@ -65,7 +65,7 @@ def optimize(folder: Path, use: Use, command: Command) -> None:
         "iterations": ITERATIONS,
         "spp": 16,
         "picture_spp": 16,
-        "learning_rate": 0.05,
+        "learning_rate": use.rate,
         "integrator": {"type": "pathreplay", "max_depth": 4},
         "parameters": [{"key": use.key, "initial": use.start, "lower": 0.0}],
         "target": {"values": {use.key: use.truth}, "spp": 64, "integrator": {"type": use.target, "max_depth": 4}},

@@ -20,6 +20,12 @@ _LAZY = {"check_gradient": "pathreplay.check", "optimize": "pathreplay.inverse"}
 
 
 def _set_up() -> None:
+    import os
+
+    try:
+        os.getcwd()
+    except OSError:
+        return  # the folder was removed: Mitsuba would bring Python down at its end; the command says so
     # Before the first import of mitsuba: Dr.Jit looks for libLLVM while it is imported.
     from pathreplay import backend, interrupts, plugins
 

@@ -183,6 +183,13 @@ def _require_text(argument: str) -> None:
         raise PathreplayError(f"argument '{argument}' is not UTF-8; rename the file or folder") from None
 
 
+def _require_folder() -> None:
+    try:
+        os.getcwd()
+    except OSError:  # Mitsuba would bring the process down
+        raise PathreplayError("the current folder was removed; change to another and start again") from None
+
+
 def _fail(message: str) -> NoReturn:
     # Plain stderr, one line: neither markup nor wrapping may touch a path or a parameter key.
     print("pathreplay: error: " + plain_line(message), file=sys.stderr)
@@ -198,6 +205,7 @@ def main() -> None:
         with interrupts.raised():
             for argument in sys.argv[1:]:
                 _require_text(argument)
+            _require_folder()
             status = app(sys.argv[1:] or ["--help"], prog_name="pathreplay", standalone_mode=False)
     except _UsageError as error:
         command = error.ctx.command_path if error.ctx else "pathreplay"

@@ -15,11 +15,17 @@ _A_PIXEL = 128
 
 
 def film_size(sensor: mi.Sensor) -> tuple[int, int]:
-    """Width and height of what is rendered: the crop window, and the film's border where it samples one."""
+    """Width and height of what is rendered: the crop window, and the film's border where it samples one.
+
+    Raises:
+        PathreplayError: the film has no pixel.
+    """
     film = sensor.film()
     border = 2 * int(film.rfilter().border_size()) if film.sample_border() else 0
-    width, height = (int(n) + border for n in film.crop_size())
-    return width, height
+    width, height = (int(n) for n in film.crop_size())
+    if width < 1 or height < 1:
+        raise PathreplayError(f"The film of sensor '{sensor.id()}' is {width} x {height}; give it at least one pixel")
+    return width + border, height + border
 
 
 def require_samples(key: str, spp: int, size: tuple[int, int], sensor: str) -> None:

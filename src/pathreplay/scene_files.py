@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,23 +17,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
+from pathreplay.files import file_problem
 from pathreplay.media.volume_files import require_whole_vol
+from pathreplay.serialized_files import require_sound_serialized
 
 DEEPEST = 64
 """Elements inside each other in a scene file. Real ones have ten; Mitsuba's parser runs out of stack at some 10 000."""
 
 
+LONGEST = 2**28
+"""Bytes of a scene file. Mitsuba takes some ten times as much memory to read one."""
+
+
 def require_shallow(path: Path) -> None:
-    """Return quietly if no element of a scene file, or of the files that it includes, is nested too deep.
+    """Return quietly if a scene file, or one that it includes, is not too long, and no element nested too deep.
 
     Raises:
-        PathreplayError: names the file and the line.
+        PathreplayError: names the file, and the line.
     """
     waiting, seen = [path], set()
     while waiting:
         file = waiting.pop()
         if file.resolve() in seen or not file.is_file():
             continue  # Mitsuba tells of circles and of what is missing
+        if problem := file_problem(file, LONGEST):
+            raise PathreplayError(f"Scene {file} {problem}; keep meshes and textures in files of their own")
         seen.add(file.resolve())
         waiting += [path.parent / name for name in _included(file)]
 
@@ -71,18 +78,39 @@ def _included(path: Path) -> list[str]:
 def require_sound_files(state: Any) -> None:
     """Return quietly if the files that a parsed scene names (`mi.parser`) can be given to Mitsuba.
 
-    Looks at the indices of PLY meshes and at the sizes of volumes.
+    Looks at the indices of PLY and serialized meshes and at the sizes of volumes; and for groups without a shape.
 
     Raises:
         PathreplayError: names the file, what is wrong, and the way out.
     """
-    looks: dict[str, Callable[[Path], None]] = {"ply": _require_sound_ply, "gridvolume": require_whole_vol}
     for node in state.nodes:
-        look, name = looks.get(node.props.plugin_name()), node.props.get("filename", None)
-        if look is not None and isinstance(name, str):
-            path = Path(str(mi.file_resolver().resolve(name)))
-            if path.is_file():
-                look(path)
+        kind, name = node.props.plugin_name(), node.props.get("filename", None)
+        if kind == "shapegroup":
+            _require_shapes(state, node)
+        path = Path(str(mi.file_resolver().resolve(name))) if isinstance(name, str) else None
+        if path is None or not path.is_file():
+            continue
+        if kind == "ply":
+            _require_sound_ply(path)
+        elif kind == "gridvolume":
+            require_whole_vol(path)
+        elif kind == "serialized":
+            require_sound_serialized(path, node.props.get("shape_index", 0))
+
+
+def _require_shapes(state: Any, group: Any) -> None:
+    """Raise PathreplayError for a group in which nothing is; Dr.Jit dies of its instances."""
+    by_id = {node.props.id(): node for node in state.nodes}
+    for key in group.props.keys():
+        child, kind = group.props.get(key), group.props.type(key)
+        node = None
+        if kind == mi.Properties.Type.ResolvedReference:
+            node = state.nodes[child.index()]
+        elif kind == mi.Properties.Type.Reference:
+            node = by_id.get(child.id())
+        if kind == mi.Properties.Type.Object or (node is not None and node.type == mi.ObjectType.Shape):
+            return
+    raise PathreplayError(f"Shape group '{group.props.id()}' holds no shape; put one into it, or leave it out")
 
 
 # ------------------------------------------------------------------------------
@@ -115,6 +143,8 @@ class _Element:
 
 def _require_sound_ply(path: Path) -> None:
     with path.open("rb") as file:
+        if file.read(3) != b"ply":
+            raise PathreplayError(f"Mesh {path} is no PLY file: it does not begin with 'ply'; get it anew")
         kind, elements = _ply_header(file)
         begin = file.tell()
     by_name = {element.name: element for element in elements}

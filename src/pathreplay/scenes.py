@@ -6,7 +6,8 @@ import difflib
 import gc
 import inspect
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +124,26 @@ def _unknown(spec: str, path: Path) -> str:
     close = difflib.get_close_matches(Path(spec).name, [*BUILTINS, *neighbours], n=1, cutoff=0.5)
     hint = f"; did you mean '{close[0]}'?" if close else ""
     return f"No scene '{spec}': {path} is no file and no built-in has that name{hint} (built-ins: {names})"
+
+
+@contextmanager
+def told(what: str) -> Iterator[None]:
+    """What Mitsuba and Dr.Jit raise within, as one line that begins with ``what``.
+
+    Raises:
+        PathreplayError: there was a RuntimeError.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        raise PathreplayError(f"{what}: {innermost(error)}") from error
+
+
+def innermost(error: BaseException) -> str:
+    """`one_line` of the error that came first: Dr.Jit's calls and loops raise others that say nothing."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return one_line(error)
 
 
 def one_line(error: BaseException) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,6 +13,8 @@ from .room import Room
 
 OPTIMIZE = ("optimize", "job.toml", "--quiet")
 CHECK = ("check", "ball.xml", "--param", "paint.reflectance.data", "--seeds", "2", "--spp", "1")
+RUN = f"{shlex.quote(sys.executable)} -m pathreplay.cli"
+"""The command in a shell line."""
 
 
 @dataclass(frozen=True)

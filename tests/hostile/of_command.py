@@ -53,7 +53,7 @@ def _line(*words: str, refused: bool = True, writes: tuple[str, ...] = ()) -> No
     add(KIND, told.encode("ascii", "backslashreplace").decode(), lambda room, rng: action, refused=refused)
 
 
-_line()
+add(KIND, "nothing, which shows the help", lambda room, rng: Action())
 _line("chekc", "ball.xml")
 _line("")
 _line("\udcff")

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from .case import Action, add, recipe
+from .case import RUN, Action, add, recipe
 from .room import Room
 
 KIND = "process"
-RUN = "python -m pathreplay.cli"
 CHECK = f"{RUN} check ball.xml --param paint.reflectance.data --seeds 2 --spp 1"
 OPTIMIZE = f"{RUN} optimize job.toml --quiet"
 
@@ -39,10 +38,11 @@ _shell("no descriptors to spare", f"ulimit -n 40; {OPTIMIZE}")
 _shell("files of at most a block", f"ulimit -f 1; {OPTIMIZE}", refused=True)
 _shell("optimisation of Python", f"PYTHONOPTIMIZE=2 {OPTIMIZE}")
 _shell("warnings as errors", f"PYTHONWARNINGS=error {RUN} optimize no.toml", refused=True)
-_shell("the folder is gone", f"mkdir gone && cd gone && rmdir ../gone && {RUN} optimize ../job.toml --quiet")
+_shell("the folder is gone", f"mkdir gone && cd gone && rmdir ../gone && {RUN} optimize ../job.toml", refused=True)
 _shell(
     "the folder is gone, a scene by name",
     f"mkdir gone && cd gone && rmdir ../gone && {RUN} check cornell-box --param x",
+    refused=True,
 )
 _shell("input from a device", f"{CHECK} < /dev/zero")
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .assets import pfm
-from .case import OPTIMIZE, Action, add, recipe
+from .case import OPTIMIZE, RUN, Action, add, recipe
 from .room import ODD_FILES, Room
 from .values import VALUES, pick, spoiled
 
@@ -353,7 +353,7 @@ for _name, _act in {
 @recipe(KIND)
 def two_resumes_at_once(room: Room, rng: np.random.Generator) -> Action:
     room.put_run(iterations=30)
-    line = "python -m pathreplay.cli optimize --resume runs/job --quiet"
+    line = f"{RUN} optimize --resume runs/job --quiet"
     return Action(
         shell=f"{line} 2> ../outside/first & {line}; status=$?; wait; exit $status", writes=("../outside/first",)
     )
@@ -373,7 +373,7 @@ for _signals, _statuses in (
         sends = "; sleep 0.02; ".join(f"kill -{name} $process" for name in signals.split())
         wait = "while [ ! -e runs/job/checkpoint.safetensors ]; do sleep 0.1; done"
         return Action(
-            shell="set -m; python -m pathreplay.cli optimize job.toml --quiet & process=$!; "
+            shell=f"set -m; {RUN} optimize job.toml --quiet & process=$!; "
             f"{wait}; {sends}; wait $process",
             statuses=statuses,
         )

@@ -131,8 +131,10 @@ def _run_script(code: str) -> None:
     except Exception as error:
         if not _told_by_mitsuba(error):
             raise
-        # Mitsuba wraps what a plugin raises and adds where; the last line is the plugin's, or all is Mitsuba's own.
-        print("pathreplay: error: " + ascii(str(error).strip().splitlines()[-1])[:1000], file=sys.stderr)
+        # Mitsuba wraps what a plugin raises and adds where; then the last line is the plugin's. Else all is Mitsuba's.
+        lines = str(error).strip().splitlines()
+        told = lines[-1] if "Traceback" in str(error) else " ".join(lines)
+        print("pathreplay: error: " + ascii(told)[:1000], file=sys.stderr)
         sys.exit(2)
 
 

@@ -72,7 +72,8 @@ def choose_line(
     ``spectra`` move so that what they stand for changes by such steps: see :mod:`pathreplay.spectra`.
 
     Raises:
-        PathreplayError: the direction has the wrong shape, is zero or is not finite; the step is not a positive number.
+        PathreplayError: the direction has the wrong shape, is zero or is not finite; the step is not a positive number,
+            or too long or too short for the parameter.
     """
     if value.size == 0:
         raise PathreplayError(f"Parameter '{key}' is empty; there is nothing to check")
@@ -96,7 +97,22 @@ def choose_line(
         raise PathreplayError(
             f"Step {step} for '{key}' is not a positive number; leave it out, or give one such as 0.01"
         )
+    else:
+        _require_seen(key, value, v, step, size)
     return Line(value, v, description, size, float(step), _choose_stencil(key, value, v * step))
+
+
+# A parameter a million times as large or small is that of another scene.
+_LONGEST_STEP = 1e6
+
+
+def _require_seen(key: str, value: np.ndarray, direction: np.ndarray, step: float, size: float) -> None:
+    """Raise PathreplayError for a step beyond the parameter's size, or that single precision does not see."""
+    way_out = f"leave it out, or give one such as {RELATIVE_STEP * size:g}"
+    if step * float(np.abs(direction).max()) > _LONGEST_STEP * size:
+        raise PathreplayError(f"Step {step} for '{key}' is too long for values up to {size:g}; {way_out}")
+    if (np.float32(value + step / 2 * direction) == np.float32(value)).all():
+        raise PathreplayError(f"Step {step} for '{key}' is lost in the rounding of single precision; {way_out}")
 
 
 def _random_direction(

@@ -131,6 +131,7 @@ def check_gradient(
         PathreplayError: a bad argument, a parameter without derivative, NaN in the scene, an integrator that cannot
             differentiate this parameter.
     """
+    _require_types(key, loss, sensor=sensor, seeds=seeds, spp=spp, fd_spp=fd_spp, seed=seed)
     _require_arguments(scene, sensor, seeds, spp, fd_spp, seed, mode)
     params = mi.traverse(scene)
     tested = integrator_under_test(integrator, scene, max_depth)
@@ -200,6 +201,18 @@ def _is_far(owner: Any) -> bool:
     """Whether a light stands infinitely far away, where only its orientation counts."""
     flags = mi.EmitterFlags.Infinite | mi.EmitterFlags.DeltaDirection
     return isinstance(owner, mi.Emitter) and bool(mi.has_flag(owner.flags(), flags))
+
+
+def _require_types(key: Any, loss: Any, **numbers: Any) -> None:
+    if not isinstance(key, str):
+        raise PathreplayError(f"key is {shown(key)}; give the name of one parameter, as 'wall.reflectance.data'")
+    if loss is not None and not callable(loss):
+        raise PathreplayError(f"loss is {shown(loss)}; give a function from the image to a number, or leave it out")
+    for name, number in numbers.items():
+        if name == "fd_spp" and number is None:
+            continue
+        if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
+            raise PathreplayError(f"{name} is {shown(number)}; give a whole number")
 
 
 def _require_arguments(scene: Any, sensor: int, seeds: int, spp: int, fd_spp: int | None, seed: int, mode: str) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from pathreplay.check.direction import Line
 from pathreplay.errors import PathreplayError
 from pathreplay.parameters import displaced
-from pathreplay.scenes import one_line
+from pathreplay.scenes import innermost, told
 
 Mode = Literal["backward", "forward"]
 
@@ -61,8 +61,9 @@ class View:
         self.params.update()
 
     def render(self, integrator: Any, seed: int, spp: int) -> Any:
-        image = integrator.render(self.scene, self.sensor, seed=mi.UInt32(seed), spp=spp)
-        return mi.TensorXf(image)
+        with told(f"Integrator '{integrator_name(integrator)}' cannot render the scene"):
+            image = integrator.render(self.scene, self.sensor, seed=mi.UInt32(seed), spp=spp)
+            return mi.TensorXf(image)
 
     def weights(self, plain: Any, loss: Any, seed: int, spp: int) -> tuple[Any, float]:
         """The weights w / n as a tensor like the image, and the scale Σ |w_k I_k| / n of the objective."""
@@ -72,10 +73,12 @@ class View:
         else:
             dr.enable_grad(image)
             value = loss(image)
-            if not dr.grad_enabled(value):
+            if not dr.is_diff_v(value) or not dr.grad_enabled(value):
                 raise PathreplayError("loss does not depend on its image, or not through Dr.Jit operations")
             dr.backward(value)
             w = np.array(dr.grad(image), np.float64)
+            if not np.isfinite(w).all():
+                raise PathreplayError("loss has a derivative that is NaN or infinite; give a function without, or none")
             if _has_alpha(self.sensor):
                 w[..., -1] = 0
         return mi.TensorXf(w), float(np.abs(w * np.array(image, np.float64)).sum())
@@ -103,14 +106,8 @@ class View:
         except (RuntimeError, TypeError, NotImplementedError) as error:
             name = integrator_name(integrator)
             raise PathreplayError(
-                f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode: {_innermost(error)}"
+                f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode: {innermost(error)}"
             ) from error
-
-
-def _innermost(error: BaseException) -> str:
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return one_line(error)
 
 
 def _has_alpha(sensor: Any) -> bool:

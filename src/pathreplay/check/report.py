@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -88,20 +89,26 @@ def _with_error(value: float, error: float) -> str:
 def write_checks(results: Sequence[GradientCheck], path: Path) -> None:
     """Write all fields of the checks as a JSON list, the samples too; NaN and infinity become null."""
     records = [{**asdict(result), "passed": result.passed, "variant": mi.variant()} for result in results]
-    path.write_text(json.dumps(_finite(records), indent=2) + "\n", encoding="utf-8")
+    try:
+        path.write_text(json.dumps(_finite(records), indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise PathreplayError(f"{path} cannot be written ({error.strerror}); give --json another file") from None
 
 
 def require_writable(path: Path) -> None:
     """Return quietly if ``path`` can be written later.
 
     Raises:
-        PathreplayError: it is a folder, its name is no name of a file, or its folder does not exist.
+        PathreplayError: it is no regular file, its name is no name of a file, its folder does not exist, or one of them
+            may not be written.
     """
     problem = file_problem(path)
-    if problem == "is a folder" or problem.startswith("cannot be reached"):
+    if problem.startswith(("is ", "cannot be reached")):
         raise PathreplayError(f"{path} {problem}; give --json the name of a file")
     if not path.parent.is_dir():
         raise PathreplayError(f"Folder {path.parent} for {path.name} does not exist; make it first")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise PathreplayError(f"{path} may not be written (its permissions); give --json another file")
 
 
 def _finite(value: Any) -> Any:

@@ -41,6 +41,7 @@ from pathreplay.inverse.stopping import Stop, stopping
 from pathreplay.inverse.values import Array
 from pathreplay.media.volume_files import vol_bytes
 from pathreplay.parameters import get_array, to_value
+from pathreplay.scenes import told
 from pathreplay.threads import one_thread, require_one_thread_possible
 
 
@@ -147,7 +148,7 @@ def _run(
         stop = stack.enter_context(stopping(bar.say, way_out))
         _iterate(start.config, folder, problem, run, rival, stop, bar)
         bar.say("writing")
-        with one_thread(start.config.deterministic):
+        with one_thread(start.config.deterministic), told(_failing(start.config)):
             result = render_views(problem, start.config)
             theirs = None if rival is None else finished(problem, start.config, rival)
         return _finish(start, folder, problem, run, before, result, theirs, variant, stop.by())
@@ -155,7 +156,7 @@ def _run(
 
 def _begun(start: _Start, problem: Problem, run: Run, rival: Run | None) -> tuple[dict[str, Image], RunFolder]:
     """A new folder for a run at its start; and the pictures there."""
-    with one_thread(start.config.deterministic):
+    with one_thread(start.config.deterministic), told(_failing(start.config)):
         put_values(problem, run.adam)
         before = render_views(problem, start.config)
     for view in problem.views:
@@ -199,10 +200,20 @@ def _iterate(
             folder.write(_checkpoints(run, rival))
             saved = done
 
-    with one_thread(config.deterministic):
-        iterate(problem, config, run, rival, stop, after)
+    try:
+        with one_thread(config.deterministic), told(_failing(config)):
+            iterate(problem, config, run, rival, stop, after)
+    except PathreplayError:
+        if not run.history:
+            folder.remove()
+        raise
     if saved < len(run.history):
         folder.write(_checkpoints(run, rival))
+
+
+def _failing(config: Config) -> str:
+    names = config.integrator.type if config.rival is None else f"{config.integrator.type}' or '{config.rival.type}"
+    return f"Integrator '{names}' cannot do this job"
 
 
 @dataclass(frozen=True)
@@ -223,6 +234,10 @@ class _Start:
 def _fresh(config: str | Path | Config | None, output: str | Path | None) -> _Start:
     if config is None:
         raise PathreplayError("Nothing to do: give a config file, or --resume RUN_FOLDER")
+    if not isinstance(config, (str, Path, Config)):
+        raise PathreplayError(
+            f"config is a {type(config).__name__}; give the path of a TOML file, or make_config of a dictionary"
+        )
     source = None if isinstance(config, Config) else Path(config)
     job = config if isinstance(config, Config) else load_config(Path(config))
     base = Path.cwd() if source is None else source.parent

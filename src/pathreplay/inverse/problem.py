@@ -27,7 +27,7 @@ from pathreplay.inverse.images import Image, find_image, over_black, read_image,
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.values import Array, make_value, require_finite_array
-from pathreplay.scenes import load_scene, load_scene_for, one_line
+from pathreplay.scenes import load_scene, load_scene_for, one_line, told
 from pathreplay.stored import AS_STORED, Form, form_of
 from pathreplay.threads import one_thread
 
@@ -335,8 +335,9 @@ def _rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) 
     targets: dict[str, Image] = {}
     for name, index in sensors.items():
         seed, _ = seeds(config.seed, TARGET, 0, index)
-        image = mi.render(scene, sensor=index, integrator=integrator, spp=config.target.spp, seed=mi.UInt32(seed))
-        targets[name] = np.array(image, dtype=np.float32)
+        with told(f"Integrator '{config.target.integrator.type}' cannot render the target of sensor '{name}'"):
+            image = mi.render(scene, sensor=index, integrator=integrator, spp=config.target.spp, seed=mi.UInt32(seed))
+            targets[name] = np.array(image, dtype=np.float32)
         require_finite_array(f"Target picture of sensor '{name}'", targets[name])
     return targets
 

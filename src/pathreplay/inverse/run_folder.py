@@ -35,6 +35,11 @@ class RunFolder:
         """Unlock it."""
         self.lock.close()
 
+    def remove(self) -> None:
+        """Remove it with all that is in it, where it still is the folder that was made."""
+        if _identity(self.path) == self.identity:
+            shutil.rmtree(self.path, ignore_errors=True)
+
     def require_in_place(self, lost: str) -> None:
         """Raise PathreplayError if the folder is no longer where it was; ``lost`` names what was not saved."""
         if _identity(self.path) != self.identity:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 from pathreplay.errors import PathreplayError
@@ -49,15 +50,17 @@ def require_whole_nanovdb(path: Path) -> None:
     Raises:
         PathreplayError: it is no such file, of an unknown version, or damaged.
     """
-    content = path.read_bytes()
+    if path.stat().st_size < _SEGMENT.size:
+        raise _damaged(path, "its header is cut off")
     try:
-        for place in _places(path, content):
-            _require_grid(path, content, place)
+        with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+            for place in _places(path, content):
+                _require_grid(path, content, place)
     except (struct.error, UnicodeDecodeError):
         raise _damaged(path, "a header is cut off or holds no text where a name should be") from None
 
 
-def _places(path: Path, content: bytes) -> list[_Place]:
+def _places(path: Path, content: mmap) -> list[_Place]:
     places: list[_Place] = []
     at = 0
     while at < len(content) or not places:
@@ -83,7 +86,7 @@ def _places(path: Path, content: bytes) -> list[_Place]:
     return places
 
 
-def _require_grid(path: Path, content: bytes, place: _Place) -> None:
+def _require_grid(path: Path, content: mmap, place: _Place) -> None:
     data = content[place.begin : place.begin + place.file_size]
     if place.grid_size > _MOST_PACKED * place.file_size:
         raise _damaged(path, f"{place.file_size} bytes cannot unpack to {place.grid_size}")

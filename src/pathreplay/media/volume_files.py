@@ -34,6 +34,9 @@ _FLOAT32 = 1
 # 4 GiB of float32: beyond, a wrong bounding box is likelier than a volume that anyone can render.
 _MOST_VOXELS = 2**30
 
+# An extinction beyond has free paths far below what single precision tells apart.
+_LARGEST = 1e12
+
 
 @dataclass(frozen=True)
 class Volume:
@@ -70,7 +73,17 @@ def load_volume(path: str | Path, grid: str | None = None) -> Volume:
     volume = read(path, grid)
     if not np.isfinite(volume.data).all():
         raise PathreplayError(f"Volume {path} holds NaN or infinite values; repair it first")
+    _require_small(path, volume.data)
     return volume
+
+
+def _require_small(path: Path, data: NDArray[np.float32]) -> None:
+    extreme = float(max(data.max(), -data.min()))
+    if extreme > _LARGEST:
+        raise PathreplayError(
+            f"Volume {path} holds values up to {extreme:g}, through which no path would come to an end; scale it "
+            f"below {_LARGEST:g}"
+        )
 
 
 def save_vol(path: str | Path, data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -> None:
@@ -82,11 +95,13 @@ def vol_bytes(data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -> bytes:
     """The `.vol` file of a grid; ``bounds`` is the box that it fills, used where `use_grid_bbox` is set.
 
     Raises:
-        PathreplayError: the data have neither three nor four dimensions.
+        PathreplayError: the data have neither three nor four dimensions, or no voxels.
     """
     grid = data[..., None] if data.ndim == 3 else data
-    if grid.ndim != 4:
-        raise PathreplayError(f"Volume of shape {data.shape}; a volume has the shape (z, y, x) or (z, y, x, channels)")
+    if grid.ndim != 4 or not grid.size:
+        raise PathreplayError(
+            f"Volume of shape {data.shape}; a volume has the shape (z, y, x) or (z, y, x, channels), none 0"
+        )
     z, y, x, channels = grid.shape
     header = _VOL_HEADER.pack(_VOL_MAGIC, _FLOAT32, x, y, z, channels, *bounds[0], *bounds[1])
     return header + np.ascontiguousarray(grid, "<f4").tobytes()
@@ -113,10 +128,11 @@ def grid_volume(path: str | Path, grid: str | None = None, **options: Any) -> di
 
 
 def require_whole_vol(path: Path) -> None:
-    """Return quietly if a `.vol` file is as long as its header says; only the header is read.
+    """Return quietly if a `.vol` file is as long as its header says, with channels and values for a scene.
 
     Raises:
-        PathreplayError: it is too short or of impossible size. Mitsuba reports whatever else may be wrong.
+        PathreplayError: it is too short, of impossible size, with other channels or values beyond all extinctions.
+            Mitsuba tells of other damage.
     """
     with path.open("rb") as file:
         header = file.read(_VOL_HEADER.size)
@@ -129,24 +145,34 @@ def require_whole_vol(path: Path) -> None:
             f"Volume {path} should hold {x} x {y} x {z} x {channels} numbers and has {path.stat().st_size} bytes; "
             "it is damaged, get it anew"
         )
+    if shape[3] not in _CHANNELS:
+        raise PathreplayError(f"Volume {path} has {shape[3]} channels, and scenes take 1, 3 or 6; convert it")
+    if encoding == _FLOAT32:
+        _require_small(path, np.memmap(path, "<f4", "r", _VOL_HEADER.size, math.prod(shape)))
+
+
+_CHANNELS = (1, 3, 6)
+"""Numbers, colours, and what SGGX phase functions take."""
 
 
 def _read_vol(path: Path, grid: str | None) -> Volume:
     if grid is not None:
         raise PathreplayError(f"Volume {path} is asked for its grid '{grid}', but a .vol file holds one without name")
-    content = path.read_bytes()
-    if content[:4] != _VOL_MAGIC or len(content) < _VOL_HEADER.size:
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        header = file.read(_VOL_HEADER.size)
+    if header[:4] != _VOL_MAGIC or len(header) < _VOL_HEADER.size:
         raise PathreplayError(f"Volume {path} is no Mitsuba volume of version 3; write it with mi.VolumeGrid.write")
-    _, encoding, x, y, z, channels, *box = _VOL_HEADER.unpack_from(content)
+    _, encoding, x, y, z, channels, *box = _VOL_HEADER.unpack(header)
     if encoding != _FLOAT32:
         raise PathreplayError(f"Volume {path} has encoding {encoding}; write it as float32 (encoding 1)")
     count = x * y * z * channels
-    if min(x, y, z, channels) < 1 or len(content) != _VOL_HEADER.size + 4 * count:
+    if min(x, y, z, channels) < 1 or size != _VOL_HEADER.size + 4 * count:
         raise PathreplayError(
-            f"Volume {path} should hold {x} x {y} x {z} x {channels} numbers and has {len(content)} bytes; "
+            f"Volume {path} should hold {x} x {y} x {z} x {channels} numbers and has {size} bytes; "
             "it is damaged, get it anew"
         )
-    values = np.frombuffer(content, "<f4", offset=_VOL_HEADER.size).astype(np.float32)
+    values = np.fromfile(path, "<f4", offset=_VOL_HEADER.size).astype(np.float32)
     low, high = np.array(box[:3]), np.array(box[3:])
     to_world = np.diag([*(high - low), 1.0])
     to_world[:3, 3] = low
