@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -84,6 +85,11 @@ def test_volumes_are_as_long_as_they_say(sides: tuple[int, ...], tmp_path: Path)
     load(tmp_path, FOG)
     (tmp_path / "f.vol").write_bytes(good[:8] + struct.pack("<3i", *sides) + good[20:])
     assert f"{sides[0]} x {sides[1]} x {sides[2]} x 1 numbers and has 80 bytes" in refused(tmp_path, FOG)
+
+
+def test_included_files_are_regular_ones(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "part.xml")
+    assert "part.xml is a pipe" in refused(tmp_path, '<include filename="part.xml"/>')
 
 
 def test_nesting_has_a_bound_in_included_files_too(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
-from pathreplay.files import file_problem
+from pathreplay.files import MISSING, file_problem
 from pathreplay.media.volume_files import require_whole_vol
 from pathreplay.serialized_files import require_sound_serialized
 
@@ -38,9 +38,10 @@ def require_shallow(path: Path) -> None:
     waiting, seen = [path], set()
     while waiting:
         file = waiting.pop()
-        if file.resolve() in seen or not file.is_file():
+        problem = file_problem(file, LONGEST)
+        if file.resolve() in seen or problem == MISSING:
             continue  # Mitsuba tells of circles and of what is missing
-        if problem := file_problem(file, LONGEST):
+        if problem:
             raise PathreplayError(f"Scene {file} {problem}; keep meshes and textures in files of their own")
         seen.add(file.resolve())
         waiting += [path.parent / name for name in _included(file)]
