@@ -373,8 +373,7 @@ for _signals, _statuses in (
         sends = "; sleep 0.02; ".join(f"kill -{name} $process" for name in signals.split())
         wait = "while [ ! -e runs/job/checkpoint.safetensors ]; do sleep 0.1; done"
         return Action(
-            shell=f"set -m; {RUN} optimize job.toml --quiet & process=$!; "
-            f"{wait}; {sends}; wait $process",
+            shell=f"set -m; {RUN} optimize job.toml --quiet & process=$!; {wait}; {sends}; wait $process",
             statuses=statuses,
         )
 
