@@ -227,7 +227,7 @@ def test_a_target_that_cannot_be_rendered_is_told(room: Path) -> None:
 
     mi.register_integrator("blind", Blind)
     target = {"scene": "room.xml", "integrator": {"type": "blind", "max_depth": 3}}
-    with pytest.raises(PathreplayError, match="Integrator 'blind' cannot render the target of .*: not today"):
+    with pytest.raises(PathreplayError, match=r"Integrator 'blind' cannot render the target of .*: not today"):
         run(target=target)
     assert not list(room.glob("runs/*"))
 
