@@ -130,20 +130,29 @@ def _unknown(spec: str, path: Path) -> str:
 def told(what: str) -> Iterator[None]:
     """What Mitsuba and Dr.Jit raise within, as one line that begins with ``what``.
 
+    A Ctrl-C that Dr.Jit has turned into such an error comes out as what it was.
+
     Raises:
         PathreplayError: there was a RuntimeError.
     """
     try:
         yield
     except RuntimeError as error:
-        raise PathreplayError(f"{what}: {innermost(error)}") from error
+        first = _first(error)
+        if isinstance(first, KeyboardInterrupt):
+            raise first from None
+        raise PathreplayError(f"{what}: {one_line(first)}") from error
 
 
 def innermost(error: BaseException) -> str:
     """`one_line` of the error that came first: Dr.Jit's calls and loops raise others that say nothing."""
+    return one_line(_first(error))
+
+
+def _first(error: BaseException) -> BaseException:
     while error.__cause__ is not None:
         error = error.__cause__
-    return one_line(error)
+    return error
 
 
 def one_line(error: BaseException) -> str:

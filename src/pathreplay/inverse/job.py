@@ -204,7 +204,7 @@ def _iterate(
         with one_thread(config.deterministic), told(_failing(config)):
             iterate(problem, config, run, rival, stop, after)
     except PathreplayError:
-        if not run.history:
+        if not run.history and not stop.aborted:
             folder.remove()
         raise
     if saved < len(run.history):

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from pathreplay.errors import PathreplayError
 from pathreplay.interrupts import handled, name_of, raise_once
 
 
@@ -45,7 +46,7 @@ def stopping(say: Callable[[str], None], way_out: str) -> Iterator[Stop]:
     with handled(handle):
         try:
             yield stop
-        except RuntimeError:
+        except (RuntimeError, PathreplayError):
             if stop.aborted:  # Dr.Jit turns what is raised while it traces into errors of its own
                 raise KeyboardInterrupt(way_out) from None
             raise
