@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -73,7 +74,7 @@ def test_a_closed_terminal_does_not_stop_the_writing(tmp_path: Path) -> None:
     pid, terminal = pty.fork()
     if pid == 0:  # with a progress bar, on a terminal of its own
         os.chdir(tmp_path)
-        os.execvp("python", ["python", "-m", "pathreplay.cli", "optimize", "job.json"])
+        os.execv(sys.executable, [sys.executable, "-m", "pathreplay.cli", "optimize", "job.json"])
     path, end = tmp_path / "run/history.jsonl", time.monotonic() + 100
     os.set_blocking(terminal, False)
     while not (tmp_path / "run/checkpoint.safetensors").exists() and time.monotonic() < end:

@@ -146,7 +146,7 @@ def _run(
             before = _went_on(folder, start.config, problem, run, rival)
         way_out = f"aborted; go on from the last checkpoint with: {_resume_command(folder.path)}"
         stop = stack.enter_context(stopping(bar.say, way_out))
-        _iterate(start.config, folder, problem, run, rival, stop, bar)
+        _iterate(start, folder, problem, run, rival, stop, bar)
         bar.say("writing")
         with one_thread(start.config.deterministic), told(_failing(start.config)):
             result = render_views(problem, start.config)
@@ -185,9 +185,13 @@ def _went_on(folder: RunFolder, config: Config, problem: Problem, run: Run, riva
 
 
 def _iterate(
-    config: Config, folder: RunFolder, problem: Problem, run: Run, rival: Run | None, stop: Stop, bar: Progress
+    start: _Start, folder: RunFolder, problem: Problem, run: Run, rival: Run | None, stop: Stop, bar: Progress
 ) -> None:
-    """Do the iterations that are left, with a checkpoint now and then and one at the end."""
+    """Do the iterations that are left, with a checkpoint now and then and one at the end.
+
+    A new folder goes again where not even the first iteration can be done; one that is resumed never does.
+    """
+    config = start.config
     bar.start(len(run.history), config.iterations)
     saved = len(run.history)
 
@@ -204,7 +208,7 @@ def _iterate(
         with one_thread(config.deterministic), told(_failing(config)):
             iterate(problem, config, run, rival, stop, after)
     except PathreplayError:
-        if not run.history and not stop.aborted:
+        if start.folder is None and not run.history and not stop.aborted:
             folder.remove()
         raise
     if saved < len(run.history):
