@@ -15,7 +15,7 @@ import pytest
 import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import RunResult, make_config, optimize
+from pathreplay.inverse import RunResult, job, make_config, optimize
 from pathreplay.inverse import run_folder as folders
 from pathreplay.inverse.images import read_image
 from pathreplay.inverse.progress import Progress
@@ -218,6 +218,26 @@ def test_an_integrator_that_fails_is_told_and_leaves_no_folder(room: Path) -> No
     with pytest.raises(PathreplayError, match="Integrator 'broken' cannot do this job: not today"):
         run(integrator={"type": "broken", "max_depth": 3})
     assert not list(room.glob("runs/*"))
+
+
+def test_a_folder_that_is_resumed_stays_even_where_no_iteration_can_be_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    def aborted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def failing(*_: object) -> None:
+        raise PathreplayError("no iteration can be done")
+
+    monkeypatch.setattr(job, "iterate", aborted)
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    (folder,) = Path("runs").iterdir()
+    monkeypatch.setattr(job, "iterate", failing)
+    with pytest.raises(PathreplayError, match="no iteration"):
+        optimize(resume=folder, progress=False)
+    assert (folder / "checkpoint.safetensors").is_file()
+    with pytest.raises(PathreplayError, match="no iteration"):
+        run()
+    assert list(Path("runs").iterdir()) == [folder]
 
 
 def test_a_target_that_cannot_be_rendered_is_told(room: Path) -> None:
