@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pathreplay import interrupts
 from pathreplay.inverse import make_config
 from test_inverse_run import JOB, SCENE
 
@@ -33,13 +34,20 @@ def write_job(folder: Path, **changes: Any) -> Path:
     return config
 
 
+def hear_signals() -> None:
+    """In a child: what the tests' own parent ignores (nohup, a shell's background jobs) is not to be ignored there."""
+    for number in interrupts.ENDING:
+        signal.signal(number, signal.SIG_DFL)
+
+
 def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     """The command `pathreplay optimize ARGUMENTS` under way in ``folder``."""
     environment = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"}
     command = [sys.executable, "-m", "pathreplay.cli", "optimize", *arguments]
     return subprocess.Popen(
-        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=hear_signals,
+    )  # fmt: skip
 
 
 def wait_for(path: Path, process: subprocess.Popen[str], newer_than: float = 0.0) -> None:
@@ -54,7 +62,11 @@ def wait_for(path: Path, process: subprocess.Popen[str], newer_than: float = 0.0
 
 def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
     """Status, stdout and stderr."""
-    out, err = process.communicate(timeout=TIMEOUT_S)
+    try:
+        out, err = process.communicate(timeout=TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        raise
     return process.returncode, out, err
 
 

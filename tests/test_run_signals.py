@@ -14,7 +14,7 @@ import pytest
 from pathreplay import interrupts
 from pathreplay.inverse import optimize
 from pathreplay.inverse.stopping import stopping
-from small_job import ended, kill_at_checkpoint, start, wait_for, write_job
+from small_job import TIMEOUT_S, ended, hear_signals, kill_at_checkpoint, start, wait_for, write_job
 
 ENDLESS = {"iterations": 100_000, "checkpoint_every": 1}
 
@@ -74,6 +74,7 @@ def test_a_closed_terminal_does_not_stop_the_writing(tmp_path: Path) -> None:
     pid, terminal = pty.fork()
     if pid == 0:  # with a progress bar, on a terminal of its own
         os.chdir(tmp_path)
+        hear_signals()
         os.execv(sys.executable, [sys.executable, "-m", "pathreplay.cli", "optimize", "job.json"])
     path, end = tmp_path / "run/history.jsonl", time.monotonic() + 100
     os.set_blocking(terminal, False)
@@ -84,8 +85,14 @@ def test_a_closed_terminal_does_not_stop_the_writing(tmp_path: Path) -> None:
         except BlockingIOError:
             pass
     os.close(terminal)  # the kernel sends SIGHUP
-    _, status = os.waitpid(pid, 0)
-    assert os.WIFEXITED(status)
+    done, end = 0, time.monotonic() + TIMEOUT_S
+    while not done and time.monotonic() < end:
+        time.sleep(0.01)
+        done, status = os.waitpid(pid, os.WNOHANG)
+    if not done:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+    assert done and os.WIFEXITED(status)
     assert path.is_file() and (tmp_path / "run/report.html").is_file()
 
 
