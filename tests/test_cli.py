@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -204,3 +206,18 @@ except AttributeError as error:
     print(error)
 """
     assert run_python(code).stdout.split("\n") == ["", "module 'pathreplay' has no attribute 'no_such_name'", ""]
+
+
+def test_output_to_a_full_disk_is_told() -> None:
+    """With buffered output, which Python writes out at its end."""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+    command = [sys.executable, "-m", "pathreplay.cli", "--version"]
+    with open("/dev/full", "w") as full:
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, env=environment, text=True, timeout=60)
+    assert ended.returncode == 2
+    (line,) = ended.stderr.splitlines()
+    assert line.startswith("pathreplay: error: ") and "no space left" in line.lower()
+    with open("/dev/full", "w") as full:
+        command[-1] = "nothing"
+        ended = subprocess.run(command, stdout=subprocess.PIPE, stderr=full, env=environment, text=True, timeout=60)
+    assert ended.returncode == 2

@@ -192,12 +192,38 @@ def _require_folder() -> None:
 
 def _fail(message: str) -> NoReturn:
     # Plain stderr, one line: neither markup nor wrapping may touch a path or a parameter key.
-    print("pathreplay: error: " + plain_line(message), file=sys.stderr)
+    with contextlib.suppress(OSError):  # nobody can be told; the status still says it
+        print("pathreplay: error: " + plain_line(message), file=sys.stderr)
     raise SystemExit(2)
 
 
 def main() -> None:
     """Run the command line; the entry point `pathreplay`."""
+    try:
+        _run()
+    except SystemExit as end:
+        if (trouble := _let_go_of_streams()) and end.code != 2:  # with 2 one line has been said
+            _fail(trouble)
+        raise
+
+
+def _let_go_of_streams() -> str:
+    """Write out what is printed, while an error can still be told; Python's own ending would just say status 120.
+
+    Returns why stdout could not be written, or "". What cannot be written is given up.
+    """
+    trouble = ""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError as error:
+            if stream is sys.stdout and error.errno != errno.EPIPE:  # whoever reads may have read enough
+                trouble = f"the output cannot be written ({error.strerror}); send it elsewhere"
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    return trouble
+
+
+def _run() -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a terminal without ± should not end a run

@@ -140,8 +140,11 @@ def _run_script(code: str) -> None:
 
 def _told_by_mitsuba(error: Exception) -> bool:
     """Whether an error is one of ours in Mitsuba's wrapping, or one with which Mitsuba refuses a property."""
+    import pathreplay
+
     text, frames = str(error), traceback.extract_tb(error.__traceback__)
-    ours = any("pathreplay" in frame.filename for frame in frames) or "Traceback" in text
+    package = str(Path(pathreplay.__file__).parent)
+    ours = any(frame.filename.startswith(package) for frame in frames) or "Traceback" in text
     refused = isinstance(error, RuntimeError) and (not ours or 'roperty "' in text.strip().splitlines()[-1])
     return refused or "PathreplayError: " in text
 
