@@ -213,7 +213,7 @@ def _let_go_of_streams() -> str:
     Returns why stdout could not be written, or "". What cannot be written is given up.
     """
     trouble = ""
-    for stream in (sys.stdout, sys.stderr):
+    for stream in filter(None, (sys.stdout, sys.stderr)):  # one that was closed before is None
         try:
             stream.flush()
         except OSError as error:
