@@ -42,7 +42,8 @@ class Passes:
         self.problem, self.integrator = problem, integrator
         self.targets = [mi.TensorXf(view.target) for view in problem.views]
         # What an integrator learns of media from pass to pass is read and written between kernels.
-        media = any(isinstance(node, mi.Medium) for node in nodes_of(problem.scene))
+        nodes = nodes_of(problem.scene)
+        media = any(isinstance(node, mi.Medium) for node in nodes)
         # Spectral variants look up the eye's response in tables of Mitsuba's library: no input of ours, as a recorded
         # function must have them, leads there. Recorded kernels are cut otherwise than traced ones, and round otherwise
         # in the last bit.
@@ -50,7 +51,7 @@ class Passes:
         self.freezes = record and recordable
         self.swept: tuple[bool, ...] = ()  # views whose pixels can be swept; empty before the first call
         self.frozen: dict[Any, Callable[..., Any]] = {}  # recorded functions, by the shapes of the parameters
-        self.tables = scene_tables(nodes_of(problem.scene))
+        self.tables = scene_tables(nodes)
 
     def __call__(self, seeds: list[int], spp: int) -> float:
         """The loss, with ``spp`` samples per pixel and a seed for every view; adds its gradient to the parameters.

@@ -64,7 +64,7 @@ def scene_traits(nodes: set[Any], scene: Any, media: bool, tables: Tables | None
     """
     bsdfs = [node for node in nodes if isinstance(node, mi.BSDF) and not (media and node.class_name() == "Null")]
     shapes = [node for node in nodes if isinstance(node, mi.Shape)]
-    attachables = _attachables(nodes)
+    attachables = _attachables(nodes, shapes)
     others = [bsdf for bsdf in bsdfs if not _is_attachable(bsdf) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
     masks = [bsdf for bsdf in bsdfs if bsdf.class_name() == "MaskBSDF"]
     return Traits(
@@ -80,21 +80,24 @@ def scene_traits(nodes: set[Any], scene: Any, media: bool, tables: Tables | None
         opacity_moves=any(with_gradients(mask, "opacity") for mask in masks),
         outlines=not _seamless(shapes, nodes),
         lights_vary=any(map(with_gradients, [*scene.emitters(), *(shape for shape in shapes if shape.is_emitter())])),
-        tables=scene_tables(nodes) if tables is None else tables,
+        tables=_tables(attachables, shapes) if tables is None else tables,
     )
 
 
 def scene_tables(nodes: set[Any]) -> Tables:
     """The tables of a scene, by its nodes."""
-    attachables = _attachables(nodes)
+    shapes = [node for node in nodes if isinstance(node, mi.Shape)]
+    return _tables(_attachables(nodes, shapes), shapes)
+
+
+def _tables(attachables: list[Any], shapes: list[Any]) -> Tables:
     return Tables(
         attachable=_mask_by_index(attachables) if attachables else None,
-        blend_lengths=blend_lengths([node for node in nodes if isinstance(node, mi.Shape)]),
+        blend_lengths=blend_lengths(shapes),
     )
 
 
-def _attachables(nodes: set[Any]) -> list[Any]:
-    shapes = [node for node in nodes if isinstance(node, mi.Shape)]
+def _attachables(nodes: set[Any], shapes: list[Any]) -> list[Any]:
     # A lamp for which the scene names no BSDF has a diffuse one all the same: nobody asked to have that attached.
     of_lamps = {shape.bsdf() for shape in shapes if shape.is_emitter()}
     seen = {shape.bsdf() for shape in shapes if not shape.is_emitter()}
