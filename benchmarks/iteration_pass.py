@@ -16,7 +16,7 @@ from pathreplay.inverse.loop import Run, take_step
 from pathreplay.inverse.losses import l2
 from pathreplay.inverse.passes import Passes
 from pathreplay.inverse.problem import Problem, Variable, View
-from pathreplay.parameters import get_array
+from pathreplay.scenes.parameters import get_array
 
 from .iteration import OWN
 from .job import METHODS, Job

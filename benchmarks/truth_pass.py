@@ -14,7 +14,7 @@ from pathreplay.check.direction import choose_line
 from pathreplay.check.objective import Mode, View, alone
 from pathreplay.check.reference import reference_integrator
 from pathreplay.check.verdict import NEGLIGIBLE, judge
-from pathreplay.parameters import get_array
+from pathreplay.scenes.parameters import get_array
 
 from .job import METHODS, Job
 from .truth import CELLS, STEPS, Cell

@@ -11,7 +11,7 @@ import pytest
 from pathreplay.check import check_gradient
 from pathreplay.check.report import check_all
 from pathreplay.errors import PathreplayError
-from pathreplay.parameters import carries_derivative, require_differentiable, resolve_differentiable
+from pathreplay.scenes.parameters import carries_derivative, require_differentiable, resolve_differentiable
 
 
 @pytest.fixture(scope="module")

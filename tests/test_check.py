@@ -22,7 +22,7 @@ from pathreplay.check.objective import smooth_weights
 from pathreplay.check.reference import has_media, integrator_under_test, read_limits, reference_integrator
 from pathreplay.check.verdict import Judgement, judge
 from pathreplay.errors import PathreplayError
-from pathreplay.parameters import get_array, set_arrays
+from pathreplay.scenes.parameters import get_array, set_arrays
 
 # ------------------------------------------------------------------------------
 #  Verdict

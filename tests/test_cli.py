@@ -189,7 +189,8 @@ sys.argv = ["pathreplay", "--help"]
 try:
     cli.main()
 except SystemExit:
-    heavy = {"pathreplay.inverse", "pathreplay.check", "pathreplay.integrator", "matplotlib", "scipy", "pydantic"}
+    ours = {"pathreplay.inverse", "pathreplay.check", "pathreplay.render.integrator"}
+    heavy = ours | {"matplotlib", "scipy", "pydantic"}
     print("imported:", sorted(heavy & set(sys.modules)))
 """
     assert run_python(code).stdout.splitlines()[-1] == "imported: []"

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.parameters import get_array
+from pathreplay.scenes.parameters import get_array
 
 SYMBOLIC = {
     "loops": dr.JitFlag.SymbolicLoops,

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from pathreplay import PathreplayError, check_gradient
-from pathreplay.bsdfs.substitute import load_dict_with
 from pathreplay.inverse.config import Plugin
 from pathreplay.inverse.problem import load_integrator
+from pathreplay.scenes.substitute import load_dict_with
 from truth import bitmap, lit_room, noise, random, rgb, translate, under_sky
 
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}

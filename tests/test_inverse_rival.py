@@ -14,7 +14,7 @@ from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.grids import rmse
 from pathreplay.inverse.loop import judged, new_run, put_values, render_views
 from pathreplay.inverse.problem import build_problem
-from pathreplay.parameters import to_value
+from pathreplay.scenes.parameters import to_value
 from test_inverse_run import JOB, TEXTURE, interrupt_at, room, run  # noqa: F401 (room: its folder, for every test)
 
 # What the job itself has: its kernels are compiled when the rival's turn comes.

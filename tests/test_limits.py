@@ -9,8 +9,8 @@ import pytest
 
 from pathreplay import memory
 from pathreplay.errors import PathreplayError
-from pathreplay.films import MOST_SAMPLES, require_samples
 from pathreplay.inverse.limits import require_grid, require_learning_rate
+from pathreplay.render.films import MOST_SAMPLES, require_samples
 
 
 def test_a_container_s_limit_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from pathreplay import parameters
 from pathreplay.check import check_gradient
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import RunResult, make_config, optimize
 from pathreplay.inverse.file_names import LONGEST, file_names
-from pathreplay.scenes import load_scene
+from pathreplay.scenes import parameters
+from pathreplay.scenes.loading import load_scene
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n{}f 1 2 3\nf 1 3 4\n"
 PLY = """ply

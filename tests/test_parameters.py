@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.parameters import (
+from pathreplay.scenes.parameters import (
     displaced,
     get_array,
     require_differentiable,

@@ -18,7 +18,7 @@ from pathreplay import backend
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize, problem
 from pathreplay.inverse.pose import Pose, make_pose, rotation_matrix
-from pathreplay.parameters import get_array
+from pathreplay.scenes.parameters import get_array
 
 
 @pytest.fixture(autouse=True)

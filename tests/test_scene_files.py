@@ -11,8 +11,8 @@ import mitsuba as mi
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.scene_files import DEEPEST
-from pathreplay.scenes import load_scene
+from pathreplay.scenes.loading import load_scene
+from pathreplay.scenes.scene_files import DEEPEST
 
 CORNERS = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)]
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")

@@ -9,7 +9,7 @@ import pytest
 
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes import BUILTINS, load_scene, load_scene_for
+from pathreplay.scenes.loading import BUILTINS, load_scene, load_scene_for
 
 XML = """<scene version="3.0.0">
   <default name="res" value="8"/>

@@ -18,8 +18,8 @@ import safetensors.numpy
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.images import exr_bytes, read_image
-from pathreplay.parameters import get_array, to_value
-from pathreplay.stored import AS_STORED, form_of
+from pathreplay.scenes.parameters import get_array, to_value
+from pathreplay.scenes.stored import AS_STORED, form_of
 
 SKY = np.random.default_rng(0).uniform(0.1, 1, (4, 8, 3)).astype(np.float32)
 OTHER = np.random.default_rng(1).uniform(0.1, 1, (4, 8, 3)).astype(np.float32)
@@ -163,9 +163,9 @@ import mitsuba as mi, numpy as np, drjit as dr
 from pathreplay.backend import set_variant
 set_variant("llvm_ad_spectral")
 from pathreplay.errors import PathreplayError
-from pathreplay.parameters import get_array
-from pathreplay.spectra import WAVELENGTHS
-from pathreplay.stored import form_of
+from pathreplay.scenes.parameters import get_array
+from pathreplay.scenes.spectra import WAVELENGTHS
+from pathreplay.scenes.stored import form_of
 
 rgb = np.random.default_rng(0).uniform(0.05, 0.95, (4, 8, 3)).astype(np.float32)
 def ball(**reflectance):
@@ -234,8 +234,8 @@ MONO = """
 import mitsuba as mi, numpy as np
 from pathreplay.backend import set_variant
 set_variant("llvm_ad_mono")
-from pathreplay.parameters import get_array
-from pathreplay.stored import form_of
+from pathreplay.scenes.parameters import get_array
+from pathreplay.scenes.stored import form_of
 rgb = np.random.default_rng(0).uniform(0.05, 0.95, (4, 8, 3)).astype(np.float32)
 params = mi.traverse(mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(rgb)}))
 form = form_of(params, "data")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import pathreplay  # noqa: F401 (registers the plugins)
-from pathreplay.bsdfs.substitute import load_dict_with, load_file_with
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images import exr_bytes
+from pathreplay.scenes.substitute import load_dict_with, load_file_with
 
 SMOOTH = {"dielectric": "smoothdielectric"}
 SCENE = """<scene version="3.0.0">

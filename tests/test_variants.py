@@ -108,7 +108,7 @@ import numpy as np
 import pathreplay
 from pathreplay import check_gradient, optimize
 from pathreplay.inverse.images import exr_bytes
-from pathreplay.scenes import load_scene
+from pathreplay.scenes.loading import load_scene
 
 folder, *variants = sys.argv[1:]
 folder = Path(folder)

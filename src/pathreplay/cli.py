@@ -115,7 +115,7 @@ def check(
     with interrupts.undisturbed():  # as in `optimize`
         from pathreplay import backend
         from pathreplay.check import report
-        from pathreplay.scenes import load_scene_for
+        from pathreplay.scenes.loading import load_scene_for
 
     if json is not None:
         report.require_writable(json)

@@ -15,8 +15,8 @@ from pathreplay.errors import PathreplayError
 
 #: Each has `register() -> None`, which registers its plugins for the active variant; doing so again is harmless.
 PLUGIN_MODULES = (
-    "pathreplay.integrator",
-    "pathreplay.rivals",
+    "pathreplay.render.integrator",
+    "pathreplay.rivals.plugins",
     "pathreplay.bsdfs.smoothdielectric",
     "pathreplay.media.gridmedium",
 )

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.spectra import coefficients, values_of_p
+from pathreplay.scenes.spectra import coefficients, values_of_p
 
 RELATIVE_STEP = 1e-2
 """h over the size of the parameter: truncation (h² after division) near 1e-4, float32 rounding of images near 1e-5."""
@@ -69,7 +69,7 @@ def choose_line(
     nowhere negative would become so (a black texel), the differences are one-sided: a negative reflectance is no
     harm to a linear texture, but a negative roughness or density is. Transforms move by a random translation, those
     of things infinitely ``far`` away (sun, sky), which no translation moves, turn about a random axis. Coefficients of
-    ``spectra`` move so that what they stand for changes by such steps: see :mod:`pathreplay.spectra`.
+    ``spectra`` move so that what they stand for changes by such steps: see :mod:`pathreplay.scenes.spectra`.
 
     Raises:
         PathreplayError: the direction has the wrong shape, is zero or is not finite; the step is not a positive number,

@@ -18,9 +18,9 @@ from pathreplay.check.objective import Mode, View, alone, integrator_name
 from pathreplay.check.reference import integrator_under_test, reference_integrator
 from pathreplay.check.verdict import NEGLIGIBLE, Verdict, judge
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.films import film_size, require_memory, require_samples
-from pathreplay.parameters import get_array, require_differentiable, require_finite
-from pathreplay.spectra import coefficient_channels
+from pathreplay.render.films import film_size, require_memory, require_samples
+from pathreplay.scenes.parameters import get_array, require_differentiable, require_finite
+from pathreplay.scenes.spectra import coefficient_channels
 
 _MOST_SEEDS = 1_000_000
 

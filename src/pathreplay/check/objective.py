@@ -16,8 +16,8 @@ import numpy as np
 
 from pathreplay.check.direction import Line
 from pathreplay.errors import PathreplayError
-from pathreplay.parameters import displaced
-from pathreplay.scenes import innermost, told
+from pathreplay.scenes.loading import innermost, told
+from pathreplay.scenes.parameters import displaced
 
 Mode = Literal["backward", "forward"]
 

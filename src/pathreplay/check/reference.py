@@ -13,9 +13,9 @@ from typing import Any
 
 import mitsuba as mi
 
-from pathreplay.descriptions import load_description
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes import one_line
+from pathreplay.scenes.descriptions import load_description
+from pathreplay.scenes.loading import one_line
 
 UNBOUNDED = 0xFFFFFFFF
 """What Mitsuba's Python integrators keep for ``max_depth = -1``."""

@@ -21,7 +21,7 @@ from pathreplay.check.gradient import GradientCheck, check_gradient
 from pathreplay.check.reference import integrator_under_test
 from pathreplay.errors import PathreplayError
 from pathreplay.files import file_problem
-from pathreplay.parameters import resolve_differentiable
+from pathreplay.scenes.parameters import resolve_differentiable
 
 _STYLES = {"pass": "green", "zero": "green", "fail": "bold red", "inconclusive": "yellow"}
 

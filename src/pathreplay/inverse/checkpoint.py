@@ -18,7 +18,7 @@ from pydantic import ConfigDict, Field, NonNegativeInt, TypeAdapter, ValidationE
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.grids import Levels
 from pathreplay.inverse.values import Array
-from pathreplay.parameters import get_array, to_value
+from pathreplay.scenes.parameters import get_array, to_value
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 

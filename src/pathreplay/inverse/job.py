@@ -40,8 +40,8 @@ from pathreplay.inverse.saved_pictures import require_pictures, saved_picture
 from pathreplay.inverse.stopping import Stop, stopping
 from pathreplay.inverse.values import Array
 from pathreplay.media.volume_files import vol_bytes
-from pathreplay.parameters import get_array, to_value
-from pathreplay.scenes import told
+from pathreplay.scenes.loading import told
+from pathreplay.scenes.parameters import get_array, to_value
 from pathreplay.threads import one_thread, require_one_thread_possible
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from pathreplay import memory
 from pathreplay.errors import PathreplayError
-from pathreplay.films import MOST_SAMPLES, film_size, require_memory, require_samples
 from pathreplay.inverse.images import Image
+from pathreplay.render.films import MOST_SAMPLES, film_size, require_memory, require_samples
 from pathreplay.transport.traits import nodes_of
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from pathreplay.inverse.images import Image
 from pathreplay.inverse.passes import NotRecordable, Passes
 from pathreplay.inverse.problem import ITERATION, JUDGEMENT, PICTURE, Problem, seeds
 from pathreplay.inverse.stopping import Stop
-from pathreplay.parameters import get_array, to_value
+from pathreplay.scenes.parameters import get_array, to_value
 
 # Adam's second moment remembers about 1 / (1 - beta_2) steps. Its usual 0.999 outlasts a whole run of a few hundred.
 BETA_1, BETA_2 = 0.9, 0.99

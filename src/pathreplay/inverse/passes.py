@@ -18,8 +18,8 @@ import mitsuba as mi
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.losses import QUADRATIC, Loss
 from pathreplay.inverse.problem import Problem
-from pathreplay.parameters import keep_only
-from pathreplay.path_integrator import plain_errors
+from pathreplay.render.path_integrator import plain_errors
+from pathreplay.scenes.parameters import keep_only
 from pathreplay.transport.traits import Tables, nodes_of, scene_tables
 
 #: Integrators that look at nothing on the host while they render, by class.

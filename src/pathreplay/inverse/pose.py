@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
-from pathreplay.parameters import get_array, is_transform
+from pathreplay.scenes.parameters import get_array, is_transform
 
 PoseKind = Literal["translation", "rotation", "rigid"]
 PARTS: dict[str, tuple[str, ...]] = {

@@ -13,12 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay import parameters
-from pathreplay.descriptions import load_description
-from pathreplay.edges import edges_note, moves_edges
 from pathreplay.errors import PathreplayError
-from pathreplay.films import picture_shape
-from pathreplay.integrator import EDGES
 from pathreplay.inverse import limits
 from pathreplay.inverse.config import Config, Parameter, Plugin, Value
 from pathreplay.inverse.file_names import file_names
@@ -27,8 +22,13 @@ from pathreplay.inverse.images import Image, find_image, over_black, read_image,
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.values import Array, make_value, require_finite_array
-from pathreplay.scenes import load_scene, load_scene_for, one_line, told
-from pathreplay.stored import AS_STORED, Form, form_of
+from pathreplay.render.edges import edges_note, moves_edges
+from pathreplay.render.films import picture_shape
+from pathreplay.render.integrator import EDGES
+from pathreplay.scenes import parameters
+from pathreplay.scenes.descriptions import load_description
+from pathreplay.scenes.loading import load_scene, load_scene_for, one_line, told
+from pathreplay.scenes.stored import AS_STORED, Form, form_of
 from pathreplay.threads import one_thread
 
 

@@ -14,7 +14,7 @@ from pathreplay.inverse.images import Image
 from pathreplay.inverse.loop import Run, put_values, render_views
 from pathreplay.inverse.problem import Problem
 from pathreplay.inverse.values import Array
-from pathreplay.parameters import get_array
+from pathreplay.scenes.parameters import get_array
 
 
 @dataclass(frozen=True)

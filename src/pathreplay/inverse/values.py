@@ -12,7 +12,7 @@ from pathreplay.inverse.config import Picture, Value
 from pathreplay.inverse.grids import Array, resampled
 from pathreplay.inverse.images import find_image, read_image, resized, with_channels
 from pathreplay.media.volume_files import load_volume
-from pathreplay.parameters import get_array, is_transform
+from pathreplay.scenes.parameters import get_array, is_transform
 
 
 def make_value(key: str, like: Any, value: Value, base: Path) -> Array:

@@ -8,7 +8,7 @@ parameter                     what Mitsuba stores                     what peopl
                               mono variants three channels alike
 textures of 16 bits           half precision                          single precision
 colours in spectral variants  coefficients of a smooth spectrum S,    S at three wavelengths, red, green and blue; where
-                              see :mod:`pathreplay.spectra`; for      there is a factor (environment maps, volumes)
+                              see `spectra`; for                      there is a factor (environment maps, volumes)
                               some with a factor                      multiplied by it
 ============================  ======================================  =================================================
 
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
-from pathreplay.spectra import TO_COEFFICIENTS, WAVELENGTHS, coefficient_channels, spectrum
+from pathreplay.scenes.spectra import TO_COEFFICIENTS, WAVELENGTHS, coefficient_channels, spectrum
 
 Array = NDArray[np.float32]
 

@@ -11,13 +11,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .errors import PathreplayError
-from .gradient.primal import primal
-from .gradient.radiative import radiative
-from .gradient.tape import tape_backward, tape_forward
-from .path_integrator import path_integrator
-from .properties import choice, flag
-from .transport.vertex import Walk
+from ..errors import PathreplayError
+from ..gradient.primal import primal
+from ..render.path_integrator import path_integrator
+from ..render.properties import choice, flag
+from ..transport.vertex import Walk
+from .radiative import radiative
+from .tape import tape_backward, tape_forward
 
 ATTACH = ("delta", "none")
 

@@ -12,10 +12,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..gradient.adjoint import backward
+from ..gradient.primal import walk_on
 from ..transport.path import count, first_arrival, next_arrival, repeat_step, survival, take_step
 from ..transport.vertex import Numbers, Walk
-from .adjoint import backward
-from .primal import walk_on
 
 
 @dr.syntax

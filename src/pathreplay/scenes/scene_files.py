@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pathreplay.errors import PathreplayError
 from pathreplay.files import MISSING, file_problem
 from pathreplay.media.volume_files import require_whole_vol
-from pathreplay.serialized_files import require_sound_serialized
+from pathreplay.scenes.serialized_files import require_sound_serialized
 
 DEEPEST = 64
 """Elements inside each other in a scene file. Real ones have ten; Mitsuba's parser runs out of stack at some 10 000."""

@@ -8,21 +8,21 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import PathreplayError
+from ..gradient.adjoint import LostPaths
+from ..gradient.baseline import FIRST_BRANCHING, Baseline
+from ..gradient.forward import forward
+from ..gradient.listing import listing
+from ..gradient.pixel_sweep import PixelLoss, fits, pixel_camera, pixel_sweep, sweepable
+from ..gradient.primal import primal
+from ..gradient.ray_jacobian import Recovery
+from ..gradient.replay import replay
+from ..gradient.sweep import MAX_DEPTH, deepest, sweep
+from ..transport.traits import Traits, nodes_of
+from ..transport.vertex import Walk
 from .edges import edges_note, keys_that_move_edges
-from .errors import PathreplayError
-from .gradient.adjoint import LostPaths
-from .gradient.baseline import FIRST_BRANCHING, Baseline
-from .gradient.forward import forward
-from .gradient.listing import listing
-from .gradient.pixel_sweep import PixelLoss, fits, pixel_camera, pixel_sweep, sweepable
-from .gradient.primal import primal
-from .gradient.ray_jacobian import Recovery
-from .gradient.replay import replay
-from .gradient.sweep import MAX_DEPTH, deepest, sweep
 from .path_integrator import UNBOUNDED, path_integrator
 from .properties import choice, deviation
-from .transport.traits import Traits, nodes_of
-from .transport.vertex import Walk
 
 DRIVERS = ("auto", "sweep", "replay")
 ATTACH = ("delta", "all", "none")

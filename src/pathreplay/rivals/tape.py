@@ -12,10 +12,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..gradient.adjoint import backward, tangents
 from ..transport.motion import path_moves
 from ..transport.path import count, first_arrival, next_arrival, repeat_step, survival, sustain, take_step
 from ..transport.vertex import Numbers, Walk
-from .adjoint import backward, tangents
 
 
 def tape_backward(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:

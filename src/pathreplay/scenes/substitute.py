@@ -8,10 +8,10 @@ from typing import Any
 
 import mitsuba as mi
 
-from pathreplay.descriptions import require_values
 from pathreplay.errors import PathreplayError
 from pathreplay.files import MISSING, file_problem
-from pathreplay.scene_files import require_shallow, require_sound_files
+from pathreplay.scenes.descriptions import require_values
+from pathreplay.scenes.scene_files import require_shallow, require_sound_files
 from pathreplay.threads import spare_thread
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .errors import PathreplayError, shown
+from ..errors import PathreplayError, shown
 
 #: What Mitsuba's own integrators can hold.
 LARGEST = 2**31 - 1

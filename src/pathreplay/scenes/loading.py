@@ -14,11 +14,11 @@ from typing import Any
 import mitsuba as mi
 
 from pathreplay import memory
-from pathreplay import parameters as scene_parameters
-from pathreplay.bsdfs.substitute import load_dict_with, load_file_with
-from pathreplay.builtin_scenes import BUILTINS, COSTS, SceneDict
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import MISSING, file_problem
+from pathreplay.scenes import parameters as scene_parameters
+from pathreplay.scenes.builtin_scenes import BUILTINS, COSTS, SceneDict
+from pathreplay.scenes.substitute import load_dict_with, load_file_with
 
 
 def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any) -> mi.Scene:

@@ -10,11 +10,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .errors import PathreplayError
+from ..errors import PathreplayError
+from ..transport.media import scene_media
+from ..transport.traits import Tables, nodes_of, scene_traits
+from ..transport.vertex import Walk
 from .properties import flag, whole_number
-from .transport.media import scene_media
-from .transport.traits import Tables, nodes_of, scene_traits
-from .transport.vertex import Walk
 
 UNBOUNDED = 0xFFFFFFFF
 

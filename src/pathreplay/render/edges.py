@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.parameters import needs_ray_adjoint
+from pathreplay.scenes.parameters import needs_ray_adjoint
 
 # Of shapes: what moves a point of the surface. Others, such as B-spline controls, Mitsuba marks as discontinuous.
 _PLACES = {"vertex_positions", "to_world", "control_points"}

@@ -1,0 +1,1 @@
+"""Scenes: loading and looking through files, the built-in ones, and parameters by their keys."""
