@@ -29,7 +29,11 @@ from media_scenes import (
     sparse,
     sunlit,
 )
-from truth import RESOLVED, TRANSPOSE_MAX, UPWARD, WIDE, Z_MAX, Case, Move, add, hold, random, rgb, translate
+from pathreplay.check.objective import Move
+from pathreplay.check.statistics import gap
+from pathreplay.check.stencil import UPWARD, WIDE
+from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
+from truth import TRANSPOSE_MAX, Case, add, hold, random, rgb, translate
 
 MEDIUM = "object.interior_medium."
 DENSITY, ALBEDO, G = MEDIUM + "sigma_t.data", MEDIUM + "albedo.data", MEDIUM + "phase_function.g"
@@ -50,7 +54,6 @@ def cell(name: str, scene: Callable[[], dict], key: str, move: Move, **options: 
         "spp": 32,
         "reference_spp": 128,
         "lanes": None,
-        "peer": True,
     }
     return Case(name, scene, key, move, **{**common, **options})
 
@@ -219,9 +222,9 @@ def test_density_beside_a_moving_camera() -> None:
             sums.append([g[checkers() == 1].sum(), g[checkers() == 0].sum()])
         found.append(np.array(sums))
     still, moving = found
-    error = np.sqrt((still.var(0, ddof=1) + moving.var(0, ddof=1)) / len(still))
-    assert (error < RESOLVED * np.abs(still.mean(0))).all()
-    assert (np.abs(still.mean(0) - moving.mean(0)) < Z_MAX * error).all()
+    difference = gap(still, moving)
+    assert (difference.error < RESOLUTION * np.abs(still.mean(0))).all()
+    assert (np.abs(difference.z) < Z_LIMIT).all()
 
 
 class Fixed:
@@ -258,9 +261,9 @@ def test_any_baseline_leaves_the_mean_alone(name: str, σ_t: np.ndarray, keys: t
             integrator.render_backward(scene, params, adjoint, seed=seed, spp=256)
             sums.append(np.array(dr.grad(params[DENSITY]))[..., 0].sum())
         found.append(np.array(sums))
-    error = np.sqrt(sum(g.var(ddof=1) for g in found) / len(found[0]))
-    assert error < RESOLVED * abs(found[0].mean())
-    assert abs(found[1].mean() - found[0].mean()) < Z_MAX * error
+    difference = gap(*found)
+    assert difference.error < RESOLUTION * abs(found[0].mean())
+    assert abs(difference.z) < Z_LIMIT
 
 
 @pytest.mark.parametrize("channels", [1, 3])
