@@ -383,7 +383,7 @@ def test_nothing_moves_when_only_a_smooth_lobe_changes() -> None:
     for key, moves in (("object.bsdf.alpha.value", False), ("object.to_world", True), ("sky.radiance.value", False)):
         dr.enable_grad(params[key])
         params.update()
-        walk = plugin()._walk(scene, True)
+        walk = plugin()._walk(scene, None)
         with dr.suspend_grad():
             assert path_moves(walk, ray, first_arrival(walk, ray, mi.Bool(True))) == moves, key
         dr.disable_grad(params[key])

@@ -3,7 +3,7 @@
 Every tentative collision is differentiated by itself, in a second walk with the same random numbers: null ones as
 dσ_n/σ_n, real ones as dσ_s/σ_s (supplement of Vicini, Speierer, Jakob 2021, listings 1 and 2). Where σ_n or σ_s is zero
 such a collision is never drawn and its derivative is missing: on a constant grid all of that of the transmittance.
-`volume_gradient='score'` has no such holes; this driver is here to compare with.
+The score (`sweep`, `replay`) has no such holes; this driver is here to compare with.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def listing(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
     active = mi.Bool(active) & (walk.max_depth > 0)
     at = first_arrival(walk, ray, active)
     if dr.hint(path_moves(walk, ray, at), mode="scalar"):
-        raise PathreplayError("volume_gradient = 'listing' cannot follow what moves: use volume_gradient = 'score'")
+        raise PathreplayError("pathreplay_listing cannot follow what moves: use the integrator 'pathreplay'")
     L, _ = primal(walk, sampler.clone(), ray, active)  # β_i L_i, peeled on the way
     β = mi.Spectrum(1)  # throughput
     η = mi.Float(1)  # relative index of refraction since the camera
