@@ -26,8 +26,8 @@ from pathreplay.render.edges import edges_note, moves_edges
 from pathreplay.render.films import picture_shape
 from pathreplay.render.integrator import EDGES
 from pathreplay.scenes import parameters
-from pathreplay.scenes.descriptions import load_description
-from pathreplay.scenes.loading import load_scene, load_scene_for, one_line, told
+from pathreplay.scenes.descriptions import load_integrator
+from pathreplay.scenes.loading import load_scene, load_scene_for, told
 from pathreplay.scenes.stored import AS_STORED, Form, form_of
 from pathreplay.threads import one_thread
 
@@ -112,7 +112,7 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     if rival is not None:
         _keys(params, config.parameters, rival)
         _edges(params, keys, rival)  # for its log: one note is enough
-    judge = integrator if config.target.images is not None else load_integrator(config.target.integrator)
+    judge = integrator if config.target.images is not None else load_integrator(config.target.integrator.as_dict())
     # Before any target is rendered: the cheap mistakes first.
     sensors = _sensors(scene, config.sensors)
     limits.require_visible(scene, params, keys)
@@ -147,24 +147,10 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
 
 
 def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
-    integrator = load_integrator(plugin)
+    integrator = load_integrator(plugin.as_dict())
     if not isinstance(integrator, mi.CppADIntegrator):
         raise PathreplayError(
             f"Integrator '{plugin.type}' computes no gradients; use 'pathreplay' or another AD integrator"
-        )
-    return integrator
-
-
-def load_integrator(plugin: Plugin) -> mi.Integrator:
-    """The integrator that the job names; an unknown type or option becomes one line."""
-    try:
-        integrator = load_description(plugin.as_dict())
-    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
-        raise PathreplayError(f"Integrator '{plugin.type}' cannot be made: {one_line(error)}") from None
-    if not isinstance(integrator, mi.Integrator):
-        raise PathreplayError(
-            f"Integrator '{plugin.type}' is a {type(integrator).__name__}; name an integrator, such as 'pathreplay' "
-            "(or 'path' for targets)"
         )
     return integrator
 
@@ -326,7 +312,7 @@ def _truth(scene: mi.Scene, own: mi.SceneParameters, keys: dict[str, Parameter])
 
 
 def _rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -> dict[str, Image]:
-    integrator = load_integrator(config.target.integrator)
+    integrator = load_integrator(config.target.integrator.as_dict())
     if len(scene.sensors()) <= max(sensors.values()):
         raise PathreplayError(
             f"The target scene has {len(scene.sensors())} sensors, the job uses number {max(sensors.values())} (from 0)"
