@@ -54,6 +54,7 @@ def _make_class() -> type:
         """
 
         name = "pathreplay"
+        recordable = True  # where there are no media: it looks at nothing on the host while it renders
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
@@ -216,9 +217,10 @@ def _make_class() -> type:
             return {} if self.baseline is None else self.baseline[1].learned()
 
         def restore_learned(self, scene: Any, learned: Any) -> None:
-            """Go on with what `learned` told of the same scene, in another process. Raises PathreplayError."""
+            """Go on with what `learned` told of the same scene; where that is nothing, anew. Raises PathreplayError."""
             baseline = Baseline(scene.bbox())
-            baseline.restore(learned)
+            if learned:
+                baseline.restore(learned)
             self.baseline = scene.ptr, baseline
             self.known.clear()
 
