@@ -43,8 +43,8 @@ def load_integrator(description: Mapping[str, Any]) -> mi.Integrator:
         raise PathreplayError(f"Integrator '{name}' cannot be made: {one_line(error)}") from None
     if not isinstance(integrator, mi.Integrator):
         raise PathreplayError(
-            f"'{name}' is no integrator but a {type(integrator).__name__}; name one, such as 'pathreplay', or 'path' "
-            "for reference images and targets"
+            f"'{name}' is a {type(integrator).__name__}, which is no integrator; name one, such as 'pathreplay' (or "
+            "'path' for targets)"
         )
     return integrator
 
