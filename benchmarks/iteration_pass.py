@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import gc
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import drjit as dr
+import drjit.opt
 import mitsuba as mi
 import numpy as np
-from drjit.opt import Adam
 
 from pathreplay.inverse.config import make_config
+from pathreplay.inverse.evaluate import Evaluator
+from pathreplay.inverse.executor import Local
 from pathreplay.inverse.loop import Run, take_step
 from pathreplay.inverse.losses import l2
-from pathreplay.inverse.passes import Passes
+from pathreplay.inverse.optimiser import Adam
 from pathreplay.inverse.problem import Problem, Variable, View
 from pathreplay.scenes.parameters import get_array
 
@@ -34,12 +37,12 @@ TARGET_SPP = 256
 class Watched(Adam):
     """Adam that remembers the gradients of its last step."""
 
-    seen: dict[str, Any]
+    seen: Mapping[str, np.ndarray]
 
-    def step(self) -> None:
+    def step(self, values: Any, gradients: Any, rates: Any) -> dict[str, np.ndarray]:
         """Take the step of Adam."""
-        self.seen = {key: dr.grad(value) for key, value in self.items()}
-        super().step()
+        self.seen = gradients
+        return super().step(values, gradients, rates)
 
 
 class Step:
@@ -72,43 +75,54 @@ class Step:
             }
         )
         self.runs: dict[str, Run] = {}
+        self.usual: dict[str, tuple[mi.Integrator, drjit.opt.Adam]] = {}
 
     def forget(self) -> None:
         """Make integrators and optimisers anew."""
         self.runs.clear()
+        self.usual.clear()
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
         """Seconds of a step, and the gradient that it took."""
         name, loop = method.split(", ")
-        if method not in self.runs:
+        if method not in self.runs and method not in self.usual:
             depths = {"max_depth": self.job.max_depth, "rr_depth": self.job.rr_depth}
-            self.runs[method] = Run(Passes(self.problem, mi.load_dict(METHODS[name] | depths)), Watched(lr=RATE), [])
-        run = self.runs[method]
-        run.adam[self.key] = type(self.start)(self.start)
-        if loop != OWN:
-            self.params.update(run.adam)
-        gc.collect()
-        dr.sync_thread()
-        begin = time.perf_counter()
-        if loop == OWN:
-            take_step(self.problem, self.config, run, len(run.history))
-        else:
-            self._usual(run, seed)
-        dr.eval(run.adam[self.key])
-        dr.sync_thread()
-        seconds = time.perf_counter() - begin
-        return seconds, np.ravel(np.array(run.adam.seen[self.key]))
+            integrator = mi.load_dict(METHODS[name] | depths)
+            if loop == OWN:
+                self.runs[method] = Run(Local(Evaluator(self.problem, integrator)), Watched({}), {})
+            else:
+                self.usual[method] = integrator, drjit.opt.Adam(lr=RATE)
+        return self._own(self.runs[method]) if loop == OWN else self._usual(*self.usual[method], seed)
 
-    def _usual(self, run: Run, seed: int) -> None:
+    def _own(self, run: Run) -> tuple[float, np.ndarray]:
+        run.values = {self.key: get_array(self.start)}
+        begin = self._begin()
+        take_step(self.problem, self.config, run, len(run.history))
+        seconds = time.perf_counter() - begin
+        return seconds, np.ravel(run.optimiser.seen[self.key])  # type: ignore[attr-defined]
+
+    def _usual(self, integrator: mi.Integrator, adam: drjit.opt.Adam, seed: int) -> tuple[float, np.ndarray]:
         """The loop of Mitsuba's tutorials."""
-        adam = run.adam
-        image = mi.render(self.scene, self.params, integrator=run.passes.integrator, spp=self.job.spp, seed=seed)
+        adam[self.key] = type(self.start)(self.start)
+        self.params.update(adam)
+        begin = self._begin()
+        image = mi.render(self.scene, self.params, integrator=integrator, spp=self.job.spp, seed=seed)
         loss = dr.mean(dr.square(image - self.target), axis=None)
         dr.backward(loss)
+        gradient = dr.grad(adam[self.key])
         adam.step()
         value = dr.maximum(adam[self.key], 0.0)
         adam[self.key] = value if self.upper is None else dr.minimum(value, self.upper)
         self.params.update(adam)
+        dr.eval(adam[self.key])
+        dr.sync_thread()
+        return time.perf_counter() - begin, np.ravel(np.array(gradient))
+
+    @staticmethod
+    def _begin() -> float:
+        gc.collect()
+        dr.sync_thread()
+        return time.perf_counter()
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """What the gradients of all steps say: see `spread`."""

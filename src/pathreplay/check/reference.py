@@ -14,8 +14,7 @@ from typing import Any
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes.descriptions import load_description
-from pathreplay.scenes.loading import one_line
+from pathreplay.scenes.descriptions import load_integrator
 
 UNBOUNDED = 0xFFFFFFFF
 """What Mitsuba's Python integrators keep for ``max_depth = -1``."""
@@ -75,7 +74,7 @@ def integrator_under_test(spec: Any, scene: Any, max_depth: int | None = None) -
             description.update(vars(limits))
     if max_depth is not None:
         description["max_depth"] = max_depth
-    return _load(description)
+    return load_integrator(description)
 
 
 def reference_integrator(spec: Any, scene: Any, tested: Any) -> Any:
@@ -90,7 +89,7 @@ def reference_integrator(spec: Any, scene: Any, tested: Any) -> Any:
     if isinstance(spec, mi.Integrator):
         return spec
     if isinstance(spec, Mapping):
-        return _load(dict(spec))
+        return load_integrator(dict(spec))
     limits = read_limits(tested)
     if limits is None:
         raise PathreplayError(
@@ -100,7 +99,7 @@ def reference_integrator(spec: Any, scene: Any, tested: Any) -> Any:
     short = 0 <= limits.max_depth <= LONGEST_WITHOUT_ROULETTE
     name = spec or ("volpath" if has_media(scene) else "path")
     rr_depth = NO_ROULETTE if short else limits.rr_depth
-    return _load({"type": name, **vars(limits), "rr_depth": rr_depth})
+    return load_integrator({"type": name, **vars(limits), "rr_depth": rr_depth})
 
 
 def has_media(scene: Any) -> bool:
@@ -109,17 +108,3 @@ def has_media(scene: Any) -> bool:
         return True
     # Sensors do not tell their medium to Python, but it is among their parameters.
     return any(key.startswith("medium.") for sensor in scene.sensors() for key in mi.traverse(sensor).keys())
-
-
-def _load(description: dict[str, Any]) -> Any:
-    try:
-        integrator = load_description(description)
-    except PathreplayError:
-        raise
-    except Exception as error:  # Mitsuba raises RuntimeError, plugins in Python whatever they like
-        # Mitsuba writes the whole traceback of a Python plugin into its message; its last line says what is wrong.
-        told = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else one_line(error)
-        raise PathreplayError(f"Integrator '{description.get('type')}' cannot be made: {told}") from error
-    if not isinstance(integrator, mi.Integrator):
-        raise PathreplayError(f"'{description.get('type')}' is no integrator but a {type(integrator).__name__}")
-    return integrator

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.files import file_problem
-from pathreplay.scenes.loading import one_line
+from pathreplay.scenes.descriptions import one_line
 from pathreplay.threads import spare_thread
 
 Image = NDArray[np.float32]

@@ -89,8 +89,7 @@ def _make_class() -> type:
         """
 
         name = "pathreplay"
-        #: It looks at nothing on the host while it renders a scene without media, so that Dr.Jit can record it.
-        recordable = True
+        recordable = True  # where there are no media: it looks at nothing on the host while it renders
 
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
@@ -155,8 +154,9 @@ def _make_class() -> type:
             return {} if self.baseline is None else self.baseline[1].learned()
 
         def restore_learned(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
-            """Go on with what `learned` told of the same scene, in another process. Raises PathreplayError."""
-            self.baseline = self._facts(scene), Baseline.restored(scene.bbox(), learned)
+            """Go on with what `learned` told of the same scene; where that is nothing, anew. Raises PathreplayError."""
+            box = scene.bbox()
+            self.baseline = self._facts(scene), Baseline.restored(box, learned) if learned else Baseline.fresh(box)
 
         def _told(self, view: Pass, walk: Walk, found: Found) -> None:
             """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see `take_lost`,
