@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field, NonNegativeInt, TypeAdapter, ValidationE
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.grids import Levels
 from pathreplay.inverse.optimiser import Optimiser, State
-from pathreplay.inverse.values import Array
+from pathreplay.inverse.values import Array, Arrays
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -48,7 +48,7 @@ _STEPS = TypeAdapter(dict[str, NonNegativeInt])
 _VALUE, _LEARNED = "value:", "learned:"
 
 
-def save(values: Mapping[str, Array], state: State, history: list[Entry], learned: Mapping[str, Array]) -> bytes:
+def save(values: Arrays, state: State, history: list[Entry], learned: Arrays) -> bytes:
     """All that is known after the iterations of ``history``, as the bytes of a safetensors file."""
     tensors = {
         **{_LEARNED + name: value for name, value in learned.items()},
@@ -72,7 +72,7 @@ class Saved:
     learned: dict[str, Array]
 
 
-def restore(path: Path, optimiser: Optimiser, values: Mapping[str, Array], levels: Mapping[str, Levels]) -> Saved:
+def restore(path: Path, optimiser: Optimiser, values: Arrays, levels: Mapping[str, Levels]) -> Saved:
     """Read what was saved, and bring the optimiser back to it.
 
     ``values`` are like those that were saved, but for the shapes of those in ``levels``.
@@ -96,7 +96,7 @@ def _unusable(path: Path, why: str) -> PathreplayError:
     return PathreplayError(f"Checkpoint {path} cannot be read ({why}); start the job from its config")
 
 
-def _read(path: Path, values: Mapping[str, Array], levels: Mapping[str, Levels]) -> Saved:
+def _read(path: Path, values: Arrays, levels: Mapping[str, Levels]) -> Saved:
     """What the file holds, checked; raises what `restore` makes plain."""
     if not path.is_file():
         raise ValueError("no such file")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +15,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.losses import QUADRATIC
 from pathreplay.inverse.problem import Problem, put, variables_of
 from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
-from pathreplay.inverse.values import Array
+from pathreplay.inverse.values import Array, Arrays
 from pathreplay.render.path_integrator import plain_errors
 from pathreplay.scenes.parameters import get_array
 from pathreplay.transport.facts import SceneFacts
@@ -47,15 +47,14 @@ class Evaluation:
     loss: float
     gradients: dict[str, Array]
     diagnostics: Diagnostics
-    learned: Mapping[str, Array]
+    learned: Arrays
 
 
-class Evaluate(Protocol):
-    """A pure function: the same arguments give the same evaluation, but for rounding where threads add."""
+Evaluate = Callable[[Arrays, Shard, Arrays], Evaluation]
+"""evaluate(values, shard, learned): a pure function, but for rounding where threads add.
 
-    def __call__(self, values: Mapping[str, Array], shard: Shard, learned: Mapping[str, Array], /) -> Evaluation:
-        """Of all variables, what people see; ``learned`` is what evaluations before have learned, by name."""
-        ...
+The values are those of all variables, as people see them; ``learned`` is what evaluations before have learned, by name.
+"""
 
 
 def total(evaluations: Sequence[Evaluation]) -> Evaluation:
@@ -83,15 +82,15 @@ class Evaluator:
         self._tables = facts.traits().tables
         self._recordings = Recordings()
         self._sweeps: dict[int, bool] = {}  # of each view that was seen: whether its pixels can be swept
-        self._learned: Mapping[str, Array] = {}  # what the integrator knows
+        self._learned: Arrays = {}  # what the integrator knows
 
-    def __call__(self, values: Mapping[str, Array], shard: Shard, learned: Mapping[str, Array], /) -> Evaluation:
+    def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`. Raises what the integrator raises; warns as it does."""
         self._know(learned)
         found = [self._view(values, *each, shard.samples) for each in zip(shard.views, shard.seeds, strict=True)]
         return total(found)
 
-    def _know(self, learned: Mapping[str, Array]) -> None:
+    def _know(self, learned: Arrays) -> None:
         """Go on with what an evaluation has learned. Raises PathreplayError if it is none of this integrator's."""
         if learned is self._learned or not (learned or self._learned):
             return
@@ -103,7 +102,7 @@ class Evaluator:
         self.integrator.restore_learned(self.problem.scene, learned)
         self._learned = learned
 
-    def _view(self, values: Mapping[str, Array], view: int, seed: int, spp: int) -> Evaluation:
+    def _view(self, values: Arrays, view: int, seed: int, spp: int) -> Evaluation:
         variables = variables_of(self.problem, values)
         dr.enable_grad(variables)
         put(self.problem, variables)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 from pathreplay.inverse.evaluate import Evaluate, Evaluation, Shard
-from pathreplay.inverse.values import Array
+from pathreplay.inverse.values import Arrays
 
 
 class Executor(Protocol):
     """Evaluates the shards of an iteration."""
 
-    def run(
-        self, values: Mapping[str, Array], shards: Sequence[Shard], learned: Mapping[str, Array]
-    ) -> list[Evaluation]:
+    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
         """One evaluation for each shard, in their order; the last one has learned from all of them."""
         ...
 
@@ -25,9 +23,7 @@ class Local:
     def __init__(self, evaluate: Evaluate) -> None:
         self.evaluate = evaluate
 
-    def run(
-        self, values: Mapping[str, Array], shards: Sequence[Shard], learned: Mapping[str, Array]
-    ) -> list[Evaluation]:
+    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
         """See `Executor`."""
         found: list[Evaluation] = []
         for shard in shards:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
@@ -22,7 +22,7 @@ from pathreplay.inverse.optimiser import Adam, Optimiser
 from pathreplay.inverse.problem import Problem, put_values
 from pathreplay.inverse.seeds import ITERATION, JUDGEMENT, PICTURE, seeds
 from pathreplay.inverse.stopping import Stop
-from pathreplay.inverse.values import Array
+from pathreplay.inverse.values import Array, Arrays
 from pathreplay.scenes.parameters import get_array, to_value
 
 # How often the pictures are judged in a job with a rival: enough for a curve, at some per cent of its time.
@@ -37,7 +37,7 @@ class Run:
     optimiser: Optimiser
     values: dict[str, Array]
     """Of the variables, by key: what people see."""
-    learned: Mapping[str, Array] = field(default_factory=dict)
+    learned: Arrays = field(default_factory=dict)
     """By the evaluations, from one to the next."""
     history: list[Entry] = field(default_factory=list)
 
@@ -109,7 +109,8 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     decay = config.learning_rate_decay ** (position / config.iterations)
     rates = {v.key: v.learning_rate * decay for v in problem.variables}
     stepped = run.optimiser.step(run.values, found.gradients, rates)
-    run.values, run.learned = _projected(problem, stepped), found.learned
+    run.values = {v.key: np.clip(stepped[v.key], *v.bounds()) for v in problem.variables}
+    run.learned = found.learned
     seconds = time.perf_counter() - begin
     norms = {key: float(np.linalg.norm(gradient)) for key, gradient in found.gradients.items()}
     errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
@@ -162,12 +163,3 @@ def _refine(problem: Problem, run: Run, position: int) -> list[Refined]:
             run.values[key] = resampled(run.values[key], shape)
             refined.append(Refined(key, shape))
     return refined
-
-
-def _projected(problem: Problem, values: Mapping[str, Array]) -> dict[str, Array]:
-    """The values within their bounds."""
-    return {v.key: _clipped(values[v.key], v.lower, v.upper) for v in problem.variables}
-
-
-def _clipped(value: Array, lower: float | None, upper: float | None) -> Array:
-    return value if lower is None and upper is None else np.clip(value, lower, upper)

@@ -11,7 +11,7 @@ import drjit.opt
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.inverse.values import Array
+from pathreplay.inverse.values import Array, Arrays
 
 # The second moment remembers about 1 / (1 - beta_2) steps. Its usual 0.999 outlasts a whole run of a few hundred.
 BETA_1, BETA_2 = 0.9, 0.99
@@ -28,9 +28,7 @@ class State:
 class Optimiser(Protocol):
     """Arrays are by key of the variable. A variable that comes in another shape than before begins anew."""
 
-    def step(
-        self, values: Mapping[str, Array], gradients: Mapping[str, Array], rates: Mapping[str, float]
-    ) -> dict[str, Array]:
+    def step(self, values: Arrays, gradients: Arrays, rates: Mapping[str, float]) -> dict[str, Array]:
         """The values after a step against the gradients; ``rates`` are about its length in each variable."""
         ...
 
@@ -38,7 +36,7 @@ class Optimiser(Protocol):
         """All that later steps depend on, besides the values."""
         ...
 
-    def restore(self, state: State, values: Mapping[str, Array]) -> None:
+    def restore(self, state: State, values: Arrays) -> None:
         """Go on from ``state`` at ``values``, bit for bit. Raises KeyError or ValueError if they do not belong."""
         ...
 
@@ -46,12 +44,10 @@ class Optimiser(Protocol):
 class Adam:
     """Dr.Jit's Adam, of variables that begin at ``values``."""
 
-    def __init__(self, values: Mapping[str, Array]) -> None:
+    def __init__(self, values: Arrays) -> None:
         self._adam = drjit.opt.Adam(1.0, {k: mi.TensorXf(v) for k, v in values.items()}, beta_1=BETA_1, beta_2=BETA_2)
 
-    def step(
-        self, values: Mapping[str, Array], gradients: Mapping[str, Array], rates: Mapping[str, float]
-    ) -> dict[str, Array]:
+    def step(self, values: Arrays, gradients: Arrays, rates: Mapping[str, float]) -> dict[str, Array]:
         """See `Optimiser`."""
         adam = self._adam
         for key, value in values.items():
@@ -71,7 +67,7 @@ class Adam:
             arrays |= {f"first:{key}": np.array(first), f"second:{key}": np.array(second)}
         return State(steps, arrays)
 
-    def restore(self, state: State, values: Mapping[str, Array]) -> None:
+    def restore(self, state: State, values: Arrays) -> None:
         """See `Optimiser`."""
         for key, value in values.items():
             moments = [state.arrays[f"first:{key}"], state.arrays[f"second:{key}"]]

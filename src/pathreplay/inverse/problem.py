@@ -22,7 +22,7 @@ from pathreplay.inverse.images import Image
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.targets import read_targets, rendered_targets, target_scene, truth_of
-from pathreplay.inverse.values import Array, make_value, seen
+from pathreplay.inverse.values import Array, Arrays, make_value, seen
 from pathreplay.render.edges import edges_note, moves_edges
 from pathreplay.render.integrator import EDGES
 from pathreplay.scenes import parameters
@@ -53,6 +53,10 @@ class Variable:
     form: Form = AS_STORED
     """How Mitsuba stores it; everything here is what people see."""
 
+    def bounds(self) -> tuple[float, float]:
+        """Lowest and highest value that a step may end at."""
+        return -np.inf if self.lower is None else self.lower, np.inf if self.upper is None else self.upper
+
 
 @dataclass(frozen=True)
 class View:
@@ -82,14 +86,17 @@ class Problem:
     """What was done to the scene that the user should know of."""
 
 
-def variables_of(problem: Problem, values: Mapping[str, Array]) -> dict[str, Any]:
-    """The values of the variables (what people see) as Dr.Jit holds them, in memory: no numbers within a kernel."""
+def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
+    """The values of the variables (what people see) as Dr.Jit holds them, in memory of its own."""
+    # NumPy's memory, which Dr.Jit would take over, begins anywhere: to a frozen function that is another kind of input.
+    one = dr.opaque(mi.Float, 1)
     variables = {
         # A grid may have another resolution than at first.
-        v.key: type(v.like)(values[v.key]) if dr.is_tensor_v(v.like) else parameters.to_value(v.like, values[v.key])
+        v.key: (type(v.like)(values[v.key]) if dr.is_tensor_v(v.like) else parameters.to_value(v.like, values[v.key]))
+        * one
         for v in problem.variables
     }
-    dr.make_opaque(variables)
+    dr.eval(variables)
     return variables
 
 
@@ -105,7 +112,7 @@ def put(problem: Problem, variables: Mapping[str, Any]) -> None:
     problem.params.update(scene_values(problem, variables))
 
 
-def put_values(problem: Problem, values: Mapping[str, Array]) -> None:
+def put_values(problem: Problem, values: Arrays) -> None:
     """Give the scene these values of the variables, without derivatives."""
     put(problem, variables_of(problem, values))
 

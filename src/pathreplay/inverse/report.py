@@ -88,15 +88,17 @@ def versions(variant: str) -> dict[str, str]:
 def swatch(values: list[float]) -> str:
     """A CSS colour for linear RGB; brighter than white is scaled to full brightness, hue kept."""
     colour = np.array(values, dtype=np.float32).clip(min=0)
-    colour = colour / max(1.0, float(colour.max()))
-    encoded = np.where(colour <= 0.0031308, 12.92 * colour, 1.055 * np.maximum(colour, 1e-8) ** (1 / 2.4) - 0.055)
-    return "#" + "".join(f"{round(float(c) * 255):02x}" for c in encoded)
+    return "#" + "".join(f"{round(float(c) * 255):02x}" for c in _encoded(colour / max(1.0, float(colour.max()))))
 
 
 def _shown(image: Image, exposure: float) -> Image:
-    linear = np.clip(image[:, :, :3] * exposure, 0, 1)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
+    encoded = _encoded(np.clip(image[:, :, :3] * exposure, 0, 1))
     return encoded[:, :, 0] if image.shape[2] < 3 else encoded
+
+
+def _encoded(linear: np.ndarray) -> np.ndarray:
+    """sRGB of linear radiance, both from 0 to 1."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
 
 
 def _with_palette(png: bytes) -> bytes:

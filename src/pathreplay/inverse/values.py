@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,9 @@ from pathreplay.inverse.images import find_image, read_image, resized, with_chan
 from pathreplay.media.volume_files import load_volume
 from pathreplay.scenes.parameters import get_array, is_transform
 from pathreplay.scenes.stored import form_of
+
+Arrays = Mapping[str, Array]
+"""By key of the variable, or by name."""
 
 
 def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
