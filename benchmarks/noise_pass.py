@@ -14,6 +14,7 @@ from pathreplay.gradient.ray_jacobian import Recovery
 
 from .job import Job
 from .noise import RECOVERIES, SWEEP
+from .recoveries import OtherRecovery
 
 PICTURE = 16  # pixels, width = height
 
@@ -103,7 +104,7 @@ class ReplayError:
             seconds, found = self._gradient("sweep", Recovery(), self.job.rounds + seed)
             error = np.linalg.norm(found - right) / np.sqrt(2)  # of one pass, from the difference of two
         else:
-            seconds, found = self._gradient("replay", Recovery(*RECOVERIES[method]), seed)
+            seconds, found = self._gradient("replay", OtherRecovery(*RECOVERIES[method]), seed)
             error = np.linalg.norm(found - right)
         return seconds, np.array([error / np.linalg.norm(right)])
 
