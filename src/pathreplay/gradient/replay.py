@@ -33,7 +33,7 @@ def replay(
     δL: mi.Spectrum,
     active: mi.Bool,
     lost: LostPaths,
-    recovery: Recovery,
+    recovery: Recovery = Recovery(),  # noqa: B008 (it is frozen)
 ) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
 

@@ -109,7 +109,7 @@ def _make_class() -> type:
                 driver = "replay"
             moves = False
             if walk.media is not None and self.volume_gradient == "listing":
-                listing(walk, sampler, CameraStart(ray), δL, active)
+                listing(walk, sampler, CameraStart(ray), δL, active, lost)
             elif driver == "sweep":
                 if walk.baseline is not None and self.baseline is not None and self.of_pass is not None:
                     self.learner = self.baseline[1]

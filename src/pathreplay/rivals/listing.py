@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..gradient.adjoint import backward
+from ..gradient.adjoint import LostPaths, backward
 from ..gradient.primal import primal
 from ..transport import arrive, scatter
 from ..transport.connect import Connection, shadow_start
@@ -29,7 +29,9 @@ from ..transport.vertex import Arrival, Numbers, Walk, reciprocal
 
 
 @dr.syntax
-def listing(walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectrum, active: mi.Bool) -> None:
+def listing(
+    walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectrum, active: mi.Bool, lost: LostPaths
+) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters.
 
     Uses one majorant for each medium. Not differentiated: what the listings miss (above), visibility, emission of
@@ -47,8 +49,9 @@ def listing(walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectru
         raise PathreplayError("pathreplay_listing cannot follow what moves: use 'pathreplay'")
     L = primal(walk, sampler.clone(), start, active)[0]  # β_i L_i, peeled on the way
     path = PathState.begin(at, active)
+    ctx = mi.BSDFContext()
 
-    while dr.hint(path.active, exclude=[walk], label="pathreplay: listing"):
+    while dr.hint(path.active, exclude=[walk, ctx], label="pathreplay: listing"):
         past = sampler.clone()
         Numbers.draw(past)
         u, step = path.choose(walk, sampler)
@@ -61,10 +64,10 @@ def listing(walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectru
         with dr.resume_grad():
             v = arrive.choose(walk, path.at, past, path.β, path.active, kept.media.flight)
             light, Le = redraw_emitter(walk, v.origin, u.light, kept.light, False, kept.lit)
-            f, pdf = scatter.towards(v, light.d, kept.lit)
+            f, pdf = scatter.towards(v, ctx, light.d, kept.lit)
             reached = Connection(light, Le * kept.media.shadow.T, kept.lit).reaches(pdf, False)
             lighting = v.inside.w * dr.select(kept.lit, f * reached, 0)
-            w = scatter.repeat(walk, v, path.at, u, kept, False, None, step.active)[0]
+            w = scatter.repeat(walk, v, path.at, u, ctx, kept, False, None, step.active)[0]
             w *= v.inside.w
             Lo = path.β * (v.inside.e + v.inside.w * v.glow + lighting) + L * w * dr.detach(reciprocal(w))
             if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
@@ -74,6 +77,7 @@ def listing(walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectru
         begins = shadow_start(v, light, path.at.medium)
         _shadow(walk, v.origin, light, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
         path = path.advance(walk, u, step)[0]
+    return False
 
 
 @dr.syntax

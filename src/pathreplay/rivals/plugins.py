@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
+from ..gradient.adjoint import LostPaths
 from ..gradient.primal import primal
 from ..render.path_integrator import path_integrator
 from ..render.properties import choice, flag
@@ -63,11 +64,11 @@ def _make_classes() -> tuple[type, type]:
 
         def propagate(self, walk: Walk, sampler: Any, start: CameraStart, δL: Any, active: Any) -> None:
             """Back-propagate ``δL``: see `tape_backward`."""
-            tape_backward(walk, sampler, start, δL, active)
+            tape_backward(walk, sampler, start, δL, active, LostPaths())
 
         def tangent(self, walk: Walk, sampler: Any, start: CameraStart, active: Any) -> tuple[Any, Any]:
             """Tangent of the radiance: see `tape_forward`."""
-            return tape_forward(walk, sampler, start, active)
+            return tape_forward(walk, sampler, start, active, LostPaths())[:2]
 
     class RadiativeIntegrator(Rival):
         """Radiative backpropagation: for comparison only, since time grows with the square of the depth.
@@ -84,7 +85,7 @@ def _make_classes() -> tuple[type, type]:
 
         def propagate(self, walk: Walk, sampler: Any, start: CameraStart, δL: Any, active: Any) -> None:
             """Back-propagate ``δL``: see `radiative`."""
-            radiative(walk, sampler, start, δL, active, self.linear)
+            radiative(walk, sampler, start, δL, active, LostPaths(), self.linear)
 
     return TapeIntegrator, RadiativeIntegrator
 

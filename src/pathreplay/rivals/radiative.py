@@ -10,7 +10,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..gradient.adjoint import backward
+from ..gradient.adjoint import LostPaths, backward
 from ..gradient.primal import walk_on
 from ..transport.path import PathState, next_arrival
 from ..transport.start import CameraStart
@@ -20,14 +20,20 @@ from ..transport.vertex import Walk
 
 @dr.syntax
 def radiative(
-    walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectrum, active: mi.Bool, linear: bool
-) -> None:
+    walk: Walk,
+    sampler: mi.Sampler,
+    start: CameraStart,
+    δL: mi.Spectrum,
+    active: mi.Bool,
+    lost: LostPaths,
+    linear: bool = False,
+) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters.
 
     ``linear`` is a biased variant in linear time, after those of the paper, which leave the incident radiance out: no
     fresh paths, and L_{i+1} is taken to be one in all channels wherever a path goes on, while emission and next-event
     estimation (e_i) are as they are. The size of a gradient is wrong, and where media are also dark its sign may be.
-    Not differentiated: everything that moves (as with ``attach='none'``), and visibility. Raises
+    Nothing is lost. Not differentiated: everything that moves (as with ``attach='none'``), and visibility. Raises
     PathreplayError when no parameter reaches the paths.
     """
     active = mi.Bool(active) & (walk.max_depth > 0)
@@ -45,3 +51,4 @@ def radiative(
             again = repeat_step(walk, path.at, u, step.kept, step.active, path.active)
             backward(dr.sum(δL * path.β * (again.e + again.w * L)))
         path = path.advance(walk, u, step)[0]
+    return False

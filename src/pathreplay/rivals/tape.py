@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..gradient.adjoint import backward, tangents
+from ..gradient.adjoint import LostPaths, backward, tangents
 from ..transport.motion import path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
@@ -21,28 +21,29 @@ from ..transport.vertex import Walk
 
 
 def tape_backward(
-    walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectrum, active: mi.Bool
-) -> None:
+    walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectrum, active: mi.Bool, lost: LostPaths
+) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
 
     The estimator is that of the sweep driver, and with the same random numbers so is the gradient. Not differentiated:
     see `tape`. Raises PathreplayError when no parameter reaches the paths.
     """
     with dr.resume_grad(), dr.isolate_grad():
-        L, _ = tape(walk, sampler, start, active)
+        L, _, moves = tape(walk, sampler, start, active)
         backward(dr.sum(δL * L))
+    return moves
 
 
 def tape_forward(
-    walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool
-) -> tuple[mi.Spectrum, mi.Bool]:
-    """Tangent of the radiance along the rays of a ``start``, ``(δL, valid)``, per ray.
+    walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool, lost: LostPaths
+) -> tuple[mi.Spectrum, mi.Bool, bool]:
+    """Tangent of the radiance along the rays of a ``start``, ``(δL, valid, moves)``: see `forward`.
 
     The parameters must carry their tangents already. Not differentiated: see `tape`.
     """
     with dr.resume_grad():
-        L, valid = tape(walk, sampler, start, active)
-        return tangents(L)[0], valid
+        L, valid, moves = tape(walk, sampler, start, active)
+        return tangents(L)[0], valid, moves
 
 
 def _cut(state: tuple[Any, ...]) -> Any:
@@ -69,8 +70,8 @@ def _cut(state: tuple[Any, ...]) -> Any:
 
 
 @dr.syntax
-def tape(walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
-    """Radiance along the rays of a ``start`` as an AD variable, ``(L, valid)``: L = Σ β_i e_i, derivatives attached.
+def tape(walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool, bool]:
+    """Radiance along the rays of a ``start`` as an AD variable, ``(L, valid, moves)``: L = Σ β_i e_i.
 
     Every step is taken detached, to make its choices, and once more attached. Not differentiated: visibility, Russian
     roulette and, with ``attach='none'``, everything that moves. Adjoints that are not finite are not looked for. Call
@@ -107,4 +108,4 @@ def tape(walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool) -
             o, d, pdf = mi.Point3f(onward.at.ray.o), mi.Vector3f(onward.at.ray.d), mi.Float(onward.at.pdf)
         path = onward
 
-    return L, valid
+    return L, valid, moves

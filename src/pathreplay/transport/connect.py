@@ -50,16 +50,16 @@ def shadow_start(v: Vertex, light: mi.DirectionSample3f, medium: mi.MediumPtr) -
     return dr.select(v.surface & v.si.is_medium_transition(), v.si.target_medium(light.d), medium)
 
 
-def repeat(walk: Walk, v: Vertex, u: Numbers, kept: Kept, attached: bool) -> mi.Spectrum:
+def repeat(walk: Walk, v: Vertex, u: Numbers, ctx: mi.BSDFContext, kept: Kept, attached: bool) -> mi.Spectrum:
     """The part of e that the kept emitter sample brings (Spectrum), differentiably.
 
     If ``attached`` the point on the emitter follows the emitter. Visibility is not differentiated.
     """
     if kept.known is not None and not attached:
-        f = v.bsdf.eval(mi.BSDFContext(), v.si, v.si.to_local(kept.known.d), kept.lit)
+        f = v.bsdf.eval(ctx, v.si, v.si.to_local(kept.known.d), kept.lit)
         return dr.select(kept.lit, f * kept.known.w, 0)
     light, Le = redraw_emitter(walk, v.origin, u.light, kept.light, attached, kept.lit)
     if kept.media is not None:
         Le *= shadow_again(walk, v.origin, light, kept.media.shadow, attached, kept.lit)
-    f, pdf = towards(v, light.d, kept.lit)
+    f, pdf = towards(v, ctx, light.d, kept.lit)
     return dr.select(kept.lit, f * Connection(light, Le, kept.lit).reaches(pdf, attached), 0)

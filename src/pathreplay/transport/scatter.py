@@ -45,14 +45,24 @@ class Sampled:
 
 
 def choose(
-    walk: Walk, v: Vertex, at: Arrival, u: Numbers, light_d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool
+    walk: Walk,
+    v: Vertex,
+    at: Arrival,
+    u: Numbers,
+    ctx: mi.BSDFContext,
+    light_d: mi.Vector3f,
+    lit: mi.Bool,
+    go_on: mi.Bool,
 ) -> Sampled:
-    """Sample the continuation, and evaluate the vertex for the direction of the emitter sample. Detached."""
+    """Sample the continuation, and evaluate the vertex for the direction of the emitter sample. Detached.
+
+    ``ctx`` has the transport mode, and the lobe where it is to be a given one.
+    """
     at_surface = go_on & v.surface
     if v.inside is not None and walk.media.passes:
         at_surface |= v.surface & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.Null)
     f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(
-        mi.BSDFContext(), v.si, v.si.to_local(light_d), u.lobe, u.direction, at_surface
+        ctx, v.si, v.si.to_local(light_d), u.lobe, u.direction, at_surface
     )
     sampled = Sampled(
         f=f,
@@ -94,10 +104,10 @@ def _in_medium(
     )
 
 
-def towards(v: Vertex, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
+def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
     """What the vertex scatters from the world direction ``d`` (Spectrum), and the density of sampling it there."""
     surface = active if v.inside is None else active & v.surface
-    f, pdf = v.bsdf.eval_pdf(mi.BSDFContext(), v.si, v.si.to_local(d), surface)
+    f, pdf = v.bsdf.eval_pdf(ctx, v.si, v.si.to_local(d), surface)
     if v.inside is None:
         return f, pdf
     event = v.inside.event
@@ -110,6 +120,7 @@ def repeat(
     v: Vertex,
     at: Arrival,
     u: Numbers,
+    ctx: mi.BSDFContext,
     kept: Kept,
     attached: bool,
     hit_next: mi.PreliminaryIntersection3f,
@@ -120,7 +131,7 @@ def repeat(
     ``hit_next`` is where it went. Not differentiated: the choice among lobes and, unless ``attached``, direction and
     density.
     """
-    w, d, pdf = _at_surface(walk, v, u, kept, attached, hit_next, go_on & v.surface)
+    w, d, pdf = _at_surface(walk, v, u, ctx, kept, attached, hit_next, go_on & v.surface)
     if v.inside is None:
         return w, d, pdf
     event, through = v.inside.event, v.inside.through
@@ -134,12 +145,13 @@ def _at_surface(
     walk: Walk,
     v: Vertex,
     u: Numbers,
+    ctx: mi.BSDFContext,
     kept: Kept,
     attached: bool,
     hit_next: mi.PreliminaryIntersection3f,
     active: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
-    ctx, bsdf, si = mi.BSDFContext(), v.bsdf, v.si
+    bsdf, si = v.bsdf, v.si
     smooth = active & ~kept.delta
     d, J = kept.d, mi.Float(1)
     if attached:
@@ -148,7 +160,7 @@ def _at_surface(
     if walk.resamples:
         sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
         if attached:
-            free = _followed(walk, v, u, smooth)
+            free = _followed(walk, v, u, ctx, smooth)
             follows = free | (active & kept.delta)
             d = dr.select(follows, dr.replace_grad(kept.d, si.to_world(sample.wo)), d)
             J = dr.select(follows, 1, J)
@@ -168,11 +180,11 @@ def _at_surface(
         w = dr.select(free, w_sample, w)
     if walk.traits.lobes > 0:
         delta = active & kept.delta
-        w = dr.select(delta, _delta_weight(walk, v, u, kept, w_sample, delta), w)
+        w = dr.select(delta, _delta_weight(walk, v, u, ctx, kept, w_sample, delta), w)
     return w, d, pdf
 
 
-def _followed(walk: Walk, v: Vertex, u: Numbers, active: mi.Bool) -> mi.Bool:
+def _followed(walk: Walk, v: Vertex, u: Numbers, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:
     """Which smooth lobes are sampled attached: decided by what the lobe is, never by the direction drawn."""
     if not walk.follows:
         return mi.Bool(False)
@@ -181,11 +193,13 @@ def _followed(walk: Walk, v: Vertex, u: Numbers, active: mi.Bool) -> mi.Bool:
     free = active & dr.gather(mi.Bool, table, index, active & (index < dr.width(table)))
     if walk.attach == "all":
         return free
-    centre, _ = v.bsdf.sample(mi.BSDFContext(), dr.detach(v.si), u.lobe, mi.Point2f(0.5), free)
+    centre, _ = v.bsdf.sample(ctx, dr.detach(v.si), u.lobe, mi.Point2f(0.5), free)
     return free & (dr.detach(centre.pdf) > NARROW)
 
 
-def _delta_weight(walk: Walk, v: Vertex, u: Numbers, kept: Kept, w: mi.Spectrum, active: mi.Bool) -> mi.Spectrum:
+def _delta_weight(
+    walk: Walk, v: Vertex, u: Numbers, ctx: mi.BSDFContext, kept: Kept, w: mi.Spectrum, active: mi.Bool
+) -> mi.Spectrum:
     """Weight of a sampled delta lobe, with the derivative of (weight of the lobe alone) / (probability of its choice).
 
     A BSDF that picks among lobes returns weights in which the choice has cancelled, and with it, in some plugins,
@@ -196,7 +210,7 @@ def _delta_weight(walk: Walk, v: Vertex, u: Numbers, kept: Kept, w: mi.Spectrum,
     drawn = dr.detach(w)
     missing = mi.Bool(active)
     for k in range(walk.traits.lobes):
-        alone = mi.BSDFContext()
+        alone = mi.BSDFContext(ctx.mode)
         alone.component = k
         # The lobes of a surface's back are counted from zero, too, but asked for after those of the front.
         picked = missing if walk.traits.two_sides else missing & (kept.lobe == k)

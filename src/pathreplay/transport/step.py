@@ -23,16 +23,19 @@ def choose_step(
     go_on: mi.Bool,
     active: mi.Bool,
     flight: Flight | None = None,
+    ctx: mi.BSDFContext | None = None,
 ) -> Chosen:
     """The step of a first walk, which draws emitter sample and continuation from the numbers ``u``.
 
     With media also the flight, choosing real collisions by the throughput ``β``, unless ``flight`` is given, and the
     shadow ray, both from ``sampler``; null boundaries come back as ``null`` steps, which are not counted as vertices.
-    ``go_on`` (Bool) is False at the last vertex that ``max_depth`` allows.
+    ``go_on`` is False at the last vertex that ``max_depth`` allows. ``ctx`` has the transport mode (radiance), and
+    Mitsuba's number of a lobe where surfaces are to scatter by that one alone.
     """
+    ctx = mi.BSDFContext() if ctx is None else ctx
     v = arrive.choose(walk, at, sampler, β, active, flight)
     link = connect.choose(walk, v, at.medium, u, sampler, go_on)
-    to = scatter.choose(walk, v, at, u, link.light.d, link.lit, go_on)
+    to = scatter.choose(walk, v, at, u, ctx, link.light.d, link.lit, go_on)
     reached = link.reaches(to.pdf_light, False)
     lighting = dr.select(link.lit, to.f * reached, 0)
     kept = Kept(to.d, to.pdf, to.delta, to.black, to.lobe, link.lit, light=link.light)
@@ -67,16 +70,18 @@ def repeat_step(
     active: mi.Bool,
     attached: bool = False,
     hit_next: mi.PreliminaryIntersection3f | None = None,
+    ctx: mi.BSDFContext | None = None,
 ) -> Step:
     """The same step once more, differentiable in emission, BSDFs, textures and media.
 
     If ``attached``, also in ``at.ray``, ``at.pdf`` and everything that moves: the hit point follows ray and shape, and
     the continuation follows as `scatter` says (``hit_next`` is where it went). Else vertices and directions are
-    constants. Visibility and Russian roulette are never differentiated.
+    constants. Visibility and Russian roulette are never differentiated. ``ctx`` is that of the first walk.
     """
+    ctx = mi.BSDFContext() if ctx is None else ctx
     v = arrive.repeat(walk, at, kept, attached, active)
-    e = v.glow + connect.repeat(walk, v, u, kept, attached)
-    w, d, pdf = scatter.repeat(walk, v, at, u, kept, attached, hit_next, go_on)
+    e = v.glow + connect.repeat(walk, v, u, ctx, kept, attached)
+    w, d, pdf = scatter.repeat(walk, v, at, u, ctx, kept, attached, hit_next, go_on)
     if v.inside is not None:
         e, w = v.inside.e + v.inside.w * e, v.inside.w * w
     return Step(e, w, v.origin.spawn_ray(d), pdf, _signature(v, at, kept.lobe, go_on))
