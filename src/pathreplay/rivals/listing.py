@@ -41,7 +41,7 @@ def listing(
     if dr.hint(walk.media is None, mode="scalar"):
         raise PathreplayError("pathreplay_listing differentiates media, and the scene has none: use 'pathreplay'")
     # Nobody else's tracking is used, so that every collision is one that can be differentiated.
-    media = replace(walk.media, grids=(), plain=True, homogeneous=False)
+    media = replace(walk.media, grids=(), plain=True)
     walk = replace(walk, baseline=None, branching=None, media=media)
     active = mi.Bool(active) & (walk.max_depth > 0)
     at = start.choose(walk, active)
@@ -110,12 +110,14 @@ def _shadow(
     active: mi.Bool,
     adjoint: mi.Spectrum,
 ) -> None:
-    """Differentiate the tentative collisions of a shadow ray that arrived."""
+    """Differentiate the tentative collisions of a shadow ray that arrived. In homogeneous media there are none."""
     stretch = Stretch.begin(dr.detach(origin.spawn_ray_to(light.p)), medium, active)
     while dr.hint(stretch.active, exclude=[walk], label="pathreplay: listing, shadow"):
         hit, a, b, inside = stretch.part(walk.scene)
         σ_bar = majorant(stretch.medium, stretch.ray, inside)
         tracked = inside & (σ_bar > 0)
+        if dr.hint(walk.media.homogeneous, mode="scalar"):
+            tracked &= ~stretch.medium.is_homogeneous()  # known without tracking
         t = mi.Float(a)
         while dr.hint(tracked, label="pathreplay: listing, ratio tracking"):
             t -= dr.log(1 - past.next_1d(tracked)) / σ_bar
