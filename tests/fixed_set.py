@@ -33,7 +33,6 @@ SAVED = Path(__file__).with_name("fixed_set.safetensors")
 VARIANT = "llvm_ad_rgb"
 LIMIT = 1e-5
 """Of the relative L1 error of an array: float32 sums in another order stay well below."""
-SEED = 1
 PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
     "primal": ("pathreplay", {}),
     "sweep": ("pathreplay", {"driver": "sweep"}),
@@ -95,9 +94,9 @@ class Opened:
         properties = {"max_depth": self.scene.depth, "rr_depth": self.scene.rr_depth, **properties, **case.options}
         integrator = mi.load_dict({"type": plugin, **properties})
         try:
-            for seed in range(SEED, SEED + case.passes - 1):
-                self._backward(case, integrator, seed)
-            seed = SEED + case.passes - 1
+            seed = self.scene.seed + case.passes - 1
+            for earlier in range(self.scene.seed, seed):
+                self._backward(case, integrator, earlier)
             if case.driver == "primal":
                 image = integrator.render(self.loaded, sensor=case.sensor, seed=seed, spp=self.scene.spp)
                 return {"image": np.array(image)}
