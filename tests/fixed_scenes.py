@@ -440,11 +440,11 @@ SCENES = (
         case("primal"), case("sweep"), case("forward"), case("pixels"),
     )),
     Scene("fog", fog, (*FOG, "floor.bsdf.reflectance.value", LIGHT), (
-        case("primal"), case("sweep"), case("sweep", passes=2), case("replay"), case("forward", passes=2),
+        case("primal"), case("sweep"), case("sweep", passes=3), case("replay"), case("forward", passes=2),
         case("tape"), case("tape-forward"), case("rb"),
     )),
     Scene("cloud", cloud, (*CLOUD, "kernel.bsdf.reflectance.value", "sky.data"), (
-        case("primal"), case("sweep"), case("sweep", passes=2), case("sweep", passes=2, branch=False),
+        case("primal"), case("sweep"), case("sweep", passes=3), case("sweep", passes=2, branch=False),
         case("replay", branch=True), case("forward"), case("sweep", *LISTED, volume_gradient="listing"), case("tape"),
     )),
     Scene("rainbow", rainbow, (*RAINBOW, "beside.interior_medium.sigma_t.data"), (
