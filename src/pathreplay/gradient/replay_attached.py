@@ -72,6 +72,7 @@ def replay_attached(
     with dr.resume_grad():
         o, d = start.repeat()
         if dr.hint(dr.grad_enabled(o, d), mode="scalar"):
+            dr.eval(q, L, overflow)  # else each entry of a camera's matrix runs the first pass again
             x = RayFrame.of(first.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
             backward(sum(q0[k] * x[k] for k in range(4)))
