@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from media_scenes import constant, grid
 
+from media_scenes import constant, grid
 from pathreplay.gradient.adjoint import LostPaths, RayDerivative
 from pathreplay.gradient.record import Layout, record_type
 from pathreplay.gradient.sweep import first_walk, room_for, walk_back

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.flight import Flight
 from ..transport.media import interaction, majorant
 from ..transport.path import PathState, next_arrival
 from ..transport.step import choose_step
-from ..transport.vertex import Arrival, Chosen, Numbers, Walk
+from ..transport.vertex import Arrival, Chosen, Flight, Numbers, Walk
 from .adjoint import backward
 from .primal import walk_on
 

@@ -13,9 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.flight import Flight
-from ..transport.shadow import Shadow
-from ..transport.vertex import Arrival, Kept, KeptInMedia, KnownLight, Numbers, Walk
+from ..transport.vertex import Arrival, Flight, Kept, KeptInMedia, KnownLight, Numbers, Shadow, Walk
 from .adjoint import Replayed
 
 

@@ -19,13 +19,12 @@ from ..gradient.primal import primal
 from ..transport import arrive, scatter
 from ..transport.connect import Connection, shadow_start
 from ..transport.emitters import redraw_emitter
-from ..transport.flight import Flight
 from ..transport.media import interaction, majorant, span
 from ..transport.motion import path_moves
 from ..transport.path import PathState
 from ..transport.shadow import Stretch
 from ..transport.start import CameraStart
-from ..transport.vertex import Arrival, Numbers, Walk, reciprocal
+from ..transport.vertex import Arrival, Flight, Numbers, Walk, reciprocal
 
 
 @dr.syntax

@@ -12,9 +12,9 @@ import drjit as dr
 import mitsuba as mi
 
 from .emitters import emission
-from .flight import Flight, fly, fly_again
+from .flight import fly, fly_again
 from .media import interaction
-from .vertex import Arrival, Kept, Walk
+from .vertex import Arrival, Flight, Kept, Walk
 
 
 @dataclass

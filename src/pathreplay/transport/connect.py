@@ -10,8 +10,8 @@ import mitsuba as mi
 from .arrive import Vertex
 from .emitters import draw_emitter, redraw_emitter
 from .scatter import towards
-from .shadow import Shadow, shadow, shadow_again
-from .vertex import Kept, Numbers, Walk, is_smooth, mis_weight
+from .shadow import shadow, shadow_again
+from .vertex import Kept, Numbers, Shadow, Walk, is_smooth, mis_weight
 
 
 @dataclass

@@ -17,39 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .media import carried, interaction, is_grid, majorant, span
-from .vertex import Arrival, Walk, reciprocal
-
-
-@dataclass
-class Flight:
-    """What a first walk found between two vertices."""
-
-    event: mi.Bool  # a real collision, before any surface
-    t: mi.Float  # distance to it
-    density: mi.Float  # probability density of a collision there, p σ̄; 1 if there was none
-    W: mi.Spectrum  # weight of the null collisions on the way; 1 where the medium is grey
-    along: mi.Float  # shifts the points at which its derivative is taken, in [0, 1) of their distance
-    p: mi.Float = None  # probability that the collision was real (if the walk branches, else None)
-    # Of walks with emission only, else None:
-    E: mi.Spectrum = None  # emission gathered on the way
-    t_emit: mi.Float = None  # distance of the tentative collision at which emission is differentiated
-    c_emit: mi.Spectrum = None  # weight of the emission there
-    # Only the first walk needs these; they are None in a record that is read back.
-    σ_s: mi.Spectrum = None  # scattering coefficient at the collision
-    null: NullCollision = None  # type: ignore[assignment]  # one of those on the way, if the walk branches
-
-
-@dataclass
-class NullCollision:
-    """A null collision, kept with a probability proportional to ``mass``: see `branch_weight`."""
-
-    t: mi.Float  # distance
-    ω: mi.Spectrum  # weight of the collision and of those before, over the probability that it was kept
-    bare: mi.Float  # the same without those before
-    mass: mi.Float  # of all null collisions on the way
-    number: mi.Float  # of null collisions on the way
-    pick: mi.Float  # a random number, to choose among flights
-
+from .vertex import Arrival, Flight, NullCollision, Walk, reciprocal
 
 # Points of a flight at which the derivative of its transmittance is taken. Few leave a variance of their own, many take
 # time; of the cloud of `pathreplay bench media` four make the least of both.

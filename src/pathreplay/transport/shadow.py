@@ -12,17 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .media import carried, interaction, is_grid, majorant, span
-from .vertex import Walk
-
-
-@dataclass
-class Shadow:
-    """What a first walk found between a vertex and its emitter sample."""
-
-    T: mi.Spectrum  # estimate of the transmittance, 0 if something is in the way
-    y: mi.Float  # distance of the point where its derivative is taken
-    medium: mi.MediumPtr  # the medium there; null if there is none on the way
-    length: mi.Float  # length of medium on the ray
+from .vertex import Shadow, Walk
 
 
 @dataclass

@@ -10,8 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import arrive, connect, scatter
-from .flight import Flight
-from .vertex import Arrival, Chosen, Kept, KeptInMedia, KnownLight, Numbers, Signature, Step, Walk
+from .vertex import Arrival, Chosen, Flight, Kept, KeptInMedia, KnownLight, Numbers, Signature, Step, Walk
 
 
 def choose_step(

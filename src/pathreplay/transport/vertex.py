@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
+from .media import Media
 from .traits import Traits
-
-if TYPE_CHECKING:
-    from .flight import Flight
-    from .media import Media
-    from .shadow import Shadow
 
 
 @dataclass(frozen=True)
@@ -116,6 +111,47 @@ class KeptInMedia:
     null: mi.Bool  # the lobe passes straight through
     flight: Flight  # on the way to the vertex
     shadow: Shadow  # between the vertex and its emitter sample
+
+
+@dataclass
+class Flight:
+    """What a first walk found between two vertices."""
+
+    event: mi.Bool  # a real collision, before any surface
+    t: mi.Float  # distance to it
+    density: mi.Float  # probability density of a collision there, p σ̄; 1 if there was none
+    W: mi.Spectrum  # weight of the null collisions on the way; 1 where the medium is grey
+    along: mi.Float  # shifts the points at which its derivative is taken, in [0, 1) of their distance
+    p: mi.Float = None  # probability that the collision was real (if the walk branches, else None)
+    # Of walks with emission only, else None:
+    E: mi.Spectrum = None  # emission gathered on the way
+    t_emit: mi.Float = None  # distance of the tentative collision at which emission is differentiated
+    c_emit: mi.Spectrum = None  # weight of the emission there
+    # Only the first walk needs these; they are None in a record that is read back.
+    σ_s: mi.Spectrum = None  # scattering coefficient at the collision
+    null: NullCollision = None  # type: ignore[assignment]  # one of those on the way, if the walk branches
+
+
+@dataclass
+class NullCollision:
+    """A null collision, kept with a probability proportional to ``mass``: see `branch_weight`."""
+
+    t: mi.Float  # distance
+    ω: mi.Spectrum  # weight of the collision and of those before, over the probability that it was kept
+    bare: mi.Float  # the same without those before
+    mass: mi.Float  # of all null collisions on the way
+    number: mi.Float  # of null collisions on the way
+    pick: mi.Float  # a random number, to choose among flights
+
+
+@dataclass
+class Shadow:
+    """What a first walk found between a vertex and its emitter sample."""
+
+    T: mi.Spectrum  # estimate of the transmittance, 0 if something is in the way
+    y: mi.Float  # distance of the point where its derivative is taken
+    medium: mi.MediumPtr  # the medium there; null if there is none on the way
+    length: mi.Float  # length of medium on the ray
 
 
 @dataclass
