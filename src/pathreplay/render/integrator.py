@@ -15,8 +15,9 @@ from ..gradient.forward import forward
 from ..gradient.pixel_sweep import PixelLoss, fits, pixel_camera, pixel_sweep, sweepable
 from ..gradient.primal import primal
 from ..gradient.ray_jacobian import Recovery
+from ..gradient.record import MAX_DEPTH, deepest
 from ..gradient.replay import replay
-from ..gradient.sweep import MAX_DEPTH, deepest, sweep
+from ..gradient.sweep import sweep
 from ..rivals.listing import listing
 from ..transport.start import CameraStart
 from ..transport.traits import Traits, nodes_of
