@@ -15,7 +15,7 @@ from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 from .adjoint import LostPaths, RayDerivative, backward
-from .baseline import Baseline
+from .baseline import Seen
 from .branch import branch_backward
 from .record import Layout, deepest, record_type, room_for
 from .two_walks import first_walk, walk_back
@@ -28,14 +28,14 @@ def sweep(
     δL: mi.Spectrum,
     active: mi.Bool,
     lost: LostPaths,
-    baseline: Baseline | None = None,
+    seen: Seen | None = None,
 ) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
 
     Returns whether the path moves with the parameters; if so, ``lost`` counts paths with an adjoint that was not
-    finite, and those that crossed so many null boundaries between media that they had to end. ``baseline`` learns from
-    this pass, for later ones. A weight that is exactly zero keeps its derivative. Not differentiated: visibility and,
-    with ``attach='none'``, everything that moves.
+    finite, and those that crossed so many null boundaries between media that they had to end. ``seen`` collects what
+    this pass sees of media, for later ones. A weight that is exactly zero keeps its derivative. Not differentiated:
+    visibility and, with ``attach='none'``, everything that moves.
     Raises PathreplayError when ``max_depth`` is above `deepest`, or when no parameter reaches the paths.
     """
     if walk.max_depth > deepest(walk):
@@ -52,10 +52,10 @@ def sweep(
     records, count, _, branch = first_walk(walk, sampler, path, layout, records, mi.UInt32(0), lost)
 
     first, L, q = mi.UInt32(0), mi.Spectrum(0), RayDerivative.zero()
-    _, q = walk_back(walk, layout, records, first, count, count - 1, at.ray, δL, L, q, lost, baseline)
+    _, q = walk_back(walk, layout, records, first, count, count - 1, at.ray, δL, L, q, lost, seen)
     if walk.branch:
-        if baseline is not None:
-            baseline.tally(branch.number)
+        if seen is not None:
+            seen.tally(branch.number)
         branch_backward(walk, branch, sampler, at.ray, δL)
     with dr.resume_grad():
         o, d = start.repeat()

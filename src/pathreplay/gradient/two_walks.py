@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..transport.path import PathState
 from ..transport.vertex import Walk
 from .adjoint import LostPaths, RayDerivative, Replayed, backward_step
-from .baseline import Baseline
+from .baseline import Seen
 from .branch import Branch
 from .record import Layout, read_back, record, room_for
 
@@ -57,7 +57,7 @@ def walk_back(
     L: mi.Spectrum,
     q: RayDerivative,
     lost: LostPaths,
-    baseline: Baseline | None = None,
+    seen: Seen | None = None,
 ) -> tuple[mi.Spectrum, RayDerivative]:
     """Back-propagate from the last of ``count`` records to the first; gives radiance and ray adjoint there.
 
@@ -66,12 +66,12 @@ def walk_back(
     """
     broken = mi.Bool(False)  # a part of the adjoint was not finite
 
-    while dr.hint(count > 0, exclude=[walk, layout, ray0, lost, baseline], label="pathreplay: sweep"):
+    while dr.hint(count > 0, exclude=[walk, layout, ray0, lost, seen], label="pathreplay: sweep"):
         count -= 1
         v = read_back(layout, records, first + count, last, ray0)
         L, q, breaks = backward_step(walk, v, layout.moves, δL, L, q, mi.Bool(True))
-        if dr.hint(baseline is not None, mode="scalar"):
-            baseline.learn(v, L)  # type: ignore[union-attr]
+        if dr.hint(seen is not None, mode="scalar"):
+            seen.learn(v, L)  # type: ignore[union-attr]
         if dr.hint(layout.moves, mode="scalar"):
             lost.add(breaks & ~broken)
             broken |= breaks
