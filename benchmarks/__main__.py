@@ -13,18 +13,18 @@ from rich.console import Console
 
 from pathreplay.errors import PathreplayError
 
-from . import attached, depth, events, iteration, media, noise, records, startup, supergrid, surface, truth
+from . import records
 from .compare import compare
 from .drafts import ROOT, Draft, draft_of
-from .job import Record
-from .report import fill, pages
+from .measures.job import Record
+from .pages import fill, pages
 from .runner import run_jobs
 from .tables import footnote
+from .tasks import attached, depth, events, gridmedium, iteration, media, noise, startup, supergrid, surface, truth
 
 # Quick ones first, so that a run that is cut short has most of the answers.
-TASKS: dict[str, ModuleType] = {
-    task.TITLE: task for task in (startup, surface, iteration, attached, truth, noise, depth, events, supergrid, media)
-}
+_TASKS = (startup, surface, iteration, attached, truth, noise, depth, events, supergrid, gridmedium, media)
+TASKS: dict[str, ModuleType] = {task.TITLE: task for task in _TASKS}
 
 
 def main(

@@ -13,7 +13,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.files import file_problem
 
 from .drafts import ROOT, Draft
-from .job import Record
+from .measures.job import Record
 from .runner import Measured
 
 RESULTS = ROOT / "benchmarks" / "results"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 
-from . import attached, depth, iteration, media, surface, truth
-from .estimates import cost_ratio, efficiency, time_ratio, variance_ratio
-from .job import Point, Record
+from .measures.estimates import cost_ratio, efficiency, mean_ratio, time_ratio
+from .measures.job import Point, Record
 from .tables import groups, markdown
+from .tasks import attached, depth, iteration, media, surface, truth
 
 
 def _surface(record: Record) -> str:
@@ -18,7 +18,7 @@ def _surface(record: Record) -> str:
         if pair := _pair(found, "sweep", "prb"):
             ours, rival = pair
             times = time_ratio(ours.seconds, rival.seconds)
-            rows.append([str(scene), str(times), str(variance_ratio(ours.squared_errors, rival.squared_errors))])
+            rows.append([str(scene), str(times), str(mean_ratio(ours.squared_errors, rival.squared_errors))])
     return markdown(["gradient of a texture, sweep / prb", "time", "variance"], rows)
 
 

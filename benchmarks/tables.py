@@ -6,8 +6,8 @@ import statistics as st
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from .estimates import cost_ratio, time_ratio, variance_ratio
-from .job import Point, Record
+from .measures.estimates import cost_ratio, mean_ratio, time_ratio
+from .measures.job import Point, Record
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -59,7 +59,7 @@ def comparison(point: Point, rival: Point | None) -> list[str]:
     times, errors = (point.seconds, rival.seconds), (point.squared_errors, rival.squared_errors)
     if not all(errors):
         return [seconds, str(time_ratio(*times)), "", ""]
-    return [seconds, str(time_ratio(*times)), str(variance_ratio(*errors)), str(cost_ratio(times, errors))]
+    return [seconds, str(time_ratio(*times)), str(mean_ratio(*errors)), str(cost_ratio(times, errors))]
 
 
 def brief_footnote(record: Record) -> str:

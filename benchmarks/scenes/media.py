@@ -213,4 +213,3 @@ MEDIA_SCENES: dict[str, Callable[[int], SceneDict]] = {
     "uniform, supergrid": partial(_outdoors, partial(_uniform, True)),
     "uniform, auto": partial(_outdoors, partial(_uniform, "auto")),
 }
-"""Scene by name: resolution -> dictionary for mi.load_dict (with optimize=False, to keep the keys)."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from .estimates import bias_share, efficiency, time_ratio, variance_ratio
-from .job import Job, Point, Record
-from .media_scenes import ALBEDO, ASYMMETRY, DENSITY, EXTINCTION
-from .tables import groups, markdown, median_seconds, method_cell
+from ..measures.estimates import bias_share, efficiency, mean_ratio, time_ratio
+from ..measures.job import Job, Point, Record
+from ..scenes.media import ALBEDO, ASYMMETRY, DENSITY, EXTINCTION
+from ..tables import groups, markdown, median_seconds, method_cell
 
 TITLE = "media"
 TAKES = (18, 460)
@@ -83,8 +83,8 @@ def _cells(point: Point, rival: Point | None) -> list[str]:
         smooth = point.smooth_errors and rival.smooth_errors
         cells += [
             str(time_ratio(*times)),
-            str(variance_ratio(*errors)),
-            str(variance_ratio(point.smooth_errors, rival.smooth_errors)) if smooth else "",
+            str(mean_ratio(*errors)),
+            str(mean_ratio(point.smooth_errors, rival.smooth_errors)) if smooth else "",
             str(efficiency(times, errors)),
         ]
     told = point.bias_products and point.method != REFERENCE

@@ -1,4 +1,4 @@
-"""The scenes that are measured: all made here or by Mitsuba, nothing is read from a file."""
+"""The scenes of surfaces that are measured: Cornell boxes, a sealed box, and metal balls under an environment."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-
-from .media_scenes import MEDIA_SCENES
 
 SceneDict = dict[str, Any]
 
@@ -120,12 +118,11 @@ def _boxed(make: Callable[[int], SceneDict]) -> Callable[[int], SceneDict]:
     return boxed
 
 
-SCENES: dict[str, Callable[[int], SceneDict]] = {
+SURFACE_SCENES: dict[str, Callable[[int], SceneDict]] = {
     "cornell-box": cornell_box,
     "cornell-box, box filter": _boxed(cornell_box),
     "glossy-environment": glossy_environment,
     "glass-and-diffuse": glass_and_diffuse,
     "glass-and-diffuse, box filter": _boxed(glass_and_diffuse),
     "closed-box": closed_box,
-} | MEDIA_SCENES
-"""Scene by name: resolution -> dictionary for mi.load_dict (with optimize=False, to keep the keys)."""
+}

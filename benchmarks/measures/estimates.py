@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import bootstrap
 
 # Enough that the ends of a 95 % interval move by less than the last digit that the tables print.
 RESAMPLES = 4000
@@ -23,46 +25,54 @@ class Estimate:
         return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
 
 
+def interval(statistic: Callable[..., np.ndarray], *samples: Sequence[float] | np.ndarray, paired: bool) -> Estimate:
+    """The statistic of the samples; bootstrap over rounds or seeds, the same ones of all samples if they are paired."""
+    found = bootstrap(
+        samples, statistic, paired=paired, n_resamples=RESAMPLES, method="percentile", vectorized=True, random_state=0
+    ).confidence_interval
+    return Estimate(float(statistic(*map(np.asarray, samples), axis=-1)), float(found.low), float(found.high))
+
+
 def time_ratio(ours: Sequence[float], theirs: Sequence[float]) -> Estimate:
-    """Median over rounds of (our seconds) / (their seconds of the same round); bootstrap over rounds."""
-    ratios = np.asarray(ours) / np.asarray(theirs)
-    return _bootstrap(len(ratios), lambda rounds: np.median(ratios[rounds], axis=-1))
+    """Median over rounds of (our seconds) / (their seconds of the same round)."""
+    return interval(np.median, np.divide(ours, theirs), paired=True)
 
 
-def variance_ratio(ours: Sequence[float], theirs: Sequence[float]) -> Estimate:
-    """Ratio of the means of squared errors; bootstrap over seeds, the same ones on both sides."""
-    a, b = np.asarray(ours), np.asarray(theirs)
-    return _bootstrap(len(a), lambda seeds: a[seeds].mean(axis=-1) / b[seeds].mean(axis=-1))
+def mean_ratio(ours: Sequence[float], theirs: Sequence[float]) -> Estimate:
+    """Ratio of the means, as of squared errors, of the same rounds (or seeds) on both sides."""
+    return interval(lambda a, b, axis: a.mean(axis) / b.mean(axis), ours, theirs, paired=True)
 
 
 def cost_ratio(
     seconds: tuple[Sequence[float], Sequence[float]], squared_errors: tuple[Sequence[float], Sequence[float]]
 ) -> Estimate:
-    """Time ratio x variance ratio: the time for equal variance. Each is (ours, theirs); bootstrap over rounds."""
-    times = np.asarray(seconds[0]) / np.asarray(seconds[1])
-    a, b = map(np.asarray, squared_errors)
-    return _bootstrap(len(times), lambda k: np.median(times[k], axis=-1) * a[k].mean(axis=-1) / b[k].mean(axis=-1))
+    """Time ratio x variance ratio: the time for equal variance. Each is (ours, theirs)."""
+
+    def cost(times: np.ndarray, a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
+        return np.median(times, axis) * a.mean(axis) / b.mean(axis)
+
+    return interval(cost, np.divide(*seconds), *squared_errors, paired=True)
 
 
 def efficiency(
     seconds: tuple[Sequence[float], Sequence[float]], squared_errors: tuple[Sequence[float], Sequence[float]]
 ) -> Estimate:
-    """How many times less (time x variance) we need than they do. Each is (ours, theirs); bootstrap over rounds.
+    """How many times less (time x variance) we need than they do. Each is (ours, theirs).
 
     Sums over all rounds on both sides, not medians: a method that learns pays for its first passes.
     """
-    t, u, a, b = map(np.asarray, (*seconds, *squared_errors))
-    return _bootstrap(len(t), lambda k: (u[k].sum(-1) * b[k].sum(-1)) / (t[k].sum(-1) * a[k].sum(-1)))
+
+    def gain(t: np.ndarray, u: np.ndarray, a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
+        return (u.sum(axis) * b.sum(axis)) / (t.sum(axis) * a.sum(axis))
+
+    return interval(gain, *seconds, *squared_errors, paired=True)
 
 
-def unpaired_ratio(above: Sequence[float], below: Sequence[float], centre: Callable[..., np.ndarray]) -> Estimate:
-    """Ratio of the medians (or means) of samples that were not taken in the same rounds; bootstrap of both."""
-    a, b = np.asarray(above), np.asarray(below)
-    random = np.random.default_rng(0)
-    top = centre(a[random.integers(len(a), size=(RESAMPLES, len(a)))], axis=-1)
-    bottom = centre(b[random.integers(len(b), size=(RESAMPLES, len(b)))], axis=-1)
-    low, high = np.quantile(top / bottom, [0.025, 0.975])
-    return Estimate(float(centre(a) / centre(b)), float(low), float(high))
+def unpaired_ratio(
+    above: Sequence[float] | np.ndarray, below: Sequence[float] | np.ndarray, centre: Callable[..., np.ndarray]
+) -> Estimate:
+    """Ratio of the medians (or means) of samples that were not taken in the same rounds."""
+    return interval(lambda a, b, axis: centre(a, axis=axis) / centre(b, axis=axis), above, below, paired=False)
 
 
 def bias_share(bias_products: Sequence[float], squared_errors: Sequence[float]) -> Estimate:
@@ -76,20 +86,12 @@ def bias_share(bias_products: Sequence[float], squared_errors: Sequence[float]) 
     return Estimate(value, value - half, value + half)
 
 
-def _bootstrap(count: int, statistic: Callable[[np.ndarray], np.ndarray]) -> Estimate:
-    draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
-    low, high = np.quantile(statistic(draws), [0.025, 0.975])
-    return Estimate(float(statistic(np.arange(count)[None])[0]), float(low), float(high))
-
-
 def growth(sizes: Sequence[float], seconds: Sequence[float]) -> Estimate:
     """Exponent p of  seconds = a + b sizes^p,  a, b >= 0: least squares of the logarithms, +- 1.96 standard errors.
 
     The offset a is what a pass costs however short its paths are: tracing and launching the kernel. It takes at least
     five sizes to tell the two apart.
     """
-    from scipy.optimize import least_squares
-
     n, t = np.asarray(sizes, dtype=float), np.asarray(seconds, dtype=float)
     if len(n) < 5:
         raise ValueError(f"{len(n)} sizes are too few for an exponent: use at least 5")
