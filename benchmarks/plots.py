@@ -18,7 +18,7 @@ from scipy.stats import gmean
 
 from . import records
 from .drafts import ROOT
-from .measures.estimates import Estimate, bias_share, efficiency
+from .measures.estimates import Estimate, Versus, bias_share
 from .measures.job import Point, Record
 from .pages import PICTURES
 from .tables import groups
@@ -133,7 +133,7 @@ def _media_efficiency(record: Record) -> Figure:
     for (scene, parameters, *_), methods in reversed(found):
         bars = _efficiencies(methods)
         ticks.append(at + (len(bars) - 1) / 2)
-        names.append(f"{scene}, {media.WHAT[parameters[0]]}")  # type: ignore[index]
+        names.append(f"{scene}, {media.WHAT[parameters[0]]}")
         for method, gain in reversed(bars.items()):
             error = [[gain.value - gain.low], [gain.high - gain.value]]
             colour, far = LOOKS[method][0], max(1.0, gain.high)
@@ -165,7 +165,7 @@ def _efficiencies(methods: dict[str, Point]) -> dict[str, Estimate]:
     if rival is None or not rival.squared_errors:
         return {}
     return {
-        name: efficiency((point.seconds, rival.seconds), (point.squared_errors, rival.squared_errors))
+        name: Versus(point, rival).efficiency()
         for name, point in methods.items()
         if point is not rival and point.squared_errors
     }

@@ -9,6 +9,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import bootstrap
 
+from .job import Point
+
 # Enough that the ends of a 95 % interval move by less than the last digit that the tables print.
 RESAMPLES = 4000
 
@@ -33,39 +35,9 @@ def interval(statistic: Callable[..., np.ndarray], *samples: Sequence[float] | n
     return Estimate(float(statistic(*map(np.asarray, samples), axis=-1)), float(found.low), float(found.high))
 
 
-def time_ratio(ours: Sequence[float], theirs: Sequence[float]) -> Estimate:
-    """Median over rounds of (our seconds) / (their seconds of the same round)."""
-    return interval(np.median, np.divide(ours, theirs), paired=True)
-
-
 def mean_ratio(ours: Sequence[float], theirs: Sequence[float]) -> Estimate:
-    """Ratio of the means, as of squared errors, of the same rounds (or seeds) on both sides."""
+    """Ratio of the means, of the same rounds on both sides."""
     return interval(lambda a, b, axis: a.mean(axis) / b.mean(axis), ours, theirs, paired=True)
-
-
-def cost_ratio(
-    seconds: tuple[Sequence[float], Sequence[float]], squared_errors: tuple[Sequence[float], Sequence[float]]
-) -> Estimate:
-    """Time ratio x variance ratio: the time for equal variance. Each is (ours, theirs)."""
-
-    def cost(times: np.ndarray, a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
-        return np.median(times, axis) * a.mean(axis) / b.mean(axis)
-
-    return interval(cost, np.divide(*seconds), *squared_errors, paired=True)
-
-
-def efficiency(
-    seconds: tuple[Sequence[float], Sequence[float]], squared_errors: tuple[Sequence[float], Sequence[float]]
-) -> Estimate:
-    """How many times less (time x variance) we need than they do. Each is (ours, theirs).
-
-    Sums over all rounds on both sides, not medians: a method that learns pays for its first passes.
-    """
-
-    def gain(t: np.ndarray, u: np.ndarray, a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
-        return (u.sum(axis) * b.sum(axis)) / (t.sum(axis) * a.sum(axis))
-
-    return interval(gain, *seconds, *squared_errors, paired=True)
 
 
 def unpaired_ratio(
@@ -73,6 +45,42 @@ def unpaired_ratio(
 ) -> Estimate:
     """Ratio of the medians (or means) of samples that were not taken in the same rounds."""
     return interval(lambda a, b, axis: centre(a, axis=axis) / centre(b, axis=axis), above, below, paired=False)
+
+
+@dataclass(frozen=True)
+class Versus:
+    """A method relative to a rival that it took turns with."""
+
+    ours: Point
+    rival: Point
+
+    def time(self) -> Estimate:
+        """Median over rounds of (our seconds) / (their seconds of the same round)."""
+        return interval(np.median, np.divide(self.ours.seconds, self.rival.seconds), paired=True)
+
+    def variance(self) -> Estimate:
+        """Ratio of the means of squared errors."""
+        return mean_ratio(self.ours.squared_errors, self.rival.squared_errors)
+
+    def cost(self) -> Estimate:
+        """Time ratio x variance ratio: the time for equal variance."""
+
+        def cost(times: np.ndarray, a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
+            return np.median(times, axis) * a.mean(axis) / b.mean(axis)
+
+        times = np.divide(self.ours.seconds, self.rival.seconds)
+        return interval(cost, times, self.ours.squared_errors, self.rival.squared_errors, paired=True)
+
+    def efficiency(self) -> Estimate:
+        """How many times less (time x variance) we need than they do.
+
+        Sums over all rounds on both sides, not medians: a method that learns pays for its first passes.
+        """
+
+        def gain(t: np.ndarray, a: np.ndarray, u: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
+            return (u.sum(axis) * b.sum(axis)) / (t.sum(axis) * a.sum(axis))
+
+        return interval(gain, *(s for p in (self.ours, self.rival) for s in (p.seconds, p.squared_errors)), paired=True)
 
 
 def bias_share(bias_products: Sequence[float], squared_errors: Sequence[float]) -> Estimate:

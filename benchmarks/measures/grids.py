@@ -16,7 +16,7 @@ import numpy as np
 from pathreplay.media import cellwalk
 
 from ..scenes.grids import grid_medium
-from .job import Job
+from .job import Job, Measure
 from .scene import stopwatch
 
 POINTS = 1000  # of the quadrature, along each ray
@@ -25,16 +25,13 @@ POINTS = 1000  # of the quadrature, along each ray
 MAJORANTS: dict[str, str | bool] = {"one majorant": False, "auto": "auto", "cells": True}
 
 
-class Flight:
+class Flight(Measure):
     """Delta tracking to the first real collision, along lines through the cube: time, and tentative collisions."""
 
     def __init__(self, job: Job) -> None:
         self.rays = job.resolution**2 * job.spp
         self.grids = {name: grid_medium(job.scene, MAJORANTS[name]) for name in job.methods}
         self.ray = _lines(self.rays)
-
-    def forget(self) -> None:
-        """Nothing is learned."""
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
         """CPU seconds, and tentative collisions a ray."""
@@ -50,7 +47,7 @@ class Flight:
         return {name: {"mean": float(np.mean(rows))} for name, rows in kept.items()}
 
 
-class Transmittance:
+class Transmittance(Measure):
     """Estimates of it along shadow rays, next to a quadrature: squared error and time.
 
     The rays start at points of the medium, drawn in proportion to the density, in all directions.
@@ -62,9 +59,6 @@ class Transmittance:
         self.cells = {name: CANDIDATES[name](self.grid) for name in job.methods}
         self.ray = _shadow_rays(self.grid, self.rays)
         self.right = _quadrature(self.grid, self.ray)
-
-    def forget(self) -> None:
-        """Nothing is learned."""
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
         """CPU seconds, and the error of each ray."""

@@ -80,7 +80,7 @@ class Measure(Protocol):
         """Seconds of one pass and what came of it, as one flat array; raises what the method raises."""
 
     def forget(self) -> None:
-        """Begin anew: the methods have learned nothing."""
+        """Begin anew: what the methods have learned is gone. Nothing is to be done where they do not learn."""
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """By method: fields of `Point` that follow from the arrays of all rounds together."""

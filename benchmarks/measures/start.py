@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from ..drafts import ROOT
-from .job import Job
+from .job import Job, Measure
 from .methods import STAGES, STOCK, parts
 
 
-class Start:
+class Start(Measure):
     """Each method and seed has one process, which is started by the call that asks for its first stage."""
 
     def __init__(self, job: Job) -> None:
@@ -26,9 +26,6 @@ class Start:
         self.kept = tempfile.TemporaryDirectory()
         self.homes = [tempfile.mkdtemp(dir=self.kept.name) for _ in range(2)]
         self.stages: dict[tuple[str, int], list[float]] = {}
-
-    def forget(self) -> None:
-        """Nothing is learned but the kernels."""
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
         """Seconds of one stage."""

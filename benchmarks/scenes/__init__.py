@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from .media import MEDIA_SCENES
+from .parts import SceneDict
 from .sheets import SHEET_SCENES
 from .surfaces import SURFACE_SCENES
 
 #: Scene by name: resolution -> dictionary for mi.load_dict (with optimize=False, to keep the keys).
-SCENES: dict[str, Callable[[int], dict[str, Any]]] = SURFACE_SCENES | MEDIA_SCENES | SHEET_SCENES
+SCENES: dict[str, Callable[[int], SceneDict]] = SURFACE_SCENES | MEDIA_SCENES | SHEET_SCENES

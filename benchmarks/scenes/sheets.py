@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-SceneDict = dict[str, Any]
+from .parts import SceneDict, sensor
+
+UP = (0, 0.1, 1)
 
 DIFFUSE: SceneDict = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.7, 0.9]}}
 ROUGH_METAL: SceneDict = {"type": "roughconductor", "alpha": 0.2}
@@ -38,21 +39,12 @@ def smooth_environment(height: int = 32) -> SceneDict:
     return {"type": "envmap", "bitmap": mi.Bitmap((1 + np.stack(waves, axis=-1)).astype(np.float32))}
 
 
-def camera(resolution: int, origin: list[float], target: list[float]) -> SceneDict:
-    return {
-        "type": "perspective",
-        "fov": 30,
-        "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=target, up=[0, 0.1, 1]),
-        "film": {"type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}},
-    }
-
-
 def corridor(bsdf: SceneDict, resolution: int) -> SceneDict:
     """Two sheets, seen from the side: nearly every path bounces to and fro between them."""
     return {
         "type": "scene",
         "environment": smooth_environment(),
-        "camera": camera(resolution, [0, -5, 0.3], [0, 0, -0.6]),
+        "camera": sensor(resolution, [0, -5, 0.3], [0, 0, -0.6], 30, up=UP),
         "low": sheet(-1, 0.1, 2, True, bsdf),
         "high": sheet(1, 0.1, 2, False, bsdf),
     }
@@ -64,7 +56,7 @@ def panes(interfaces: int, wall: SceneDict | None, resolution: int) -> SceneDict
     scene = {
         "type": "scene",
         "environment": smooth_environment(),
-        "camera": camera(resolution, [0.3, -0.2, -5], [0.3, 0, 0]),
+        "camera": sensor(resolution, [0.3, -0.2, -5], [0.3, 0, 0], 30, up=UP),
     }
     names = ["low"] + [f"pane-{k}" for k in range(1, interfaces)]
     scene |= {name: sheet(0.25 * k, 0.05, 4, k % 2 == 1, glass) for k, name in enumerate(names)}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import statistics as st
 
-from ..measures.estimates import efficiency, mean_ratio
+from ..measures.estimates import Versus, mean_ratio
 from ..measures.grids import CANDIDATES, MAJORANTS
 from ..measures.job import Job, Kind, Point, Record
 from ..scenes.grids import GRIDS
@@ -51,7 +51,7 @@ def table(record: Record) -> str:
     """Flights: collisions and speed-up. Transmittance: time, squared error, cost, and mean error in standard errors."""
     flights = groups(point for point in record.points if point.measure == "flight")
     speed = [
-        [str(scene), *(_count(found.get(name)) for name in (ONE, AUTO)), *(_gain(found, n) for n in (AUTO, CELLS))]
+        [scene, *(_count(found.get(name)) for name in (ONE, AUTO)), *(_gain(found, n) for n in (AUTO, CELLS))]
         for (scene, *_), found in flights.items()
     ]
     estimates = groups(point for point in record.points if point.measure == "transmittance")
@@ -79,5 +79,5 @@ def _gain(found: dict[str, Point], name: str) -> str:
 def _cost(point: Point, rival: Point | None) -> list[str]:
     if point.error or rival is None or rival.error or point.z is None:
         return [point.error or "", "", "", ""]
-    cost = efficiency((rival.seconds, point.seconds), (rival.squared_errors, point.squared_errors))
-    return [f"{st.fmean(point.seconds):.4f}", f"{st.fmean(point.squared_errors):.2e}", str(cost), f"{point.z:.1f}"]
+    errors, cost = f"{st.fmean(point.squared_errors):.2e}", Versus(rival, point).efficiency()
+    return [f"{st.fmean(point.seconds):.4f}", errors, str(cost), f"{point.z:.1f}"]

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 import numpy as np
 from scipy.stats import gmean
 
-from ..measures.estimates import time_ratio
+from ..measures.estimates import Versus
 from ..measures.job import Job, Point, Record
 from ..measures.replay_error import KINDS, NOISES, RECOVERIES, SWEEP
 from ..tables import groups, markdown
@@ -65,7 +65,7 @@ def table(record: Record) -> str:
             points = [found.get(f"{kind}, {level:g}") for level in levels]
             if any(points):
                 cells = [kind, *map(_error, points), _error(sweep), _slowness(points, sweep)]
-                rows.append([str(scene), str(int(str(depth)) - 1), *cells])
+                rows.append([scene, str(depth - 1), *cells])
     header = ["scene", "bounces", "noise is put", *(f"{level:g}" for level in levels), "Monte Carlo", "time / sweep"]
     return markdown(header, rows)
 
@@ -83,5 +83,5 @@ def _slowness(points: Iterable[Point | None], sweep: Point | None) -> str:
     """Of the slowest level."""
     if sweep is None or sweep.error:
         return ""
-    ratios = [time_ratio(point.seconds, sweep.seconds).value for point in points if point and not point.error]
+    ratios = [Versus(point, sweep).time().value for point in points if point and not point.error]
     return f"{max(ratios):.1f}" if ratios else ""
