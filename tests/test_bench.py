@@ -272,7 +272,7 @@ def test_the_page_shows_what_was_measured(tmp_path: Path, monkeypatch: pytest.Mo
         "".join(f"<!-- begin {task} -->\nold\n<!-- end {task} -->\n" for task in ("depth", "media", "depth-summary"))
     )
     monkeypatch.setattr(records, "RESULTS", tmp_path)
-    records.save(record(point("sweep", scene=depth.SURFACES), task="depth"))
+    records.save(record(point("sweep", scene=depth.SURFACES), task="depth"), tmp_path)
     assert pages.fill({"depth": depth.table, "media": media.table}, [page]) == ["media"]
     told = page.read_text()
     assert "![Peak memory against path length](images/depth-memory.svg)" in told and "`pathreplay bench depth`" in told
@@ -300,7 +300,8 @@ def test_summaries_count_and_compare() -> None:
     ("arguments", "told"),
     [
         ({"tasks": ["nonsense"]}, "there is no task 'nonsense': use "),
-        ({"quick": True, "save": True}, "--save keeps full runs only"),
+        ({"quick": True, "save": True}, "--save and --into keep full runs only"),
+        ({"quick": True, "into": Path("folder")}, "--save and --into keep full runs only"),
         ({"against": Path("none.json")}, "none.json cannot be read"),
         ({"against": records.RESULTS / "surface.json", "tasks": ["depth"]}, "is a record of task 'surface'"),
         (
@@ -314,13 +315,10 @@ def test_wrong_usage_says_what_would_be_right(arguments: dict, told: str) -> Non
         main(**arguments)
 
 
-def test_two_records_are_compared(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_records_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By the command, which is run where the user is: exit status, table, and a mistake as one line."""
-    monkeypatch.setattr(records, "RESULTS", tmp_path)
     for name, slowness in (("old", 0.7), ("new", 1.4)):
-        path = records.save(record(point("prb", seed=1), point("sweep", slowness, seed=2)))
+        path = records.save(record(point("prb", seed=1), point("sweep", slowness, seed=2)), tmp_path)
         path.rename(tmp_path / f"{name}.json")
     main(tasks=[str(tmp_path / "old.json")], against=tmp_path / "old.json")
     assert "2 of 2 quantities are the same" in capsys.readouterr().out
