@@ -31,7 +31,9 @@ def main(
     tasks: Annotated[list[str] | None, typer.Argument(help=f"{', '.join(TASKS)}, or report. Default: all.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Smaller and fewer: to see that it works.")] = False,
     save: Annotated[bool, typer.Option("--save", help="Keep the samples under benchmarks/results/.")] = False,
-    into: Annotated[Path | None, typer.Option("--into", metavar="FOLDER", help="Keep them in that folder instead.")] = None,
+    into: Annotated[
+        Path | None, typer.Option("--into", metavar="FOLDER", help="Keep them in that folder instead.")
+    ] = None,
     against: Annotated[
         Path | None,
         typer.Option(
