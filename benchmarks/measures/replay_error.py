@@ -13,6 +13,7 @@ from pathreplay.gradient.ray_jacobian import Recovery
 
 from .job import Job
 from .methods import METHODS
+from .recoveries import OtherRecovery
 from .scene import SceneMeasure, stopwatch
 
 SWEEP = "sweep"
@@ -23,7 +24,7 @@ KINDS = {
     "everywhere, float64": ("everywhere", True),
     "directions, float64": ("directions", True),
 }
-#: Arguments of `Recovery` by method.
+#: Arguments of `OtherRecovery` by method.
 RECOVERIES = {f"{kind}, {noise:g}": (noise, *how) for kind, how in KINDS.items() for noise in (*NOISES, 0)}
 
 
@@ -44,7 +45,7 @@ class ReplayError(SceneMeasure):
             seconds, found = self._gradient(SWEEP, Recovery(), self.job.rounds + seed)
             error = np.linalg.norm(found - right) / np.sqrt(2)  # of one pass, from the difference of two
         else:
-            seconds, found = self._gradient("replay", Recovery(*RECOVERIES[method]), seed)
+            seconds, found = self._gradient("replay", OtherRecovery(*RECOVERIES[method]), seed)
             error = np.linalg.norm(found - right)
         return seconds, np.array([error / np.linalg.norm(right)])
 

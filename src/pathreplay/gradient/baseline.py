@@ -76,7 +76,7 @@ class Baseline:
 
     def learn(self, replayed: Any, L: Any) -> None:
         """Collect the radiance ``L`` (Spectrum) that came back along the ray of a replayed vertex."""
-        at, flight = replayed.at, replayed.kept.flight
+        at, flight = replayed.at, replayed.kept.media.flight
         in_medium = at.medium != None  # noqa: E711 (an array of pointers)
         event = in_medium & flight.event
         reach = dr.select(at.hit.is_valid(), at.hit.t, dr.inf)

@@ -12,12 +12,13 @@ from ..errors import PathreplayError
 from ..gradient.adjoint import LostPaths
 from ..gradient.baseline import FIRST_BRANCHING, Baseline
 from ..gradient.forward import forward
-from ..gradient.listing import listing
 from ..gradient.pixel_sweep import PixelLoss, fits, pixel_camera, pixel_sweep, sweepable
 from ..gradient.primal import primal
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.replay import replay
 from ..gradient.sweep import MAX_DEPTH, deepest, sweep
+from ..rivals.listing import listing
+from ..transport.start import CameraStart
 from ..transport.traits import Traits, nodes_of
 from ..transport.vertex import Walk
 from .edges import edges_note, keys_that_move_edges
@@ -93,12 +94,12 @@ def _make_class() -> type:
                 return mi.Spectrum(0), mi.Bool(True), [], None
             walk = self._walk(scene, mode != dr.ADMode.Primal)
             if mode == dr.ADMode.Primal:
-                L, valid = primal(walk, sampler, dr.detach(ray), active)
+                L, valid = primal(walk, sampler, CameraStart(dr.detach(ray)), active)
                 return L, valid, [], None
             self._check(walk)
             lost = LostPaths()
             if mode == dr.ADMode.Forward:
-                tangent, valid, moves = forward(walk, sampler, ray, active, lost)
+                tangent, valid, moves = forward(walk, sampler, CameraStart(ray), active, lost)
                 if moves:
                     self._tell_edges(walk)
                     self.lost.append((lost, dr.width(ray)))
@@ -108,14 +109,14 @@ def _make_class() -> type:
                 driver = "replay"
             moves = False
             if walk.media is not None and self.volume_gradient == "listing":
-                listing(walk, sampler, ray, δL, active)
+                listing(walk, sampler, CameraStart(ray), δL, active, lost)
             elif driver == "sweep":
                 if walk.baseline is not None and self.baseline is not None and self.of_pass is not None:
                     self.learner = self.baseline[1]
                     self.known.add(self._pass_key())
-                moves = sweep(walk, sampler, ray, δL, active, lost, self.learner)
+                moves = sweep(walk, sampler, CameraStart(ray), δL, active, lost, self.learner)
             else:
-                moves = replay(replace(walk, baseline=None), sampler, ray, δL, active, lost, self.recovery)
+                moves = replay(replace(walk, baseline=None), sampler, CameraStart(ray), δL, active, lost, self.recovery)
             if moves:
                 self._tell_edges(walk)
             if moves or walk.media is not None:

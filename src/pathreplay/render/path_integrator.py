@@ -142,7 +142,7 @@ def path_integrator() -> type:
             return Walk(
                 scene=scene,
                 traits=scene_traits(nodes, scene, media is not None, self.tables),
-                media=media,
+                media=media,  # type: ignore[arg-type]
                 attach=self.attach,
                 hide_emitters=self.hide_emitters,
                 max_depth=self.max_depth,

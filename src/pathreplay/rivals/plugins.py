@@ -12,9 +12,11 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
+from ..gradient.adjoint import LostPaths
 from ..gradient.primal import primal
 from ..render.path_integrator import path_integrator
 from ..render.properties import choice, flag
+from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 from .radiative import radiative
 from .tape import tape_backward, tape_forward
@@ -37,13 +39,13 @@ def _make_classes() -> tuple[type, type]:
                 return mi.Spectrum(0), mi.Bool(True), [], None
             walk = self._walk(scene, mode != dr.ADMode.Primal)
             if mode == dr.ADMode.Primal:
-                return *primal(walk, sampler, dr.detach(ray), active), [], None
+                return *primal(walk, sampler, CameraStart(dr.detach(ray)), active), [], None
             if mode == dr.ADMode.Forward:
-                return *self.tangent(walk, sampler, ray, active), [], None
-            self.propagate(walk, sampler, ray, δL, active)
+                return *self.tangent(walk, sampler, CameraStart(ray), active), [], None
+            self.propagate(walk, sampler, CameraStart(ray), δL, active)
             return mi.Spectrum(0), mi.Bool(True), [], None
 
-        def tangent(self, walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
+        def tangent(self, walk: Walk, sampler: Any, start: CameraStart, active: Any) -> tuple[Any, Any]:
             """Tangent of the radiance (Spectrum) and whether anything was met (Bool), per ray."""
             raise PathreplayError(f"{self.name} has no forward mode: use the integrator 'pathreplay'")
 
@@ -60,13 +62,13 @@ def _make_classes() -> tuple[type, type]:
             super().__init__(props)
             self.attach = choice(props, self.name, "attach", "delta", ATTACH)
 
-        def propagate(self, walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
+        def propagate(self, walk: Walk, sampler: Any, start: CameraStart, δL: Any, active: Any) -> None:
             """Back-propagate ``δL``: see `tape_backward`."""
-            tape_backward(walk, sampler, ray, δL, active)
+            tape_backward(walk, sampler, start, δL, active, LostPaths())
 
-        def tangent(self, walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
+        def tangent(self, walk: Walk, sampler: Any, start: CameraStart, active: Any) -> tuple[Any, Any]:
             """Tangent of the radiance: see `tape_forward`."""
-            return tape_forward(walk, sampler, ray, active)
+            return tape_forward(walk, sampler, start, active, LostPaths())[:2]
 
     class RadiativeIntegrator(Rival):
         """Radiative backpropagation: for comparison only, since time grows with the square of the depth.
@@ -81,9 +83,9 @@ def _make_classes() -> tuple[type, type]:
             super().__init__(props)
             self.linear = flag(props, self.name, "linear", False)
 
-        def propagate(self, walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
+        def propagate(self, walk: Walk, sampler: Any, start: CameraStart, δL: Any, active: Any) -> None:
             """Back-propagate ``δL``: see `radiative`."""
-            radiative(walk, sampler, ray, δL, active, self.linear)
+            radiative(walk, sampler, start, δL, active, LostPaths(), self.linear)
 
     return TapeIntegrator, RadiativeIntegrator
 
