@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from .supergrid import Bounds
 
 #: The residual collisions come this much denser than the largest residual density. Twice as many halve the exponent of
-#: the variance; four times as many cost more time than they save noise (benchmarks/gridmedium.py).
+#: the variance; four times as many cost more time than they save noise (`pathreplay bench gridmedium`).
 DENSER = 2.0
 #: Largest relative variance that crossing one cell adds to the transmittance of a ray that meets nothing in it. A ray
 #: meets 10 to 50 cells; with the mean as control density, whatever the risk, dense grids with edges have wild outliers.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .job import Job, Record
-from .tables import comparison, groups, markdown, method_cell
+from ..measures.job import Job, Record
+from ..tables import comparison, groups, markdown, method_cell
 
 TITLE = "surface"
 TAKES = (12, 40)  # seconds on two quiet cores: quick, full

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import time
 from typing import Any
 
 import drjit as dr
@@ -18,10 +16,11 @@ from pathreplay.inverse.passes import Passes
 from pathreplay.inverse.problem import Problem, Variable, View
 from pathreplay.scenes.parameters import get_array
 
-from .iteration import OWN
-from .job import METHODS, Job
-from .passes import spreads
-from .scenes import SCENES
+from ..scenes import SCENES
+from .job import Job
+from .methods import METHODS, OWN, parts
+from .scene import stopwatch
+from .spread import spreads
 
 # Where steps begin. Textures are grey, so that some texels are too bright and some too dark, as in most problems: with
 # one set of paths for image and gradient the variance depends on that. Densities are half of what they should be.
@@ -79,24 +78,23 @@ class Step:
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
         """Seconds of a step, and the gradient that it took."""
-        name, loop = method.split(", ")
+        name, loop = parts(method)
         if method not in self.runs:
-            depths = {"max_depth": self.job.max_depth, "rr_depth": self.job.rr_depth}
-            self.runs[method] = Run(Passes(self.problem, mi.load_dict(METHODS[name] | depths)), Watched(lr=RATE), [])
+            integrator = mi.load_dict(METHODS[name] | self.job.limits)
+            self.runs[method] = Run(Passes(self.problem, integrator), Watched(lr=RATE), [])
         run = self.runs[method]
         run.adam[self.key] = type(self.start)(self.start)
         if loop != OWN:
             self.params.update(run.adam)
-        gc.collect()
-        dr.sync_thread()
-        begin = time.perf_counter()
-        if loop == OWN:
-            take_step(self.problem, self.config, run, len(run.history))
-        else:
-            self._usual(run, seed)
-        dr.eval(run.adam[self.key])
-        dr.sync_thread()
-        seconds = time.perf_counter() - begin
+
+        def step() -> Any:
+            if loop == OWN:
+                take_step(self.problem, self.config, run, len(run.history))
+            else:
+                self._usual(run, seed)
+            return run.adam[self.key]
+
+        seconds, _ = stopwatch(step)
         return seconds, np.ravel(np.array(run.adam.seen[self.key]))
 
     def _usual(self, run: Run, seed: int) -> None:

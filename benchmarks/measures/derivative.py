@@ -15,9 +15,10 @@ from pathreplay.check.objective import Mode, Objective, alone
 from pathreplay.check.reference import reference_integrator
 from pathreplay.scenes.parameters import get_array
 
-from .job import METHODS, Job
-from .truth import CELLS, STEPS, Cell
-from .truth_scenes import TRUTH_SCENES
+from ..scenes.truth import TRUTH_SCENES
+from ..tasks.truth import CELLS, STEPS, Cell
+from .job import Job
+from .methods import METHODS
 
 # Of random numbers: the picture of a gradient, its derivative, the reference, the weights.
 PICTURE, DERIVATIVE, REFERENCE, SCALE = range(4)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from . import records
 from .drafts import ROOT
-from .job import Record
+from .measures.job import Record
 from .summaries import SUMMARIES
 from .tables import brief_footnote, footnote
 

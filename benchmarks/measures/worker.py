@@ -1,11 +1,12 @@
 """Runs one job in this process and writes what happens to stdout, one JSON object a line.
 
-Started by `runner.py` as `python -m benchmarks.worker JOB`. A method that raises is reported and left out of the
-following rounds; one that kills the process is known by the line that said it was about to run.
+Started by `runner.py` as `python -m benchmarks.measures.worker JOB`. A method that raises is reported and left out of
+the following rounds; one that kills the process is known by the line that said it was about to run.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import platform
@@ -14,13 +15,27 @@ import sys
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 import numpy as np
 
 from pathreplay import __version__, backend
 
-from .job import Job, Machine
+from .job import Job, Kind, Machine, Measure
+
+#: Module beside this one, and class.
+MEASURES: dict[Kind, tuple[str, str]] = {
+    "gradient": ("passes", "Pass"),
+    "image": ("passes", "Pass"),
+    "events": ("passes", "Pass"),
+    "truth": ("derivative", "Derivative"),
+    "noise": ("replay_error", "ReplayError"),
+    "step": ("step", "Step"),
+    "cold start": ("start", "Start"),
+    "warm start": ("start", "Start"),
+    "flight": ("grids", "Flight"),
+    "transmittance": ("grids", "Transmittance"),
+}
 
 #: What a process may allocate: a method whose memory grows without bound dies of it before the machine swaps.
 MEMORY_LIMIT_GIB = 8
@@ -70,6 +85,9 @@ def _machine(variant: str) -> Machine:
 
 def peak_mib() -> float:
     """Largest resident size that this process has had, MiB."""
+    status = Path("/proc/self/status")
+    if status.exists():  # what the system calls ru_maxrss counts the size of the process that started this one, too
+        return int(status.read_text().split("VmHWM:")[1].split()[0]) / 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # KiB; bytes on macOS
     return peak / (1024 if sys.platform != "darwin" else 1024**2)
 
@@ -91,40 +109,10 @@ def limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (wanted if hard < 0 else min(wanted, hard), hard))
 
 
-class Measure(Protocol):
-    """What a job is measured with, made from the job."""
-
-    def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
-        """Seconds of one pass and what came of it, as one flat array; raises what the method raises."""
-
-    def forget(self) -> None:
-        """Begin anew: the methods have learned nothing."""
-
-    def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """By method: fields of `Point` that follow from the arrays of all rounds together."""
-
-
 def _measure(job: Job) -> Measure:
-    """Modules that load mitsuba are imported here, once there is a variant."""
-    if job.measure == "truth":
-        from .truth_pass import Derivative
-
-        return Derivative(job)
-    if job.measure == "noise":
-        from .noise_pass import ReplayError
-
-        return ReplayError(job)
-    if job.measure == "step":
-        from .iteration_pass import Step
-
-        return Step(job)
-    if job.measure in ("cold start", "warm start"):
-        from .startup_pass import Start
-
-        return Start(job)
-    from .passes import Pass
-
-    return Pass(job)
+    """Its module, which loads mitsuba, is imported here, once there is a variant."""
+    module, name = MEASURES[job.measure]
+    return getattr(importlib.import_module(f".{module}", __package__), name)(job)
 
 
 def run(job: Job) -> None:
@@ -165,5 +153,4 @@ def run(job: Job) -> None:
 
 if __name__ == "__main__":
     _PIPE = _take_stdout()
-    arguments = json.loads(sys.argv[1])
-    run(Job(**arguments | {name: tuple(arguments[name]) for name in ("parameters", "methods")}))
+    run(Job.decode(sys.argv[1]))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from ..measures.estimates import growth
+from ..measures.job import Job, Record
+from ..scenes.media import DENSITY
+from ..tables import markdown
 from .depth import PATIENCE_S, alive, fastest, memory_cell, memory_growth, seconds_cell
-from .estimates import growth
-from .job import Job, Record
-from .media_scenes import DENSITY
-from .tables import markdown
 
 TITLE = "events"
 TAKES = (12, 140)

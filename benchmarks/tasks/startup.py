@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import statistics as st
 
-from .job import Job, Record
-from .tables import groups, markdown
+from ..measures.job import Job, Record
+from ..measures.methods import STAGES
+from ..tables import groups, markdown
 
 TITLE = "startup"
 TAKES = (15, 20)
-STAGES = ("import", "first gradient", "second gradient")
 METHODS = ("prb", "sweep")
 
 

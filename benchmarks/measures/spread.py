@@ -10,6 +10,15 @@ import numpy as np
 DIRECTIONS = 16  # random, but the same for all methods
 
 
+def spreads(
+    kept: dict[str, list[np.ndarray]], reference: str | None, grid: tuple[int, ...]
+) -> dict[str, dict[str, Any]]:
+    """`spread` of every method with at least two rows, all of them finite."""
+    others = kept.get(reference or "")
+    fit = {name: rows for name, rows in kept.items() if len(rows) > 1 and np.isfinite(rows).all()}
+    return {name: spread(rows, others, grid) for name, rows in fit.items()}
+
+
 def spread(rows: Sequence[np.ndarray], reference: Sequence[np.ndarray] | None, grid: tuple[int, ...]) -> dict[str, Any]:
     """Values by the names that `Point` has for them; ``rows`` are flat gradients, one a seed, as are the lists' values.
 

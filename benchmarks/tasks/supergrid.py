@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from .estimates import unpaired_ratio
-from .job import Job, Kind, Point, Record
-from .media_scenes import DENSITY
-from .tables import markdown, median_seconds, pooled
+from ..measures.estimates import unpaired_ratio
+from ..measures.job import Job, Kind, Point, Record
+from ..scenes.media import DENSITY
+from ..tables import markdown, median_seconds, pooled
 
 TITLE = "supergrid"
 TAKES = (20, 165)

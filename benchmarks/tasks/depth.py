@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from .estimates import growth
-from .job import Job, Point, Record
-from .media_scenes import DENSITY
-from .tables import markdown
+from ..measures.estimates import growth
+from ..measures.job import Job, Point, Record
+from ..scenes.media import DENSITY
+from ..tables import markdown
 
 TITLE = "depth"
 TAKES = (25, 220)

@@ -7,53 +7,49 @@ import os
 import subprocess
 import sys
 import tempfile
-from dataclasses import asdict
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from .drafts import ROOT
-from .job import METHODS, STOCK, Job
-from .startup import STAGES
+from ..drafts import ROOT
+from .job import Job, Measure
+from .methods import STAGES, STOCK, parts
 
 
-class Start:
+class Start(Measure):
     """Each method and seed has one process, which is started by the call that asks for its first stage."""
 
     def __init__(self, job: Job) -> None:
         self.job = job
-        # Of a warm start: filled in the rounds that are not kept.
-        self.homes = {name: tempfile.TemporaryDirectory() for name in ("ours", "theirs")}
+        # Of a warm start, ours and theirs: filled in the rounds that are not kept.
+        self.kept = tempfile.TemporaryDirectory()
+        self.homes = [tempfile.mkdtemp(dir=self.kept.name) for _ in range(2)]
         self.stages: dict[tuple[str, int], list[float]] = {}
-
-    def forget(self) -> None:
-        """Nothing is learned but the kernels."""
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
         """Seconds of one stage."""
-        name, stage = method.split(", ")
+        name, stage = parts(method)
         if (name, seed) not in self.stages:
-            whose = "theirs" if name in STOCK else "ours"
             if self.job.measure == "warm start":
-                self.stages[name, seed] = self._start(name, whose, self.homes[whose].name)
+                self.stages[name, seed] = self._start(name, self.homes[name in STOCK])
             else:
                 with tempfile.TemporaryDirectory() as home:
-                    self.stages[name, seed] = self._start(name, whose, home)
+                    self.stages[name, seed] = self._start(name, home)
         seconds = self.stages[name, seed][STAGES.index(stage)]
         return seconds, np.array([seconds])
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """Nothing follows but the seconds themselves."""
-        for home in self.homes.values():
-            home.cleanup()
+        self.kept.cleanup()
         return {}
 
-    def _start(self, name: str, whose: str, home: str) -> list[float]:
-        arguments = [json.dumps(asdict(self.job)), json.dumps(METHODS[name]), whose]
-        environment = os.environ | {"HOME": home, "DRJIT_CACHE_DIR": home, "PYTHONPATH": str(ROOT)}
-        if whose == "ours":
+    def _start(self, name: str, home: str) -> list[float]:
+        paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = os.environ | {"HOME": home, "DRJIT_CACHE_DIR": home, "PYTHONPATH": os.pathsep.join(paths)}
+        if name not in STOCK:
             environment.pop("DRJIT_LIBLLVM_PATH", None)  # finding it is part of the import
-        command = [sys.executable, "-m", "benchmarks.first", *arguments]
+        command = [sys.executable, "-m", "benchmarks.measures.first", replace(self.job, methods=(name,)).encode()]
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         if done.returncode != 0:
             lines = done.stderr.strip().splitlines()

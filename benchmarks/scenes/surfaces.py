@@ -1,26 +1,19 @@
-"""The scenes that are measured: all made here or by Mitsuba, nothing is read from a file."""
+"""The scenes of surfaces that are measured: Cornell boxes, a sealed box, and metal balls under an environment."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from .media_scenes import MEDIA_SCENES
-
-SceneDict = dict[str, Any]
+from .parts import SceneDict, sensor
 
 
 def _texture(size: int, low: float, high: float) -> SceneDict:
     """Random texels between ``low`` and ``high``: no two alike, so that nothing averages out by symmetry."""
     texels = np.random.default_rng(0).uniform(low, high, (size, size, 3)).astype(np.float32)
     return {"type": "bitmap", "data": mi.TensorXf(texels), "raw": True}
-
-
-def _film(resolution: int) -> SceneDict:
-    return {"type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}}
 
 
 def cornell_box(resolution: int) -> SceneDict:
@@ -46,12 +39,7 @@ def glossy_environment(resolution: int) -> SceneDict:
     floor = {"type": "principled", "base_color": _texture(64, 0.1, 0.9), "roughness": 0.3, "specular": 0.6}
     scene: SceneDict = {
         "type": "scene",
-        "sensor": {
-            "type": "perspective",
-            "fov": 40,
-            "to_world": T().look_at(origin=[0, -4.5, 2.2], target=[0, 0, 0.4], up=[0, 0, 1]),
-            "film": _film(resolution),
-        },
+        "sensor": sensor(resolution, [0, -4.5, 2.2], [0, 0, 0.4], fov=40),
         "floor": {"type": "rectangle", "to_world": T().scale(3), "bsdf": floor},
         "environment": {"type": "envmap", "bitmap": mi.Bitmap(_sky()), "to_world": T().rotate([1, 0, 0], 90)},
     }
@@ -84,12 +72,7 @@ def closed_box(resolution: int) -> SceneDict:
     white = {"type": "diffuse", "reflectance": _texture(16, 0.999, 0.9991)}
     return {
         "type": "scene",
-        "sensor": {
-            "type": "perspective",
-            "fov": 60,
-            "to_world": T().look_at(origin=[0, -0.9, 0], target=[0, 1, 0], up=[0, 0, 1]),
-            "film": _film(resolution),
-        },
+        "sensor": sensor(resolution, [0, -0.9, 0], [0, 1, 0], fov=60),
         "box": {"type": "cube", "flip_normals": True, "bsdf": white},
         "ball": {
             "type": "sphere",
@@ -120,12 +103,11 @@ def _boxed(make: Callable[[int], SceneDict]) -> Callable[[int], SceneDict]:
     return boxed
 
 
-SCENES: dict[str, Callable[[int], SceneDict]] = {
+SURFACE_SCENES: dict[str, Callable[[int], SceneDict]] = {
     "cornell-box": cornell_box,
     "cornell-box, box filter": _boxed(cornell_box),
     "glossy-environment": glossy_environment,
     "glass-and-diffuse": glass_and_diffuse,
     "glass-and-diffuse, box filter": _boxed(glass_and_diffuse),
     "closed-box": closed_box,
-} | MEDIA_SCENES
-"""Scene by name: resolution -> dictionary for mi.load_dict (with optimize=False, to keep the keys)."""
+}

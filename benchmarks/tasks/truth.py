@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from .job import Job, Point, Record
-from .tables import groups, markdown
+from ..measures.job import Job, Point, Record
+from ..tables import groups, markdown
 
 TITLE = "truth"
 TAKES = (18, 290)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from .job import Job, Record
-from .media_scenes import DENSITY
+from ..measures.job import Job, Record
+from ..measures.methods import OWN, USUAL
+from ..scenes.media import DENSITY
+from ..tables import comparison, groups, markdown, method_cell
 from .surface import BACK_WALL, FLOOR
-from .tables import comparison, groups, markdown, method_cell
 
 TITLE = "iteration"
 TAKES = (12, 165)
 
-USUAL, OWN = "usual loop", "own loop"
 SURFACE = (f"prb, {USUAL}", f"prb, {OWN}", f"sweep, {USUAL}", f"sweep, {OWN}")
 MEDIA = (f"prbvolpath, {USUAL}", f"score, {USUAL}", f"score, {OWN}")
 

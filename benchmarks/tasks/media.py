@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from .estimates import bias_share, efficiency, time_ratio, variance_ratio
-from .job import Job, Point, Record
-from .media_scenes import ALBEDO, ASYMMETRY, DENSITY, EXTINCTION
-from .tables import groups, markdown, median_seconds, method_cell
+from ..measures.estimates import Versus, bias_share, mean_ratio
+from ..measures.job import Job, Point, Record
+from ..scenes.media import ALBEDO, ASYMMETRY, DENSITY, EXTINCTION
+from ..tables import groups, markdown, median_seconds, method_cell
 
 TITLE = "media"
 TAKES = (18, 460)
@@ -76,16 +76,11 @@ def _cells(point: Point, rival: Point | None) -> list[str]:
         cells += [""] * 4
     elif rival is point:
         cells += ["1", "1", "1" if point.smooth_errors else "", "1"]
-    elif not (point.squared_errors and rival.squared_errors):
-        cells += [str(time_ratio(point.seconds, rival.seconds)), "", "", ""]
     else:
-        times, errors = (point.seconds, rival.seconds), (point.squared_errors, rival.squared_errors)
-        smooth = point.smooth_errors and rival.smooth_errors
-        cells += [
-            str(time_ratio(*times)),
-            str(variance_ratio(*errors)),
-            str(variance_ratio(point.smooth_errors, rival.smooth_errors)) if smooth else "",
-            str(efficiency(times, errors)),
-        ]
+        cells.append(str((versus := Versus(point, rival)).time()))
+        smooth = bool(point.smooth_errors and rival.smooth_errors)
+        along = str(mean_ratio(point.smooth_errors, rival.smooth_errors)) if smooth else ""
+        finite = point.squared_errors and rival.squared_errors
+        cells += [str(versus.variance()), along, str(versus.efficiency())] if finite else [""] * 3
     told = point.bias_products and point.method != REFERENCE
     return [*cells, str(bias_share(point.bias_products, point.squared_errors)) if told else ""]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .job import Job, Point, Record
-from .tables import comparison, groups, markdown, method_cell
+from ..measures.job import Job, Point, Record
+from ..tables import comparison, groups, markdown, method_cell
 
 TITLE = "attached"
 TAKES = (12, 75)

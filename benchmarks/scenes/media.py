@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-SceneDict = dict[str, Any]
+from .parts import SceneDict, sensor
 
 #: Keys of what is differentiated.
 DENSITY = "cloud.interior_medium.sigma_t.data"
@@ -79,15 +79,6 @@ def _body(medium: SceneDict, **more: Any) -> SceneDict:
     return {"type": "cube", "bsdf": {"type": "null"}, "interior": medium} | more
 
 
-def _sensor(resolution: int, origin: list[float], target: list[float], fov: float) -> SceneDict:
-    return {
-        "type": "perspective",
-        "fov": fov,
-        "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=target, up=[0, 0, 1]),
-        "film": {"type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}},
-    }
-
-
 def _sun_and_sky() -> SceneDict:
     """A dim sky of radiance 0.1 to 0.25 and a sun of 5 degrees and 1000: it gives three quarters of the light."""
     v, u = np.mgrid[0:128, 0:256].astype(np.float32)
@@ -102,7 +93,7 @@ def _sun_and_sky() -> SceneDict:
 def _outdoors(medium: Callable[[], SceneDict], resolution: int) -> SceneDict:
     return {
         "type": "scene",
-        "sensor": _sensor(resolution, [0.6, -4.5, 1.2], [0, 0, 0], fov=32),
+        "sensor": sensor(resolution, [0.6, -4.5, 1.2], [0, 0, 0], fov=32),
         "cloud": _body(medium()),
         "environment": _sun_and_sky(),
     }
@@ -138,7 +129,7 @@ def room_with_cloud(resolution: int) -> SceneDict:
     grey = [0.7, 0.7, 0.7]
     return {
         "type": "scene",
-        "sensor": _sensor(resolution, [0, -6, 0.4], [0, 0, 0], fov=36),
+        "sensor": sensor(resolution, [0, -6, 0.4], [0, 0, 0], fov=36),
         "cloud": _body(_cloud()),
         "floor": wall(T().translate([0, 0, -1.3]).scale(1.7), grey),
         "back": wall(T().translate([0, 1.7, 0]).rotate([1, 0, 0], 90).scale(1.7), grey),
@@ -164,7 +155,7 @@ def sealed_fog(resolution: int) -> SceneDict:
     white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.999}}
     return {
         "type": "scene",
-        "sensor": _sensor(resolution, [0, -0.95, 0], [0, 1, 0], fov=60),
+        "sensor": sensor(resolution, [0, -0.95, 0], [0, 1, 0], fov=60),
         "cloud": _body(fog, to_world=place),
         "room": {"type": "cube", "flip_normals": True, "bsdf": white},
         "lamp": {
@@ -213,4 +204,3 @@ MEDIA_SCENES: dict[str, Callable[[int], SceneDict]] = {
     "uniform, supergrid": partial(_outdoors, partial(_uniform, True)),
     "uniform, auto": partial(_outdoors, partial(_uniform, "auto")),
 }
-"""Scene by name: resolution -> dictionary for mi.load_dict (with optimize=False, to keep the keys)."""

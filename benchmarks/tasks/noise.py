@@ -11,25 +11,17 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+from scipy.stats import gmean
 
-from .estimates import time_ratio
-from .job import Job, Point, Record
-from .tables import groups, markdown
+from ..measures.estimates import Versus
+from ..measures.job import Job, Point, Record
+from ..measures.replay_error import KINDS, NOISES, RECOVERIES, SWEEP
+from ..tables import groups, markdown
 
 TITLE = "noise"
 TAKES = (7, 130)
 KEY = "low.vertex_positions"
-SWEEP = "sweep"
 
-NOISES = (0.1, 0.01, 0.001)
-#: Where the noise is put, and whether the books are kept in float64, by the name that the table gives them.
-KINDS = {
-    "everywhere, float32": ("everywhere", False),
-    "everywhere, float64": ("everywhere", True),
-    "directions, float64": ("directions", True),
-}
-#: Arguments of `Recovery` by method.
-RECOVERIES = {f"{kind}, {noise:g}": (noise, *how) for kind, how in KINDS.items() for noise in (*NOISES, 0)}
 NOISY = tuple(name for name, (noise, *_) in RECOVERIES.items() if noise)
 QUIET = tuple(name for name, (noise, *_) in RECOVERIES.items() if not noise and name.startswith("directions"))
 QUIET += ("everywhere, float32, 0",)
@@ -73,14 +65,9 @@ def table(record: Record) -> str:
             points = [found.get(f"{kind}, {level:g}") for level in levels]
             if any(points):
                 cells = [kind, *map(_error, points), _error(sweep), _slowness(points, sweep)]
-                rows.append([str(scene), str(int(str(depth)) - 1), *cells])
+                rows.append([scene, str(depth - 1), *cells])
     header = ["scene", "bounces", "noise is put", *(f"{level:g}" for level in levels), "Monte Carlo", "time / sweep"]
     return markdown(header, rows)
-
-
-def geometric_mean(point: Point) -> float:
-    """Of the errors of all seeds, which differ by factors."""
-    return float(np.exp(np.mean(np.log(point.values))))
 
 
 def _error(point: Point | None) -> str:
@@ -89,12 +76,12 @@ def _error(point: Point | None) -> str:
     if point.error:
         return point.error
     finite = np.isfinite(point.values).all() and len(point.values) > 0
-    return f"{geometric_mean(point):.1e}" if finite else "not finite"
+    return f"{gmean(point.values):.1e}" if finite else "not finite"
 
 
 def _slowness(points: Iterable[Point | None], sweep: Point | None) -> str:
     """Of the slowest level."""
     if sweep is None or sweep.error:
         return ""
-    ratios = [time_ratio(point.seconds, sweep.seconds).value for point in points if point and not point.error]
+    ratios = [Versus(point, sweep).time().value for point in points if point and not point.error]
     return f"{max(ratios):.1f}" if ratios else ""

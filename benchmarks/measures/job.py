@@ -2,35 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+import json
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, Protocol
 
-#: Integrators by the name that the tables give them. One that does not load is a row that says so.
-METHODS: dict[str, dict[str, Any]] = {
-    "prb": {"type": "prb"},
-    "prb_basic": {"type": "prb_basic"},
-    "tape": {"type": "pathreplay_tape"},
-    "rb": {"type": "pathreplay_rb"},
-    "rb linear": {"type": "pathreplay_rb", "linear": True},
-    "sweep": {"type": "pathreplay", "driver": "sweep"},
-    "replay": {"type": "pathreplay", "driver": "replay"},
-    "volpath": {"type": "volpath"},
-    "prbvolpath": {"type": "prbvolpath"},
-    "score": {"type": "pathreplay"},
-    "no branch": {"type": "pathreplay", "branch": False},
-    "listing": {"type": "pathreplay_listing"},
-}
+import numpy as np
 
-#: Mitsuba's own: what ours is compared with, and not held to anything when two records are compared.
-STOCK = ("prb", "prb_basic", "prbvolpath", "volpath", "finite differences", "half steps")
-
-# What a pass is, and by that which module runs it: see `worker.MEASURES`.
-Kind = Literal["gradient", "image", "events", "truth", "noise", "step", "cold start", "warm start"]
+#: What a pass is, and by that what runs it: see `worker.MEASURES`.
+Kind = Literal[
+    "gradient",  # a backward pass
+    "image",  # a primal one, with the noise of the image
+    "events",  # a primal one: the mean number of real events a path
+    "truth",  # a derivative, to hold against finite differences
+    "noise",  # the error of a replay
+    "step",  # an optimisation step
+    "cold start",  # the start of a process, without cached kernels
+    "warm start",  # and with them
+    "flight",  # way to the first real collision in a grid
+    "transmittance",  # and through it, with its squared error
+]
 
 
 @dataclass(frozen=True)
 class Job:
-    """Gradient passes of some methods on one scene, in turn (A B C A B C ...), in one process.
+    """Passes of some methods on one scene, in turn (A B C A B C ...), in one process: all that a worker is told.
+
+    Scenes are named in `benchmarks.scenes`, methods in `methods.py` or where the measure is; a name is all there is.
 
     Round k of every method has the seed k. ``warm_up`` rounds before the first compile the kernels and are not kept;
     after them all integrators are made anew, and again every ``restart`` rounds: what a method learns from its passes
@@ -49,10 +46,8 @@ class Job:
     restart: int = 0  # make all integrators anew every so many rounds; 0 = never
     threads: int = 0  # 0 = all processors
     patience: float = 0  # seconds after which a method sits out the rounds that are left; 0 = endless
-    # A gradient pass, a primal one with the noise of the image, the mean number of real events a path, a derivative
-    # to hold against finite differences, the error of a replay, an optimisation step, or the start of a process.
     measure: Kind = "gradient"
-    # Adjoint image: one everywhere, or a smooth wave (both over the number of entries).
+    # Of gradient passes. Adjoint image: one everywhere, or a smooth wave (both over the number of entries).
     weights: Literal["even", "wave"] = "even"
     # Announce new parameters before each pass, as an optimiser does: majorants are then made anew; this is timed.
     update: bool = False
@@ -60,8 +55,35 @@ class Job:
 
     @property
     def passes(self) -> int:
-        """Gradient passes in all, for the progress bar."""
+        """Passes in all, for the progress bar."""
         return (self.rounds + self.warm_up) * len(self.methods)
+
+    @property
+    def limits(self) -> dict[str, int]:
+        """What every integrator is given."""
+        return {"max_depth": self.max_depth, "rr_depth": self.rr_depth}
+
+    def encode(self) -> str:
+        """The job as one argument of a command; `decode` reads it."""
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def decode(text: str) -> Job:
+        """The job that was encoded."""
+        return Job(**{name: tuple(fact) if isinstance(fact, list) else fact for name, fact in json.loads(text).items()})
+
+
+class Measure(Protocol):
+    """What runs the passes of a job, made from the job."""
+
+    def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
+        """Seconds of one pass and what came of it, as one flat array; raises what the method raises."""
+
+    def forget(self) -> None:
+        """Begin anew: what the methods have learned is gone. Nothing is to be done where they do not learn."""
+
+    def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
+        """By method: fields of `Point` that follow from the arrays of all rounds together."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +96,7 @@ class Point:
     max_depth: int
     paths: int  # resolution² · spp
     seeds: tuple[int, ...]
-    seconds: tuple[float, ...]  # of each gradient pass
+    seconds: tuple[float, ...]  # of each pass
     # Of each seed, over the entries of all gradients: mean of (gradient - mean over seeds)² · n / (n - 1). Their mean
     # is the sample variance. Empty if a gradient was not finite.
     squared_errors: tuple[float, ...]
@@ -89,7 +111,7 @@ class Point:
     measure: Kind = "gradient"
     mean: float | None = None  # of what was measured, over entries and seeds
     values: tuple[float, ...] = ()  # of each seed, where what was measured is one number
-    z: float | None = None  # of task `truth`: the difference from the reference, in standard errors
+    z: float | None = None  # the difference from a reference, in standard errors, where there is one
     verdict: str | None = None  # of task `truth`: see pathreplay.check.verdict
 
 
