@@ -98,6 +98,7 @@ def replay_attached(
         if dr.hint(dr.grad_enabled(ray.o, ray.d), mode="scalar"):
             x = RayFrame.of(dr.detach(ray), scale).coordinates(ray.o, ray.d)
             q0 = mi.Vector4f(q)
+            dr.eval(q0, overflow)  # as in the sweep
             backward(sum(q0[k] * x[k] for k in range(4)))
 
     # --------- Second pass: peel L and q, feed the parameters --------

@@ -120,5 +120,6 @@ def sweep(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostP
 
     with dr.resume_grad():
         if dr.hint(attached and dr.grad_enabled(ray.o, ray.d), mode="scalar"):
+            dr.eval(q)  # every parameter of the camera sums over it apart, which would run the loops as often
             backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
     return attached
