@@ -193,9 +193,9 @@ def test_a_chain_of_sixteen_delta_lobes_agrees_with_the_sweep(key: str) -> None:
     ("scene", "depth", "recovery"),
     [
         (lambda: panes(2), 6, OtherRecovery(noise=0.2, place="everywhere")),
-        (lambda: valley(DIFFUSE), 3, OtherRecovery(noise=0.5, place="smooth")),
+        pytest.param(lambda: valley(DIFFUSE), 3, OtherRecovery(noise=0.5, place="smooth"), marks=pytest.mark.slow),
         (lambda: valley(DIFFUSE), 4, Recovery(noise=0.5)),
-        (lambda: valley(ROUGH), 4, Recovery(noise=0.5)),
+        pytest.param(lambda: valley(ROUGH), 4, Recovery(noise=0.5), marks=pytest.mark.slow),
     ],
     ids=["glass", "diffuse-identity", "diffuse", "rough-metal"],
 )
@@ -239,6 +239,7 @@ def test_float64_books_reach_further_than_float32() -> None:
     assert by_double[False] > 10 * by_double[True]
 
 
+@pytest.mark.slow
 def test_rough_metal_sampled_attached_needs_noise_at_few_vertices() -> None:
     scene = valley(ROUGH)
     expected = gradient(scene, "sweep", 6, attach="all")

@@ -60,6 +60,6 @@ def sweep(
     with dr.resume_grad():
         o, d = start.repeat()
         if moves and dr.grad_enabled(o, d):
-            dr.eval(q)  # with the gradients in the scene: else each entry of a camera's matrix runs the kernel again
+            dr.eval(q)  # every parameter of the camera sums over it apart, which would run the loops as often
             backward(dr.dot(q.o, o) + dr.dot(q.d, d))
     return moves
