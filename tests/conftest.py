@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,11 +23,20 @@ import mitsuba as mi  # isort: skip
 VARIANT = "llvm_ad_rgb"
 #: Far above what any of these takes (a few seconds): a hanging process must not hang the tests.
 TIMEOUT_S = 120
+#: Files that take longest, begun first, so that of several processes none is left alone with one of them.
+LONGEST = ("test_truth_media", "test_motion_noise", "test_truth_attached", "test_truth_materials", "test_primal_media",
+           "test_replay_attached", "test_pixel_sweep", "test_variants")  # fmt: skip
 
 
 def pytest_configure() -> None:
     """Set the variant before test modules are imported, so that module-level `mi.<Type>` works in them."""
     set_variant(VARIANT)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files, in their order; the others follow in theirs."""
+    rank = {name: i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 
 @pytest.fixture(autouse=True)
@@ -66,22 +76,43 @@ def run_python(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]
     return run
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print what was measured: pictures, gradients, the cells that are left out, with the reason, and hostile cases."""
+Sections = dict[str, str]
+#: Of the processes that ran tests for this one.
+MEASURED: list[Sections] = []
+
+
+def measured() -> Sections:
+    """What was measured here: pictures, gradients, the cells that are left out, with the reason, and hostile cases."""
     from test_hostile import TOLD
     from test_primal_media import PRIMALS
     from test_primal_media import table as pictures
     from test_truth_materials import EXCLUSIONS
     from truth import ROWS, table
 
-    if PRIMALS:
-        terminalreporter.section("pictures against volpath, in standard errors")
-        terminalreporter.write_line(pictures())
-    if ROWS:
-        terminalreporter.section("gradients against finite differences")
-        terminalreporter.write_line(table())
-        for name, reason in EXCLUSIONS.items():
-            terminalreporter.write_line(f"left out: {name}: {reason}")
-    if TOLD:
-        terminalreporter.section("hostile cases")
-        terminalreporter.write_line("\n".join(TOLD))
+    left_out = [f"left out: {name}: {reason}" for name, reason in EXCLUSIONS.items()]
+    sections = {
+        "pictures against volpath, in standard errors": pictures() if PRIMALS else "",
+        "gradients against finite differences": "\n".join([table(), *left_out]) if ROWS else "",
+        "hostile cases": "\n".join(TOLD),
+    }
+    return {title: text for title, text in sections.items() if text}
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Hand what was measured to the process that asked for it."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["measured"] = measured()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any, error: object) -> None:
+    """Take it. A process that died has nothing to hand over."""
+    MEASURED.append(getattr(node, "workeroutput", {}).get("measured", {}))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print what was measured, of every process by itself."""
+    for sections in (measured(), *MEASURED):
+        for title, text in sections.items():
+            terminalreporter.section(title)
+            terminalreporter.write_line(text)

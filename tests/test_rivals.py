@@ -120,7 +120,9 @@ def test_the_tape_has_the_tangent_of_the_forward_driver(case: Case, bench) -> No
     assert 0 < np.abs(ours).sum() and np.abs(tape - ours).sum() < ROUNDING * np.abs(ours).sum()
 
 
-@pytest.mark.parametrize("case", [TEXTURE, FLOOR, DENSITY], ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case", [TEXTURE, FLOOR, pytest.param(DENSITY, marks=pytest.mark.slow)], ids=lambda case: case.name
+)
 def test_radiative_backpropagation_is_right_and_its_linear_variant_is_not(case: Case, bench) -> None:
     """Light that comes back from other surfaces or from the fog is not one."""
     b = bench(case)

@@ -233,7 +233,8 @@ class Fixed:
 
 
 @pytest.mark.parametrize("name, σ_t", [
-    ("grey", checkers()), ("one channel", smooth(0.2, 1.0) * np.array([2.0, 1.0, 0.5])),
+    ("grey", checkers()),
+    pytest.param("one channel", smooth(0.2, 1.0) * np.array([2.0, 1.0, 0.5]), marks=pytest.mark.slow),
 ])  # fmt: skip
 @pytest.mark.parametrize("keys", [
     pytest.param((DENSITY,), id="still"),

@@ -84,7 +84,7 @@ class Seen:
 
     def learn(self, replayed: Replayed, L: mi.Spectrum) -> None:
         """Collect the radiance ``L`` that came back along the ray of a replayed vertex; in the loop of a pass."""
-        at, flight = replayed.at, replayed.kept.flight
+        at, flight = replayed.at, replayed.kept.media.flight
         in_medium = at.medium != None  # noqa: E711 (an array of pointers)
         event = in_medium & flight.event
         reach = dr.select(at.hit.is_valid(), at.hit.t, dr.inf)

@@ -12,7 +12,7 @@ from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
 from ..gradient.pixel_sweep import PixelLoss, fits, sweepable
 from ..gradient.ray_jacobian import Recovery
-from ..gradient.sweep import MAX_DEPTH
+from ..gradient.record import MAX_DEPTH
 from ..transport.facts import SceneFacts
 from ..transport.vertex import Walk
 from .camera_pass import Pass

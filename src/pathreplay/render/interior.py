@@ -14,8 +14,10 @@ from ..gradient.forward import forward
 from ..gradient.pixel_sweep import PixelLoss, pixel_camera, pixel_sweep
 from ..gradient.primal import primal
 from ..gradient.ray_jacobian import Recovery
+from ..gradient.record import deepest
 from ..gradient.replay import replay
-from ..gradient.sweep import deepest, sweep
+from ..gradient.sweep import sweep
+from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 from .camera_pass import Pass
 from .diagnostics import Diagnostics
@@ -25,7 +27,7 @@ from .term import Found
 
 def radiance(walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
     """Radiance along camera rays, and whether anything was met: see `primal`. Nothing is differentiated."""
-    return primal(walk, sampler, dr.detach(ray), active)
+    return primal(walk, sampler, CameraStart(dr.detach(ray)), active)
 
 
 def image(view: Pass, walk: Walk) -> mi.TensorXf:
@@ -35,27 +37,30 @@ def image(view: Pass, walk: Walk) -> mi.TensorXf:
 
 
 class Interior(ABC):
-    """A term by a driver: classes below say what happens along given rays.
-
-    Rays may be attached to the camera.
-    """
+    """A term by drivers: classes below say which, and what is to be said of them."""
 
     @abstractmethod
     def tangent(
-        self, walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
+        self, walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
         """Tangent of the radiance, whether anything was met, and what is to be said."""
 
     @abstractmethod
     def propagate(
-        self, walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum, active: mi.Bool, seen: Seen | None
+        self,
+        walk: Walk,
+        sampler: mi.Sampler,
+        start: CameraStart,
+        δL: mi.Spectrum,
+        active: mi.Bool,
+        seen: Seen | None = None,
     ) -> Diagnostics:
         """Back-propagate the adjoint of the radiance; ``seen`` (or None) collects what is seen of media."""
 
     def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
         """Tangent of the image: see `Term`."""
         rays = view.rays()
-        δL, valid, diagnostics = self.tangent(walk, rays.sampler, rays.ray, mi.Bool(True))
+        δL, valid, diagnostics = self.tangent(walk, rays.sampler, CameraStart(rays.ray), mi.Bool(True))
         tangent = splat(view, rays, δL, valid)
         if diagnostics.counters:
             dr.eval(tangent)  # in one kernel with the count of lost paths
@@ -67,7 +72,7 @@ class Interior(ABC):
         """Back-propagate the adjoint of the image: see `Term`."""
         rays = view.rays()
         δL = adjoint(view, rays, grad_in)
-        diagnostics = self.propagate(walk, rays.sampler, rays.ray, δL, mi.Bool(True), seen)
+        diagnostics = self.propagate(walk, rays.sampler, CameraStart(rays.ray), δL, mi.Bool(True), seen)
         del rays, δL  # so that loops need not compute what comes out of them
         dr.eval()
         return Found(None, diagnostics, seen)
@@ -86,22 +91,28 @@ class PathReplay(Interior):
     recovery: Recovery  # of the replay driver
 
     def tangent(
-        self, walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
+        self, walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
         lost = LostPaths()
-        δL, valid, moves = forward(walk, sampler, ray, active, lost)
-        return δL, valid, Diagnostics((lost,), dr.width(ray), True) if moves else Diagnostics()
+        δL, valid, moves = forward(walk, sampler, start, active, lost)
+        return δL, valid, Diagnostics((lost,), dr.width(start.ray), True) if moves else Diagnostics()
 
     def propagate(
-        self, walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum, active: mi.Bool, seen: Seen | None
+        self,
+        walk: Walk,
+        sampler: mi.Sampler,
+        start: CameraStart,
+        δL: mi.Spectrum,
+        active: mi.Bool,
+        seen: Seen | None = None,
     ) -> Diagnostics:
         lost = LostPaths()
         if self._sweeps(walk):
-            moves = sweep(walk, sampler, ray, δL, active, lost, seen)
+            moves = sweep(walk, sampler, start, δL, active, lost, seen)
         else:
-            moves = replay(replace(walk, baseline=None), sampler, ray, δL, active, lost, self.recovery)
+            moves = replay(replace(walk, baseline=None), sampler, start, δL, active, lost, self.recovery)
         counted = moves or walk.media is not None
-        return Diagnostics((lost,), dr.width(ray), moves) if counted else Diagnostics()
+        return Diagnostics((lost,), dr.width(start.ray), moves) if counted else Diagnostics()
 
     def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
         return super().forward(view, self._informed(walk, learned), learned)

@@ -15,6 +15,7 @@ import mitsuba as mi
 from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
 from ..transport.facts import SceneFacts
+from ..transport.start import CameraStart
 from ..transport.traits import Tables
 from ..transport.vertex import Walk
 from .camera_pass import Pass, mitsuba_integrator
@@ -175,8 +176,8 @@ def path_integrator() -> type:
             if mode == dr.ADMode.Primal:
                 return *radiance(walk, sampler, ray, active), [], None
             if mode == dr.ADMode.Forward:
-                return *self.interior.tangent(walk, sampler, ray, active)[:2], [], None
-            self.interior.propagate(walk, sampler, ray, δL, active, None)
+                return *self.interior.tangent(walk, sampler, CameraStart(ray), active)[:2], [], None
+            self.interior.propagate(walk, sampler, CameraStart(ray), δL, active)
             return mi.Spectrum(0), mi.Bool(True), [], None
 
         def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
@@ -203,7 +204,7 @@ def path_integrator() -> type:
             return Walk(
                 scene=scene,
                 traits=facts.traits(self.tables),
-                media=facts.media(sensor),
+                media=facts.media(sensor),  # type: ignore[arg-type]
                 attach=self.attach,
                 hide_emitters=self.hide_emitters,
                 max_depth=self.max_depth,

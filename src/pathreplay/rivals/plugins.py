@@ -7,19 +7,22 @@ use them: `pathreplay` gives the same gradients for less.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import mitsuba as mi
 
 from ..errors import PathreplayError
 from ..gradient.adjoint import LostPaths
 from ..gradient.baseline import Seen
+from ..gradient.driver import Driver, ForwardDriver
 from ..gradient.forward import forward
-from ..gradient.listing import listing
 from ..render.diagnostics import Diagnostics
 from ..render.interior import Interior
 from ..render.path_integrator import path_integrator
 from ..render.properties import choice, flag
+from ..transport.start import CameraStart
 from ..transport.vertex import Walk
+from .listing import listing
 from .radiative import radiative
 from .tape import tape_backward, tape_forward
 
@@ -28,62 +31,33 @@ ATTACH = ("delta", "none")
 
 @dataclass(frozen=True)
 class Rival(Interior):
-    """The interior term in another way: reverse mode only, unless a class below says otherwise.
+    """The interior term in another way, of which nothing is told.
 
     Media are differentiated by the score, without a baseline, and where they are empty not at all.
     """
 
     name: str
+    backwards: Driver
+    forwards: ForwardDriver | None = None
 
     def tangent(
-        self, walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
+        self, walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
-        raise PathreplayError(f"{self.name} has no forward mode: use the integrator 'pathreplay'")
-
-
-class Tape(Rival):
-    """See `tape_backward` and `tape_forward`."""
-
-    def tangent(
-        self, walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
-    ) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
-        return *tape_forward(walk, sampler, ray, active), Diagnostics()
-
-    def propagate(
-        self, walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum, active: mi.Bool, seen: Seen | None
-    ) -> Diagnostics:
-        tape_backward(walk, sampler, ray, δL, active)
-        return Diagnostics()
-
-
-@dataclass(frozen=True)
-class Radiative(Rival):
-    """See `radiative`."""
-
-    linear: bool
-
-    def propagate(
-        self, walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum, active: mi.Bool, seen: Seen | None
-    ) -> Diagnostics:
-        radiative(walk, sampler, ray, δL, active, self.linear)
-        return Diagnostics()
-
-
-class Listing(Rival):
-    """See `listing`. It has no forward mode of its own: tangents are those of `pathreplay`."""
-
-    def tangent(
-        self, walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
-    ) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
-        δL, valid, _ = forward(walk, sampler, ray, active, LostPaths())
+        if self.forwards is None:
+            raise PathreplayError(f"{self.name} has no forward mode: use the integrator 'pathreplay'")
+        δL, valid, _ = self.forwards(walk, sampler, start, active, LostPaths())
         return δL, valid, Diagnostics()
 
     def propagate(
-        self, walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum, active: mi.Bool, seen: Seen | None
+        self,
+        walk: Walk,
+        sampler: mi.Sampler,
+        start: CameraStart,
+        δL: mi.Spectrum,
+        active: mi.Bool,
+        seen: Seen | None = None,
     ) -> Diagnostics:
-        if walk.media is None:
-            raise PathreplayError(f"{self.name} is for scenes with media: use the integrator 'pathreplay'")
-        listing(walk, sampler, ray, δL, active)
+        self.backwards(walk, sampler, start, δL, active, LostPaths())
         return Diagnostics()
 
 
@@ -98,7 +72,7 @@ def _make_classes() -> tuple[type, ...]:
         """
 
         name = "pathreplay_tape"
-        interior = Tape(name)
+        interior = Rival(name, tape_backward, tape_forward)
 
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
@@ -115,17 +89,19 @@ def _make_classes() -> tuple[type, ...]:
 
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
-            self.interior = Radiative(self.name, flag(props, self.name, "linear", False))
+            linear = flag(props, self.name, "linear", False)
+            self.interior = Rival(self.name, partial(radiative, linear=linear))
 
     class ListingIntegrator(base):  # type: ignore[misc, valid-type]
         """Delta tracking as first published: for comparison only, since it misses derivatives (see `listing`).
 
-        Properties: those of `PathIntegrator`. For scenes with media; what moves raises in reverse mode.
+        Properties: those of `PathIntegrator`. For scenes with media; what moves raises in reverse mode. Tangents are
+        those of `pathreplay`.
         """
 
         name = "pathreplay_listing"
         attach = "delta"  # so that it is noticed
-        interior = Listing(name)
+        interior = Rival(name, listing, forward)
 
     return TapeIntegrator, RadiativeIntegrator, ListingIntegrator
 
