@@ -384,7 +384,7 @@ def test_nothing_moves_when_only_a_smooth_lobe_changes() -> None:
         params.update()
         walk = plugin()._walk(scene, None)
         with dr.suspend_grad():
-            start = CameraStart(ray)
+            start = CameraStart(ray, None, mi.Bool(True))
             assert path_moves(walk, start, start.choose(walk, mi.Bool(True))) == moves, key
         dr.disable_grad(params[key])
         params.update()

@@ -17,7 +17,7 @@ from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.step import choose_step, repeat_step
-from pathreplay.transport.vertex import Numbers, Walk
+from pathreplay.transport.vertex import Arrival, Chosen, Numbers, Replayed, Walk
 
 LANES = 256
 GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
@@ -55,14 +55,20 @@ def rays(spread: float = 0.9) -> mi.Ray3f:
     return mi.Ray3f(mi.Point3f(x, y, 0.5), dr.normalize(mi.Vector3f(0.1 * y, 0.2, -1)))
 
 
-def first_step(walk: Walk, ctx: mi.BSDFContext | None = None) -> tuple[Any, Any, Any]:
+def first_step(walk: Walk, ctx: mi.BSDFContext | None = None) -> tuple[Arrival, Numbers, Chosen]:
     """An arrival, the numbers, and the step that they choose."""
     on = mi.Bool(True)
-    at, drawn = CameraStart(rays()).choose(walk, on), sampler()
+    drawn = sampler()
+    at = CameraStart(rays(), drawn, on).choose(walk, on)
     if walk.media is not None:
         at.medium = mi.MediumPtr(next(filter(None, (shape.interior_medium() for shape in walk.scene.shapes()))))
     u = Numbers.draw(drawn)
     return at, u, choose_step(walk, at, u, drawn, mi.Spectrum(1), on, on, ctx=ctx)
+
+
+def replayed(walk: Walk, at: Arrival, u: Numbers, chosen: Chosen) -> Replayed:
+    hit_next = walk.scene.ray_intersect_preliminary(chosen.ray_next)
+    return Replayed(at, u, chosen.kept, chosen.active, hit_next, mi.Float(1), mi.Spectrum(1))
 
 
 @pytest.mark.parametrize("attached", [False, True])
@@ -80,8 +86,7 @@ def test_a_repeated_step_is_the_chosen_one(world: Any, attached: bool) -> None:
     walk = walk_of(world())
     with dr.suspend_grad():
         at, u, chosen = first_step(walk)
-        hit_next = walk.scene.ray_intersect_preliminary(chosen.ray_next)
-        again = repeat_step(walk, at, u, chosen.kept, chosen.active, mi.Bool(True), attached, hit_next)
+        again = repeat_step(walk, replayed(walk, at, u, chosen), attached, mi.Bool(True))
     for name in ("e", "w"):
         assert np.allclose(getattr(again, name), getattr(chosen, name), rtol=1e-4, atol=1e-6), name
     goes_on = np.array(chosen.active)
@@ -105,7 +110,7 @@ def test_the_transport_mode_reaches_the_bsdf() -> None:
         for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
             ctx = mi.BSDFContext(mode)
             at, u, chosen = first_step(walk, ctx)
-            again = repeat_step(walk, at, u, chosen.kept, chosen.active, mi.Bool(True), ctx=ctx)
+            again = repeat_step(walk, replayed(walk, at, u, chosen), False, mi.Bool(True), ctx)
             through = np.array(chosen.ray_next.d.z) < 0
             weights[mode] = np.array(chosen.w)[:, through]
             assert np.allclose(np.array(again.w)[:, through], weights[mode], rtol=1e-4)
@@ -120,7 +125,7 @@ def test_a_lobe_can_be_asked_for(lobe: int, down: bool) -> None:
     ctx.component = lobe
     with dr.suspend_grad():
         at, u, chosen = first_step(walk, ctx)
-        again = repeat_step(walk, at, u, chosen.kept, chosen.active, mi.Bool(True), ctx=ctx)
+        again = repeat_step(walk, replayed(walk, at, u, chosen), False, mi.Bool(True), ctx)
     assert np.array_equal(np.array(chosen.ray_next.d.z) < 0, np.full(LANES, down))
     assert (np.array(chosen.signature.lobe) == lobe).all()
     assert np.allclose(again.w, chosen.w, rtol=1e-4)
@@ -131,9 +136,10 @@ def test_signatures_tell_the_edge_of_a_shape() -> None:
     walk = walk_of(scene({"type": "diffuse"}, ball=ball))
     down = mi.Ray3f(mi.Point3f(mi.Float([0, 0.39, 0.41, 5]), 0, 2), mi.Vector3f(0, 0, -1))
     with dr.suspend_grad():
-        at, drawn = CameraStart(down).choose(walk, mi.Bool(True)), mi.load_dict({"type": "independent"})
+        drawn, on = mi.load_dict({"type": "independent"}), mi.Bool(True)
         drawn.seed(0, 4)
-        step = choose_step(walk, at, Numbers.draw(drawn), drawn, mi.Spectrum(1), mi.Bool(True), mi.Bool(True))
+        at = CameraStart(down, drawn, on).choose(walk, on)
+        step = choose_step(walk, at, Numbers.draw(drawn), drawn, mi.Spectrum(1), on, on)
     shape = np.array(step.signature.shape)
     assert shape[0] == shape[1] != shape[2]
     assert list(step.signature.met) == [True, True, True, False]
@@ -147,14 +153,14 @@ def back(scene: mi.Scene, L: float, q: RayDerivative, δL: float) -> mi.Spectrum
     walk = walk_of(scene, max_depth=2)
     with dr.suspend_grad():
         ray = mi.Ray3f(rays().o, mi.Vector3f(0, 0, -1))
-        start, on = CameraStart(ray), mi.Bool(True)
-        at = start.choose(walk, on)
-        layout = Layout.of(walk, path_moves(walk, start, at))
+        start = CameraStart(ray, sampler(), mi.Bool(True))
+        path = PathState.begin(walk, start, sustained=True)
+        layout = Layout.of(walk, path_moves(walk, start, path.at))
         records = dr.alloc_local(record_type(layout), room_for(walk))
-        path, lost, first = PathState.begin(at, on, sustained=True), LostPaths(), mi.UInt32(0)
-        records, count, _, _ = first_walk(walk, sampler(), path, layout, records, first, lost)
+        lost, first = LostPaths(), mi.UInt32(0)
+        records, count, _, _ = first_walk(walk, start.sampler, path, layout, records, first, lost)
         given = mi.Spectrum(δL), mi.Spectrum(L), q
-        L, _ = walk_back(walk, layout, records, first, mi.UInt32(1), count - 1, at.ray, *given, lost)
+        L, _ = walk_back(walk, layout, records, first, mi.UInt32(1), count - 1, dr.detach(ray), *given, lost)
         dr.eval(L)
     return L
 

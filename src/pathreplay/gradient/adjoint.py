@@ -9,9 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..transport.path import PathState
 from ..transport.step import repeat_step
-from ..transport.vertex import Arrival, Chosen, Kept, Numbers, Step, Walk
+from ..transport.vertex import Arrival, Replayed, Step, Walk
 
 
 @dataclass
@@ -44,34 +43,12 @@ class LostPaths:
         dr.scatter_add(self.count, mi.UInt32(1), mi.UInt32(0), lost)
 
 
-@dataclass
-class Replayed:
-    """What a later pass knows about a vertex and its continuation."""
-
-    at: Arrival
-    u: Numbers
-    kept: Kept
-    go_on: mi.Bool  # there is a next vertex
-    hit_next: mi.PreliminaryIntersection3f  # of the next vertex
-    rr_weight: mi.Float  # 1 / survival probability
-    β: mi.Spectrum  # throughput before the vertex
-
-    @staticmethod
-    def of(path: PathState, u: Numbers, step: Chosen, onward: PathState, rr_weight: mi.Float) -> Replayed:
-        """The vertex that a walk has just left for the ``onward`` one."""
-        return Replayed(path.at, u, step.kept, onward.active, onward.at.hit, rr_weight, path.β)
-
-
 def _attached_arrival(at: Arrival) -> Arrival:
     """A copy of an arrival whose ray and density are AD variables of their own."""
     ray = mi.Ray3f(at.ray)
     ray.o, ray.d, pdf = mi.Point3f(dr.detach(ray.o)), mi.Vector3f(dr.detach(ray.d)), mi.Float(dr.detach(at.pdf))
     dr.enable_grad(ray.o, ray.d, pdf)
     return replace(at, ray=ray, pdf=pdf)
-
-
-def _step(walk: Walk, v: Replayed, at: Arrival, attached: bool, active: mi.Bool) -> Step:
-    return repeat_step(walk, at, v.u, v.kept, v.go_on, active, attached, v.hit_next)
 
 
 def backward_step(
@@ -85,7 +62,7 @@ def backward_step(
     lost = mi.Bool(False)
     with dr.resume_grad():
         at = _attached_arrival(v.at) if attached else v.at
-        step = _step(walk, v, at, attached, active)
+        step = repeat_step(walk, replace(v, at=at), attached, active)
         Li = step.e + step.w * (v.rr_weight * L)
         target = dr.sum(δL * v.β * Li)
         if attached:
@@ -109,7 +86,7 @@ def forward_step(
             dr.set_grad(at.ray.o, tangent.o)
             dr.set_grad(at.ray.d, tangent.d)
             dr.set_grad(at.pdf, tangent.pdf)
-        step = _step(walk, v, at, attached, active)
+        step = repeat_step(walk, replace(v, at=at), attached, active)
         δe, δw, δo, δd, δpdf = tangents(step.e, step.w, step.ray_next.o, step.ray_next.d, step.pdf)
     return step, δe, δw, RayDerivative(δo, δd, δpdf)
 

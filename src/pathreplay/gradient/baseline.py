@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import PathreplayError
 from ..transport.media import interaction, majorant, span
-from .adjoint import Replayed
+from ..transport.vertex import Replayed
 
 # Cells along each axis of space, and along each side of the octahedron of directions. 8³ x 4² cells of two averages
 # with four numbers each are 256 KiB, three times: what is known, its sums, and what the present pass sees. More cells

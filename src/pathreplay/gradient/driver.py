@@ -18,15 +18,7 @@ class Driver(Protocol):
     under `dr.suspend_grad`. Its docstring says what it does not differentiate.
     """
 
-    def __call__(
-        self,
-        walk: Walk,
-        sampler: mi.Sampler,
-        start: CameraStart,
-        δL: mi.Spectrum,
-        active: mi.Bool,
-        lost: LostPaths,
-    ) -> bool: ...
+    def __call__(self, walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -> bool: ...
 
 
 class ForwardDriver(Protocol):
@@ -35,6 +27,4 @@ class ForwardDriver(Protocol):
     The parameters carry their tangents already.
     """
 
-    def __call__(
-        self, walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool, lost: LostPaths
-    ) -> tuple[mi.Spectrum, mi.Bool, bool]: ...
+    def __call__(self, walk: Walk, start: CameraStart, lost: LostPaths) -> tuple[mi.Spectrum, mi.Bool, bool]: ...

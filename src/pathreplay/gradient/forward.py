@@ -9,14 +9,12 @@ from ..transport.motion import path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
-from .adjoint import LostPaths, RayDerivative, Replayed, forward_step, tangents
+from .adjoint import LostPaths, RayDerivative, forward_step, tangents
 from .branch import Branch, branch_term
 
 
 @dr.syntax
-def forward(
-    walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool, lost: LostPaths
-) -> tuple[mi.Spectrum, mi.Bool, bool]:
+def forward(walk: Walk, start: CameraStart, lost: LostPaths) -> tuple[mi.Spectrum, mi.Bool, bool]:
     """Tangent of the radiance along the rays of a ``start``: ``(δL, valid, moves)``, the first two per ray.
 
     The parameters must carry their tangents already (propagate to them before the call). Nothing is divided, so a
@@ -31,11 +29,11 @@ def forward(
     δL = mi.Spectrum(0)  # tangent of the radiance
     δβ = mi.Spectrum(0)  # tangent of the throughput
     broken = mi.Bool(False)  # a tangent was not finite
-    active = mi.Bool(active) & (walk.max_depth > 0)
-    valid = mi.Bool(walk.background_is_opaque) & active
-    at = start.choose(walk, active)
-    moves = path_moves(walk, start, at)
-    path = PathState.begin(at, active, sustained=True)
+    sampler = start.sampler
+    path = PathState.begin(walk, start, sustained=True)
+    ray0 = path.at.ray
+    valid = mi.Bool(walk.background_is_opaque) & path.active
+    moves = path_moves(walk, start, path.at)
     branch = Branch.none()
 
     while dr.hint(path.active, exclude=[walk, moves, lost], label="pathreplay: forward"):
@@ -43,19 +41,17 @@ def forward(
         valid |= path.active & step.seen
         if dr.hint(walk.branch, mode="scalar"):
             branch = branch.offer(path, step)
-        onward, rr_weight = path.advance(walk, u, step)
-
-        v = Replayed.of(path, u, step, onward, rr_weight)
+        onward, v = path.advance(walk, u, step)
         again, δe, δw, δ = forward_step(walk, v, moves, δ, path.active)
         if dr.hint(moves, mode="scalar"):
             δ, finite = δ.finite_part()
             lost.add(path.active & ~finite & ~broken)
             broken |= ~finite
         δL += δβ * dr.detach(again.e) + path.β * δe
-        δβ = (δβ * dr.detach(again.w) + path.β * δw) * rr_weight
+        δβ = (δβ * dr.detach(again.w) + path.β * δw) * v.rr_weight
         path = onward
 
     if dr.hint(walk.branch, mode="scalar"):
         with dr.resume_grad():
-            δL += tangents(branch_term(walk, branch, sampler, at.ray))[0]
+            δL += tangents(branch_term(walk, branch, sampler, ray0))[0]
     return δL, valid, moves

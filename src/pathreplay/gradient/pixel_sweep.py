@@ -103,16 +103,15 @@ def pixel_sweep(
     total = mi.Spectrum(0)  # radiance of all paths
     with dr.suspend_grad():
         ray0, _ = camera(sampler.clone(), mi.Bool(True))
-        start = CameraStart(ray0)
-        layout = Layout.of(walk, path_moves(walk, start, start.choose(walk, mi.Bool(True))))
+        start = CameraStart(ray0, sampler, mi.Bool(True))
+        layout = Layout.of(walk, path_moves(walk, start, PathState.begin(walk, start).at))
     records = dr.alloc_local(record_type(layout), paths * room)
     ends = dr.alloc_local(end_type(), paths)
     s = mi.UInt32(0)  # number of the path
 
     while dr.hint(s < paths, exclude=[walk, camera, layout, start, lost], label="pathreplay: paths of a pixel"):
-        active = mi.Bool(walk.max_depth > 0)
-        ray, β = camera(sampler, active)
-        path = PathState.begin(CameraStart(ray).choose(walk, active), active, sustained=True)
+        ray, β = camera(sampler, mi.Bool(walk.max_depth > 0))
+        path = PathState.begin(walk, CameraStart(ray, sampler, mi.Bool(True)), sustained=True)
         path.β, path.β_alive = mi.Spectrum(β), mi.Spectrum(β)
         records, count, L, _branch = first_walk(walk, sampler, path, layout, records, s * room, lost)
         ends[s] = end_type()(L, count)

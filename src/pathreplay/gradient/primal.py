@@ -10,15 +10,15 @@ from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 
 
-def primal(walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
+def primal(walk: Walk, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool]:
     """Estimate the radiance along the rays of a ``start``: ``(L, valid)``, per ray.
 
     ``valid`` is Mitsuba's alpha: the path met a particle, or a surface that does not merely let it pass. Nothing is
     differentiated.
     """
-    active = mi.Bool(active) & (walk.max_depth > 0)
-    L, valid = walk_on(walk, sampler, PathState.begin(start.choose(walk, active), active))
-    return L, valid | (walk.background_is_opaque & active)
+    path = PathState.begin(walk, start)
+    L, valid = walk_on(walk, start.sampler, path)
+    return L, valid | (walk.background_is_opaque & path.active)
 
 
 @dr.syntax

@@ -9,15 +9,15 @@ its emission: the density of the ray and the distance it came. They are differen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from ..transport.emitters import emission
 from ..transport.step import repeat_step
-from ..transport.vertex import Arrival, Numbers, Walk, reciprocal
-from .adjoint import Replayed, tangents
+from ..transport.vertex import Arrival, Numbers, Replayed, Walk, reciprocal
+from .adjoint import tangents
 
 # Noise is needed where `independence` is below this. At held smooth lobes it would be zero but for float32 rounding,
 # which makes it 1e-7; at mirrors, glass and attached rough metal it is above 1e-3. float64 forgives 1e-4.
@@ -131,7 +131,7 @@ def local_terms(
     δL·β_i e_i + (slope of e_{i+1})·(pdf, slide), w_i/detach(w_i) (0 where w_i is 0) and the four coordinates of
     the next ray. ``weight`` is δL β_i, ``slope`` that of the next vertex.
     """
-    step = repeat_step(walk, at, v.u, v.kept, v.go_on, active, True, v.hit_next)
+    step = repeat_step(walk, replace(v, at=at), True, active)
     o, d = step.ray_next.o, step.ray_next.d
     e = dr.sum(weight * step.e)
     e += dr.select(v.go_on, slope.pdf * step.pdf + slope.slide * dr.dot(dr.detach(d), o), 0)

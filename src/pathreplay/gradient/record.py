@@ -13,8 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.vertex import Arrival, Flight, Kept, KeptInMedia, KnownLight, Numbers, Shadow, Walk
-from .adjoint import Replayed
+from ..transport.vertex import Arrival, Flight, Kept, KeptInMedia, KnownLight, Numbers, Replayed, Shadow, Walk
 
 # Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x up to 136 bytes are 4.5 MB, and a
 # thread's stack is 8 MB. Beyond the stack the process would die without a word.

@@ -17,10 +17,10 @@ from ..transport.motion import path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.step import repeat_step
-from ..transport.vertex import Arrival, Walk, reciprocal
+from ..transport.vertex import Walk, reciprocal
 from .adjoint import LostPaths, backward
 from .branch import Branch, branch_backward
-from .primal import primal
+from .primal import walk_on
 from .ray_jacobian import Recovery, has_smooth_lobes
 from .record import MAX_DEPTH_MEDIA
 from .replay_attached import replay_attached
@@ -28,10 +28,8 @@ from .replay_attached import replay_attached
 
 def replay(
     walk: Walk,
-    sampler: mi.Sampler,
     start: CameraStart,
     δL: mi.Spectrum,
-    active: mi.Bool,
     lost: LostPaths,
     recovery: Recovery = Recovery(),  # noqa: B008 (it is frozen)
 ) -> bool:
@@ -42,11 +40,10 @@ def replay(
     visibility, weights that are exactly zero (the sweep driver keeps their derivatives) and, with ``attach='none'``,
     everything that moves.
     """
-    active = mi.Bool(active) & (walk.max_depth > 0)
-    at = start.choose(walk, active)
-    moves = path_moves(walk, start, at)
+    path = PathState.begin(walk, start)
+    moves = path_moves(walk, start, path.at)
     if not moves:
-        _replay_still(walk, sampler, start, at, δL, active)
+        _replay_still(walk, start, path, δL)
     elif walk.media is not None:
         raise PathreplayError(
             "driver = 'replay' cannot follow paths that move through media: use driver = 'sweep', "
@@ -55,7 +52,7 @@ def replay(
     else:
         if has_smooth_lobes(walk):
             _warn_of_smooth_lobes()
-        replay_attached(walk, sampler, start, δL, active, lost, recovery)
+        replay_attached(walk, start, path, δL, lost, recovery)
     return moves
 
 
@@ -71,16 +68,14 @@ def _warn_of_smooth_lobes() -> None:
 
 
 @dr.syntax
-def _replay_still(
-    walk: Walk, sampler: mi.Sampler, start: CameraStart, at: Arrival, δL: mi.Spectrum, active: mi.Bool
-) -> None:
+def _replay_still(walk: Walk, start: CameraStart, path: PathState, δL: mi.Spectrum) -> None:
     """Replay a path that does not move.
 
     Peels β_{i+1} L_{i+1} = β_i L_i - β_i e_i and differentiates it as (β_i L_{i+1}) w_i through the relative
     derivative of w_i.
     """
-    L, _ = primal(walk, sampler.clone(), start, active)  # β_i L_i, peeled on the way
-    path = PathState.begin(at, active)
+    sampler, ray0 = start.sampler, path.at.ray
+    L = walk_on(walk, sampler.clone(), dr.copy(path))[0]  # β_i L_i, peeled on the way
     branch = Branch.none()
 
     while dr.hint(path.active, exclude=[walk], label="pathreplay: replay"):
@@ -89,12 +84,12 @@ def _replay_still(
         if dr.hint(walk.branch, mode="scalar"):
             branch = branch.offer(path, step)
 
+        onward, v = path.advance(walk, u, step)
         with dr.resume_grad():
-            again = repeat_step(walk, path.at, u, step.kept, step.active, path.active)
+            again = repeat_step(walk, v, False, path.active)
             Lo = path.β * again.e + L * again.w * dr.detach(reciprocal(again.w))
             backward(dr.sum(δL * Lo))
-
-        path = path.advance(walk, u, step)[0]
+        path = onward
 
     if dr.hint(walk.branch, mode="scalar"):
-        branch_backward(walk, branch, sampler, at.ray, δL)
+        branch_backward(walk, branch, sampler, ray0, δL)

@@ -17,29 +17,22 @@ import mitsuba as mi
 from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
-from .adjoint import LostPaths, Replayed, backward
+from .adjoint import LostPaths, backward
 from .ray_jacobian import RayFrame, Recovery, emission_slope, length_scale, linearise, local_terms, random_sign
 
 
 def replay_attached(
-    walk: Walk,
-    sampler: mi.Sampler,
-    start: CameraStart,
-    δL: mi.Spectrum,
-    active: mi.Bool,
-    lost: LostPaths,
-    recovery: Recovery,
+    walk: Walk, start: CameraStart, path: PathState, δL: mi.Spectrum, lost: LostPaths, recovery: Recovery
 ) -> None:
-    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
+    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start`` of a ``path``.
 
     ``lost`` counts the paths on which a q was not finite, and what it had to tell was left out. Exact on chains of
     delta lobes. Behind smooth lobes A_i has rank two: without noise q is lost there, with noise the result is unbiased
     as long as rounding is not magnified beyond it. Not differentiated: visibility, and weights that are exactly zero.
     """
     scale = length_scale(walk.scene)
-    again = sampler.clone()
-    path = PathState.begin(start.choose(walk, active), active)
-    L, q = _tangents(walk, sampler, dr.copy(path), δL, recovery, scale)
+    again = start.sampler.clone()
+    L, q = _tangents(walk, start.sampler, dr.copy(path), δL, recovery, scale)
     overflow = ~dr.all(dr.isfinite(q))
     q = dr.select(overflow, 0, q)
     with dr.resume_grad():
@@ -66,8 +59,7 @@ def _tangents(
 
     while dr.hint(path.active, exclude=[walk, recovery, scale], label="pathreplay: tangents"):
         u, step = path.choose(walk, sampler)
-        onward, rr_weight = path.advance(walk, u, step)
-        v = Replayed.of(path, u, step, onward, rr_weight)
+        onward, v = path.advance(walk, u, step)
         slope = emission_slope(walk, onward.at, δL * onward.β, v.go_on)
         frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
         local = linearise(walk, v, δL * v.β, slope, frame, frame_next, path.active)
@@ -101,8 +93,7 @@ def _peel(
 
     while dr.hint(path.active, exclude=[walk, recovery, scale, lost], label="pathreplay: replay"):
         u, step = path.choose(walk, sampler)
-        onward, rr_weight = path.advance(walk, u, step)
-        v = Replayed.of(path, u, step, onward, rr_weight)
+        onward, v = path.advance(walk, u, step)
         slope = emission_slope(walk, onward.at, δL * onward.β, v.go_on)
         frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
         L = dr.select(v.go_on, L - Spectrum(v.β * step.e), 0)

@@ -21,15 +21,7 @@ from .record import Layout, deepest, record_type, room_for
 from .two_walks import first_walk, walk_back
 
 
-def sweep(
-    walk: Walk,
-    sampler: mi.Sampler,
-    start: CameraStart,
-    δL: mi.Spectrum,
-    active: mi.Bool,
-    lost: LostPaths,
-    seen: Seen | None = None,
-) -> bool:
+def sweep(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths, seen: Seen | None = None) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
 
     Returns whether the path moves with the parameters; if so, ``lost`` counts paths with an adjoint that was not
@@ -43,20 +35,19 @@ def sweep(
             f"max_depth = {walk.max_depth} is more than the sweep driver can hold ({deepest(walk)}): "
             "use driver = 'replay', which has no limit"
         )
-    active = mi.Bool(active) & (walk.max_depth > 0)
-    at = start.choose(walk, active)
-    moves = path_moves(walk, start, at)
+    path = PathState.begin(walk, start, sustained=True)
+    ray0 = path.at.ray
+    moves = path_moves(walk, start, path.at)
     layout = Layout.of(walk, moves)
     records = dr.alloc_local(record_type(layout), room_for(walk))
-    path = PathState.begin(at, active, sustained=True)
-    records, count, _, branch = first_walk(walk, sampler, path, layout, records, mi.UInt32(0), lost)
+    records, count, _, branch = first_walk(walk, start.sampler, path, layout, records, mi.UInt32(0), lost)
 
     first, L, q = mi.UInt32(0), mi.Spectrum(0), RayDerivative.zero()
-    _, q = walk_back(walk, layout, records, first, count, count - 1, at.ray, δL, L, q, lost, seen)
+    _, q = walk_back(walk, layout, records, first, count, count - 1, ray0, δL, L, q, lost, seen)
     if walk.branch:
         if seen is not None:
             seen.tally(branch.number)
-        branch_backward(walk, branch, sampler, at.ray, δL)
+        branch_backward(walk, branch, start.sampler, ray0, δL)
     with dr.resume_grad():
         o, d = start.repeat()
         if moves and dr.grad_enabled(o, d):

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ..transport.path import PathState
 from ..transport.vertex import Walk
-from .adjoint import LostPaths, RayDerivative, Replayed, backward_step
+from .adjoint import LostPaths, RayDerivative, backward_step
 from .baseline import Seen
 from .branch import Branch
 from .record import Layout, read_back, record, room_for
@@ -29,8 +29,8 @@ def first_walk(
 
     while dr.hint(path.active, exclude=[walk, layout, lost], label="pathreplay: record"):
         u, step = path.choose(walk, sampler)
-        onward, rr_weight = path.advance(walk, u, step)
-        records[first + count] = record(layout, Replayed.of(path, u, step, onward, rr_weight))
+        onward, v = path.advance(walk, u, step)
+        records[first + count] = record(layout, v)
         if dr.hint(walk.branch, mode="scalar"):
             branch = branch.offer(path, step)
         L += path.β * step.e

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
+
+from ..transport.start import CameraStart
 
 
 def mitsuba_integrator() -> Any:
@@ -30,8 +31,8 @@ class Rays:
     spp: int  # samples per pixel: those of the pass, rounded as the sampler needs them
 
     @property
-    def number(self) -> int:
-        return dr.width(self.ray)
+    def start(self) -> CameraStart:
+        return CameraStart(self.ray, self.sampler, mi.Bool(True))
 
 
 @dataclass(frozen=True)

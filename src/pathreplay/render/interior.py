@@ -25,42 +25,27 @@ from .film import adjoint, splat
 from .term import Found
 
 
-def radiance(walk: Walk, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
-    """Radiance along camera rays, and whether anything was met: see `primal`. Nothing is differentiated."""
-    return primal(walk, sampler, CameraStart(dr.detach(ray)), active)
-
-
 def image(view: Pass, walk: Walk) -> mi.TensorXf:
     """The image of a pass (height x width x channels)."""
     rays = view.rays()
-    return splat(view, rays, *radiance(walk, rays.sampler, rays.ray, mi.Bool(True)))
+    return splat(view, rays, *primal(walk, rays.start))
 
 
 class Interior(ABC):
     """A term by drivers: classes below say which, and what is to be said of them."""
 
     @abstractmethod
-    def tangent(
-        self, walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool
-    ) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
+    def tangent(self, walk: Walk, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
         """Tangent of the radiance, whether anything was met, and what is to be said."""
 
     @abstractmethod
-    def propagate(
-        self,
-        walk: Walk,
-        sampler: mi.Sampler,
-        start: CameraStart,
-        δL: mi.Spectrum,
-        active: mi.Bool,
-        seen: Seen | None = None,
-    ) -> Diagnostics:
+    def propagate(self, walk: Walk, start: CameraStart, δL: mi.Spectrum, seen: Seen | None = None) -> Diagnostics:
         """Back-propagate the adjoint of the radiance; ``seen`` (or None) collects what is seen of media."""
 
     def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
         """Tangent of the image: see `Term`."""
         rays = view.rays()
-        δL, valid, diagnostics = self.tangent(walk, rays.sampler, CameraStart(rays.ray), mi.Bool(True))
+        δL, valid, diagnostics = self.tangent(walk, rays.start)
         tangent = splat(view, rays, δL, valid)
         if diagnostics.counters:
             dr.eval(tangent)  # in one kernel with the count of lost paths
@@ -72,7 +57,7 @@ class Interior(ABC):
         """Back-propagate the adjoint of the image: see `Term`."""
         rays = view.rays()
         δL = adjoint(view, rays, grad_in)
-        diagnostics = self.propagate(walk, rays.sampler, CameraStart(rays.ray), δL, mi.Bool(True), seen)
+        diagnostics = self.propagate(walk, rays.start, δL, seen)
         del rays, δL  # so that loops need not compute what comes out of them
         dr.eval()
         return Found(None, diagnostics, seen)
@@ -90,27 +75,17 @@ class PathReplay(Interior):
     branch: str | bool  # whether a null collision of each path is kept (auto: where it is needed)
     recovery: Recovery  # of the replay driver
 
-    def tangent(
-        self, walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool
-    ) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
+    def tangent(self, walk: Walk, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
         lost = LostPaths()
-        δL, valid, moves = forward(walk, sampler, start, active, lost)
+        δL, valid, moves = forward(walk, start, lost)
         return δL, valid, Diagnostics((lost,), dr.width(start.ray), True) if moves else Diagnostics()
 
-    def propagate(
-        self,
-        walk: Walk,
-        sampler: mi.Sampler,
-        start: CameraStart,
-        δL: mi.Spectrum,
-        active: mi.Bool,
-        seen: Seen | None = None,
-    ) -> Diagnostics:
+    def propagate(self, walk: Walk, start: CameraStart, δL: mi.Spectrum, seen: Seen | None = None) -> Diagnostics:
         lost = LostPaths()
         if self._sweeps(walk):
-            moves = sweep(walk, sampler, start, δL, active, lost, seen)
+            moves = sweep(walk, start, δL, lost, seen)
         else:
-            moves = replay(replace(walk, baseline=None), sampler, start, δL, active, lost, self.recovery)
+            moves = replay(replace(walk, baseline=None), start, δL, lost, self.recovery)
         counted = moves or walk.media is not None
         return Diagnostics((lost,), dr.width(start.ray), moves) if counted else Diagnostics()
 

@@ -14,12 +14,13 @@ import mitsuba as mi
 
 from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
+from ..gradient.primal import primal
 from ..transport.facts import SceneFacts
 from ..transport.start import CameraStart
 from ..transport.traits import Tables
 from ..transport.vertex import Walk
 from .camera_pass import Pass, mitsuba_integrator
-from .interior import Interior, image, radiance
+from .interior import Interior, image
 from .properties import flag, whole_number
 from .term import Found, Term
 
@@ -172,12 +173,12 @@ def path_integrator() -> type:
             For those who have rays and no sensor, such as Mitsuba's `aov`: the rays start in no medium. As it is no
             pass, nothing is learned from it and nothing is told.
             """
-            walk, active = self._walk(scene, None), mi.Bool(active)
+            walk, start = self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))
             if mode == dr.ADMode.Primal:
-                return *radiance(walk, sampler, ray, active), [], None
+                return *primal(walk, start), [], None
             if mode == dr.ADMode.Forward:
-                return *self.interior.tangent(walk, sampler, CameraStart(ray), active)[:2], [], None
-            self.interior.propagate(walk, sampler, CameraStart(ray), δL, active)
+                return *self.interior.tangent(walk, start)[:2], [], None
+            self.interior.propagate(walk, start, δL)
             return mi.Spectrum(0), mi.Bool(True), [], None
 
         def _learned(self, view: Pass, walk: Walk) -> Baseline | None:

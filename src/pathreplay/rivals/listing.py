@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from ..errors import PathreplayError
 from ..gradient.adjoint import LostPaths, backward
-from ..gradient.primal import primal
+from ..gradient.primal import walk_on
 from ..transport import arrive, scatter
 from ..transport.connect import Connection, shadow_start
 from ..transport.emitters import redraw_emitter
@@ -27,9 +27,7 @@ from .collisions import differentiate_flight, differentiate_shadow
 
 
 @dr.syntax
-def listing(
-    walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectrum, active: mi.Bool, lost: LostPaths
-) -> bool:
+def listing(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters.
 
     Uses one majorant for each medium. Not differentiated: what the listings miss (above), visibility, emission of
@@ -41,12 +39,10 @@ def listing(
     # Nobody else's tracking is used, so that every collision is one that can be differentiated.
     media = replace(walk.media, grids=(), plain=True)
     walk = replace(walk, baseline=None, branching=None, media=media)
-    active = mi.Bool(active) & (walk.max_depth > 0)
-    at = start.choose(walk, active)
-    if dr.hint(path_moves(walk, start, at), mode="scalar"):
+    sampler, path = start.sampler, PathState.begin(walk, start)
+    if dr.hint(path_moves(walk, start, path.at), mode="scalar"):
         raise PathreplayError("pathreplay_listing cannot follow what moves: use 'pathreplay'")
-    L = primal(walk, sampler.clone(), start, active)[0]  # β_i L_i, peeled on the way
-    path = PathState.begin(at, active)
+    L = walk_on(walk, sampler.clone(), dr.copy(path))[0]  # β_i L_i, peeled on the way
     ctx = mi.BSDFContext()
 
     while dr.hint(path.active, exclude=[walk, ctx], label="pathreplay: listing"):
@@ -59,13 +55,14 @@ def listing(
         differentiate_flight(path.at, kept.media.flight, past, path.active, δL * L)
         L -= path.β * step.e
 
+        onward, again = path.advance(walk, u, step)
         with dr.resume_grad():
             v = arrive.choose(walk, path.at, past, path.β, path.active, kept.media.flight)
             light, Le = redraw_emitter(walk, v.origin, u.light, kept.light, False, kept.lit)
             f, pdf = scatter.towards(v, ctx, light.d, kept.lit)
             reached = Connection(light, Le * kept.media.shadow.T, kept.lit).reaches(pdf, False)
             lighting = v.inside.w * dr.select(kept.lit, f * reached, 0)
-            w = scatter.repeat(walk, v, path.at, u, ctx, kept, False, None, step.active)[0]
+            w = scatter.repeat(walk, v, again, ctx, False)[0]
             w *= v.inside.w
             Lo = path.β * (v.inside.e + v.inside.w * v.glow + lighting) + L * w * dr.detach(reciprocal(w))
             if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
@@ -74,5 +71,5 @@ def listing(
         # The same for the light of the emitter sample, along its shadow ray.
         begins = shadow_start(v, light, path.at.medium)
         differentiate_shadow(walk, v.origin, light, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
-        path = path.advance(walk, u, step)[0]
+        path = onward
     return False

@@ -40,24 +40,14 @@ class Rival(Interior):
     backwards: Driver
     forwards: ForwardDriver | None = None
 
-    def tangent(
-        self, walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool
-    ) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
+    def tangent(self, walk: Walk, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
         if self.forwards is None:
             raise PathreplayError(f"{self.name} has no forward mode: use the integrator 'pathreplay'")
-        δL, valid, _ = self.forwards(walk, sampler, start, active, LostPaths())
+        δL, valid, _ = self.forwards(walk, start, LostPaths())
         return δL, valid, Diagnostics()
 
-    def propagate(
-        self,
-        walk: Walk,
-        sampler: mi.Sampler,
-        start: CameraStart,
-        δL: mi.Spectrum,
-        active: mi.Bool,
-        seen: Seen | None = None,
-    ) -> Diagnostics:
-        self.backwards(walk, sampler, start, δL, active, LostPaths())
+    def propagate(self, walk: Walk, start: CameraStart, δL: mi.Spectrum, seen: Seen | None = None) -> Diagnostics:
+        self.backwards(walk, start, δL, LostPaths())
         return Diagnostics()
 
 

@@ -7,6 +7,8 @@ Radiative Backpropagation, 2020). Memory is constant; time grows with the square
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -19,15 +21,7 @@ from ..transport.vertex import Walk
 
 
 @dr.syntax
-def radiative(
-    walk: Walk,
-    sampler: mi.Sampler,
-    start: CameraStart,
-    δL: mi.Spectrum,
-    active: mi.Bool,
-    lost: LostPaths,
-    linear: bool = False,
-) -> bool:
+def radiative(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths, linear: bool = False) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters.
 
     ``linear`` is a biased variant in linear time, after those of the paper, which leave the incident radiance out: no
@@ -36,8 +30,7 @@ def radiative(
     Nothing is lost. Not differentiated: everything that moves (as with ``attach='none'``), and visibility. Raises
     PathreplayError when no parameter reaches the paths.
     """
-    active = mi.Bool(active) & (walk.max_depth > 0)
-    path = PathState.begin(start.choose(walk, active), active)
+    sampler, path = start.sampler, PathState.begin(walk, start)
 
     while dr.hint(path.active, exclude=[walk], label="pathreplay: radiative backpropagation"):
         u, step = path.choose(walk, sampler)
@@ -47,8 +40,9 @@ def radiative(
             at = next_arrival(walk, path.at, step, step.active)
             depth, η = path.passed(walk, step), path.η * step.eta
             L, _ = walk_on(walk, sampler, PathState(at, mi.Spectrum(1), None, η, depth, step.active))
+        onward, v = path.advance(walk, u, step)
         with dr.resume_grad():
-            again = repeat_step(walk, path.at, u, step.kept, step.active, path.active)
+            again = repeat_step(walk, replace(v, go_on=step.active), False, path.active)
             backward(dr.sum(δL * path.β * (again.e + again.w * L)))
-        path = path.advance(walk, u, step)[0]
+        path = onward
     return False

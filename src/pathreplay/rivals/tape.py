@@ -20,29 +20,25 @@ from ..transport.step import repeat_step
 from ..transport.vertex import Walk
 
 
-def tape_backward(
-    walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectrum, active: mi.Bool, lost: LostPaths
-) -> bool:
+def tape_backward(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
 
     The estimator is that of the sweep driver, and with the same random numbers so is the gradient. Not differentiated:
     see `tape`. Raises PathreplayError when no parameter reaches the paths.
     """
     with dr.resume_grad(), dr.isolate_grad():
-        L, _, moves = tape(walk, sampler, start, active)
+        L, _, moves = tape(walk, start)
         backward(dr.sum(δL * L))
     return moves
 
 
-def tape_forward(
-    walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool, lost: LostPaths
-) -> tuple[mi.Spectrum, mi.Bool, bool]:
+def tape_forward(walk: Walk, start: CameraStart, lost: LostPaths) -> tuple[mi.Spectrum, mi.Bool, bool]:
     """Tangent of the radiance along the rays of a ``start``, ``(δL, valid, moves)``: see `forward`.
 
     The parameters must carry their tangents already. Not differentiated: see `tape`.
     """
     with dr.resume_grad():
-        L, valid, moves = tape(walk, sampler, start, active)
+        L, valid, moves = tape(walk, start)
         return tangents(L)[0], valid, moves
 
 
@@ -70,18 +66,18 @@ def _cut(state: tuple[Any, ...]) -> Any:
 
 
 @dr.syntax
-def tape(walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool, bool]:
+def tape(walk: Walk, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, bool]:
     """Radiance along the rays of a ``start`` as an AD variable, ``(L, valid, moves)``: L = Σ β_i e_i.
 
     Every step is taken detached, to make its choices, and once more attached. Not differentiated: visibility, Russian
     roulette and, with ``attach='none'``, everything that moves. Adjoints that are not finite are not looked for. Call
     it under `dr.resume_grad`.
     """
-    active = mi.Bool(active) & (walk.max_depth > 0)
+    sampler = start.sampler
     with dr.suspend_grad():
-        at = start.choose(walk, active)
-        valid = mi.Bool(walk.background_is_opaque) & active
-        path = PathState.begin(at, active, sustained=True)
+        path = PathState.begin(walk, start, sustained=True)
+        at = path.at
+        valid = mi.Bool(walk.background_is_opaque) & path.active
     moves = path_moves(walk, start, at)
     L = mi.Spectrum(0)  # radiance so far
     β = mi.Spectrum(1)  # throughput, differentiable, and so the arrival: where, whence, density
@@ -93,15 +89,15 @@ def tape(walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool) -
         with dr.suspend_grad():
             u, step = path.choose(walk, sampler)
             valid |= path.active & step.seen
-            onward, rr_weight = path.advance(walk, u, step)
+            onward, v = path.advance(walk, u, step)
 
         L, β, o, d, pdf = _cut((L, β, o, d, pdf))
         ray = mi.Ray3f(path.at.ray)
         ray.o, ray.d = o, d
         at = replace(path.at, ray=ray, pdf=pdf)
-        again = repeat_step(walk, at, u, step.kept, onward.active, path.active, moves, onward.at.hit)
+        again = repeat_step(walk, replace(v, at=at), moves, path.active)
         L += β * again.e
-        β *= again.w * rr_weight
+        β *= again.w * v.rr_weight
         if dr.hint(moves, mode="scalar"):
             o, d, pdf = mi.Point3f(again.ray_next.o), mi.Vector3f(again.ray_next.d), mi.Float(again.pdf)
         else:

@@ -14,7 +14,7 @@ import mitsuba as mi
 from .emitters import emission
 from .flight import fly, fly_again
 from .media import interaction
-from .vertex import Arrival, Flight, Kept, Walk
+from .vertex import Arrival, Flight, Replayed, Walk
 
 
 @dataclass
@@ -60,11 +60,12 @@ def choose(
     return _in_medium(walk, at, si, mei, flight, w, e, False, active)
 
 
-def repeat(walk: Walk, at: Arrival, kept: Kept, attached: bool, active: mi.Bool) -> Vertex:
+def repeat(walk: Walk, again: Replayed, attached: bool, active: mi.Bool) -> Vertex:
     """Arrive once more, differentiably in emission and the coefficients of media.
 
-    If ``attached`` the hit point follows ``at.ray`` and the shape, and the emission's MIS weight ``at.pdf``.
+    If ``attached`` the hit point follows the ray and the shape, and the emission's MIS weight the ray's density.
     """
+    at, kept = again.at, again.kept
     with dr.suspend_grad(when=not attached):
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
     if kept.media is None:

@@ -11,7 +11,7 @@ from .arrive import Vertex
 from .emitters import draw_emitter, redraw_emitter
 from .scatter import towards
 from .shadow import shadow, shadow_again
-from .vertex import Kept, Numbers, Shadow, Walk, is_smooth, mis_weight
+from .vertex import Numbers, Replayed, Shadow, Walk, is_smooth, mis_weight
 
 
 @dataclass
@@ -50,15 +50,16 @@ def shadow_start(v: Vertex, light: mi.DirectionSample3f, medium: mi.MediumPtr) -
     return dr.select(v.surface & v.si.is_medium_transition(), v.si.target_medium(light.d), medium)
 
 
-def repeat(walk: Walk, v: Vertex, u: Numbers, ctx: mi.BSDFContext, kept: Kept, attached: bool) -> mi.Spectrum:
+def repeat(walk: Walk, v: Vertex, again: Replayed, ctx: mi.BSDFContext, attached: bool) -> mi.Spectrum:
     """The part of e that the kept emitter sample brings (Spectrum), differentiably.
 
     If ``attached`` the point on the emitter follows the emitter. Visibility is not differentiated.
     """
+    kept = again.kept
     if kept.known is not None and not attached:
         f = v.bsdf.eval(ctx, v.si, v.si.to_local(kept.known.d), kept.lit)
         return dr.select(kept.lit, f * kept.known.w, 0)
-    light, Le = redraw_emitter(walk, v.origin, u.light, kept.light, attached, kept.lit)
+    light, Le = redraw_emitter(walk, v.origin, again.u.light, kept.light, attached, kept.lit)
     if kept.media is not None:
         Le *= shadow_again(walk, v.origin, light, kept.media.shadow, attached, kept.lit)
     f, pdf = towards(v, ctx, light.d, kept.lit)

@@ -9,9 +9,7 @@ from .surface import held_point
 from .vertex import Arrival, Walk, mis_weight, reciprocal
 
 
-def emission(
-    scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool
-) -> mi.Spectrum:
+def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool) -> mi.Spectrum:
     """Radiance emitted towards the ray's origin by what the ray hit (the environment on a miss), MIS weighted.
 
     Differentiable in the emitter's radiance and, if ``attached``, in the ray, the hit point and

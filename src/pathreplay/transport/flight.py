@@ -215,9 +215,7 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: mi.Float, attached
     return Flown(mei=mei, w=w, e=e)
 
 
-def _guess(
-    walk: Walk, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool
-) -> mi.Spectrum:
+def _guess(walk: Walk, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool) -> mi.Spectrum:
     """The baseline; where collisions are never real, and null ones not asked, it would be a bias, and is left out."""
     b = walk.baseline(mei, σ_t, σ_bar, active)  # type: ignore[misc]
     return b if walk.branch else mi.Spectrum(dr.select(dr.detach(σ_t) != 0, b, 0))

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .start import behind_emitters
+from .start import CameraStart, behind_emitters
 from .step import choose_step
-from .vertex import Arrival, Chosen, Numbers, Walk, reciprocal
+from .vertex import Arrival, Chosen, Numbers, Replayed, Walk, reciprocal
 
 # Russian roulette ends at least one path in twenty, so that a path between mirrors comes to an end.
 MAX_SURVIVAL = 0.95
@@ -28,11 +28,11 @@ class PathState:
     active: mi.Bool
 
     @staticmethod
-    def begin(at: Arrival, active: mi.Bool, sustained: bool = False) -> PathState:
-        """A path at its first vertex; ``sustained`` says that weights of zero are to keep their derivatives."""
-        return PathState(
-            at, mi.Spectrum(1), mi.Spectrum(1) if sustained else None, mi.Float(1), mi.UInt32(0), mi.Bool(active)
-        )
+    def begin(walk: Walk, start: CameraStart, sustained: bool = False) -> PathState:
+        """Paths at their first vertices; ``sustained`` says that weights of zero are to keep their derivatives."""
+        active = mi.Bool(start.active) & (walk.max_depth > 0)
+        β_alive = mi.Spectrum(1) if sustained else None
+        return PathState(start.choose(walk, active), mi.Spectrum(1), β_alive, mi.Float(1), mi.UInt32(0), active)
 
     def choose(self, walk: Walk, sampler: mi.Sampler) -> tuple[Numbers, Chosen]:
         """The random numbers of this vertex, and the step that they choose."""
@@ -44,8 +44,8 @@ class PathState:
         """Vertices before the next: one more, but with media not so at null boundaries."""
         return self.depth + (1 if walk.media is None else dr.select(step.null, mi.UInt32(0), 1))
 
-    def advance(self, walk: Walk, u: Numbers, step: Chosen) -> tuple[PathState, mi.Float]:
-        """The path at its next vertex, and the weight that Russian roulette gave it, 1 / (survival probability)."""
+    def advance(self, walk: Walk, u: Numbers, step: Chosen) -> tuple[PathState, Replayed]:
+        """The path at its next vertex, and what later passes are to know of the one that it has left."""
         β = self.β * dr.detach(step.w)
         β_alive = None if self.β_alive is None else sustain(self.β_alive, self.β, step)
         lasting = β if β_alive is None else β_alive
@@ -53,8 +53,9 @@ class PathState:
         rr_weight, survives = survival(lasting, η, self.depth, u.roulette, walk, step)
         active = step.active & survives & (dr.max(lasting) != 0)
         at = next_arrival(walk, self.at, step, active)
-        onward = None if β_alive is None else β_alive * rr_weight
-        return PathState(at, β * rr_weight, onward, η, self.passed(walk, step), active), rr_weight
+        β_alive = None if β_alive is None else β_alive * rr_weight
+        onward = PathState(at, β * rr_weight, β_alive, η, self.passed(walk, step), active)
+        return onward, Replayed(self.at, u, step.kept, active, at.hit, rr_weight, self.β)
 
 
 def survival(

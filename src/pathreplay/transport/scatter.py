@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from .arrive import Vertex
 from .velocity import moved_direction
-from .vertex import Arrival, Kept, Numbers, Walk, is_smooth, reciprocal
+from .vertex import Arrival, Kept, Numbers, Replayed, Walk, is_smooth, reciprocal
 
 # Share by which the weight of a lobe sampled alone may differ from the weight that was drawn (and squared distance of
 # their directions) and still belong to the same lobe: float32 rounding is far below it, BSDFs without support for
@@ -61,9 +61,7 @@ def choose(
     at_surface = go_on & v.surface
     if v.inside is not None and walk.media.passes:
         at_surface |= v.surface & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.Null)
-    f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(
-        ctx, v.si, v.si.to_local(light_d), u.lobe, u.direction, at_surface
-    )
+    f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(ctx, v.si, v.si.to_local(light_d), u.lobe, u.direction, at_surface)
     sampled = Sampled(
         f=f,
         pdf_light=pdf_light,
@@ -116,46 +114,30 @@ def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> 
 
 
 def repeat(
-    walk: Walk,
-    v: Vertex,
-    at: Arrival,
-    u: Numbers,
-    ctx: mi.BSDFContext,
-    kept: Kept,
-    attached: bool,
-    hit_next: mi.PreliminaryIntersection3f,
-    go_on: mi.Bool,
+    walk: Walk, v: Vertex, again: Replayed, ctx: mi.BSDFContext, attached: bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
-    """Weight w (Spectrum), world direction and density (Float) of the kept continuation, differentiably.
+    """Weight w, world direction and density of the kept continuation, differentiably.
 
-    ``hit_next`` is where it went. Not differentiated: the choice among lobes and, unless ``attached``, direction and
-    density.
+    Not differentiated: the choice among lobes and, unless ``attached``, direction and density.
     """
-    w, d, pdf = _at_surface(walk, v, u, ctx, kept, attached, hit_next, go_on & v.surface)
+    w, d, pdf = _at_surface(walk, v, again, ctx, attached, again.go_on & v.surface)
     if v.inside is None:
         return w, d, pdf
     event, through = v.inside.event, v.inside.through
-    w_medium, d_medium, pdf_medium = _at_particle(walk, v, kept, attached, hit_next, go_on & event)
-    d = dr.select(event, d_medium, dr.select(through, at.ray.d, d))
-    pdf = dr.select(event, pdf_medium, dr.select(kept.media.null, at.pdf, pdf))
+    w_medium, d_medium, pdf_medium = _at_particle(walk, v, again, attached, again.go_on & event)
+    d = dr.select(event, d_medium, dr.select(through, again.at.ray.d, d))
+    pdf = dr.select(event, pdf_medium, dr.select(again.kept.media.null, again.at.pdf, pdf))
     return dr.select(event, w_medium, dr.select(through, 1, w)), d, pdf
 
 
 def _at_surface(
-    walk: Walk,
-    v: Vertex,
-    u: Numbers,
-    ctx: mi.BSDFContext,
-    kept: Kept,
-    attached: bool,
-    hit_next: mi.PreliminaryIntersection3f,
-    active: mi.Bool,
+    walk: Walk, v: Vertex, again: Replayed, ctx: mi.BSDFContext, attached: bool, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
-    bsdf, si = v.bsdf, v.si
+    bsdf, si, kept, u = v.bsdf, v.si, again.kept, again.u
     smooth = active & ~kept.delta
     d, J = kept.d, mi.Float(1)
     if attached:
-        d, J = moved_direction(walk.traits.tables.blend_lengths, si, kept.d, hit_next, smooth)
+        d, J = moved_direction(walk.traits.tables.blend_lengths, si, kept.d, again.hit_next, smooth)
 
     if walk.resamples:
         sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
@@ -224,11 +206,12 @@ def _delta_weight(
 
 
 def _at_particle(
-    walk: Walk, v: Vertex, kept: Kept, attached: bool, hit_next: mi.PreliminaryIntersection3f, active: mi.Bool
+    walk: Walk, v: Vertex, again: Replayed, attached: bool, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
     """The direction is held as on surfaces, towards the next surface point, but only where that matters: where the
     surface scatters or emits, and so may have seams and edges. Otherwise it is fixed in space, which is less noisy.
     """
+    kept, hit_next = again.kept, again.hit_next
     d, J = kept.d, mi.Float(1)
     if attached:
         shape = hit_next.shape

@@ -148,9 +148,7 @@ def shadow_again(
     return kept.T * dr.replace_grad(mi.Spectrum(1), log_T)
 
 
-def _boundary(
-    walk: Walk, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int, active: mi.Bool
-) -> mi.Float:
+def _boundary(walk: Walk, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int, active: mi.Bool) -> mi.Float:
     """Distance along ``ray`` of the first surface that is met from y on towards its end (sign 1) or origin (sign -1).
 
     Where none is met it is the end of the ray, or its origin (0). Differentiable in the ray and in the surface.

@@ -15,6 +15,8 @@ class CameraStart:
     """Paths that begin with camera rays. The rays are the differentiable function whose adjoint is q_0."""
 
     ray: mi.Ray3f  # attached to the camera, if that has gradients
+    sampler: mi.Sampler  # of the numbers that choose the paths
+    active: mi.Bool
 
     def choose(self, walk: Walk, active: mi.Bool) -> Arrival:
         """The first arrival along the rays, detached; ``hide_emitters`` makes area emitters transparent."""

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import arrive, connect, scatter
-from .vertex import Arrival, Chosen, Flight, Kept, KeptInMedia, KnownLight, Numbers, Signature, Step, Walk
+from .vertex import Arrival, Chosen, Flight, Kept, KeptInMedia, KnownLight, Numbers, Replayed, Signature, Step, Walk
 
 
 def choose_step(
@@ -61,29 +61,21 @@ def choose_step(
 
 
 def repeat_step(
-    walk: Walk,
-    at: Arrival,
-    u: Numbers,
-    kept: Kept,
-    go_on: mi.Bool,
-    active: mi.Bool,
-    attached: bool = False,
-    hit_next: mi.PreliminaryIntersection3f | None = None,
-    ctx: mi.BSDFContext | None = None,
+    walk: Walk, again: Replayed, attached: bool, active: mi.Bool, ctx: mi.BSDFContext | None = None
 ) -> Step:
     """The same step once more, differentiable in emission, BSDFs, textures and media.
 
-    If ``attached``, also in ``at.ray``, ``at.pdf`` and everything that moves: the hit point follows ray and shape, and
-    the continuation follows as `scatter` says (``hit_next`` is where it went). Else vertices and directions are
-    constants. Visibility and Russian roulette are never differentiated. ``ctx`` is that of the first walk.
+    If ``attached``, also in the ray that arrives, its density and everything that moves: the hit point follows ray and
+    shape, and the continuation follows as `scatter` says. Else vertices and directions are constants. Visibility and
+    Russian roulette are never differentiated. ``ctx`` is that of the first walk.
     """
     ctx = mi.BSDFContext() if ctx is None else ctx
-    v = arrive.repeat(walk, at, kept, attached, active)
-    e = v.glow + connect.repeat(walk, v, u, ctx, kept, attached)
-    w, d, pdf = scatter.repeat(walk, v, at, u, ctx, kept, attached, hit_next, go_on)
+    v = arrive.repeat(walk, again, attached, active)
+    e = v.glow + connect.repeat(walk, v, again, ctx, attached)
+    w, d, pdf = scatter.repeat(walk, v, again, ctx, attached)
     if v.inside is not None:
         e, w = v.inside.e + v.inside.w * e, v.inside.w * w
-    return Step(e, w, v.origin.spawn_ray(d), pdf, _signature(v, at, kept.lobe, go_on))
+    return Step(e, w, v.origin.spawn_ray(d), pdf, _signature(v, again.at, again.kept.lobe, again.go_on))
 
 
 def _signature(v: arrive.Vertex, at: Arrival, lobe: mi.UInt32, go_on: mi.Bool) -> Signature:

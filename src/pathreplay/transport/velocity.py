@@ -66,9 +66,7 @@ def moved_direction(
     return dr.select(ok, dr.replace_grad(d, φ * d_H), d), dr.replace_grad(mi.Float(1), log_J)
 
 
-def _share(
-    h0: mi.Float, y: HeldPoint, towards: mi.Vector3f, active: mi.Bool
-) -> tuple[mi.Float, mi.Vector3f]:
+def _share(h0: mi.Float, y: HeldPoint, towards: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Vector3f]:
     """φ, and the slope that makes ∇φ·V_H = slope·d_H'; nothing here is attached."""
     r = dr.norm(towards)
     n = dr.normalize(y.A)

@@ -164,6 +164,19 @@ class KnownLight:
 
 
 @dataclass
+class Replayed:
+    """What later passes know about a vertex and its continuation."""
+
+    at: Arrival
+    u: Numbers
+    kept: Kept
+    go_on: mi.Bool  # there is a next vertex
+    hit_next: mi.PreliminaryIntersection3f  # of the next vertex
+    rr_weight: mi.Float  # 1 / survival probability
+    β: mi.Spectrum  # throughput before the vertex
+
+
+@dataclass
 class Signature:
     """Where a vertex lies among the discontinuities of its path: two paths that differ in it have an edge between."""
 
