@@ -121,7 +121,7 @@ def path_integrator() -> type:
         def render_forward(
             self,
             scene: mi.Scene,
-            params: Any,
+            params: object,
             sensor: int | mi.Sensor = 0,
             seed: int | mi.UInt32 = 0,
             spp: int = 0,
@@ -141,7 +141,7 @@ def path_integrator() -> type:
         def render_backward(
             self,
             scene: mi.Scene,
-            params: Any,
+            params: object,
             grad_in: mi.TensorXf,
             sensor: int | mi.Sensor = 0,
             seed: int | mi.UInt32 = 0,
