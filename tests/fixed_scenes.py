@@ -445,11 +445,11 @@ SCENES = (
     )),
     Scene("cloud", cloud, (*CLOUD, "kernel.bsdf.reflectance.value", "sky.data"), (
         case("primal"), case("sweep"), case("sweep", passes=3), case("sweep", passes=2, branch=False),
-        case("replay", branch=True), case("forward"), case("sweep", *LISTED, volume_gradient="listing"), case("tape"),
+        case("replay", branch=True), case("forward"), case("listing", *LISTED), case("tape"),
     )),
     Scene("rainbow", rainbow, (*RAINBOW, "beside.interior_medium.sigma_t.data"), (
         case("primal"), case("sweep", passes=2), case("replay"), case("forward"),
-        case("sweep", *RAINBOW, volume_gradient="listing"),
+        case("listing", *RAINBOW),
     ), depth=6),
     Scene("within", within, ("fog.sigma_t.data", "pane.to_world", "pane.bsdf.eta", "gauze.to_world"), (
         case("primal"), case("sweep", passes=2), case("forward"), case("tape"), case("sweep", attach="all"),

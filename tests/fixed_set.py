@@ -42,6 +42,7 @@ PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
     "tape": ("pathreplay_tape", {}),
     "tape-forward": ("pathreplay_tape", {}),
     "rb": ("pathreplay_rb", {}),
+    "listing": ("pathreplay_listing", {}),
 }
 Arrays = dict[str, np.ndarray]
 

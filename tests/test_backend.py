@@ -85,12 +85,14 @@ def test_a_file_that_is_no_library_fails_its_trial_with_a_reason(bogus: str) -> 
     assert bogus in library.message and "\n" not in library.message
 
 
-def test_every_library_of_the_system_gets_a_verdict_and_the_old_ones_fail() -> None:
-    for path in libllvm.system_libraries():
-        library = libllvm.probe(path)
-        assert library.works == (not library.message)
-        if libllvm.version_in_path(path) < (libllvm.OLDEST_USABLE_MAJOR,):
-            assert not library.works, library
+@pytest.mark.parametrize("path", libllvm.system_libraries())
+def test_a_library_of_the_system_is_the_version_that_its_name_says_or_fails_with_a_reason(path: str) -> None:
+    library = libllvm.probe(path)
+    said = libllvm.version_in_path(os.path.realpath(path))
+    if not library.works:
+        assert "\n" not in library.message
+    elif said:
+        assert int(library.version.split(".")[0]) == said[0] >= libllvm.OLDEST_USABLE_MAJOR
 
 
 def test_a_crash_is_told_in_one_line() -> None:
@@ -275,7 +277,6 @@ def test_the_doctor_finds_that_this_machine_works(report: doctor.DoctorReport) -
     assert report.mitsuba == mi.__version__ and report.pathreplay == pathreplay.__version__
     verdicts = {variant.name: variant for variant in report.variants}
     assert verdicts["llvm_ad_rgb"].works, verdicts["llvm_ad_rgb"].message
-    assert all(variant.works or variant.message for variant in report.variants)
     assert not any("polarized" in name or "scalar" in name for name in verdicts)
 
 

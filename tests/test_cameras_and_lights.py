@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pathreplay.check import check_gradient
-from pathreplay.check.report import check_all
+from pathreplay.check.command import check_all
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.parameters import carries_derivative, require_differentiable, resolve_differentiable
 

@@ -17,9 +17,11 @@ import pytest
 
 from pathreplay import cli
 from pathreplay.check import check_gradient
-from pathreplay.check.direction import BACKWARD_STENCIL, CENTRAL_STENCIL, FORWARD_STENCIL, Stencil, choose_line
+from pathreplay.check.direction import choose_line
 from pathreplay.check.objective import smooth_weights
 from pathreplay.check.reference import has_media, integrator_under_test, read_limits, reference_integrator
+from pathreplay.check.statistics import gap, normal
+from pathreplay.check.stencil import BACKWARD, CENTRAL, FORWARD, UPWARD, WIDE, Stencil
 from pathreplay.check.verdict import Judgement, judge
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.parameters import get_array, set_arrays
@@ -80,6 +82,19 @@ def test_z_keeps_its_meaning_with_few_seeds() -> None:
     assert 0.02 < beyond / 4000 < 0.0455 + 4 * 0.0033
 
 
+@pytest.mark.parametrize("seeds", [3, 12])
+def test_gaps_of_few_samples_are_as_rare_as_their_deviates_say(seeds: int) -> None:
+    # Beyond 3: 0.27 % of normal deviates; of plain ratios with equal noise 4 % (3 seeds), 0.6 % (12).
+    noise = np.random.default_rng(5).standard_normal((2, seeds, 40_000))
+    found = gap(noise[0], noise[1])
+    rare, plain = (np.abs(x).__gt__(3).mean() for x in (found.z, found.value / found.error))
+    assert 0.0008 < rare < 0.0027 + 4 * 0.00026
+    assert plain > 2 * rare
+    known = gap(noise[0], np.zeros(40_000))
+    assert np.abs(known.z).__gt__(3).mean() == pytest.approx(0.0027, abs=4 * 0.00026)
+    assert normal(6.2416, 11) == pytest.approx(4, abs=1e-4)  # a table's quantile of Student's distribution
+
+
 def test_the_error_that_would_have_shown_does_show() -> None:
     right = verdict_on(1.0, 1.0, noise=0.05, n=200)
     assert right.verdict == "pass"
@@ -91,28 +106,35 @@ def test_the_error_that_would_have_shown_does_show() -> None:
 # ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stencil", [CENTRAL_STENCIL, FORWARD_STENCIL, BACKWARD_STENCIL], ids=lambda s: s.name)
+@pytest.mark.parametrize("stencil", [CENTRAL, FORWARD, BACKWARD], ids=lambda s: s.name)
 def test_stencils_are_of_second_order_and_richardson_of_third(stencil: Stencil) -> None:
     h = 0.1
-    t = h * np.array(stencil.offsets)
     for power, derivative in ((0, 0), (1, 1), (2, 0)):
-        assert np.dot(stencil.full, t**power) / h == pytest.approx(derivative, abs=1e-12)
-        assert np.dot(stencil.half, t**power) / h == pytest.approx(derivative, abs=1e-12)
-    full, half = np.dot(stencil.full, t**3) / h, np.dot(stencil.half, t**3) / h
+        for each in (stencil, stencil.halved()):
+            assert each(lambda t, power=power: t**power, h) == pytest.approx(derivative, abs=1e-12)
+    full, half = stencil(lambda t: t**3, h), stencil.halved()(lambda t: t**3, h)
     assert abs(full) > 1e-3  # else the next line would say nothing
     assert (4 * half - full) / 3 == pytest.approx(0, abs=1e-12)
+    assert len(stencil.points()) == 4
+
+
+@pytest.mark.parametrize(("stencil", "order"), [(WIDE, 4), (UPWARD, 3)], ids=lambda x: getattr(x, "name", str(x)))
+def test_wide_stencils_are_of_higher_order(stencil: Stencil, order: int) -> None:
+    for power in range(order + 1):
+        assert stencil(lambda t, power=power: t**power, 0.1) == pytest.approx(float(power == 1), abs=1e-12)
+    assert abs(stencil(lambda t: t ** (order + 1), 0.1)) > 1e-6
 
 
 @pytest.mark.parametrize(
     ("key", "value", "direction", "expected"),
     [
-        ("a.reflectance.value", [0.5, 0.5, 0.5], None, CENTRAL_STENCIL),
-        ("a.reflectance.value", [0.5, 0.0, 0.5], None, FORWARD_STENCIL),
-        ("a.reflectance.value", [0.5, 0.0, 0.5], [0, -1, 0], BACKWARD_STENCIL),
-        ("a.reflectance.value", [0.5, 0.0, 0.5], [1, 0, 1], CENTRAL_STENCIL),
-        ("a.reflectance.value", [0.0, 0.0, 0.5], [1, -1, 1], CENTRAL_STENCIL),
-        ("a.specular", [-0.5, 0.0, 0.5], None, CENTRAL_STENCIL),
-        ("a.vertex_positions", [0.0, 0.0, 0.5], None, CENTRAL_STENCIL),
+        ("a.reflectance.value", [0.5, 0.5, 0.5], None, CENTRAL),
+        ("a.reflectance.value", [0.5, 0.0, 0.5], None, FORWARD),
+        ("a.reflectance.value", [0.5, 0.0, 0.5], [0, -1, 0], BACKWARD),
+        ("a.reflectance.value", [0.5, 0.0, 0.5], [1, 0, 1], CENTRAL),
+        ("a.reflectance.value", [0.0, 0.0, 0.5], [1, -1, 1], CENTRAL),
+        ("a.specular", [-0.5, 0.0, 0.5], None, CENTRAL),
+        ("a.vertex_positions", [0.0, 0.0, 0.5], None, CENTRAL),
     ],
 )
 def test_no_step_below_zero_where_it_would_leave_the_domain(

@@ -13,10 +13,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from pathreplay.check.statistics import gap
+from pathreplay.check.verdict import Z_LIMIT
 from pathreplay.media import cellwalk
 
 RAYS = 1 << 12
-Z_MAX = 4
 T = mi.ScalarTransform4f
 
 #: How a grid may be looked up and where it may lie.
@@ -224,7 +225,7 @@ def test_collisions_in_a_loop_are_as_likely_as_the_transmittance_says() -> None:
         survived = 1 - np.array(mi.Float(collide(grid, ray, sampler)))
         z.append((survived - truth).sum() / np.sqrt((truth * (1 - truth)).sum()))
     assert 0.2 < truth.mean() < 0.9
-    assert abs(np.sum(z)) / np.sqrt(len(z)) < Z_MAX
+    assert abs(np.sum(z)) / np.sqrt(len(z)) < Z_LIMIT
 
 
 # -------------------------------------------------- transmittance ---------------------------------------------------
@@ -278,10 +279,9 @@ def check_transmittance(grid: Any) -> None:
         found = np.array(grid.transmittance(ray, sampler, mi.Mask(True)))
         assert np.isfinite(found).all()
         means.append((found - truth).mean(axis=1))
-    error = np.mean(means, axis=0)
-    deviation = np.std(means, axis=0, ddof=1) / np.sqrt(len(means))
-    # 16 seeds: the t-distribution exceeds 6 as rarely as the normal one exceeds 4. Quadrature is good for 1e-4.
-    assert (np.abs(error) < 6 * deviation + 1e-4).all(), (error, deviation)
+    # Quadrature is good for 1e-4.
+    wrong = gap(np.array(means), np.zeros(len(truth)))
+    assert ((np.abs(wrong.z) < Z_LIMIT) | (np.abs(wrong.value) < 1e-4)).all(), wrong
 
 
 def test_transmittance_of_a_uniform_medium_has_no_noise() -> None:
@@ -319,9 +319,9 @@ def test_faint_transmittance_is_unbiased() -> None:
     for seed in range(16):
         sampler.seed(seed, RAYS)
         means.append((np.array(grid.transmittance(ray, sampler))[0] - truth).mean())
-    deviation = np.std(means, ddof=1) / np.sqrt(len(means))
-    assert deviation < 0.05 * truth.mean()
-    assert abs(np.mean(means)) < 6 * deviation
+    wrong = gap(means)
+    assert wrong.error < 0.05 * truth.mean()
+    assert abs(wrong.z) < Z_LIMIT
 
 
 # --------------------------------------- the same as Mitsuba's heterogeneous ----------------------------------------

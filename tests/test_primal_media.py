@@ -2,8 +2,8 @@
 
 Sixteen independent pictures by each give every pixel, and every block of pixels, a difference in standard errors.
 Its ratio follows Student's distribution and is turned into the normal deviate of the same probability; the squares of
-these, summed over the picture, follow χ². What must hold: every channel's mean within `Z_MAX`, and a sum of squares
-that is no less probable than a normal deviate of `Z_MAX`, for pixels and for blocks; the same for the alpha channel.
+these, summed over the picture, follow χ². What must hold: every channel's mean within `Z_LIMIT`, and a sum of squares
+that is no less probable than a normal deviate of `Z_LIMIT`, for pixels and for blocks; the same for the alpha channel.
 """
 
 from __future__ import annotations
@@ -37,13 +37,14 @@ from media_scenes import (
     sparse,
     sunlit,
 )
+from pathreplay.check.statistics import normal
+from pathreplay.check.verdict import Z_LIMIT
 from truth import RES, camera, environment, rgb
 
 SEEDS = 16
 SPP = 64
-# Among some 300 statistics of right pictures one exceeds four standard errors in fifty runs.
-Z_MAX = 4.0
 BLOCK = 4
+# Of some 300 statistics of right pictures one exceeds Z_LIMIT in fifty runs.
 
 
 @dataclass(frozen=True)
@@ -72,11 +73,11 @@ def table() -> str:
     for name, *both in PRIMALS:
         cells = [f"{d.mean:+7.2f} {d.blocks:+7.2f} {d.pixels:+7.2f} {d.alpha:+7.2f} {d.relative:+9.2%}" for d in both]
         lines.append(f"{name:40s} {both[0].error:6.2%} | " + " | ".join(cells))
-    ours = sum(row[1].z >= Z_MAX for row in PRIMALS)
+    ours = sum(row[1].z >= Z_LIMIT for row in PRIMALS)
     theirs = [(abs(d.mean), d.blocks, d.pixels) for _, _, d in PRIMALS]
-    colours = sum(max(z) >= Z_MAX for z in theirs)
-    alphas = sum(row[2].alpha >= Z_MAX for row in PRIMALS)
-    lines.append(f"beyond {Z_MAX:g}, of {len(PRIMALS)}: pathreplay {ours}, prbvolpath {colours} (alpha {alphas})")
+    colours = sum(max(z) >= Z_LIMIT for z in theirs)
+    alphas = sum(row[2].alpha >= Z_LIMIT for row in PRIMALS)
+    lines.append(f"beyond {Z_LIMIT:g}, of {len(PRIMALS)}: pathreplay {ours}, prbvolpath {colours} (alpha {alphas})")
     return "\n".join(lines)
 
 
@@ -88,7 +89,7 @@ def deviates(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     # Float32 rounding is no difference, but where nothing varies any other difference counts.
     rounding = 1e-5 * np.abs(b.mean(0)) + 1e-9
     t = np.minimum(np.abs(gap) / np.maximum(error, rounding), 1e3)
-    z = np.sign(gap) * stats.norm.isf(np.maximum(stats.t.sf(t, 2 * n - 2), 1e-300))
+    z = np.sign(gap) * normal(t, 2 * n - 2)
     return np.where((error <= rounding) & (np.abs(gap) <= rounding), np.nan, z)
 
 
@@ -319,7 +320,7 @@ def test_picture_against_volpath(spec: Picture) -> None:
     ours = compare(pictures(scene, "pathreplay", 1, **spec.options), theirs)
     peer = compare(pictures(scene, "prbvolpath", 1, **spec.options), theirs)
     PRIMALS.append((spec.name, ours, peer))
-    assert ours.z < Z_MAX, ours
+    assert ours.z < Z_LIMIT, ours
 
 
 # ------------------------------ Emission: closed forms, since volpath has none ------------------------------
@@ -347,7 +348,7 @@ def against(images: np.ndarray, expected: np.ndarray) -> float:
 
 def test_furnace() -> None:
     scene = mi.load_dict(furnace())
-    assert against(pictures(scene, "pathreplay", 1, max_depth=64, rr_depth=64), np.float64(FURNACE)) < Z_MAX
+    assert against(pictures(scene, "pathreplay", 1, max_depth=64, rr_depth=64), np.float64(FURNACE)) < Z_LIMIT
 
 
 @pytest.mark.parametrize("supergrid", [True, False])
@@ -357,7 +358,7 @@ def test_glow_of_emptiness(supergrid: bool) -> None:
     medium = heterogeneous(0 * sparse(), 0.0, plugin="gridmedium", emission=grid(np.full((6, 6, 6, 1), glow)),
                            supergrid=supergrid)  # fmt: skip
     scene = straight_through(cloud(medium, sky={"type": "constant", "radiance": sky}))
-    assert against(pictures(mi.load_dict(scene), "pathreplay", 1, max_depth=8), np.float64(2 * glow + sky)) < Z_MAX
+    assert against(pictures(mi.load_dict(scene), "pathreplay", 1, max_depth=8), np.float64(2 * glow + sky)) < Z_LIMIT
 
 
 def straight_through(scene: dict) -> dict:
@@ -375,4 +376,4 @@ def test_glow_of_a_slab() -> None:
     medium.update(type="gridmedium", emission={"type": "constvolume", "value": glow})
     scene = straight_through(cloud(medium, sky={"type": "constant", "radiance": sky}))
     expected = glow / σ * (1 - np.exp(-2 * σ)) + sky * np.exp(-2 * σ)
-    assert against(pictures(mi.load_dict(scene), "pathreplay", 1, max_depth=8), np.float64(expected)) < Z_MAX
+    assert against(pictures(mi.load_dict(scene), "pathreplay", 1, max_depth=8), np.float64(expected)) < Z_LIMIT

@@ -11,8 +11,8 @@ import pytest
 
 from media_scenes import constant, grid
 from pathreplay.gradient.adjoint import LostPaths, RayDerivative
-from pathreplay.gradient.record import Layout, record_type
-from pathreplay.gradient.sweep import first_walk, room_for, walk_back
+from pathreplay.gradient.record import Layout, record_type, room_for
+from pathreplay.gradient.two_walks import first_walk, walk_back
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart

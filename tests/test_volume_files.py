@@ -7,7 +7,9 @@
 
 from __future__ import annotations
 
+import struct
 import sys
+import time
 import zipfile
 from pathlib import Path
 
@@ -139,6 +141,20 @@ def test_damaged_nanovdb_does_not_reach_the_reader(file: str, at: int, words: st
     with pytest.raises(PathreplayError, match=words) as caught:
         load_volume(files / "bad.nvdb", "density")
     assert "\n" not in str(caught.value)
+
+
+@needs_vdb
+@pytest.mark.parametrize("far", [399, 2**30])
+def test_a_huge_box_is_not_asked_for_voxel_by_voxel(far: int, files: Path) -> None:
+    """A million voxels a second: a box of 2^90 would have no end, one of 400 x 400 x 400 takes a minute."""
+    content = (files / "raw.nvdb").read_bytes()
+    box = struct.pack("<6i", -1, 2, 5, 1, 5, 9)
+    assert content.count(box) == 2  # in the segment and in the grid
+    (files / "huge.nvdb").write_bytes(content.replace(box, struct.pack("<6i", -1, 2, 5, far, far, far)))
+    start = time.perf_counter()
+    with pytest.raises(PathreplayError, match=rf"spans {far + 2} x .* more than \d+; crop it first"):
+        load_volume(files / "huge.nvdb", "density")
+    assert time.perf_counter() - start < 5
 
 
 @needs_vdb

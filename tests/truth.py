@@ -1,7 +1,7 @@
-"""What the truth tests measure with: a case (scene, parameter, direction), three gradients of it, and a table.
+"""The cases of the truth tests (scene, parameter, direction), what is asserted of their gradients, and a table.
 
 The objective is always J = Σ W·image with fixed random weights W in [0, 1): no two pixels can cancel by symmetry.
-The parameter moves along one direction, value(t), and all gradients are dJ/dt at t = 0.
+The parameter moves along a curve, value(t), and all gradients are dJ/dt at t = 0. What measures is pathreplay.check.
 """
 
 from __future__ import annotations
@@ -15,14 +15,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-RES = 16
-Move = Callable[[Any, Any], Any]  # (value at 0, t) -> value at t
+from pathreplay.check.objective import Move, Objective
+from pathreplay.check.statistics import gap
+from pathreplay.check.stencil import CENTRAL, Stencil
+from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
 
-# A finite difference Σ c f(o h) / h, as {o: c}. The wide ones, of third and fourth order, let h be a large share of the
-# parameter: delta tracking decides anew at every h, so that its noise does not shrink with h as a smooth path's does.
-CENTRAL = {-1: -0.5, 1: 0.5}
-WIDE = {-2: 1 / 12, -1: -8 / 12, 1: 8 / 12, 2: -1 / 12}
-UPWARD = {0: -11 / 6, 1: 3.0, 2: -1.5, 3: 1 / 3}  # where the parameter ends at its value
+RES = 16
 
 
 @dataclass(frozen=True)
@@ -40,10 +38,9 @@ class Case:
     seeds: int = 12
     options: dict = field(default_factory=dict)  # of the integrator
     drivers: tuple[str, ...] = ("sweep", "replay")
-    peer: bool = False  # measure Mitsuba's prb (prbvolpath beside volpath), too
     reference: str = "path"  # the plugin whose images are differenced
     reference_spp: int = 0  # of the reference; 0: spp
-    stencil: dict[int, float] = field(default_factory=lambda: CENTRAL)
+    stencil: Stencil = CENTRAL
     lanes: float | None = 1e-3  # largest relative L1 error lane by lane; None: random choices depend on the parameter
 
 
@@ -56,10 +53,9 @@ class Row:
     gradient: float
     reference: float
     error: float  # standard error of their difference
-    z: float
+    z: float  # their difference as a normal deviate
     lanes: float  # relative L1 error lane by lane; nan where not defined
     transpose: float  # |<W, Jv> - <J^T W, v>| / Σ|W·Jv|; nan where not defined
-    peer: float = np.nan  # Mitsuba's prb
 
 
 ROWS: list[Row] = []
@@ -70,11 +66,11 @@ SAME_SEED_SPP = 16
 def table() -> str:
     """All rows so far, as text."""
     lines = [f"{'cell':44s} {'driver':8s} {'gradient':>11s} {'fin. diff.':>11s} {'std. error':>10s} {'z':>6s} "
-             f"{'lanes':>8s} {'fwd=rev':>8s} {'prb':>9s}"]  # fmt: skip
+             f"{'lanes':>8s} {'fwd=rev':>8s}"]  # fmt: skip
     for r in ROWS:
         lines.append(
             f"{r.name:44s} {r.driver:8s} {r.gradient:+11.5f} {r.reference:+11.5f} {r.error:10.5f} {r.z:+6.2f} "
-            f"{_number(r.lanes)} {_number(r.transpose)} " + (f"{r.peer:+9.5f}" if np.isfinite(r.peer) else f"{'-':>9s}")
+            f"{_number(r.lanes)} {_number(r.transpose)}"
         )
     return "\n".join(lines)
 
@@ -129,61 +125,36 @@ def translate_vertices(x: float, y: float, z: float) -> Move:
     return lambda value, t: value + t * mi.Float(np.tile(np.array([x, y, z], np.float32), dr.width(value) // 3))
 
 
-class Bench:
-    """A loaded case: its scene, and gradients of it."""
+class Bench(Objective):
+    """A loaded case."""
 
     def __init__(self, case: Case) -> None:
+        gc.collect()  # scenes of earlier cases would be traced, too
         self.case = case
-        self.scene = mi.load_dict(case.scene(), optimize=False)
-        self.params = mi.traverse(self.scene)
-        assert case.key in self.params, f"{case.key} is not among {list(self.params.keys())}"
-        value = self.params[case.key]
-        self.value = type(value)(value)
-        self.weights = np.random.default_rng(0).uniform(0, 1, (RES, RES, 3)).astype(np.float32) / RES**2
+        scene = mi.load_dict(case.scene(), optimize=False)
+        super().__init__(scene, mi.traverse(scene), case.key, case.move)
+        self.weigh(np.random.default_rng(0).uniform(0, 1, (RES, RES, 3)).astype(np.float32) / RES**2)
 
-    def integrator(self, plugin: str = "pathreplay", **options: Any) -> Any:
+    def integrator(self, plugin: str = "pathreplay", **options: Any) -> mi.Integrator:
         return mi.load_dict({"type": plugin, "max_depth": self.case.depth, **options})
 
-    def put(self, t: Any) -> None:
-        self.params[self.case.key] = self.case.move(self.value, t)
-        self.params.update()
+    def reference(self, count: int, spp: int = 0, **options: Any) -> np.ndarray:
+        """Finite differences of the weighted image by the case's reference, for so many seeds."""
+        case = self.case
+        plain = self.integrator(case.reference, rr_depth=case.rr_depth, **options)
+        spp = spp or case.reference_spp or case.spp
+        images = (self.difference(plain, case.stencil, case.step, 1000 + k, spp) for k in range(1, count + 1))
+        return np.array([self.dot(image) for image in images])
 
-    def image(self, integrator: Any, seed: int, t: float = 0.0, spp: int = 0) -> np.ndarray:
-        self.put(dr.opaque(mi.Float, t))
-        image = mi.render(self.scene, integrator=integrator, seed=seed, spp=spp or self.case.spp)
-        return np.array(image).astype(np.float64)
-
-    def difference(self, integrator: Any, seed: int, spp: int = 0, stencil: dict[int, float] = CENTRAL) -> np.ndarray:
-        """Finite difference of the image with common random numbers."""
-        h = self.case.step
-        return sum(c * self.image(integrator, seed, o * h, spp) for o, c in stencil.items()) / h
-
-    def forward(self, integrator: Any, seed: int, spp: int = 0) -> np.ndarray:
-        t = dr.opaque(mi.Float, 0)
-        dr.enable_grad(t)
-        dr.set_grad(t, 1)
-        self.put(t)
-        dr.forward(t, dr.ADFlag.ClearEdges)
-        return np.array(integrator.render_forward(self.scene, self.params, seed=seed, spp=spp or self.case.spp))
-
-    def backward(self, integrator: Any, seed: int, spp: int = 0) -> float:
-        t = dr.opaque(mi.Float, 0)
-        dr.enable_grad(t)
-        self.put(t)
-        weights = mi.TensorXf(self.weights)
-        integrator.render_backward(self.scene, self.params, weights, seed=seed, spp=spp or self.case.spp)
-        value = self.params[self.case.key]
-        dr.enqueue(dr.ADMode.Backward, value)
-        dr.traverse(dr.ADMode.Backward)
-        return float(dr.grad(t)[0])
+    def backwards(self, integrator: mi.Integrator, count: int = 0) -> np.ndarray:
+        """The gradient by the reverse pass, for so many seeds (the case's)."""
+        case = self.case
+        return np.array([self.backward(integrator, k, case.spp) for k in range(1, (count or case.seeds) + 1)])
 
     def release(self) -> None:
         """Detach the parameter: Dr.Jit traces virtual calls through all scenes alive, and trips over attached ones."""
-        self.params[self.case.key] = self.value
+        self.params[self.key] = self.value
         self.params.update()
-
-    def dot(self, image: np.ndarray) -> float:
-        return float((image * self.weights).sum())
 
 
 def measure(case: Case) -> list[Row]:
@@ -192,60 +163,29 @@ def measure(case: Case) -> list[Row]:
     Finite differences are of the case's reference; lane by lane they are of our own primal image, without Russian
     roulette, whose probabilities move with the parameters.
     """
-    gc.collect()  # scenes of earlier cases would be traced, too
     bench = Bench(case)
     try:
-        return _measure(case, bench)
+        reference = bench.reference(case.seeds)
+        steady = bench.integrator(rr_depth=1000, **case.options)
+        lanes = np.nan if case.lanes is None else bench.lane_error(steady, case.step, 1, case.spp)
+        rows = []
+        for driver in ("forward", *case.drivers):
+            props = case.options if driver == "forward" else {"driver": driver, **case.options}
+            integrator, transpose = bench.integrator(rr_depth=case.rr_depth, **props), np.nan
+            if driver == "forward":
+                images = (bench.forward(integrator, seed, case.spp) for seed in range(1, case.seeds + 1))
+                g = np.array([bench.dot(image) for image in images])
+            else:
+                g = bench.backwards(integrator)
+                same = bench.integrator(rr_depth=1000, **props)
+                transpose = bench.transpose_error(steady, same, 1, SAME_SEED_SPP)
+            rows.append(Row(case.name, driver, g.mean(), reference.mean(), *gap(g, reference)[1:], lanes, transpose))
     finally:
         bench.release()
-
-
-def _measure(case: Case, bench: Bench) -> list[Row]:
-    plain = bench.integrator(case.reference, rr_depth=case.rr_depth)
-    seeds = range(1, case.seeds + 1)
-    wide = {"spp": case.reference_spp, "stencil": case.stencil}
-    reference = np.array([bench.dot(bench.difference(plain, 1000 + seed, **wide)) for seed in seeds])
-
-    steady = bench.integrator(rr_depth=1000, **case.options)
-    lanes = np.nan
-    if case.lanes is not None:
-        tangent = bench.forward(steady, 1)
-        difference = bench.difference(steady, 1)
-        lanes = float(np.abs(tangent - difference).sum() / np.abs(difference).sum())
-
-    peer = _peer(bench, seeds) if case.peer else np.nan
-    rows = []
-    for driver in ("forward", *case.drivers):
-        props = {} if driver == "forward" else {"driver": driver}
-        integrator = bench.integrator(rr_depth=case.rr_depth, **props, **case.options)
-        if driver == "forward":
-            g = np.array([bench.dot(bench.forward(integrator, seed)) for seed in seeds])
-            transpose = np.nan
-        else:
-            g = np.array([bench.backward(integrator, seed) for seed in seeds])
-            same = bench.integrator(rr_depth=1000, driver=driver, **case.options)
-            tangent = bench.forward(steady, 1, SAME_SEED_SPP)
-            transpose = abs(bench.dot(tangent) - bench.backward(same, 1, SAME_SEED_SPP)) / bench.dot(np.abs(tangent))
-        error = float(np.sqrt((g.var(ddof=1) + reference.var(ddof=1)) / case.seeds))
-        z = float((g.mean() - reference.mean()) / error)
-        rows.append(Row(case.name, driver, g.mean(), reference.mean(), error, z, lanes, transpose, peer))
     ROWS.extend(rows)
     return rows
 
 
-def _peer(bench: Bench, seeds: range) -> float:
-    """Mean gradient by Mitsuba's prb or prbvolpath; nan where it refuses."""
-    prb = bench.integrator("prb" if bench.case.reference == "path" else "prbvolpath", rr_depth=bench.case.rr_depth)
-    try:
-        return float(np.mean([bench.backward(prb, seed) for seed in seeds]))
-    except RuntimeError:
-        return np.nan
-
-
-# Beyond four standard errors an honest gradient falls once in ten thousand cells.
-Z_MAX = 4.0
-# A gradient must be resolved to count: a standard error of this share of it lets an error of four times that pass.
-RESOLVED = 0.1
 # Same seed, forward against reverse: float32 rounding of the sums, relative to the sum of magnitudes.
 TRANSPOSE_MAX = 1e-5
 
@@ -253,8 +193,9 @@ TRANSPOSE_MAX = 1e-5
 def hold(case: Case, transpose: float = TRANSPOSE_MAX) -> None:
     """Measure a case and assert all three levels for every driver."""
     for row in measure(case):
-        assert abs(row.z) < Z_MAX, row
-        assert row.error < RESOLVED * max(abs(row.gradient), abs(row.reference)), row
+        assert abs(row.z) < Z_LIMIT, row
+        # An error of four times this share would pass.
+        assert row.error < RESOLUTION * max(abs(row.gradient), abs(row.reference)), row
         if case.lanes is not None:
             assert row.lanes < case.lanes, row
         if row.driver != "forward":

@@ -11,9 +11,8 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.check.direction import choose_line
-from pathreplay.check.objective import Mode, View, alone
+from pathreplay.check.objective import Mode, Objective, alone
 from pathreplay.check.reference import reference_integrator
-from pathreplay.check.verdict import NEGLIGIBLE, judge
 from pathreplay.scenes.parameters import get_array
 
 from ..scenes.truth import TRUTH_SCENES
@@ -38,10 +37,9 @@ class Derivative:
         ours = mi.load_dict({"type": "pathreplay"} | self.limits)
         self.plain = reference_integrator(None, self.scene, ours)
         self.held = alone(params, self.cell.key)  # for as long as this process lives
-        held = self.held.__enter__()
-        self.view = View(self.scene, params, self.cell.key, held, self.line, self.scene.sensors()[0])
-        self.unit = np.finfo(get_array(held).dtype).eps / 2
-        self.weights, self.scale = self.view.weights(self.plain, None, _seed(0, SCALE), job.spp)
+        self.held.__enter__()
+        self.objective = Objective(self.scene, params, self.cell.key, self.line.move)
+        self.objective.weigh_by(None, self.plain, _seed(0, SCALE), job.spp)
         self.integrators: dict[str, Any] = {}
 
     def forget(self) -> None:
@@ -58,7 +56,7 @@ class Derivative:
         else:
             mode: Mode = "forward" if method == "forward" else "backward"
             seeds = _seed(seed, PICTURE), _seed(seed, DERIVATIVE)
-            value = self.view.derivative(self._integrator(method), mode, self.weights, *seeds, self.job.spp)
+            value = self.objective.derivative(self._integrator(method), mode, *seeds, self.job.spp)
         return time.perf_counter() - start, np.array([value])
 
     def _integrator(self, method: str) -> Any:
@@ -68,13 +66,9 @@ class Derivative:
         return self.integrators[method]
 
     def _difference(self, method: str, seed: int) -> float:
-        stencil, h = self.line.stencil, self.line.step
-        coefficients = stencil.full if method == STEPS[0] else stencil.half
-        return sum(
-            c * self.view.objective(self.plain, self.weights, offset * h, seed, self.cell.reference_spp) / h
-            for offset, c in zip(stencil.offsets, coefficients, strict=True)
-            if c
-        )
+        stencil = self.line.stencil if method == STEPS[0] else self.line.stencil.halved()
+        difference = self.objective.difference(self.plain, stencil, self.line.step, seed, self.cell.reference_spp)
+        return self.objective.dot(difference)
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """The samples of each method, and the verdict on it: see pathreplay.check.verdict."""
@@ -84,17 +78,9 @@ class Derivative:
         }
         if not all(name in samples and len(samples[name]) > 1 for name in STEPS):
             return facts
-        stencil, full, half = self.line.stencil, *(samples[name] for name in STEPS)
-        weight = float(np.abs(np.subtract(np.multiply(4, stencil.half), stencil.full)).sum() / 3)
         for name, values in samples.items():
             if name not in STEPS and len(values) > 1:
-                verdict = judge(
-                    values,
-                    full,
-                    half,
-                    rounding=weight * self.unit * self.scale / self.line.step,
-                    negligible=NEGLIGIBLE * self.scale / self.line.size,
-                )
+                verdict = self.objective.judge(self.line, values, *(samples[step] for step in STEPS))
                 facts[name] |= {"z": verdict.z if np.isfinite(verdict.z) else None, "verdict": verdict.verdict}
         return facts
 

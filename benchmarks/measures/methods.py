@@ -14,9 +14,9 @@ METHODS: dict[str, dict[str, object]] = {
     "replay": {"type": "pathreplay", "driver": "replay"},
     "volpath": {"type": "volpath"},
     "prbvolpath": {"type": "prbvolpath"},
-    "score": {"type": "pathreplay", "volume_gradient": "score"},
-    "no branch": {"type": "pathreplay", "volume_gradient": "score", "branch": False},
-    "listing": {"type": "pathreplay", "volume_gradient": "listing"},
+    "score": {"type": "pathreplay"},
+    "no branch": {"type": "pathreplay", "branch": False},
+    "listing": {"type": "pathreplay_listing"},
 }
 
 #: Mitsuba's own: what ours is compared with, and not held to anything when two records are compared.

@@ -114,23 +114,23 @@ def check(
     """Compare gradients with finite differences of Mitsuba's path tracer; exit status 1 if one does not pass."""
     with interrupts.undisturbed():  # as in `optimize`
         from pathreplay import backend
-        from pathreplay.check import report
+        from pathreplay.check import command
         from pathreplay.scenes.loading import load_scene_for
 
     if json is not None:
-        report.require_writable(json)
+        command.require_writable(json)
     with interrupts.undisturbed():
         backend.set_variant(variant)
     loaded, notes = load_scene_for(scene, param)
     for note in notes:
         typer.echo(f"pathreplay: {plain_line(note)}", err=True)
-    results = report.check_all(
+    results = command.check_all(
         loaded, param, integrator=integrator, seeds=seeds, spp=spp, fd_spp=fd_spp, step=step,
         max_depth=max_depth, mode=mode, sensor=sensor, seed=seed,
     )  # fmt: skip
-    report.print_checks(results)
+    command.print_checks(results)
     if json is not None:
-        report.write_checks(results, json)
+        command.write_checks(results, json)
     raise typer.Exit(0 if all(result.passed for result in results) else 1)
 
 

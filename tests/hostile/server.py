@@ -26,7 +26,7 @@ def serve() -> None:
     """Answer requests until standard input ends."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever imports print does not belong among the answers
-    import pathreplay.check.report
+    import pathreplay.check.command
     import pathreplay.cli
     import pathreplay.inverse.job  # noqa: F401
 

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from pathreplay.check.stencil import BACKWARD, CENTRAL, FORWARD, Stencil
 from pathreplay.errors import PathreplayError
+from pathreplay.scenes.parameters import displaced
 from pathreplay.scenes.spectra import coefficients, values_of_p
 
 RELATIVE_STEP = 1e-2
@@ -20,24 +22,6 @@ RELATIVE_STEP = 1e-2
 
 # Parameters in which a sign means nothing; all others that are nowhere negative are taken as bounded by 0.
 _SIGNED = ("vertex_positions", "vertex_normals", "vertex_texcoords", "to_world", "to_uv", "position", "direction")
-
-
-@dataclass(frozen=True)
-class Stencil:
-    """Two finite differences of second order, with steps h and h/2, from the same four evaluations f(offset * h).
-
-    D(h) = Σ full[i] f(offset[i] h) / h and D(h/2) = Σ half[i] f(offset[i] h) / h.
-    """
-
-    name: str
-    offsets: tuple[float, ...]
-    full: tuple[float, ...]
-    half: tuple[float, ...]
-
-
-CENTRAL_STENCIL = Stencil("central", (-1, -0.5, 0.5, 1), (-0.5, 0, 0, 0.5), (0, -1, 1, 0))
-FORWARD_STENCIL = Stencil("one-sided, up", (0, 0.5, 1, 2), (-1.5, 0, 2, -0.5), (-3, 4, -1, 0))
-BACKWARD_STENCIL = Stencil("one-sided, down", (0, -0.5, -1, -2), (1.5, 0, -2, 0.5), (3, -4, 1, 0))
 
 
 @dataclass(frozen=True)
@@ -51,6 +35,10 @@ class Line:
     """The size of the parameter: its largest absolute entry along the direction, but at least 1."""
     step: float
     stencil: Stencil
+
+    def move(self, value: Any, t: Any) -> Any:
+        """The point at t, from the parameter's own ``value``, whose type it has."""
+        return displaced(value, self.direction, t)
 
 
 def choose_line(
@@ -143,10 +131,10 @@ def _random_entries(shape: tuple[int, ...], seed: int) -> np.ndarray:
 def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
     bounded = key.rsplit(".", 1)[-1] not in _SIGNED and (value >= 0).all()
     if not bounded or (value >= np.abs(move)).all():
-        return CENTRAL_STENCIL
+        return CENTRAL
     if (value + 2 * move >= 0).all():
-        return FORWARD_STENCIL
+        return FORWARD
     if (value - 2 * move >= 0).all():
-        return BACKWARD_STENCIL
+        return BACKWARD
     # Both ways lead below zero (a given direction of mixed signs over zeros): linear parameters do not mind.
-    return CENTRAL_STENCIL
+    return CENTRAL

@@ -13,12 +13,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.check.direction import choose_line
-from pathreplay.check.objective import Mode, View, alone, integrator_name
+from pathreplay.check.direction import Line, choose_line
+from pathreplay.check.objective import Mode, Objective, alone, integrator_name
 from pathreplay.check.reference import integrator_under_test, reference_integrator
-from pathreplay.check.verdict import NEGLIGIBLE, Verdict, judge
+from pathreplay.check.verdict import Verdict
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.render.films import film_size, require_memory, require_samples
+from pathreplay.render.film import film_size
+from pathreplay.render.film_limits import require_memory, require_samples
 from pathreplay.scenes.parameters import get_array, require_differentiable, require_finite
 from pathreplay.scenes.spectra import coefficient_channels
 
@@ -135,6 +136,67 @@ def check_gradient(
     _require_arguments(scene, sensor, seeds, spp, fd_spp, seed, mode)
     params = mi.traverse(scene)
     tested = integrator_under_test(integrator, scene, max_depth)
+    line = _line(params, key, tested, step, direction, seed)
+    plain = reference_integrator(reference, scene, tested)
+    plan = _Plan(mode, seeds, spp, fd_spp or spp, seed, progress)
+    with alone(params, key):
+        return plan.carry_out(Objective(scene, params, key, line.move, sensor), line, tested, plain, loss)
+
+
+@dataclass
+class _Plan:
+    """What is sampled, how often, and who is told of every rendering that is done."""
+
+    mode: Mode
+    seeds: int
+    spp: int
+    fd_spp: int
+    seed: int
+    progress: Callable[[int, int], None] | None
+    done: int = 0
+
+    def carry_out(
+        self, objective: Objective, line: Line, tested: mi.Integrator, plain: mi.Integrator, loss: Any
+    ) -> GradientCheck:
+        n, stencil, points = self.seeds, line.stencil, line.stencil.points()
+        # Distinct 32-bit words: seeds of the gradient's primal image, of its derivative, of the reference, of the
+        # weights.
+        words = [int(word) for word in np.random.SeedSequence(self.seed).generate_state(3 * n + 1)]
+        objective.weigh_by(loss, plain, words[-1], self.fd_spp)
+        self._tick()
+        pairs, others = zip(words[:n], words[n : 2 * n], strict=True), words[2 * n : -1]
+        gradients = [self._tick(objective.derivative(tested, self.mode, *pair, self.spp)) for pair in pairs]
+        values = {}
+        for o in points:
+            images = (objective.image(plain, seed, self.fd_spp, o * line.step) for seed in others)
+            values[o] = np.array([self._tick(objective.dot(image)) for image in images])
+        full, half = (each(values.__getitem__) / line.step for each in (stencil, stencil.halved()))
+        return GradientCheck(
+            key=objective.key,
+            direction=line.description,
+            integrator=integrator_name(tested),
+            reference_integrator=integrator_name(plain),
+            mode=self.mode,
+            objective=float(np.mean(values.get(0.0, list(values.values())))),
+            step=line.step,
+            stencil=stencil.name,
+            seeds=n,
+            spp=self.spp,
+            fd_spp=self.fd_spp,
+            gradient_samples=tuple(gradients),
+            reference_samples=tuple(((4 * half - full) / 3).tolist()),
+            **vars(objective.judge(line, np.array(gradients), full, half)),
+        )
+
+    def _tick(self, result: float = 0.0) -> float:
+        self.done += 1
+        if self.progress is not None:
+            self.progress(self.done, 1 + 5 * self.seeds)
+        return result
+
+
+def _line(params: mi.SceneParameters, key: str, tested: mi.Integrator, step: Any, direction: Any, seed: int) -> Line:
+    """The line through the parameter that will be looked along; what cannot be differentiated or differenced raises."""
     require_differentiable(params, key, tested)
     require_finite(params)
     if get_array(params[key]).dtype == np.float16:
@@ -144,57 +206,7 @@ def check_gradient(
         )
     value = get_array(params[key]).astype(np.float64)
     far, spectra = _is_far(params.properties[key][2]), coefficient_channels(params, key) > 0
-    line = choose_line(key, value, direction, step, seed, far=far, spectra=spectra)
-    plain = reference_integrator(reference, scene, tested)
-    fd_spp = spp if fd_spp is None else fd_spp
-    # Distinct 32-bit words: seeds of the gradient's primal image, of its derivative, of the reference, of the weights.
-    words = np.random.SeedSequence(seed).generate_state(3 * seeds + 1)
-    primal_seeds, gradient_seeds, reference_seeds, (weight_seed,) = np.split(words, [seeds, 2 * seeds, 3 * seeds])
-
-    offsets = line.stencil.offsets
-    total, done = 1 + seeds * (1 + len(offsets)), 0
-
-    def tick() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress(done, total)
-
-    gradients = np.empty(seeds)
-    values = np.empty((seeds, len(offsets)))
-    with alone(params, key) as held:
-        view = View(scene, params, key, held, line, scene.sensors()[sensor])
-        weights, scale = view.weights(plain, loss, int(weight_seed), fd_spp)
-        tick()
-        for i in range(seeds):
-            gradients[i] = view.derivative(tested, mode, weights, int(primal_seeds[i]), int(gradient_seeds[i]), spp)
-            tick()
-        for i in range(seeds):
-            for j, offset in enumerate(offsets):
-                values[i, j] = view.objective(plain, weights, offset * line.step, int(reference_seeds[i]), fd_spp)
-                tick()
-
-    full, half = values @ line.stencil.full / line.step, values @ line.stencil.half / line.step
-    # A rounding error of one half unit in the last place of every image, all of one sign, at worst.
-    unit = np.finfo(get_array(held).dtype).eps / 2
-    rounding = float(np.abs(np.subtract(np.multiply(4, line.stencil.half), line.stencil.full)).sum() / 3) * unit * scale
-    result = judge(gradients, full, half, rounding=rounding / line.step, negligible=NEGLIGIBLE * scale / line.size)
-    return GradientCheck(
-        key=key,
-        direction=line.description,
-        integrator=integrator_name(tested),
-        reference_integrator=integrator_name(plain),
-        mode=mode,
-        objective=float(values[:, offsets.index(0) if 0 in offsets else slice(None)].mean()),
-        step=line.step,
-        stencil=line.stencil.name,
-        seeds=seeds,
-        spp=spp,
-        fd_spp=fd_spp,
-        gradient_samples=tuple(gradients.tolist()),
-        reference_samples=tuple(((4 * half - full) / 3).tolist()),
-        **vars(result),
-    )
+    return choose_line(key, value, direction, step, seed, far=far, spectra=spectra)
 
 
 def _is_far(owner: Any) -> bool:

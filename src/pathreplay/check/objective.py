@@ -1,4 +1,4 @@
-"""The objective of a check, F(t): a weighted mean of the image, as a function of one parameter along one line.
+"""The objective of a check, F(t): a weighted mean of the image, as a function of one parameter along one curve.
 
 F(π) = Σ_k w_k I_k(π) / n is linear in the image, so that the gradient of one noisy image is an unbiased sample of the
 gradient of F, and the difference of two noisy images one of its difference.
@@ -6,7 +6,7 @@ gradient of F, and the difference of two noisy images one of its difference.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Literal
 
@@ -15,16 +15,20 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.check.direction import Line
+from pathreplay.check.statistics import relative_l1
+from pathreplay.check.stencil import CENTRAL, Stencil
+from pathreplay.check.verdict import NEGLIGIBLE, Judgement, judge
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.loading import innermost, told
-from pathreplay.scenes.parameters import displaced
+from pathreplay.scenes.parameters import get_array
 
 Mode = Literal["backward", "forward"]
+Move = Callable[[Any, Any], Any]
 
 
 @contextmanager
-def alone(params: Any, key: str) -> Iterator[Any]:
-    """Yield the detached value of ``key`` while no parameter is attached; put everything back at the end."""
+def alone(params: mi.SceneParameters, key: str) -> Iterator[None]:
+    """Detach all parameters, so that only ``key`` will be attached; put everything back at the end."""
     # Copies: the map hands out references to what the scene holds, and the scene is about to change.
     held = {name: _copy(params[name]) for name in params.keys() if name == key or dr.grad_enabled(params[name])}
     # Setting through the map, then update(): objects keep values derived from their parameters.
@@ -32,7 +36,7 @@ def alone(params: Any, key: str) -> Iterator[Any]:
         params[name] = dr.detach(value)
     params.update()
     try:
-        yield dr.detach(held[key])
+        yield
     finally:
         for name, value in held.items():
             params[name] = value
@@ -44,30 +48,35 @@ def _copy(value: Any) -> Any:
     return type(value)(value)
 
 
-class View:
-    """The scene on the line value + t · direction, seen by one sensor."""
+class Objective:
+    """The scene on the curve move(value, t) through the value of one parameter, seen by one sensor, under weights.
 
-    def __init__(self, scene: Any, params: Any, key: str, value: Any, line: Line, sensor: Any) -> None:
+    ``move(value, t)`` is the parameter at t, the value itself at t = 0. Unless it says otherwise, all of a method's
+    pictures have the same seed: common random numbers.
+    """
+
+    def __init__(self, scene: mi.Scene, params: mi.SceneParameters, key: str, move: Move, sensor: int = 0) -> None:
+        assert key in params, f"{key} is not among {list(params.keys())}"
         self.scene = scene
         self.params = params
         self.key = key
-        self.value = value
-        self.line = line
-        self.sensor = sensor
+        self.value = _copy(dr.detach(params[key]))
+        self.move = move
+        self.sensor = scene.sensors()[sensor]
 
-    def move(self, t: Any) -> None:
-        """Set the parameter to value + t · direction; update() evaluates it, so that all t share one kernel."""
-        self.params[self.key] = displaced(self.value, self.line.direction, t)
+    def put(self, t: Any) -> None:
+        """Set the parameter to its value at t; update() evaluates it, so that all t share one kernel."""
+        self.params[self.key] = self.move(self.value, t)
         self.params.update()
 
-    def render(self, integrator: Any, seed: int, spp: int) -> Any:
-        with told(f"Integrator '{integrator_name(integrator)}' cannot render the scene"):
-            image = integrator.render(self.scene, self.sensor, seed=mi.UInt32(seed), spp=spp)
-            return mi.TensorXf(image)
+    def weigh(self, weights: np.ndarray) -> None:
+        """Set the weights w / n, of the shape of the picture."""
+        self.adjoint = mi.TensorXf(weights)
+        self.weights = np.array(self.adjoint, np.float64)
 
-    def weights(self, plain: Any, loss: Any, seed: int, spp: int) -> tuple[Any, float]:
-        """The weights w / n as a tensor like the image, and the scale Σ |w_k I_k| / n of the objective."""
-        image = self.render(plain, seed, spp)
+    def weigh_by(self, loss: Any, plain: mi.Integrator, seed: int, spp: int) -> None:
+        """Set smooth weights, or the derivative of a loss at a picture; and the scale Σ |w_k I_k| / n of F."""
+        image = self._render(plain, seed, spp)
         if loss is None:
             w = smooth_weights(image.shape, _has_alpha(self.sensor))
         else:
@@ -81,27 +90,35 @@ class View:
                 raise PathreplayError("loss has a derivative that is NaN or infinite; give a function without, or none")
             if _has_alpha(self.sensor):
                 w[..., -1] = 0
-        return mi.TensorXf(w), float(np.abs(w * np.array(image, np.float64)).sum())
+        self.weigh(w)
+        self.scale = float(np.abs(w * np.array(image, np.float64)).sum())
 
-    def objective(self, integrator: Any, weights: Any, t: float, seed: int, spp: int) -> float:
-        self.move(dr.opaque(mi.Float, t))
-        image = self.render(integrator, seed, spp)
-        # Double precision: sums over the image must not round what the difference is made of.
-        return float(np.vdot(np.array(weights, np.float64), np.array(image, np.float64)))
+    def dot(self, image: np.ndarray) -> float:
+        """The weighted sum; in double precision, since it must not round what a difference is made of."""
+        return float(np.vdot(self.weights, image))
 
-    def derivative(self, integrator: Any, mode: Mode, weights: Any, primal: int, seed: int, spp: int) -> float:
-        t = dr.opaque(mi.Float, 0)
-        dr.enable_grad(t)
+    def image(self, integrator: mi.Integrator, seed: int, spp: int, t: float = 0.0) -> np.ndarray:
+        """The picture at t (height x width x channels)."""
+        self.put(dr.opaque(mi.Float, t))
+        return np.array(self._render(integrator, seed, spp), np.float64)
+
+    def difference(self, integrator: mi.Integrator, stencil: Stencil, h: float, seed: int, spp: int) -> np.ndarray:
+        """Finite difference of the picture."""
+        return stencil(lambda t: self.image(integrator, seed, spp, t), h)
+
+    def derivative(self, integrator: mi.Integrator, mode: Mode, primal: int, seed: int, spp: int) -> float:
+        """dF/dt at 0, through ``mi.render`` and with seeds for picture and derivative, as users have it."""
+        t = self._attached()
         try:
-            self.move(t)
+            self.put(t)
             image = mi.render(
                 self.scene, self.params, sensor=self.sensor, integrator=integrator,
                 seed=mi.UInt32(primal), seed_grad=seed, spp=spp,
             )  # fmt: skip
             if mode == "forward":
                 dr.forward(t)
-                return float(np.vdot(np.array(weights, np.float64), np.array(dr.grad(image), np.float64)))
-            dr.backward(dr.sum(image * weights, axis=None))
+                return self.dot(np.array(dr.grad(image), np.float64))
+            dr.backward(dr.sum(image * self.adjoint, axis=None))
             return float(dr.grad(t)[0])
         except (RuntimeError, TypeError, NotImplementedError) as error:
             name = integrator_name(integrator)
@@ -109,8 +126,56 @@ class View:
                 f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode: {innermost(error)}"
             ) from error
 
+    def forward(self, integrator: mi.Integrator, seed: int, spp: int) -> np.ndarray:
+        """The derivative of the picture, by the integrator's forward pass alone."""
+        t = self._attached()
+        dr.set_grad(t, 1)
+        self.put(t)
+        dr.forward(t, dr.ADFlag.ClearEdges)
+        image = integrator.render_forward(self.scene, self.params, self.sensor, seed=seed, spp=spp)
+        return np.array(image, np.float64)
 
-def _has_alpha(sensor: Any) -> bool:
+    def backward(self, integrator: mi.Integrator, seed: int, spp: int) -> float:
+        """dF/dt, by the integrator's reverse pass alone."""
+        t = self._attached()
+        self.put(t)
+        integrator.render_backward(self.scene, self.params, self.adjoint, self.sensor, seed=seed, spp=spp)
+        return self.collect(t)
+
+    def collect(self, t: mi.Float) -> float:
+        """Bring what a reverse pass left at the parameter back to t."""
+        dr.enqueue(dr.ADMode.Backward, self.params[self.key])
+        dr.traverse(dr.ADMode.Backward)
+        return float(dr.grad(t)[0])
+
+    def lane_error(self, integrator: mi.Integrator, h: float, seed: int, spp: int) -> float:
+        """Relative L1 error, lane by lane, of the forward pass against differences with its own random numbers."""
+        found = self.forward(integrator, seed, spp)
+        return relative_l1(found, self.difference(integrator, CENTRAL, h, seed, spp))
+
+    def transpose_error(self, ahead: mi.Integrator, back: mi.Integrator, seed: int, spp: int) -> float:
+        """|<w, J v> - <Jᵀ w, v>| / Σ |w J v|: a forward pass against a reverse pass with the same random numbers."""
+        tangent = self.forward(ahead, seed, spp)
+        return abs(self.dot(tangent) - self.backward(back, seed, spp)) / self.dot(np.abs(tangent))
+
+    def judge(self, line: Line, gradients: np.ndarray, full: np.ndarray, half: np.ndarray) -> Judgement:
+        """The verdict on gradients, from differences along the line with its stencil and with this halved."""
+        # A rounding error of one half unit in the last place of every image, all of one sign, at worst.
+        unit = np.finfo(get_array(self.value).dtype).eps / 2
+        rounding = line.stencil.rounding() * unit * self.scale / line.step
+        return judge(gradients, full, half, rounding=rounding, negligible=NEGLIGIBLE * self.scale / line.size)
+
+    def _attached(self) -> mi.Float:
+        t = dr.opaque(mi.Float, 0)
+        dr.enable_grad(t)
+        return t
+
+    def _render(self, integrator: mi.Integrator, seed: int, spp: int) -> mi.TensorXf:
+        with told(f"Integrator '{integrator_name(integrator)}' cannot render the scene"):
+            return mi.TensorXf(integrator.render(self.scene, self.sensor, seed=mi.UInt32(seed), spp=spp))
+
+
+def _has_alpha(sensor: mi.Sensor) -> bool:
     return bool(mi.has_flag(sensor.film().flags(), mi.FilmFlags.Alpha))
 
 
@@ -130,7 +195,7 @@ def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
     return w / w.size
 
 
-def integrator_name(integrator: Any) -> str:
+def integrator_name(integrator: mi.Integrator) -> str:
     """The integrator as its user writes it, from the name of its class: 'PRBIntegrator' is 'prb'."""
     # For Python plugins Mitsuba's class_name() is that of the C++ base.
     python = isinstance(integrator, mi.CppADIntegrator)

@@ -6,8 +6,7 @@ combination (4 D(h/2) - D(h)) / 3 removes that term; what halving the step chang
 
     σ² = se(gradient)² + se(reference)² + step_error²,      z = (mean gradient - mean reference) / σ
 
-The standard errors are estimated from few samples, so the ratio follows Student's distribution. ``z`` is that ratio
-turned into the normal deviate of the same probability (Welch), so that |z| < 4 means the same for 3 seeds and for 300.
+and ``z`` is turned into a normal deviate, whatever the number of samples: see :mod:`pathreplay.check.statistics`.
 """
 
 from __future__ import annotations
@@ -17,7 +16,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy import stats
+
+from pathreplay.check.statistics import mean_and_error, welch
 
 Verdict = Literal["pass", "zero", "fail", "inconclusive"]
 
@@ -71,9 +71,9 @@ def judge(
     with np.errstate(invalid="ignore"):  # infinite samples are looked for below
         reference = (4 * half_step - full_step) / 3
         # D(h/2) is off by a third of what halving changed; that it bounds the better combination keeps us safe.
-        change, change_se = _mean((half_step - full_step) / 3)
-        g, g_se = _mean(gradient)
-        r, r_se = _mean(reference)
+        change, change_se = mean_and_error((half_step - full_step) / 3)
+        g, g_se = mean_and_error(gradient)
+        r, r_se = mean_and_error(reference)
     truncation = math.sqrt(max(0.0, change**2 - change_se**2))
     scale = max(abs(g), abs(r))
     known = Judgement(g, g_se, r, r_se, math.hypot(truncation, rounding), math.nan, math.inf, "inconclusive", "")
@@ -84,7 +84,7 @@ def judge(
         return replace(known, reason="the reference is NaN or infinite: look at the image, or choose a smaller step")
 
     σ = math.sqrt(g_se**2 + r_se**2 + known.step_error**2 + (SUMMATION * scale) ** 2)
-    z = _deviate(g - r, σ, (g_se, gradient.size), (r_se, reference.size))
+    z = welch(g - r, σ, (g_se, gradient.size), (r_se, reference.size))
     resolution = σ / scale if scale > 0 else math.inf
     verdict: Verdict
     if abs(z) >= Z_LIMIT:
@@ -96,26 +96,6 @@ def judge(
     else:
         verdict, reason = "inconclusive", _unresolved(resolution, known.step_error, σ)
     return replace(known, z=z, resolution=resolution, verdict=verdict, reason=reason)
-
-
-def _mean(samples: np.ndarray) -> tuple[float, float]:
-    """Mean and its standard error."""
-    samples = np.asarray(samples, np.float64)
-    return float(samples.mean()), float(samples.std(ddof=1) / math.sqrt(samples.size))
-
-
-def _deviate(difference: float, σ: float, *parts: tuple[float, int]) -> float:
-    """The normal deviate as improbable as difference/σ is under Student's distribution (Welch-Satterthwaite)."""
-    if difference == 0:
-        return 0.0
-    if σ == 0:
-        return math.copysign(math.inf, difference)
-    t = abs(difference) / σ
-    noise = sum(se**4 / (n - 1) for se, n in parts)
-    if noise > 0:
-        # σ holds the systematic bounds too: they are known, not estimated, and so add no uncertainty to σ.
-        t = float(stats.norm.isf(max(stats.t.sf(t, σ**4 / noise), 1e-300)))
-    return math.copysign(max(t, 0.0), difference)
 
 
 def _disagreement(g: float, r: float) -> str:

@@ -27,8 +27,8 @@ from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 from .adjoint import LostPaths, RayDerivative
-from .record import Layout, record_type
-from .sweep import MAX_DEPTH, first_walk, room_for, walk_back
+from .record import MAX_DEPTH, Layout, record_type, room_for
+from .two_walks import first_walk, walk_back
 
 
 def fits(max_depth: int, spp: int) -> bool:

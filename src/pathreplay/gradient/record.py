@@ -16,6 +16,25 @@ import mitsuba as mi
 from ..transport.vertex import Arrival, Flight, Kept, KeptInMedia, KnownLight, Numbers, Shadow, Walk
 from .adjoint import Replayed
 
+# Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x up to 136 bytes are 4.5 MB, and a
+# thread's stack is 8 MB. Beyond the stack the process would die without a word.
+MAX_DEPTH = 2048
+# With media a vertex takes up to 210 bytes, and null boundaries have records of their own.
+MAX_DEPTH_MEDIA = 1024
+MAX_RECORDS_MEDIA = 2000
+
+
+def deepest(walk: Walk) -> int:
+    """The largest ``max_depth`` that the sweep driver can hold in this scene."""
+    return MAX_DEPTH if walk.media is None else MAX_DEPTH_MEDIA
+
+
+def room_for(walk: Walk) -> int:
+    """How many vertices the record has room for: with media also two null boundaries at each, as convex ones need."""
+    if walk.media is None:
+        return max(walk.max_depth, 1)
+    return min(3 * walk.max_depth + 8, MAX_RECORDS_MEDIA)
+
 
 @dataclass(frozen=True)
 class Layout:

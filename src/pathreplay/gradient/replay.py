@@ -22,8 +22,8 @@ from .adjoint import LostPaths, backward
 from .branch import Branch, branch_backward
 from .primal import primal
 from .ray_jacobian import Recovery, has_smooth_lobes
+from .record import MAX_DEPTH_MEDIA
 from .replay_attached import replay_attached
-from .sweep import MAX_DEPTH_MEDIA
 
 
 def replay(

@@ -21,7 +21,6 @@ from .adjoint import LostPaths, Replayed, backward
 from .ray_jacobian import RayFrame, Recovery, emission_slope, length_scale, linearise, local_terms, random_sign
 
 
-@dr.syntax
 def replay_attached(
     walk: Walk,
     sampler: mi.Sampler,
@@ -37,18 +36,32 @@ def replay_attached(
     delta lobes. Behind smooth lobes A_i has rank two: without noise q is lost there, with noise the result is unbiased
     as long as rounding is not magnified beyond it. Not differentiated: visibility, and weights that are exactly zero.
     """
-    Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
     scale = length_scale(walk.scene)
-    sampler2 = sampler.clone()
-    first = PathState.begin(start.choose(walk, active), active)
+    again = sampler.clone()
+    path = PathState.begin(start.choose(walk, active), active)
+    L, q = _tangents(walk, sampler, dr.copy(path), δL, recovery, scale)
+    overflow = ~dr.all(dr.isfinite(q))
+    q = dr.select(overflow, 0, q)
+    with dr.resume_grad():
+        o, d = start.repeat()
+        if dr.grad_enabled(o, d):
+            dr.eval(q, L, overflow)  # else each entry of a camera's matrix runs the first pass again
+            x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
+            q0 = mi.Vector4f(q)
+            backward(sum(q0[k] * x[k] for k in range(4)))
+    _peel(walk, again, path, δL, L, q, overflow, lost, recovery, scale)
 
-    # -------------- First pass: L_0 and its derivative --------------
 
+@dr.syntax
+def _tangents(
+    walk: Walk, sampler: mi.Sampler, path: PathState, δL: mi.Spectrum, recovery: Recovery, scale: float
+) -> tuple[mi.Spectrum, mi.Vector4f]:
+    """First pass: L_0 and δL·∂L_0/∂r_0."""
+    Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
     L = Spectrum(0)  # δL is not part of it
-    q = Vector(0)  # δL·∂L_0/∂r_0
+    q = Vector(0)
     J = Matrix(1)  # ∂r_i/∂r_0
     κ = [Spectrum(0) for _ in range(4)]  # ∂ log β_i / ∂r_0, by each coordinate
-    path = dr.copy(first)
 
     while dr.hint(path.active, exclude=[walk, recovery, scale], label="pathreplay: tangents"):
         u, step = path.choose(walk, sampler)
@@ -65,25 +78,28 @@ def replay_attached(
         J = recovery.regularised(Matrix(local.A), random_sign(u), ~v.kept.delta) @ J
         path = onward
 
-    # ----------------------- Back to the camera ----------------------
+    return L, q
 
-    overflow = ~dr.all(dr.isfinite(q))
-    q = dr.select(overflow, 0, q)
-    with dr.resume_grad():
-        o, d = start.repeat()
-        if dr.hint(dr.grad_enabled(o, d), mode="scalar"):
-            dr.eval(q, L, overflow)  # else each entry of a camera's matrix runs the first pass again
-            x = RayFrame.of(first.at.ray, scale).coordinates(o, d)
-            q0 = mi.Vector4f(q)
-            backward(sum(q0[k] * x[k] for k in range(4)))
 
-    # --------- Second pass: peel L and q, feed the parameters --------
-
+@dr.syntax
+def _peel(
+    walk: Walk,
+    sampler: mi.Sampler,
+    path: PathState,
+    δL: mi.Spectrum,
+    L: mi.Spectrum,
+    q: mi.Vector4f,
+    overflow: mi.Bool,
+    lost: LostPaths,
+    recovery: Recovery,
+    scale: float,
+) -> None:
+    """Second pass: peel L and q, feed the parameters."""
+    Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
     broken = mi.Bool(False)  # this path has been counted as lost
-    path = dr.copy(first)
 
     while dr.hint(path.active, exclude=[walk, recovery, scale, lost], label="pathreplay: replay"):
-        u, step = path.choose(walk, sampler2)
+        u, step = path.choose(walk, sampler)
         onward, rr_weight = path.advance(walk, u, step)
         v = Replayed.of(path, u, step, onward, rr_weight)
         slope = emission_slope(walk, onward.at, δL * onward.β, v.go_on)

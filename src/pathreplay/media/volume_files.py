@@ -33,6 +33,8 @@ _FLOAT32 = 1
 
 # 4 GiB of float32: beyond, a wrong bounding box is likelier than a volume that anyone can render.
 _MOST_VOXELS = 2**30
+# NanoVDB's are asked for one by one, a million a second: half a minute, whatever box a file claims.
+_MOST_ASKED_FOR = 2**25
 
 # An extinction beyond has free paths far below what single precision tells apart.
 _LARGEST = 1e12
@@ -240,7 +242,7 @@ def _read_nvdb(path: Path, grid: str | None) -> Volume:
         if index > 0 and _codec(path) == 0:
             raise PathreplayError(f"{where} lies uncompressed behind another, which cannot be read; save it with zip")
         low, high = (np.array(corner, np.int64) for corner in file.bbox(index))
-        shape = _size(where, low, high)
+        shape = _size(where, low, high, _MOST_ASKED_FOR)
         voxel = np.array([file.voxel_size(index, axis) for axis in range(3)])
         first, last = (np.array(corner) for corner in file.world_bbox(index))
         # The file's matrix is not told. Without rotation the world box is the index box times the voxel size.
@@ -279,11 +281,12 @@ def _chosen(path: Path, grid: str | None, names: list[str]) -> int:
     return names.index(grid)
 
 
-def _size(where: str, low: NDArray[Any], high: NDArray[Any]) -> tuple[int, ...]:
+def _size(where: str, low: NDArray[Any], high: NDArray[Any], most: int = _MOST_VOXELS) -> tuple[int, ...]:
     """Number of voxels along x, y, z of an index box whose corners are both inside."""
     shape = tuple(int(n) for n in np.asarray(high, np.int64) - low + 1)
-    if min(shape) < 1 or np.prod(shape, dtype=np.float64) > _MOST_VOXELS:
-        raise PathreplayError(f"{where} spans {' x '.join(map(str, shape))} voxels, too many or none; crop it first")
+    if min(shape) < 1 or np.prod(shape, dtype=np.float64) > most:
+        spans = " x ".join(map(str, shape))
+        raise PathreplayError(f"{where} spans {spans} voxels, none or more than {most}; crop it first")
     return shape
 
 

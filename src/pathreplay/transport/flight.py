@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .media import carried, interaction, is_grid, majorant, span
+from .media import Media, carried, interaction, is_grid, majorant, span
 from .vertex import Arrival, Flight, NullCollision, Walk, reciprocal
 
 # Points of a flight at which the derivative of its transmittance is taken. Few leave a variance of their own, many take
@@ -63,16 +63,7 @@ def fly(walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: m
     t_null, ω_null, bare, mass, nulls = mi.Float(0), mi.Spectrum(0), mi.Float(0), mi.Float(0), mi.Float(0)
 
     while dr.hint(flying, exclude=[walk, at, media], label="pathreplay: flight"):
-        u = sampler.next_1d(flying)
-        σ_bar = mi.Float(σ_max)
-        step = dr.select(σ_bar > 0, -dr.log(1 - u) * dr.rcp(σ_bar), dr.inf)
-        for grid in media.grids:
-            mine = flying & is_grid(grid, medium)
-            onward = mi.Ray3f(ray.o + t * ray.d, ray.d, ray.time, ray.wavelengths)
-            onward.maxt = b - t
-            step_grid, σ_grid = grid.free_flight(onward, u, mine)
-            step = dr.select(mine, step_grid, step)
-            σ_bar = dr.select(mine, σ_grid, σ_bar)
+        step, σ_bar = _tentative(media, medium, ray, t, b, sampler.next_1d(flying), σ_max, flying)
         t_next = t + step
         inside = flying & (t_next < b)
         mei = interaction(medium, ray, t_next)
@@ -90,13 +81,7 @@ def fly(walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: m
                     t_emit = dr.select(picked, t_next, t_emit)
                     c_emit = dr.select(picked, c, c_emit)
 
-        if dr.hint(media.chromatic, mode="scalar"):
-            βW = dr.abs(β * W)
-            total = dr.sum(βW)
-            p = dr.select(total > 0, dr.sum(βW * σ_t) / (σ_bar * total), dr.mean(σ_t) / σ_bar)
-        else:
-            p = σ_t[0] / σ_bar
-        p = dr.clip(p, 0, 1)
+        p = _reality(media, dr.abs(β * W), σ_t, σ_bar)
         real = inside & (sampler.next_1d(inside) < p)
         flying = inside & ~real
         if dr.hint(walk.branch, mode="scalar"):
@@ -123,6 +108,36 @@ def fly(walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: m
     if dr.hint(walk.branch, mode="scalar"):
         flight.p, flight.null = p_real, NullCollision(t_null, ω_null, bare, mass, nulls, sampler.next_1d(active))
     return flight
+
+
+def _tentative(
+    media: Media,
+    medium: mi.MediumPtr,
+    ray: mi.Ray3f,
+    t: mi.Float,
+    b: mi.Float,
+    u: mi.Float,
+    σ_max: mi.Float,
+    active: mi.Bool,
+) -> tuple[mi.Float, mi.Float]:
+    """How far it is from ``t`` to the next tentative collision, and the majorant there."""
+    step = dr.select(σ_max > 0, -dr.log(1 - u) * dr.rcp(σ_max), dr.inf)
+    for grid in media.grids:
+        mine = active & is_grid(grid, medium)
+        onward = mi.Ray3f(ray.o + t * ray.d, ray.d, ray.time, ray.wavelengths)
+        onward.maxt = b - t
+        step_grid, σ_grid = grid.free_flight(onward, u, mine)
+        step, σ_max = dr.select(mine, step_grid, step), dr.select(mine, σ_grid, σ_max)
+    return step, mi.Float(σ_max)
+
+
+def _reality(media: Media, βW: mi.Spectrum, σ_t: mi.Spectrum, σ_bar: mi.Float) -> mi.Float:
+    """The probability that a collision is real."""
+    p = σ_t[0] / σ_bar
+    if media.chromatic:
+        total = dr.sum(βW)
+        p = dr.select(total > 0, dr.sum(βW * σ_t) / (σ_bar * total), dr.mean(σ_t) / σ_bar)
+    return dr.clip(p, 0, 1)
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,21 +33,19 @@ class Media:
     around: mi.Medium | None
 
 
-def scene_media(nodes: set[mi.Object], sensor: mi.Sensor | None) -> Media | None:
-    """Look at all media among the objects of a scene; None if there are none. ``sensor`` (or None) may be in one."""
-    media = [node for node in nodes if isinstance(node, mi.Medium)]
+def scene_media(media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | None) -> Media | None:
+    """Look at the media of a scene; None if there are none. ``passes`` is that of `Media`; the sensor may be in one."""
     if not media:
         return None
     grids = tuple(medium for medium in media if hasattr(medium, "free_flight"))
     plain = [medium for medium in media if not hasattr(medium, "free_flight")]
-    bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
     return Media(
         grids=grids,
         plain=bool(plain),
         homogeneous=any(medium.is_homogeneous() for medium in plain),
         chromatic=any(grid.is_chromatic for grid in grids) or any(map(_is_chromatic, plain)),
         emissive=any(grid.emission is not None for grid in grids),
-        passes=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and bsdf.class_name() != "Null" for bsdf in bsdfs),
+        passes=passes,
         branches=any(map(_wants_branch, media)),
         around=None if sensor is None else _medium_around(sensor),
     )

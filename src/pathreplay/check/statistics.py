@@ -1,0 +1,57 @@
+"""Statistics of few samples: means with their standard errors, and differences of means as normal deviates.
+
+Standard errors are estimated from the samples, so a difference over its error follows Student's distribution. ``z`` is
+that ratio turned into the normal deviate of the same probability, so that |z| < 4 means the same for 3 seeds and for
+300. All functions take numbers or arrays; samples run along the first axis.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+
+class Gap(NamedTuple):
+    """A difference of means, its standard error, and how improbable it is."""
+
+    value: Any
+    error: Any
+    z: Any
+
+
+def mean_and_error(samples: Any) -> tuple[Any, Any]:
+    """Mean of independent samples, and its standard error."""
+    samples = np.asarray(samples, np.float64)
+    return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
+
+
+def gap(a: Any, b: Any = 0.0) -> Gap:
+    """mean(a) - mean(b) of independent samples (n, ...) and (m, ...); ``b`` without a first axis is known exactly."""
+    known = np.ndim(b) < np.ndim(a)
+    (mean_a, error_a), (mean_b, error_b) = mean_and_error(a), (b, 0) if known else mean_and_error(b)
+    difference, σ = mean_a - mean_b, np.hypot(error_a, error_b)
+    return Gap(difference, σ, welch(difference, σ, (error_a, len(a)), *([] if known else [(error_b, len(b))])))
+
+
+def welch(difference: Any, σ: Any, *parts: tuple[Any, int]) -> Any:
+    """z of difference/σ, where σ holds ``parts`` (standard error, number of samples) that were estimated.
+
+    What else σ holds is known, and adds no uncertainty to it (Welch-Satterthwaite).
+    """
+    noise = sum(error**4 / (n - 1) for error, n in parts)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(difference == 0, 0.0, np.abs(difference) / σ)
+        z = np.where(noise > 0, normal(t, σ**4 / noise), t)
+    return np.copysign(np.maximum(z, 0), difference)[()]
+
+
+def normal(t: Any, freedom: Any) -> Any:
+    """The normal deviate that is as improbable as a ratio t under Student's distribution, for t >= 0."""
+    return stats.norm.isf(np.maximum(stats.t.sf(t, freedom), 1e-300))
+
+
+def relative_l1(found: np.ndarray, expected: np.ndarray) -> float:
+    """Σ |found - expected| / Σ |expected|: the error lane by lane, where nothing averages out."""
+    return float(np.abs(found - expected).sum() / np.abs(expected).sum())
