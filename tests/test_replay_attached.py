@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from pathreplay.transport.vertex import Numbers
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the benchmarks run from the checkout and are not installed
 
-from benchmarks.recoveries import OtherRecovery
+from benchmarks.measures.recoveries import OtherRecovery
 
 RESOLUTION = 8
 SPP = 16
@@ -107,7 +108,7 @@ def gradient(
         {"type": "pathreplay", "max_depth": depth, "rr_depth": 1000, "driver": driver, "attach": attach}
     )
     if recovery is not None:
-        integrator.recovery = recovery
+        integrator.interior = replace(integrator.interior, recovery=recovery)
     params = mi.traverse(scene)
     still = mi.Transform4f(params[key])
     by = [mi.Float(0) for _ in range(4)]

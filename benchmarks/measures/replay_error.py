@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -56,7 +57,7 @@ class ReplayError(SceneMeasure):
     def _gradient(self, driver: str, recovery: Recovery, seed: int) -> tuple[float, np.ndarray]:
         job, (key,) = self.job, self.job.parameters
         integrator = mi.load_dict(METHODS[driver] | job.limits)
-        integrator.recovery = recovery
+        integrator.interior = replace(integrator.interior, recovery=recovery)
         dr.clear_grad(self.params[key])
 
         def run() -> Any:
