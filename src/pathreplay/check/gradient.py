@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from pathreplay.check.direction import Line, choose_line
 from pathreplay.check.objective import Loss, Mode, Objective, alone, integrator_name
 from pathreplay.check.reference import Spec, integrator_under_test, reference_integrator
-from pathreplay.check.verdict import Verdict
+from pathreplay.check.verdict import Judgement
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.render.films import film_size, require_memory, require_samples
 from pathreplay.scenes.parameters import get_array, require_differentiable, require_finite
@@ -26,7 +26,7 @@ _MOST_SEEDS = 1_000_000
 
 
 @dataclass(frozen=True)
-class GradientCheck:
+class GradientCheck(Judgement):
     """One directional derivative, estimated twice, and what follows. Derivatives are those of the objective."""
 
     key: str
@@ -37,21 +37,10 @@ class GradientCheck:
     mode: Mode
     objective: float
     """Value of the objective F where the gradient was taken."""
-    gradient: float
-    gradient_se: float
-    reference: float
-    reference_se: float
     step: float
     """h: how far the entry with direction 1 moves."""
     stencil: str
     """'central', or 'one-sided' where the parameter stands at its bound 0."""
-    step_error: float
-    """Bound on the error of the reference that is not noise: truncation and float32 rounding."""
-    z: float
-    resolution: float
-    """Combined error over the larger of the two values; four times this is the smallest error that would show."""
-    verdict: Verdict
-    reason: str
     seeds: int
     spp: int
     fd_spp: int
@@ -195,15 +184,10 @@ class _Plan:
 
 
 def _line(
-    params: mi.SceneParameters,
-    key: str,
-    tested: mi.Integrator,
-    step: float | None,
-    direction: ArrayLike | None,
-    seed: int,
+    params: mi.SceneParameters, key: str, by: mi.Integrator, step: float | None, direction: ArrayLike | None, seed: int
 ) -> Line:
     """The line through the parameter that will be looked along; what cannot be differentiated or differenced raises."""
-    require_differentiable(params, key, tested)
+    require_differentiable(params, key, by)
     require_finite(params)
     if get_array(params[key]).dtype == np.float16:
         raise PathreplayError(
