@@ -13,24 +13,27 @@ from rich.console import Console
 
 from pathreplay.errors import PathreplayError
 
-from . import attached, depth, events, iteration, media, noise, records, startup, supergrid, surface, truth
+from . import records
 from .compare import compare
 from .drafts import ROOT, Draft, draft_of
-from .job import Record
-from .report import fill, pages
+from .measures.job import Record
+from .pages import fill, pages
 from .runner import run_jobs
 from .tables import footnote
+from .tasks import attached, depth, events, gridmedium, iteration, media, noise, startup, supergrid, surface, truth
 
 # Quick ones first, so that a run that is cut short has most of the answers.
-TASKS: dict[str, ModuleType] = {
-    task.TITLE: task for task in (startup, surface, iteration, attached, truth, noise, depth, events, supergrid, media)
-}
+_TASKS = (startup, surface, iteration, attached, truth, noise, depth, events, supergrid, gridmedium, media)
+TASKS: dict[str, ModuleType] = {task.TITLE: task for task in _TASKS}
 
 
 def main(
     tasks: Annotated[list[str] | None, typer.Argument(help=f"{', '.join(TASKS)}, or report. Default: all.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Smaller and fewer: to see that it works.")] = False,
     save: Annotated[bool, typer.Option("--save", help="Keep the samples under benchmarks/results/.")] = False,
+    into: Annotated[
+        Path | None, typer.Option("--into", metavar="FOLDER", help="Keep them in that folder instead.")
+    ] = None,
     against: Annotated[
         Path | None,
         typer.Option(
@@ -47,17 +50,18 @@ def main(
     A run that was interrupted goes on where it was when it is started again.
     """
     wanted = tasks or []
-    if quick and save:
-        raise PathreplayError("--save keeps full runs only: leave out --quick")
+    folder = into or (records.RESULTS if save else None)
+    if quick and folder:
+        raise PathreplayError("--save and --into keep full runs only: leave out --quick")
     if against is not None:
-        _compare(against, wanted, quick, save or report)
+        _compare(against, wanted, quick, report or folder is not None)
         return
     if wanted == ["report"]:
         wanted, report = [], True
     else:
         wanted = wanted or list(TASKS)
     _require_known(wanted)
-    drafts = [_run(name, quick, save)[1] for name in wanted]
+    drafts = [_run(name, quick, folder)[1] for name in wanted]
     # Only now: if the third task is interrupted, the first two need not be run again.
     for draft in drafts:
         draft.discard()
@@ -71,8 +75,8 @@ def _require_known(names: list[str]) -> None:
             raise PathreplayError(f"there is no task {name!r}: use {', '.join(TASKS)}, or report alone")
 
 
-def _run(name: str, quick: bool, save: bool) -> tuple[Record, Draft]:
-    """Measure one task, print its table, and save its record if that is wanted."""
+def _run(name: str, quick: bool, folder: Path | None) -> tuple[Record, Draft]:
+    """Measure one task, print its table, and save its record in the folder, if there is one."""
     task, console = TASKS[name], Console(stderr=True, highlight=False, soft_wrap=True)
     draft, jobs = draft_of(name, quick), task.jobs(quick)
     ready = len(draft.contents.done)
@@ -88,8 +92,8 @@ def _run(name: str, quick: bool, save: bool) -> tuple[Record, Draft]:
     command = f"pathreplay bench {name}" + (" --quick" if quick else "")
     record = records.make_record(name, command, load, measured, draft)
     typer.echo(f"\n## {name}\n\n{task.table(record)}\n\n{footnote(record)}")
-    if save:
-        typer.echo(f"\nSaved as {records.save(record).relative_to(ROOT)}")
+    if folder:
+        typer.echo(f"\nSaved as {records.save(record, folder)}")
     return record, draft
 
 
@@ -108,7 +112,7 @@ def _compare(path: Path, wanted: list[str], quick: bool, writes: bool) -> None:
         if wanted not in ([], [old.task]):
             raise PathreplayError(f"{path} is a record of task {old.task!r}: compare it with that one")
         _require_known([old.task])
-        new, draft = _run(old.task, quick, save=False)
+        new, draft = _run(old.task, quick, folder=None)
         draft.discard()
     if old.task != new.task:
         raise PathreplayError(f"{path} is a record of task {old.task!r}, {others[0]} one of {new.task!r}")

@@ -7,14 +7,15 @@ beyond a margin.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from .estimates import RESAMPLES, Estimate
-from .job import STOCK, Machine, Point, Record
+from .measures.estimates import Estimate, interval, unpaired_ratio
+from .measures.job import Machine, Point, Record
+from .measures.methods import STOCK, parts
 from .tables import markdown, pooled
 
 # Two runs of the same code differ by more than each of them tells: kernels lie elsewhere in memory, rivals meet other
@@ -87,7 +88,7 @@ def _row(point: Point, quantity: str, outcome: Outcome, told: str) -> Row:
 
 
 def _is_stock(method: str) -> bool:
-    return method.split(", ")[0] in STOCK
+    return parts(method)[0] in STOCK
 
 
 def _place(machines: Sequence[Machine]) -> set[tuple[str, int, int]]:
@@ -101,8 +102,8 @@ def _yardstick(key: Key, before: dict[Key, Point], now: dict[Key, Point]) -> tup
         for other in before
         if other[:-1] == key[:-1] and _is_stock(str(other[-1])) and _timed(before[other]) and _timed(now.get(other))
     ]
-    stage = str(key[-1]).partition(", ")[2]
-    rivals.sort(key=lambda other: str(other[-1]).partition(", ")[2] != stage)
+    stage = parts(str(key[-1]))[1]
+    rivals.sort(key=lambda other: parts(str(other[-1]))[1] != stage)
     return (before[rivals[0]], now[rivals[0]]) if rivals else None
 
 
@@ -125,10 +126,10 @@ def _rows(a: Point, b: Point, rivals: tuple[Point, Point] | None, same_machine: 
         rows.append(_row(b, "finite", "worse", f"{len(b.not_finite)} gradients are not, were {len(a.not_finite)}"))
     rows.append(_time(a, b, rivals, same_machine))
     if len(a.squared_errors) > 1 and len(b.squared_errors) > 1:
-        noise = _change(_means(a.squared_errors, 0), _means(b.squared_errors, 1))
+        noise = unpaired_ratio(b.squared_errors, a.squared_errors, np.mean)
         rows.append(_judged(b, "variance", noise, MARGIN))
     if len(a.values) > 1 and len(b.values) > 1:
-        rows.append(_judged(b, "error", _change(_means(a.values, 0), _means(b.values, 1)), MARGIN))
+        rows.append(_judged(b, "error", unpaired_ratio(b.values, a.values, np.mean), MARGIN))
     if same_machine and a.peak_mib and b.peak_mib:
         ratio = b.peak_mib / a.peak_mib
         rows.append(_judged(b, "memory", Estimate(ratio, ratio, ratio), MARGIN))
@@ -137,11 +138,10 @@ def _rows(a: Point, b: Point, rivals: tuple[Point, Point] | None, same_machine: 
 
 def _time(a: Point, b: Point, rivals: tuple[Point, Point] | None, same_machine: bool) -> Row:
     if rivals is not None and _timed(a) and _timed(b):
-        change = _change(_time_ratios(a, rivals[0], 0), _time_ratios(b, rivals[1], 1))
-        return _judged(b, f"time / {rivals[0].method}", change, MARGIN)
+        return _judged(b, f"time / {rivals[0].method}", _relative_time(a, b, *rivals), MARGIN)
     if not (same_machine and _timed(a) and _timed(b)):
         return _row(b, "time", "not comparable", "another machine and no rival in both, or a single round")
-    return _judged(b, "time", _change(_medians(a.seconds, 0), _medians(b.seconds, 1)), ALONE_MARGIN)
+    return _judged(b, "time", unpaired_ratio(b.seconds, a.seconds, np.median), ALONE_MARGIN)
 
 
 def _judged(point: Point, quantity: str, change: Estimate, margin: float) -> Row:
@@ -150,30 +150,14 @@ def _judged(point: Point, quantity: str, change: Estimate, margin: float) -> Row
     return _row(point, quantity, "better" if change.high < 1 - margin else "same", str(change))
 
 
-# ------------------------------ Resampling ------------------------------
-# Each returns the statistic of the run itself and then of RESAMPLES resampled runs, by other draws for old and new.
+def _relative_time(a: Point, b: Point, rival_of_a: Point, rival_of_b: Point) -> Estimate:
+    """Change of the time relative to a rival's: round by round, where both have had the same number of rounds."""
+    pairs = (b, rival_of_b), (a, rival_of_a)
+    if all(len(ours.seconds) == len(theirs.seconds) for ours, theirs in pairs):
+        return unpaired_ratio(*(np.divide(ours.seconds, theirs.seconds) for ours, theirs in pairs), np.median)
 
+    def change(*seconds: np.ndarray, axis: int) -> np.ndarray:
+        ours, theirs, our_old, their_old = (np.median(each, axis) for each in seconds)
+        return ours / theirs / (our_old / their_old)
 
-def _change(old: np.ndarray, new: np.ndarray) -> Estimate:
-    low, high = np.quantile(new[1:] / old[1:], [0.025, 0.975])
-    return Estimate(float(new[0] / old[0]), float(low), float(high))
-
-
-def _time_ratios(ours: Point, theirs: Point, seed: int) -> np.ndarray:
-    if len(ours.seconds) == len(theirs.seconds):
-        return _medians(np.asarray(ours.seconds) / np.asarray(theirs.seconds), seed)
-    return _medians(ours.seconds, seed) / _medians(theirs.seconds, seed + 2)
-
-
-def _medians(samples: Sequence[float] | np.ndarray, seed: int) -> np.ndarray:
-    return _resampled(samples, np.median, seed)
-
-
-def _means(samples: Sequence[float] | np.ndarray, seed: int) -> np.ndarray:
-    return _resampled(samples, np.mean, seed)
-
-
-def _resampled(samples: Sequence[float] | np.ndarray, statistic: Callable[..., np.ndarray], seed: int) -> np.ndarray:
-    x = np.asarray(samples, dtype=float)
-    draws = np.random.default_rng(seed).integers(len(x), size=(RESAMPLES, len(x)))
-    return np.concatenate([[statistic(x)], statistic(x[draws], axis=-1)])
+    return interval(change, *(point.seconds for pair in pairs for point in pair), paired=False)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from .job import Job, Machine, Point
+from .measures.job import Job, Machine, Point
 
 ROOT = Path(__file__).resolve().parents[1]
 DRAFTS = ROOT / "benchmarks" / "results" / ".partial"
@@ -96,6 +96,6 @@ def draft_of(task: str, quick: bool) -> Draft:
 def stamp() -> str:
     """A word that changes with the code of the package or of the benchmarks, and with the machine."""
     words = hashlib.sha256(f"{os.uname().nodename} {os.cpu_count()}".encode())
-    for path in sorted([*(ROOT / "src").rglob("*.py"), *(ROOT / "benchmarks").glob("*.py")]):
+    for path in sorted([*(ROOT / "src").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")]):
         words.update(str(path.relative_to(ROOT)).encode() + path.read_bytes())
     return words.hexdigest()[:16]

@@ -14,13 +14,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
+from scipy.stats import gmean
 
-from . import depth, media, noise, records
+from . import records
 from .drafts import ROOT
-from .estimates import Estimate, bias_share, efficiency
-from .job import Point, Record
-from .report import PICTURES
+from .measures.estimates import Estimate, Versus, bias_share
+from .measures.job import Point, Record
+from .pages import PICTURES
 from .tables import groups
+from .tasks import depth, media, noise
 
 IMAGES = ROOT / "docs" / "images"
 
@@ -131,7 +133,7 @@ def _media_efficiency(record: Record) -> Figure:
     for (scene, parameters, *_), methods in reversed(found):
         bars = _efficiencies(methods)
         ticks.append(at + (len(bars) - 1) / 2)
-        names.append(f"{scene}, {media.WHAT[parameters[0]]}")  # type: ignore[index]
+        names.append(f"{scene}, {media.WHAT[parameters[0]]}")
         for method, gain in reversed(bars.items()):
             error = [[gain.value - gain.low], [gain.high - gain.value]]
             colour, far = LOOKS[method][0], max(1.0, gain.high)
@@ -163,7 +165,7 @@ def _efficiencies(methods: dict[str, Point]) -> dict[str, Estimate]:
     if rival is None or not rival.squared_errors:
         return {}
     return {
-        name: efficiency((point.seconds, rival.seconds), (point.squared_errors, rival.squared_errors))
+        name: Versus(point, rival).efficiency()
         for name, point in methods.items()
         if point is not rival and point.squared_errors
     }
@@ -191,14 +193,14 @@ def _replay_noise(record: Record) -> Figure:
             if not line:
                 continue
             x = [level for level, _ in line]
-            y = [float(np.exp(np.mean(np.log(values)))) for _, values in line]
+            y = [gmean(values) for _, values in line]
             bars = [[a - min(v) for a, (_, v) in zip(y, line, strict=True)]]
             bars.append([max(v) - a for a, (_, v) in zip(y, line, strict=True)])
             axes.errorbar(x, y, yerr=bars, color=colour, marker="o", markersize=4, linewidth=1.3, capsize=2)
             labels.append((x[-1], y[-1], f"{max_depth - 1} bounces", colour))
         sweeps = [v for p in points if p.method == noise.SWEEP and _finite(p) for v in p.values]
         if sweeps:
-            typical = float(np.exp(np.mean(np.log(sweeps))))
+            typical = gmean(sweeps)
             axes.axhline(typical, color=GREY, linewidth=1.3, linestyle="--")
             if kind == kinds[-1]:
                 monte_carlo = axes.annotate(

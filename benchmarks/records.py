@@ -13,7 +13,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.files import file_problem
 
 from .drafts import ROOT, Draft
-from .job import Record
+from .measures.job import Record
 from .runner import Measured
 
 RESULTS = ROOT / "benchmarks" / "results"
@@ -46,10 +46,10 @@ def make_record(task: str, command: str, load_before: float, measured: Measured,
     )
 
 
-def save(record: Record) -> Path:
-    """Write benchmarks/results/TASK.json, all at once."""
-    RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"{record.task}.json"
+def save(record: Record, folder: Path) -> Path:
+    """Write TASK.json in the folder, all at once."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{record.task}.json"
     draft = path.with_suffix(".json.tmp")
     draft.write_bytes(_JSON.dump_json(record, indent=1) + b"\n")
     draft.replace(path)

@@ -9,16 +9,16 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from .drafts import ROOT, Done, Draft
-from .job import Job, Machine, Point
+from .measures.job import Job, Machine, Point
 
-WORKER = (sys.executable, "-m", "benchmarks.worker")
+WORKER = (sys.executable, "-m", "benchmarks.measures.worker")
 
 
 @dataclass
@@ -87,7 +87,7 @@ def _attempt(job: Job, measured: Measured, show: Callable[[str, int], None]) -> 
     running, peak, passes = job.methods[0], None, 0
     # An empty home has an empty kernel cache: compiling is in the peak memory of every job or, by chance, of some.
     with tempfile.TemporaryDirectory() as home, tempfile.TemporaryFile("w+") as complaints:
-        command = [*WORKER, json.dumps(asdict(job))]
+        command = [*WORKER, job.encode()]
         environment = os.environ | {"HOME": home, "DRJIT_CACHE_DIR": home}
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=complaints, text=True, cwd=ROOT, env=environment

@@ -3,56 +3,46 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 
-from . import attached, depth, iteration, media, surface, truth
-from .estimates import cost_ratio, efficiency, time_ratio, variance_ratio
-from .job import Point, Record
-from .tables import groups, markdown
+from .measures.estimates import Versus
+from .measures.job import Record
+from .tables import Turns, groups, markdown
+from .tasks import attached, depth, iteration, media, surface, truth
 
 
 def _surface(record: Record) -> str:
     """The sweep next to `prb`."""
-    rows = []
-    for (scene, *_), found in groups(record.points).items():
-        if pair := _pair(found, "sweep", "prb"):
-            ours, rival = pair
-            times = time_ratio(ours.seconds, rival.seconds)
-            rows.append([str(scene), str(times), str(variance_ratio(ours.squared_errors, rival.squared_errors))])
+    rows = [[key.scene, str(v.time()), str(v.variance())] for key, v in _pairs(record, "sweep", "prb")]
     return markdown(["gradient of a texture, sweep / prb", "time", "variance"], rows)
 
 
 def _attached(record: Record) -> str:
     """The sweep next to `prb`, which leaves out most of these gradients."""
-    rows = []
-    for (scene, parameters, max_depth, *_), found in groups(record.points).items():
-        if scene == attached.SCENE and (pair := _pair(found, "sweep", "prb")):
-            times = time_ratio(*(point.seconds for point in pair))
-            rows.append([", ".join(parameters), str(max_depth), str(times)])  # type: ignore[arg-type]
+    rows = [
+        [", ".join(key.parameters), str(key.max_depth), str(versus.time())]
+        for key, versus in _pairs(record, "sweep", "prb")
+        if key.scene == attached.SCENE
+    ]
     return markdown(["gradient of what moves, sweep / prb", "depth", "time"], rows)
 
 
 def _iteration(record: Record) -> str:
     """Our own loop next to the usual one with Mitsuba's integrator."""
-    rows = []
-    for (scene, *_), found in groups(record.points).items():
-        for theirs, *_, own in (iteration.SURFACE, iteration.MEDIA):
-            if pair := _pair(found, own, theirs):
-                ours, rival = pair
-                times, errors = (ours.seconds, rival.seconds), (ours.squared_errors, rival.squared_errors)
-                rows.append([str(scene), str(time_ratio(*times)), str(cost_ratio(times, errors))])
+    rows = [
+        [key.scene, str(versus.time()), str(versus.cost())]
+        for theirs, *_, own in (iteration.SURFACE, iteration.MEDIA)
+        for key, versus in _pairs(record, own, theirs)
+    ]
     return markdown(["optimisation step, relative to Mitsuba's", "time", "time at equal variance"], rows)
 
 
 def _media(record: Record) -> str:
     """How many times less (time x variance) the default needs than `prbvolpath`."""
-    rows = []
-    for (scene, parameters, *_), found in groups(record.points).items():
-        if pair := _pair(found, "score", media.RIVAL):
-            ours, rival = pair
-            gain = efficiency((ours.seconds, rival.seconds), (ours.squared_errors, rival.squared_errors))
-            what = media.WHAT[parameters[0]]  # type: ignore[index]
-            rows.append([f"{what}: {scene}", str(gain)])
+    rows = [
+        [f"{media.WHAT[key.parameters[0]]}: {key.scene}", str(versus.efficiency())]
+        for key, versus in _pairs(record, "score", media.RIVAL)
+    ]
     return markdown(["gradient of media", "time x variance, prbvolpath / pathreplay"], rows)
 
 
@@ -87,16 +77,16 @@ def _wrong(record: Record) -> str:
     for (scene, *_), found in groups(record.points).items():
         theirs = found.get(media.RIVAL)
         if theirs is not None and theirs.verdict == "fail":
-            rows.append([str(scene), *(truth.told(found.get(name)) for name in (truth.STEPS[1], "score", media.RIVAL))])
+            rows.append([scene, *(truth.told(found.get(name)) for name in (truth.STEPS[1], "score", media.RIVAL))])
     return markdown(["gradient by", "finite differences of `volpath`", "`pathreplay`", "`prbvolpath`"], rows)
 
 
-def _pair(found: Mapping[str, Point], ours: str, theirs: str) -> tuple[Point, Point] | None:
-    """Both methods, if both have come to an end with finite gradients."""
-    a, b = found.get(ours), found.get(theirs)
-    if a is None or b is None or not (a.squared_errors and b.squared_errors):
-        return None
-    return a, b
+def _pairs(record: Record, ours: str, theirs: str) -> Iterator[tuple[Turns, Versus]]:
+    """Both methods, where both have come to an end with finite gradients."""
+    for key, found in groups(record.points).items():
+        a, b = found.get(ours), found.get(theirs)
+        if a is not None and b is not None and a.squared_errors and b.squared_errors:
+            yield key, Versus(a, b)
 
 
 #: By the name of its marker: the task, and its summary.

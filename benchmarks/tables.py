@@ -5,9 +5,10 @@ from __future__ import annotations
 import statistics as st
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
-from .estimates import cost_ratio, time_ratio, variance_ratio
-from .job import Point, Record
+from .measures.estimates import Versus
+from .measures.job import Point, Record
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -26,12 +27,20 @@ def method_cell(point: Point) -> str:
     return point.method + (f" ({broken} of {len(point.seeds)} not finite)" if broken else "")
 
 
-def groups(points: Iterable[Point]) -> dict[tuple[object, ...], dict[str, Point]]:
-    """Points that were measured in turn: by scene, parameters, depth and paths, then by method."""
-    found: dict[tuple[object, ...], dict[str, Point]] = {}
+class Turns(NamedTuple):
+    """What points have in common that were measured in turn."""
+
+    scene: str
+    parameters: tuple[str, ...]
+    max_depth: int
+    paths: int
+
+
+def groups(points: Iterable[Point]) -> dict[Turns, dict[str, Point]]:
+    """Points that were measured in turn, by method."""
+    found: dict[Turns, dict[str, Point]] = {}
     for point in points:
-        group = (point.scene, point.parameters, point.max_depth, point.paths)
-        found.setdefault(group, {})[point.method] = point
+        found.setdefault(Turns(point.scene, point.parameters, point.max_depth, point.paths), {})[point.method] = point
     return found
 
 
@@ -55,11 +64,11 @@ def comparison(point: Point, rival: Point | None) -> list[str]:
     seconds = median_seconds(point)
     if rival is None or rival.error or rival is point:
         return [seconds, "1" if rival is point else "", *[("1" if rival is point else "")] * 2]
+    versus = Versus(point, rival)
     # Both have squared errors, or (a single round) neither.
-    times, errors = (point.seconds, rival.seconds), (point.squared_errors, rival.squared_errors)
-    if not all(errors):
-        return [seconds, str(time_ratio(*times)), "", ""]
-    return [seconds, str(time_ratio(*times)), str(variance_ratio(*errors)), str(cost_ratio(times, errors))]
+    if not (point.squared_errors and rival.squared_errors):
+        return [seconds, str(versus.time()), "", ""]
+    return [seconds, str(versus.time()), str(versus.variance()), str(versus.cost())]
 
 
 def brief_footnote(record: Record) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -15,25 +16,13 @@ from pathreplay.errors import PathreplayError
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # the benchmarks run from the checkout and are not installed
 
-from benchmarks import (  # noqa: E402
-    depth,
-    drafts,
-    iteration,
-    media,
-    noise,
-    plots,
-    records,
-    report,
-    runner,
-    summaries,
-    surface,
-    tables,
-    truth,
-)
+from benchmarks import drafts, pages, plots, records, runner, summaries, tables  # noqa: E402
 from benchmarks.__main__ import TASKS, main  # noqa: E402
 from benchmarks.compare import Row, compare  # noqa: E402
-from benchmarks.job import Job, Machine, Point, Record  # noqa: E402
-from benchmarks.worker import told  # noqa: E402
+from benchmarks.measures.job import Job, Machine, Point, Record  # noqa: E402
+from benchmarks.measures.replay_error import SWEEP  # noqa: E402
+from benchmarks.measures.worker import MEASURES, told  # noqa: E402
+from benchmarks.tasks import depth, iteration, media, noise, surface, truth  # noqa: E402
 
 MACHINE = Machine("a processor", 2, 2, "Linux", "3.11", "3.9.1", "1.5.0", "0.1.0", "23.1.4", "llvm_ad_rgb")
 ROUNDS = 12
@@ -193,6 +182,16 @@ def test_a_draft_of_other_code_is_not_used(tmp_path: Path, monkeypatch: pytest.M
 # ------------------------------ Workers ------------------------------
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_a_worker_is_told_all_of_a_job_and_can_do_it(task: str) -> None:
+    for job in TASKS[task].jobs(quick=False):
+        assert Job.decode(job.encode()) == job
+        module, name = MEASURES[job.measure]
+        assert {"__call__", "forget", "conclude"} <= set(
+            dir(import_module(f"benchmarks.measures.{module}").__dict__[name])
+        )
+
+
 def test_methods_that_raise_or_die_are_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In one job: a plugin that does not exist, and a process that is killed at its second method."""
     worker = tmp_path / "worker.py"
@@ -223,7 +222,7 @@ def test_a_worker_measures_and_stays_within_its_memory(tmp_path: Path) -> None:
     assert found.error is None and len(found.seconds) == 2 and len(found.squared_errors) == 2
     assert found.peak_mib is not None and 20 < found.peak_mib < 1000
     assert measured.machines[0].threads == 1
-    code = "from benchmarks.worker import limit_memory; limit_memory(); bytearray(9 * 1024**3)"
+    code = "from benchmarks.measures.worker import limit_memory; limit_memory(); bytearray(9 * 1024**3)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.stderr.strip().endswith("MemoryError")
 
@@ -249,7 +248,7 @@ def test_plots_are_drawn_from_records(tmp_path: Path) -> None:
     clouds = [point(m, 0.5 if m == "score" else 1, scene="cloud", parameters=(media.DENSITY,)) for m in media.METHODS]
     errors = [
         replace(point(name, scene="diffuse sheets", max_depth=n), values=(1e-3 * n, 2e-3 * n))
-        for name in (noise.SWEEP, *noise.NOISY)
+        for name in (SWEEP, *noise.NOISY)
         for n in (3, 6)
     ]
     known = {
@@ -273,8 +272,8 @@ def test_the_page_shows_what_was_measured(tmp_path: Path, monkeypatch: pytest.Mo
         "".join(f"<!-- begin {task} -->\nold\n<!-- end {task} -->\n" for task in ("depth", "media", "depth-summary"))
     )
     monkeypatch.setattr(records, "RESULTS", tmp_path)
-    records.save(record(point("sweep", scene=depth.SURFACES), task="depth"))
-    assert report.fill({"depth": depth.table, "media": media.table}, [page]) == ["media"]
+    records.save(record(point("sweep", scene=depth.SURFACES), task="depth"), tmp_path)
+    assert pages.fill({"depth": depth.table, "media": media.table}, [page]) == ["media"]
     told = page.read_text()
     assert "![Peak memory against path length](images/depth-memory.svg)" in told and "`pathreplay bench depth`" in told
     assert "<!-- begin media -->\n*Not measured yet.*\n<!-- end media -->\n" in told and "old" not in told
@@ -301,7 +300,8 @@ def test_summaries_count_and_compare() -> None:
     ("arguments", "told"),
     [
         ({"tasks": ["nonsense"]}, "there is no task 'nonsense': use "),
-        ({"quick": True, "save": True}, "--save keeps full runs only"),
+        ({"quick": True, "save": True}, "--save and --into keep full runs only"),
+        ({"quick": True, "into": Path("folder")}, "--save and --into keep full runs only"),
         ({"against": Path("none.json")}, "none.json cannot be read"),
         ({"against": records.RESULTS / "surface.json", "tasks": ["depth"]}, "is a record of task 'surface'"),
         (
@@ -315,13 +315,10 @@ def test_wrong_usage_says_what_would_be_right(arguments: dict, told: str) -> Non
         main(**arguments)
 
 
-def test_two_records_are_compared(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_records_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By the command, which is run where the user is: exit status, table, and a mistake as one line."""
-    monkeypatch.setattr(records, "RESULTS", tmp_path)
     for name, slowness in (("old", 0.7), ("new", 1.4)):
-        path = records.save(record(point("prb", seed=1), point("sweep", slowness, seed=2)))
+        path = records.save(record(point("prb", seed=1), point("sweep", slowness, seed=2)), tmp_path)
         path.rename(tmp_path / f"{name}.json")
     main(tasks=[str(tmp_path / "old.json")], against=tmp_path / "old.json")
     assert "2 of 2 quantities are the same" in capsys.readouterr().out

@@ -334,15 +334,15 @@ def test_edges_behind_mirrors_are_told_once(log, forward: bool) -> None:
 
 def test_lost_adjoints_are_told_with_their_share(log, monkeypatch) -> None:
     """A direction held at a hit that is made infinite: its adjoint cannot be finite."""
-    from pathreplay.transport import lobes
+    from pathreplay.transport import scatter
 
-    held = lobes.moved_direction
+    held = scatter.moved_direction
 
     def broken(*args):
         d, J = held(*args)
         return d, J * dr.replace_grad(mi.Float(1), dr.sum(d) * dr.opaque(mi.Float, np.inf))
 
-    monkeypatch.setattr(lobes, "moved_direction", broken)
+    monkeypatch.setattr(scatter, "moved_direction", broken)
     scene = mi.load_dict(lit_room(DIFFUSE), optimize=False)
     _differentiate(scene, "object.to_world", plugin())
     assert any("% of the paths lost a part of their gradient: a ray adjoint was not finite" in line for line in log)
@@ -372,7 +372,7 @@ def test_a_moving_instance_is_refused() -> None:
 def test_nothing_moves_when_only_a_smooth_lobe_changes() -> None:
     """The roughness of one thing must not make the path move because another is a mirror."""
     from pathreplay.transport.motion import path_moves
-    from pathreplay.transport.path import first_arrival
+    from pathreplay.transport.start import CameraStart
 
     gc.collect()  # shapes of earlier scenes would be asked, too
     description = lit_room({"type": "roughconductor", "alpha": 0.2})
@@ -383,8 +383,9 @@ def test_nothing_moves_when_only_a_smooth_lobe_changes() -> None:
     for key, moves in (("object.bsdf.alpha.value", False), ("object.to_world", True), ("sky.radiance.value", False)):
         dr.enable_grad(params[key])
         params.update()
-        walk = plugin()._walk(scene, True)
+        walk = plugin()._walk(scene, None)
         with dr.suspend_grad():
-            assert path_moves(walk, ray, first_arrival(walk, ray, mi.Bool(True))) == moves, key
+            start = CameraStart(ray)
+            assert path_moves(walk, start, start.choose(walk, mi.Bool(True))) == moves, key
         dr.disable_grad(params[key])
         params.update()

@@ -10,7 +10,7 @@ import pytest
 from pathreplay import memory
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.limits import require_grid, require_learning_rate
-from pathreplay.render.films import MOST_SAMPLES, require_samples
+from pathreplay.render.film_limits import MOST_SAMPLES, require_samples
 
 
 def test_a_container_s_limit_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

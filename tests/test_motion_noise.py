@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pathreplay.transport import velocity
-from pathreplay.transport.traits import nodes_of, scene_traits
+from pathreplay.transport.facts import SceneFacts
 from truth import (
     RES,
     Bench,
@@ -294,7 +294,7 @@ def test_narrow_lobes_are_right(lobe: str, alpha: float) -> None:
 
 def outlines(scene: dict) -> bool:
     loaded = mi.load_dict(scene, optimize=False)
-    return scene_traits(nodes_of(loaded), loaded, media=False).outlines
+    return SceneFacts(loaded).traits().outlines
 
 
 def test_narrow_lobes_hold_where_something_ends() -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from media_scenes import cloud, heterogeneous, lit_floor, smooth
+from media_scenes import FORWARD, cloud, heterogeneous, lit_floor, smooth, sunlit
 from pathreplay import PathreplayError
 from pathreplay.check.statistics import gap
 from pathreplay.check.stencil import WIDE
@@ -37,6 +38,14 @@ def black_and_green() -> dict:
 
 def foggy() -> dict:
     return cloud(heterogeneous(smooth(0.5, 3), 0.8))
+
+
+def coloured_fog() -> dict:
+    return cloud(heterogeneous(smooth(0.5, 3), smooth(0.3, 0.9)))
+
+
+def fog_before_the_sun() -> dict:
+    return sunlit(heterogeneous(smooth(0.4, 2), smooth(0.3, 0.9), FORWARD))
 
 
 def colourful_fog_on_the_floor() -> dict:
@@ -68,6 +77,13 @@ SLOW = [
     Case("chromatic density and lamp", colourful_fog_on_the_floor, DENSITY.key, random()),
 ]
 CASES = [TEXTURE, VERTICES, DENSITY, *(pytest.param(case, marks=pytest.mark.slow) for case in SLOW)]
+LISTED = [
+    replace(DENSITY, name="listed density"),
+    replace(DENSITY, name="listed albedo", scene=coloured_fog, key="object.interior_medium.albedo.data", step=0.1),
+    pytest.param(
+        replace(DENSITY, name="listed g", scene=fog_before_the_sun, key="object.interior_medium.phase_function.g",
+                move=add(), step=0.1), marks=pytest.mark.slow),
+]  # fmt: skip
 # Sums of some thousand float32 terms in another order.
 ROUNDING = 1e-4
 
@@ -118,7 +134,23 @@ def test_radiative_backpropagation_is_right_and_its_linear_variant_is_not(case: 
     assert abs(wrong.value) > 2 * Z_LIMIT * wrong.error
 
 
-@pytest.mark.parametrize("plugin", ["pathreplay_tape", "pathreplay_rb"])
+@pytest.mark.parametrize("case", LISTED, ids=lambda case: case.name)
+def test_delta_tracking_as_listed_is_right_where_collisions_are_drawn(case: Case, bench) -> None:
+    """By the density its transmittance is another estimate; all else is that of the forward driver, path by path."""
+    b = bench(case)
+    reference = b.reference(case.seeds)
+    listing = b.integrator("pathreplay_listing", rr_depth=case.rr_depth)
+    found = gap(b.backwards(listing), reference)
+    assert found.error < RESOLUTION * abs(reference.mean())
+    assert abs(found.z) < Z_LIMIT
+    if case is not LISTED[0]:
+        steady = {"rr_depth": 1000}
+        tangent = b.dot(b.forward(b.integrator(**steady), 1, 16))
+        again = b.backward(b.integrator("pathreplay_listing", **steady), 1, 16)
+        assert again == pytest.approx(tangent, rel=ROUNDING)
+
+
+@pytest.mark.parametrize("plugin", ["pathreplay_tape", "pathreplay_rb", "pathreplay_listing"])
 def test_images_are_those_of_pathreplay(plugin: str, bench) -> None:
     b = bench(TEXTURE)
     assert np.array_equal(b.image(b.integrator(plugin), 1, 4), b.image(b.integrator(), 1, 4))
@@ -130,6 +162,7 @@ def test_images_are_those_of_pathreplay(plugin: str, bench) -> None:
         ("pathreplay_tape", {"max_depth": -2}, ["pathreplay_tape", "max_depth = -2", "-1"]),
         ("pathreplay_rb", {"rr_depth": 0}, ["pathreplay_rb", "rr_depth = 0"]),
         ("pathreplay_tape", {"attach": "all"}, ["attach = 'all'", "'delta'"]),
+        ("pathreplay", {"volume_gradient": "listing"}, ["volume_gradient", "'pathreplay_listing'"]),
     ],
 )
 def test_bad_properties_are_named_with_the_way_out(plugin: str, properties: dict, words: list[str]) -> None:

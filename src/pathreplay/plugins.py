@@ -26,6 +26,7 @@ PLUGINS = {
     "pathreplay": "register_integrator",
     "pathreplay_tape": "register_integrator",
     "pathreplay_rb": "register_integrator",
+    "pathreplay_listing": "register_integrator",
     "smoothdielectric": "register_bsdf",
     "gridmedium": "register_medium",
 }

@@ -18,7 +18,8 @@ from pathreplay.check.objective import Loss, Mode, Objective, alone, integrator_
 from pathreplay.check.reference import Spec, integrator_under_test, reference_integrator
 from pathreplay.check.verdict import Judgement
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.render.films import film_size, require_memory, require_samples
+from pathreplay.render.film import film_size
+from pathreplay.render.film_limits import require_memory, require_samples
 from pathreplay.scenes.parameters import get_array, require_differentiable, require_finite
 from pathreplay.scenes.spectra import coefficient_channels
 

@@ -9,24 +9,25 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..transport.path import repeat_step
-from ..transport.vertex import Arrival, Kept, Numbers, Step, Walk
+from ..transport.path import PathState
+from ..transport.step import repeat_step
+from ..transport.vertex import Arrival, Chosen, Kept, Numbers, Step, Walk
 
 
 @dataclass
 class RayDerivative:
     """Derivative of an arrival: the adjoint q in reverse mode, the tangent in forward mode."""
 
-    o: Any  # Point3f
-    d: Any  # Vector3f
-    pdf: Any  # Float
+    o: mi.Point3f
+    d: mi.Vector3f
+    pdf: mi.Float
 
     @staticmethod
     def zero() -> RayDerivative:
         return RayDerivative(mi.Point3f(0), mi.Vector3f(0), mi.Float(0))
 
-    def finite_part(self) -> tuple[RayDerivative, Any]:
-        """The derivative where it is finite and zero elsewhere, and where that is (Bool)."""
+    def finite_part(self) -> tuple[RayDerivative, mi.Bool]:
+        """The derivative where it is finite and zero elsewhere, and where that is."""
         ok = dr.all(dr.isfinite(self.o)) & dr.all(dr.isfinite(self.d)) & dr.isfinite(self.pdf)
         return RayDerivative(dr.select(ok, self.o, 0), dr.select(ok, self.d, 0), dr.select(ok, self.pdf, 0)), ok
 
@@ -37,7 +38,7 @@ class LostPaths:
     def __init__(self) -> None:
         self.count = dr.zeros(mi.UInt32, 1)
 
-    def add(self, lost: Any) -> None:
+    def add(self, lost: mi.Bool) -> None:
         """Count lanes. Inside the loop, where it is a side effect like the gradients: a mask that leaves a loop and
         is evaluated by itself would run the whole kernel once more."""
         dr.scatter_add(self.count, mi.UInt32(1), mi.UInt32(0), lost)
@@ -50,9 +51,15 @@ class Replayed:
     at: Arrival
     u: Numbers
     kept: Kept
-    go_on: Any  # Bool: there is a next vertex
-    hit_next: Any  # PreliminaryIntersection3f of the next vertex
-    rr_weight: Any  # Float: 1 / survival probability
+    go_on: mi.Bool  # there is a next vertex
+    hit_next: mi.PreliminaryIntersection3f  # of the next vertex
+    rr_weight: mi.Float  # 1 / survival probability
+    β: mi.Spectrum  # throughput before the vertex
+
+    @staticmethod
+    def of(path: PathState, u: Numbers, step: Chosen, onward: PathState, rr_weight: mi.Float) -> Replayed:
+        """The vertex that a walk has just left for the ``onward`` one."""
+        return Replayed(path.at, u, step.kept, onward.active, onward.at.hit, rr_weight, path.β)
 
 
 def _attached_arrival(at: Arrival) -> Arrival:
@@ -63,24 +70,24 @@ def _attached_arrival(at: Arrival) -> Arrival:
     return replace(at, ray=ray, pdf=pdf)
 
 
-def _step(walk: Walk, v: Replayed, at: Arrival, attached: bool, active: Any) -> Step:
+def _step(walk: Walk, v: Replayed, at: Arrival, attached: bool, active: mi.Bool) -> Step:
     return repeat_step(walk, at, v.u, v.kept, v.go_on, active, attached, v.hit_next)
 
 
 def backward_step(
-    walk: Walk, v: Replayed, attached: bool, adjoint: Any, L: Any, q: RayDerivative, active: Any
-) -> tuple[Any, RayDerivative, Any]:
-    """Back-propagate  adjoint·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters; gives L_i, q_i, and its loss.
+    walk: Walk, v: Replayed, attached: bool, δL: mi.Spectrum, L: mi.Spectrum, q: RayDerivative, active: mi.Bool
+) -> tuple[mi.Spectrum, RayDerivative, mi.Bool]:
+    """Back-propagate  δL β_i·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters; gives L_i, q_i, and its loss.
 
-    ``adjoint`` is δL β_i, ``L`` is L_{i+1} (Spectrum). Where not ``attached``, q stays zero and costs nothing. A q_i
-    that is not finite is dropped: the last result (Bool) tells where.
+    ``L`` is L_{i+1}. Where not ``attached``, q stays zero and costs nothing. A q_i that is not finite is dropped: the
+    last result tells where.
     """
     lost = mi.Bool(False)
     with dr.resume_grad():
         at = _attached_arrival(v.at) if attached else v.at
         step = _step(walk, v, at, attached, active)
         Li = step.e + step.w * (v.rr_weight * L)
-        target = dr.sum(adjoint * Li)
+        target = dr.sum(δL * v.β * Li)
         if attached:
             along = dr.dot(q.o, step.ray_next.o) + dr.dot(q.d, step.ray_next.d) + q.pdf * step.pdf
             target += dr.select(v.go_on, along, 0)
@@ -92,9 +99,9 @@ def backward_step(
 
 
 def forward_step(
-    walk: Walk, v: Replayed, attached: bool, tangent: RayDerivative, active: Any
-) -> tuple[Step, Any, Any, RayDerivative]:
-    """The step, the tangents of e_i and w_i (Spectrum), and that of the next arrival."""
+    walk: Walk, v: Replayed, attached: bool, tangent: RayDerivative, active: mi.Bool
+) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative]:
+    """The step, the tangents of e_i and w_i, and that of the next arrival."""
     with dr.resume_grad():
         at = v.at
         if attached:
@@ -117,7 +124,7 @@ def tangents(*values: Any) -> list[Any]:
     return [dr.grad(value) for value in values]
 
 
-def backward(target: Any) -> None:
+def backward(target: mi.Float) -> None:
     """Back-propagate from a scalar per path.
 
     Raises PathreplayError when no parameter with gradients reaches it: the gradient would silently be zero.

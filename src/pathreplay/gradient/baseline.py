@@ -8,8 +8,8 @@ branches) null collisions are asked everywhere: a bad guess is noise, not bias. 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -17,11 +17,13 @@ import numpy as np
 
 from ..errors import PathreplayError
 from ..transport.media import interaction, majorant, span
+from .adjoint import Replayed
 
 # Cells along each axis of space, and along each side of the octahedron of directions. 8³ x 4² cells of two averages
 # with four numbers each are 256 KiB, three times: what is known, its sums, and what the present pass sees. More cells
 # know less each, so that gradients get noisier again: see the cloud of `pathreplay bench media`.
 CELLS, SIDES = 8, 4
+AVERAGES = 2 * CELLS**3 * SIDES**2  # X and Y side by side
 # How much of what was known before stays when a pass has been learned: about the last ten passes count.
 MEMORY = 0.9
 # What a null collision counts at first (see `branch_weight`): as if there were fifty on a path.
@@ -36,27 +38,20 @@ def _channels() -> int:
     return 3 if mi.is_rgb else 1
 
 
-class Baseline:
-    """Averages over the cells of a box that holds all media.
+@dataclass(frozen=True)
+class Cells:
+    """The cells of position and direction, in a box that holds all media."""
 
-    ``look`` is the guess; ``learn``, called in the loop of a pass, collects what that pass sees, and ``absorb``, called
-    after it, makes it known to later passes. ``branching`` (Float) is what a null collision is to count.
-    """
+    low: mi.ScalarPoint3f
+    scale: mi.ScalarVector3f  # cells per unit of length
 
-    def __init__(self, box: Any) -> None:
-        self.low = mi.ScalarPoint3f(box.min)
-        self.scale = mi.ScalarVector3f(*(CELLS / max(float(e), 1e-20) for e in box.extents()))
-        self.count = 2 * CELLS**3 * SIDES**2  # of averages: X and Y side by side
-        self.known = dr.zeros(mi.Float, 4 * self.count)  # the averages
-        self.sums = dr.zeros(mi.Float, 4 * self.count)  # Σ weight·L and Σ weight
-        self.seen = dr.zeros(mi.Float, 4 * self.count)  # the same of the present pass
-        self.branching = mi.Float(FIRST_BRANCHING)
-        self.nulls = dr.zeros(mi.Float, SLOTS)  # null collisions of the present pass, in parts that float32 can hold
-        self.paths = 0  # of the present pass
-        dr.make_opaque(self.known, self.sums, self.seen, self.branching, self.nulls)
+    @staticmethod
+    def of(box: mi.ScalarBoundingBox3f) -> Cells:
+        scale = mi.ScalarVector3f(*(CELLS / max(float(e), 1e-20) for e in box.extents()))
+        return Cells(mi.ScalarPoint3f(box.min), scale)
 
-    def _cell(self, p: Any, d: Any) -> Any:
-        """Index (UInt32) of the first average of the cell."""
+    def index(self, p: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
+        """Index of the first average of the cell."""
         at = mi.Vector3u(dr.clip(mi.Vector3f(p - self.low) * self.scale, 0, CELLS - 1))
         d = d * dr.rcp(dr.abs(d.x) + dr.abs(d.y) + dr.abs(d.z))
         sx, sy = dr.select(d.x >= 0, 1.0, -1.0), dr.select(d.y >= 0, 1.0, -1.0)
@@ -65,18 +60,31 @@ class Baseline:
         to = mi.Vector2u(dr.clip((mi.Vector2f(x, y) + 1) * (0.5 * SIDES), 0, SIDES - 1))
         return 2 * (((at.z * CELLS + at.y) * CELLS + at.x) * SIDES**2 + to.y * SIDES + to.x)
 
-    def look(self, mei: Any, σ_t: Any, σ_bar: Any, active: Any) -> Any:
-        """The guess (Spectrum) at a MediumInteraction3f, for radiance that travels along -mei.wi; σ̄ is the majorant."""
-        mei, σ_t = dr.detach(mei), dr.detach(σ_t)
-        cell = self._cell(mei.p, -mei.wi)
-        X, Y = dr.gather(mi.Vector4f, self.known, cell, active), dr.gather(mi.Vector4f, self.known, cell + 1, active)
-        p = dr.select(σ_bar > 0, dr.clip(dr.mean(σ_t) / σ_bar, 0, 1), 0)
-        b = X + p * (Y - X)
-        return mi.Spectrum(b.x, b.y, b.z) if _channels() == 3 else mi.Spectrum(b.x)
 
-    def learn(self, replayed: Any, L: Any) -> None:
-        """Collect the radiance ``L`` (Spectrum) that came back along the ray of a replayed vertex."""
-        at, flight = replayed.at, replayed.kept.flight
+@dataclass
+class Seen:
+    """What gradient passes saw of the media: sums, so that those of several passes or shards can be added."""
+
+    cells: Cells
+    sums: mi.Float  # Σ weight·L in three channels and Σ weight, of each average
+    nulls: mi.Float  # null collisions, in parts that float32 can hold
+    paths: int  # that these collisions are of
+    passes: frozenset[Hashable]  # keys of the passes
+
+    @staticmethod
+    def none(cells: Cells, key: Hashable) -> Seen:
+        """For the pass with that key to begin with."""
+        sums, nulls = dr.zeros(mi.Float, 4 * AVERAGES), dr.zeros(mi.Float, SLOTS)
+        dr.make_opaque(sums, nulls)
+        return Seen(cells, sums, nulls, 0, frozenset([key]))
+
+    def __add__(self, other: Seen) -> Seen:
+        sums, nulls, paths = self.sums + other.sums, self.nulls + other.nulls, self.paths + other.paths
+        return Seen(self.cells, sums, nulls, paths, self.passes | other.passes)
+
+    def learn(self, replayed: Replayed, L: mi.Spectrum) -> None:
+        """Collect the radiance ``L`` that came back along the ray of a replayed vertex; in the loop of a pass."""
+        at, flight = replayed.at, replayed.kept.media.flight
         in_medium = at.medium != None  # noqa: E711 (an array of pointers)
         event = in_medium & flight.event
         reach = dr.select(at.hit.is_valid(), at.hit.t, dr.inf)
@@ -85,57 +93,88 @@ class Baseline:
         length = dr.select(in_medium & dr.isfinite(end), end - a, 0)
         x = interaction(at.medium, at.ray, flight.t)
         y = interaction(at.medium, at.ray, a + flight.along * length)
-        self._add(self._cell(x.p, at.ray.d), L, mi.Float(1), event)
+        self._add(self.cells.index(x.p, at.ray.d), L, mi.Float(1), event)
         # Long flights are seldom cut at any given point of theirs; lengths make up for it, in mean free paths.
-        self._add(self._cell(y.p, at.ray.d) + 1, L, length * majorant(at.medium, at.ray, length > 0), length > 0)
+        weight = length * majorant(at.medium, at.ray, length > 0)
+        self._add(self.cells.index(y.p, at.ray.d) + 1, L, weight, length > 0)
 
-    def _add(self, cell: Any, L: Any, weight: Any, active: Any) -> None:
+    def _add(self, cell: mi.UInt32, L: mi.Spectrum, weight: mi.Float, active: mi.Bool) -> None:
         active = active & dr.all(dr.isfinite(L))
         x, y, z = L if _channels() == 3 else 3 * [dr.mean(L)]
-        dr.scatter_add(self.seen, mi.Vector4f(x, y, z, 1) * weight, cell, active)
+        dr.scatter_add(self.sums, mi.Vector4f(x, y, z, 1) * weight, cell, active)
 
-    def tally(self, nulls: Any) -> None:
-        """Collect the number of null collisions of each path (Float)."""
+    def tally(self, nulls: mi.Float) -> None:
+        """Collect the number of null collisions of each path."""
         paths = dr.width(nulls)
         dr.scatter_add(self.nulls, nulls, dr.arange(mi.UInt32, paths) % SLOTS)
         self.paths += paths
 
-    def absorb(self) -> None:
-        """Let later passes know what the last one saw."""
-        self.sums = MEMORY * self.sums + self.seen
-        self.seen = dr.zeros(mi.Float, 4 * self.count)
-        if self.paths:
-            self.branching = self.paths / (self.paths + dr.sum(self.nulls))
-        self.nulls, self.paths = dr.zeros(mi.Float, SLOTS), 0
-        self._conclude()
 
-    def learned(self) -> dict[str, Any]:
-        """All that it knows, as float32 arrays by name, from which `restore` makes the same again."""
+@dataclass(frozen=True)
+class Baseline:
+    """What is known of the media of a scene.
+
+    ``look`` is the guess, and ``after`` what is known when more has been seen. ``branching`` is what a null collision
+    is to count.
+    """
+
+    cells: Cells
+    sums: mi.Float  # those of `Seen`, of which older passes count less
+    branching: mi.Float
+    passes: frozenset[Hashable] = frozenset()  # keys of the passes that were learned from: none is its own judge
+    known: mi.Float = field(init=False)  # the averages
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "known", _averages(self.sums))
+        dr.make_opaque(self.known, self.sums, self.branching)
+
+    @staticmethod
+    def fresh(box: mi.ScalarBoundingBox3f) -> Baseline:
+        """Nothing is known yet of what is in the box."""
+        return Baseline(Cells.of(box), dr.zeros(mi.Float, 4 * AVERAGES), mi.Float(FIRST_BRANCHING))
+
+    def look(self, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool) -> mi.Spectrum:
+        """The guess at an interaction, for radiance that travels along -mei.wi; σ̄ is the majorant."""
+        mei, σ_t = dr.detach(mei), dr.detach(σ_t)
+        cell = self.cells.index(mei.p, -mei.wi)
+        X, Y = dr.gather(mi.Vector4f, self.known, cell, active), dr.gather(mi.Vector4f, self.known, cell + 1, active)
+        p = dr.select(σ_bar > 0, dr.clip(dr.mean(σ_t) / σ_bar, 0, 1), 0)
+        b = X + p * (Y - X)
+        return mi.Spectrum(b.x, b.y, b.z) if _channels() == 3 else mi.Spectrum(b.x)
+
+    def after(self, seen: Seen) -> Baseline:
+        """What is known when passes have seen that, too. Ask when their kernels have been launched."""
+        branching = seen.paths / (seen.paths + dr.sum(seen.nulls)) if seen.paths else self.branching
+        sums, passes = MEMORY * self.sums + seen.sums, self.passes | seen.passes
+        return Baseline(self.cells, sums, branching, passes)
+
+    def learned(self) -> dict[str, np.ndarray]:
+        """All that it knows, as float32 arrays by name, from which `restored` makes the same again."""
         return {"sums": self.sums.numpy(), "branching": self.branching.numpy()}
 
-    def restore(self, learned: Mapping[str, Any]) -> None:
-        """Know what `learned` told of another one. Raises PathreplayError if that cannot be."""
+    @staticmethod
+    def restored(box: mi.ScalarBoundingBox3f, learned: Mapping[str, np.ndarray]) -> Baseline:
+        """One that knows what `learned` told of another. Raises PathreplayError if that cannot be."""
         shapes = {name: np.shape(value) for name, value in learned.items()}
-        wanted = {"sums": (4 * self.count,), "branching": (1,)}
+        wanted = {"sums": (4 * AVERAGES,), "branching": (1,)}
         if shapes != wanted or not 0 < learned["branching"][0] <= 1:
             raise PathreplayError(
                 f"What was learned of the media has the shapes {shapes}, not {wanted}, or branching beyond 0 to 1; "
                 "start the job from its config"
             )
-        self.sums, self.branching = (mi.Float(np.array(learned[n], np.float32)) for n in ("sums", "branching"))
-        self._conclude()
+        sums, branching = (mi.Float(np.array(learned[name], np.float32)) for name in ("sums", "branching"))
+        return Baseline(Cells.of(box), sums, branching)
 
-    def _conclude(self) -> None:
-        """The averages that follow from the sums."""
-        i = dr.arange(mi.UInt32, self.count)
-        is_y = i % 2 == 1
-        weight = dr.gather(mi.Float, self.sums, 4 * i + 3)
-        total = [dr.sum(dr.select(is_y == y, weight, 0)) for y in (False, True)]
-        known = dr.zeros(mi.Float, 4 * self.count)
-        for k in range(_channels()):
-            sums = dr.gather(mi.Float, self.sums, 4 * i + k)
-            mean = [dr.sum(dr.select(is_y == y, sums, 0)) / dr.maximum(total[y], 1) for y in (False, True)]
-            value = (sums + PRIOR * dr.select(is_y, mean[1], mean[0])) / (weight + PRIOR)
-            dr.scatter(known, value, 4 * i + k)
-        self.known = known
-        dr.make_opaque(self.known, self.sums, self.seen, self.branching, self.nulls)
+
+def _averages(sums: mi.Float) -> mi.Float:
+    """The averages that follow from the sums; cells that saw little lean on all of them."""
+    i = dr.arange(mi.UInt32, AVERAGES)
+    is_y = i % 2 == 1
+    weight = dr.gather(mi.Float, sums, 4 * i + 3)
+    total = [dr.sum(dr.select(is_y == y, weight, 0)) for y in (False, True)]
+    known = dr.zeros(mi.Float, 4 * AVERAGES)
+    for k in range(_channels()):
+        part = dr.gather(mi.Float, sums, 4 * i + k)
+        mean = [dr.sum(dr.select(is_y == y, part, 0)) / dr.maximum(total[y], 1) for y in (False, True)]
+        dr.scatter(known, (part + PRIOR * dr.select(is_y, mean[1], mean[0])) / (weight + PRIOR), 4 * i + k)
+    return known

@@ -8,16 +8,14 @@ estimates it; `branch_weight` shares the work with real collisions.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.flight import Flight
 from ..transport.media import interaction, majorant
-from ..transport.medium_step import medium_step
-from ..transport.path import next_arrival
-from ..transport.vertex import Arrival, Numbers, Step, Walk
+from ..transport.path import PathState, next_arrival
+from ..transport.step import choose_step
+from ..transport.vertex import Arrival, Chosen, Flight, Numbers, Walk
 from .adjoint import backward
 from .primal import walk_on
 
@@ -26,15 +24,15 @@ from .primal import walk_on
 class Branch:
     """The null collision that was kept so far (loop state)."""
 
-    p: Any  # Point3f: where
-    d: Any  # Vector3f: direction of the path that came there
-    medium: Any  # MediumPtr
-    weight: Any  # Spectrum: throughput and weight of the collision, over its share of the mass
-    bare: Any  # Spectrum: the same without the null collisions before it on its flight
-    mass: Any  # Float: of all null collisions so far
-    number: Any  # Float: of null collisions so far
-    depth: Any  # UInt32: vertices before
-    η: Any  # Float: relative index of refraction since the camera
+    p: mi.Point3f  # where
+    d: mi.Vector3f  # direction of the path that came there
+    medium: mi.MediumPtr
+    weight: mi.Spectrum  # throughput and weight of the collision, over its share of the mass
+    bare: mi.Spectrum  # the same without the null collisions before it on its flight
+    mass: mi.Float  # of all null collisions so far
+    number: mi.Float  # of null collisions so far
+    depth: mi.UInt32  # vertices before
+    η: mi.Float  # relative index of refraction since the camera
 
     @staticmethod
     def none() -> Branch:
@@ -50,35 +48,35 @@ class Branch:
             mi.Float(1),
         )
 
-    def offer(self, at: Arrival, step: Step, β: Any, depth: Any, η: Any, active: Any) -> Branch:
+    def offer(self, path: PathState, step: Chosen) -> Branch:
         """This one, or the null collision of one more flight, by their masses."""
-        null = step.kept.flight.null
-        active = active & dr.any(β != 0)
+        at, null = path.at, step.kept.media.flight.null
+        active = path.active & dr.any(path.β != 0)
         mass = self.mass + dr.select(active, null.mass, 0)
         taken = active & (null.pick * mass < null.mass)
         return Branch(
             p=dr.select(taken, at.ray.o + null.t * at.ray.d, self.p),
             d=dr.select(taken, at.ray.d, self.d),
             medium=dr.select(taken, at.medium, self.medium),
-            weight=mi.Spectrum(dr.select(taken, β * null.ω, self.weight)),
-            bare=mi.Spectrum(dr.select(taken, β * null.bare, self.bare)),
+            weight=mi.Spectrum(dr.select(taken, path.β * null.ω, self.weight)),
+            bare=mi.Spectrum(dr.select(taken, path.β * null.bare, self.bare)),
             mass=mass,
             number=self.number + dr.select(active, null.number, 0),
-            depth=dr.select(taken, depth, self.depth),
-            η=dr.select(taken, η, self.η),
+            depth=dr.select(taken, path.depth, self.depth),
+            η=dr.select(taken, path.η, self.η),
         )
 
 
-def branch_backward(walk: Walk, branch: Branch, sampler: Any, ray: Any, δL: Any) -> None:
-    """Back-propagate ``δL`` (Spectrum) through the branch's part of the radiance, if any parameter reaches it."""
+def branch_backward(walk: Walk, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum) -> None:
+    """Back-propagate ``δL`` through the branch's part of the radiance, if any parameter reaches it."""
     with dr.resume_grad():
         term = branch_term(walk, branch, sampler, ray)
         if dr.grad_enabled(term):
             backward(dr.sum(δL * term))
 
 
-def branch_term(walk: Walk, branch: Branch, sampler: Any, ray: Any) -> Any:
-    """Spectrum whose derivative is the branch's part of that of the radiance (its value means nothing).
+def branch_term(walk: Walk, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f) -> mi.Spectrum:
+    """What has the branch's part of the radiance's derivative for derivative; its value means nothing.
 
     Walks the extra path, detached; time and wavelengths are those of the camera ``ray``. Differentiable in the
     coefficients of the medium. Call it under `dr.resume_grad`.
@@ -98,9 +96,9 @@ def branch_term(walk: Walk, branch: Branch, sampler: Any, ray: Any) -> Any:
         one = mi.Spectrum(1)
         flight = Flight(event=active, t=mi.Float(0), density=mi.Float(1), W=one, along=mi.Float(0), σ_s=one)
         u = Numbers.draw(sampler)
-        step = medium_step(onward, at, u, branch.depth + 1 < walk.max_depth, active, sampler, one, flight=flight)
+        step = choose_step(onward, at, u, sampler, one, branch.depth + 1 < walk.max_depth, active, flight)
         at_next = next_arrival(onward, at, step, step.active)
-        L, _ = walk_on(onward, sampler, at_next, branch.depth + 1, branch.η, step.active)
+        L, _ = walk_on(onward, sampler, PathState(at_next, one, None, branch.η, branch.depth + 1, step.active))
         L_s = step.e + step.w * L
     mei = interaction(branch.medium, at.ray, mi.Float(0))
     σ_s, _, σ_t = branch.medium.get_scattering_coefficients(mei, active)

@@ -15,18 +15,20 @@ second order in 1/N, by what the noise of the image and that of the derivative m
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, make_dataclass
+from functools import cache
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..transport.motion import path_moves
-from ..transport.path import first_arrival, next_arrival, survival, sustain, take_step
-from ..transport.vertex import Numbers, Walk
-from .adjoint import LostPaths, RayDerivative, backward_step
-from .record import end_type, read_back, record, record_type
-from .sweep import MAX_DEPTH
+from ..transport.path import PathState
+from ..transport.start import CameraStart
+from ..transport.vertex import Walk
+from .adjoint import LostPaths, RayDerivative
+from .record import MAX_DEPTH, Layout, record_type, room_for
+from .two_walks import first_walk, walk_back
 
 
 def fits(max_depth: int, spp: int) -> bool:
@@ -34,7 +36,7 @@ def fits(max_depth: int, spp: int) -> bool:
     return 1 < spp <= MAX_DEPTH // max(max_depth, 1)
 
 
-def sweepable(sensor: Any, max_depth: int, spp: int) -> bool:
+def sweepable(sensor: mi.Sensor, max_depth: int, spp: int) -> bool:
     """Whether pixels of a sensor can be swept: a box filter, so that each path belongs to one pixel; colours (rgb) and
     no alpha; an independent sampler; a camera that stands still and takes no time; two paths or more (``spp``), all of
     which fit into the record of a lane."""
@@ -54,7 +56,7 @@ def sweepable(sensor: Any, max_depth: int, spp: int) -> bool:
     )
 
 
-def pixel_camera(sensor: Any, pixel: Any) -> Callable[..., Any]:
+def pixel_camera(sensor: mi.Sensor, pixel: mi.UInt32) -> Callable[..., Any]:
     """Rays through random places of pixels (UInt32, row by row): (sampler, active) -> Ray3f and weight (Spectrum).
 
     As in Mitsuba's RBIntegrator. Detached.
@@ -62,7 +64,7 @@ def pixel_camera(sensor: Any, pixel: Any) -> Callable[..., Any]:
     width, height = sensor.film().crop_size()
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
 
-    def camera(sampler: Any, active: Any) -> tuple[Any, Any]:
+    def camera(sampler: mi.Sampler, active: mi.Bool) -> tuple[mi.Ray3f, mi.Spectrum]:
         place = (corner + sampler.next_2d(active)) / mi.Point2f(width, height)
         aperture = sampler.next_2d(active) if sensor.needs_aperture_sample() else mi.Point2f(0)
         return sensor.sample_ray(sensor.shutter_open(), 0.0, place, aperture, active)
@@ -72,81 +74,57 @@ def pixel_camera(sensor: Any, pixel: Any) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class PixelLoss:
-    """Derivative of a loss by each lane's pixel: offset + slope · I (Spectrum each)."""
+    """Derivative of a loss by each lane's pixel: offset + slope · I."""
 
-    offset: Any
-    slope: Any
+    offset: mi.Spectrum
+    slope: mi.Spectrum
+
+
+@cache
+def _end_type(variant: str) -> type:
+    return make_dataclass("End", {"L": mi.Spectrum, "records": mi.UInt32}.items())
+
+
+def end_type() -> type:
+    """What is kept of a path that has ended: its radiance, and its number of records."""
+    return _end_type(mi.variant())
 
 
 @dr.syntax
 def pixel_sweep(
-    walk: Walk, sampler: Any, camera: Callable[..., Any], paths: int, loss: PixelLoss, lost: LostPaths
-) -> tuple[bool, Any]:
+    walk: Walk, sampler: mi.Sampler, camera: Callable[..., Any], paths: int, loss: PixelLoss, lost: LostPaths
+) -> tuple[bool, mi.Spectrum]:
     """Walk ``paths`` paths (two or more) in every lane and back-propagate the loss.
 
-    Returns whether the paths move with the parameters, and the mean of their radiances (Spectrum). ``camera`` is a
-    `pixel_camera`. For scenes without media. What is not differentiated, what is counted as ``lost`` and what is
-    raised: see `sweep`.
+    Returns whether the paths move with the parameters, and the mean of their radiances. ``camera`` is a `pixel_camera`.
+    For scenes without media. What is not differentiated, what is counted as ``lost`` and what is raised: see `sweep`.
     """
-
-    # ---------------- First pass: record the paths -----------------
-
-    room = max(walk.max_depth, 1)
+    room = room_for(walk)
     total = mi.Spectrum(0)  # radiance of all paths
     with dr.suspend_grad():
         ray0, _ = camera(sampler.clone(), mi.Bool(True))
-        attached = path_moves(walk, ray0, first_arrival(walk, ray0, mi.Bool(True)))
-    tape = dr.alloc_local(record_type(walk, attached), paths * room)
+        start = CameraStart(ray0)
+        layout = Layout.of(walk, path_moves(walk, start, start.choose(walk, mi.Bool(True))))
+    records = dr.alloc_local(record_type(layout), paths * room)
     ends = dr.alloc_local(end_type(), paths)
     s = mi.UInt32(0)  # number of the path
 
-    while dr.hint(s < paths, exclude=[walk, camera], label="pathreplay: paths of a pixel"):
+    while dr.hint(s < paths, exclude=[walk, camera, layout, start, lost], label="pathreplay: paths of a pixel"):
         active = mi.Bool(walk.max_depth > 0)
         ray, β = camera(sampler, active)
-        at = first_arrival(walk, ray, active)
-        β_alive = mi.Spectrum(β)  # as in `sweep`
-        L = mi.Spectrum(0)  # radiance so far
-        η = mi.Float(1)
-        depth = mi.UInt32(0)
-
-        while dr.hint(active, exclude=[walk, camera], label="pathreplay: record"):
-            u = Numbers.draw(sampler)
-            step = take_step(walk, at, u, sampler, β_alive, depth + 1 < walk.max_depth, active)
-
-            β_alive = sustain(β_alive, β, step)
-            η *= step.kept.eta
-            rr_weight, survives = survival(β_alive, η, depth, u.roulette, walk, step)
-            # All lanes of a packet write to the same place: elsewhere writes to local memory get lost (Dr.Jit 1.5).
-            tape[s * room + depth] = record(walk, attached, at, u, step, β, rr_weight)
-
-            L += β * step.e
-            active = step.active & survives & (dr.max(β_alive) != 0)
-            β *= step.w * rr_weight
-            β_alive *= rr_weight
-            at = next_arrival(walk, at, step, active)
-            depth += 1
-
-        ends[s] = end_type()(L, depth)
+        path = PathState.begin(CameraStart(ray).choose(walk, active), active, sustained=True)
+        path.β, path.β_alive = mi.Spectrum(β), mi.Spectrum(β)
+        records, count, L, _branch = first_walk(walk, sampler, path, layout, records, s * room, lost)
+        ends[s] = end_type()(L, count)
         total += L
         s += 1
 
-    # ------------ Second pass: from the last vertex back ------------
-
-    while dr.hint(s > 0, exclude=[walk, ray0, lost, loss], label="pathreplay: paths of a pixel, backwards"):
+    while dr.hint(s > 0, exclude=[walk, ray0, lost, loss, layout, start], label="pathreplay: pixel, backwards"):
         s -= 1
         end = ends[s]
         δL = (loss.offset + loss.slope * ((total - end.L) / (paths - 1))) / paths
-        L = mi.Spectrum(0)  # radiance along the ray that leaves the vertex
-        q = RayDerivative.zero()  # adjoint of that ray
-        broken = mi.Bool(False)  # a part of the adjoint was not finite
-        records = mi.UInt32(end.records)
+        none, still = mi.Spectrum(0), RayDerivative.zero()
+        first, count = s * room, mi.UInt32(end.records)
+        walk_back(walk, layout, records, first, count, first + count - 1, ray0, δL, none, still, lost)
 
-        while dr.hint(records > 0, exclude=[walk, ray0, lost, loss], label="pathreplay: sweep"):
-            records -= 1
-            replayed, β = read_back(walk, tape, s * room + records, s * room + end.records - 1, ray0)
-            L, q, breaks = backward_step(walk, replayed, attached, δL * β, L, q, mi.Bool(True))
-            if dr.hint(attached, mode="scalar"):
-                lost.add(breaks & ~broken)
-                broken |= breaks
-
-    return attached, total / paths
+    return layout.moves, total / paths

@@ -10,13 +10,12 @@ its emission: the density of the ray and the distance it came. They are differen
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..transport.emitters import emission
-from ..transport.step import surface_step
+from ..transport.step import repeat_step
 from ..transport.vertex import Arrival, Numbers, Walk, reciprocal
 from .adjoint import Replayed, tangents
 
@@ -27,54 +26,55 @@ ILL_CONDITIONED = 1e-4
 
 @dataclass(frozen=True)
 class Recovery:
-    """How ray adjoints are recovered: solve (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i.
+    """How ray adjoints are recovered: solve (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i, in float64.
 
     ``noise`` is the standard deviation of ε_i, which is +noise or -noise with even odds: of all noise of mean zero and
-    that variance it stays furthest from zero, and so the matrix from being singular. 0 turns it off. ``place`` says
-    what X_i is: the identity at all vertices (``everywhere``), the identity where a smooth lobe was sampled
-    (``smooth``), or the identity on directions and zero on origins where A_i is ill-conditioned (``directions``).
-    ``double`` keeps the books in float64; local derivatives are float32 in any case.
+    that variance it stays furthest from zero, and so the matrix from being singular. 0 turns it off. X_i is the
+    identity on directions and zero on origins, and only where A_i is ill-conditioned.
     """
 
     noise: float = 0.01
-    place: str = "directions"
-    double: bool = True
 
-    def real(self, kind: type) -> Any:
+    def real(self, kind: type) -> type:
         """The array type in which the books are kept that belongs to a type of the variant."""
-        return dr.float64_array_t(kind) if self.double else kind
+        return dr.float64_array_t(kind)  # type: ignore[no-any-return]
+
+    def regularised(self, A: mi.Matrix4f, sign: mi.Float, smooth: mi.Bool) -> mi.Matrix4f:
+        """A + ε X; ``smooth`` tells where a smooth lobe was sampled."""
+        ε = dr.select(independence(A) >= ILL_CONDITIONED, 0, type(A[0, 0])(self.noise * sign))
+        return A + type(A)(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, ε, 0, 0, 0, 0, ε)
 
 
 @dataclass
 class RayFrame:
     """Two axes perpendicular to a ray: its coordinates are (s·o/ℓ, t·o/ℓ, s·d, t·d), relative to the ray itself."""
 
-    s: Any  # Vector3f
-    t: Any  # Vector3f
+    s: mi.Vector3f
+    t: mi.Vector3f
     scale: float  # ℓ, the unit of length
 
     @staticmethod
-    def of(ray: Any, scale: float) -> RayFrame:
+    def of(ray: mi.Ray3f, scale: float) -> RayFrame:
         s, t = mi.coordinate_system(ray.d)
         return RayFrame(s, t, scale)
 
-    def point(self, o: Any, x: list[Any]) -> Any:
+    def point(self, o: mi.Point3f, x: list[mi.Float]) -> mi.Point3f:
         return o + self.scale * (self.s * x[0] + self.t * x[1])
 
-    def direction(self, d: Any, x: list[Any]) -> Any:
+    def direction(self, d: mi.Vector3f, x: list[mi.Float]) -> mi.Vector3f:
         return d + self.s * x[2] + self.t * x[3]
 
-    def coordinates(self, o: Any, d: Any) -> list[Any]:
+    def coordinates(self, o: mi.Point3f, d: mi.Vector3f) -> list[mi.Float]:
         inverse = 1 / self.scale
         return [dr.dot(self.s, o) * inverse, dr.dot(self.t, o) * inverse, dr.dot(self.s, d), dr.dot(self.t, d)]
 
 
 @dataclass
 class Slope:
-    """Derivative of δL·β e of a vertex with respect to what its ray alone does not tell; Float each."""
+    """Derivative of δL·β e of a vertex with respect to what its ray alone does not tell."""
 
-    pdf: Any  # by the density of the ray
-    slide: Any  # by the length that the origin slides forward along the ray
+    pdf: mi.Float  # by the density of the ray
+    slide: mi.Float  # by the length that the origin slides forward along the ray
 
     @staticmethod
     def zero() -> Slope:
@@ -85,9 +85,9 @@ class Slope:
 class Local:
     """A step linearised in the four coordinates of its ray."""
 
-    A: Any  # Matrix4f: coordinates of the next ray by those of this ray
-    e: Any  # Vector4f: derivative of δL·β_i e_i + (slope of e_{i+1})·(pdf, slide)
-    log_w: list[Any]  # 4 x Spectrum: derivative of log w_i, by each coordinate; 0 where w_i is 0
+    A: mi.Matrix4f  # coordinates of the next ray by those of this ray
+    e: mi.Vector4f  # derivative of δL·β_i e_i + (slope of e_{i+1})·(pdf, slide)
+    log_w: list[mi.Spectrum]  # four: derivative of log w_i, by each coordinate; 0 where w_i is 0
 
 
 def has_smooth_lobes(walk: Walk) -> bool:
@@ -95,15 +95,15 @@ def has_smooth_lobes(walk: Walk) -> bool:
     return bool(walk.traits.detached_names or walk.traits.attachables)
 
 
-def length_scale(scene: Any) -> float:
+def length_scale(scene: mi.Scene) -> float:
     """Half the diagonal of the scene: a unit of length in which offsets and angles are alike. 1 for an empty scene."""
     extents = scene.bbox().extents()
     diagonal = sum(float(x) ** 2 for x in extents) ** 0.5
     return diagonal / 2 if 0 < diagonal < float("inf") else 1.0
 
 
-def emission_slope(walk: Walk, at: Arrival, weight: Any, active: Any) -> Slope:
-    """How weight·e (Spectrum weight, detached) changes with the density of an arrival and the distance it came."""
+def emission_slope(walk: Walk, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
+    """How weight·e (detached weight) changes with the density of an arrival and the distance it came."""
     if not has_smooth_lobes(walk):
         return Slope.zero()
     slopes = []
@@ -124,14 +124,14 @@ def emission_slope(walk: Walk, at: Arrival, weight: Any, active: Any) -> Slope:
 
 
 def local_terms(
-    walk: Walk, v: Replayed, at: Arrival, weight: Any, slope: Slope, frame_next: RayFrame, active: Any
-) -> tuple[Any, Any, list[Any]]:
+    walk: Walk, v: Replayed, at: Arrival, weight: mi.Spectrum, slope: Slope, frame_next: RayFrame, active: mi.Bool
+) -> tuple[mi.Float, mi.Spectrum, list[mi.Float]]:
     """The step at ``v`` with a differentiable arrival: what its adjoint is made of.
 
-    δL·β_i e_i + (slope of e_{i+1})·(pdf, slide) (Float), w_i/detach(w_i) (Spectrum, 0 where w_i is 0) and the four
-    coordinates of the next ray. ``weight`` is δL β_i (Spectrum), ``slope`` that of the next vertex.
+    δL·β_i e_i + (slope of e_{i+1})·(pdf, slide), w_i/detach(w_i) (0 where w_i is 0) and the four coordinates of
+    the next ray. ``weight`` is δL β_i, ``slope`` that of the next vertex.
     """
-    step = surface_step(walk, at, v.u, v.go_on, active, v.kept, True, v.hit_next)
+    step = repeat_step(walk, at, v.u, v.kept, v.go_on, active, True, v.hit_next)
     o, d = step.ray_next.o, step.ray_next.d
     e = dr.sum(weight * step.e)
     e += dr.select(v.go_on, slope.pdf * step.pdf + slope.slide * dr.dot(dr.detach(d), o), 0)
@@ -140,7 +140,7 @@ def local_terms(
 
 
 def linearise(
-    walk: Walk, v: Replayed, weight: Any, slope: Slope, frame: RayFrame, frame_next: RayFrame, active: Any
+    walk: Walk, v: Replayed, weight: mi.Spectrum, slope: Slope, frame: RayFrame, frame_next: RayFrame, active: mi.Bool
 ) -> Local:
     """Differentiate `local_terms` by the four coordinates of the ray, and by nothing else.
 
@@ -161,8 +161,8 @@ def linearise(
     return Local(A=mi.Matrix4f(*A), e=mi.Vector4f(*[c[0] for c in columns]), log_w=[c[1] for c in columns])
 
 
-def _unit_tangent(value: Any) -> Any:
-    """An AD variable (Float) of its own with tangent 1, also where gradients are suspended.
+def _unit_tangent(value: mi.Float) -> mi.Float:
+    """An AD variable of its own with tangent 1, also where gradients are suspended.
 
     Resume gradients for it alone: a virtual call would push tangents from parameters, too, across the border of the
     loop.
@@ -174,25 +174,14 @@ def _unit_tangent(value: Any) -> Any:
     return variable
 
 
-def random_sign(u: Numbers) -> Any:
-    """+1 or -1 (Float) with even odds: a hash of a vertex's numbers, so it repeats and takes none from the sampler."""
+def random_sign(u: Numbers) -> mi.Float:
+    """+1 or -1 with even odds: a hash of a vertex's numbers, so it repeats and takes none from the sampler."""
     bits = [dr.reinterpret_array(mi.UInt32, x) for x in (u.light.x, u.roulette)]
     return dr.select((mi.sample_tea_32(bits[0], bits[1], 4)[0] & 1) == 0, mi.Float(1), mi.Float(-1))
 
 
-def regularise(A: Any, ε: Any, place: str, smooth: Any) -> Any:
-    """A + ε X (4x4), X as `Recovery` says for ``place``; ``smooth`` (Bool): a smooth lobe was sampled."""
-    if place == "everywhere":
-        on, origin = ε, 1
-    elif place == "smooth":
-        on, origin = dr.select(smooth, ε, 0), 1
-    else:
-        on, origin = dr.select(independence(A) >= ILL_CONDITIONED, 0, ε), 0
-    return A + type(A)(on * origin, 0, 0, 0, 0, on * origin, 0, 0, 0, 0, on, 0, 0, 0, 0, on)
-
-
-def independence(A: Any) -> Any:
-    """How far the columns of a 4x4 matrix are from linear dependence (Float64): about 1 / its condition number.
+def independence(A: mi.Matrix4f) -> mi.Float64:
+    """How far the columns of a 4x4 matrix are from linear dependence, about 1 / its condition number.
 
     The smallest part of a column that the columns before it do not span, relative to the Frobenius norm, by modified
     Gram-Schmidt. (Cofactors, and so `dr.rcp`, cannot tell: of a matrix of rank two they are rounding alone.)
@@ -210,5 +199,5 @@ def independence(A: Any) -> Any:
     return smallest
 
 
-def _dot(a: list[Any], b: list[Any]) -> Any:
+def _dot(a: list[mi.Float64], b: list[mi.Float64]) -> mi.Float64:
     return sum(x * y for x, y in zip(a, b, strict=True))

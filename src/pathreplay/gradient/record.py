@@ -1,226 +1,205 @@
-"""One vertex of a path as the sweep driver remembers it: plain numbers, for thread-local memory."""
+"""One vertex of a path as the sweep drivers remember it: plain numbers, for thread-local memory.
+
+What is remembered stands in one table, from which the type of a record, its writing and its reading follow.
+"""
 
 from __future__ import annotations
 
-from dataclasses import make_dataclass
-from functools import cache
+from collections.abc import Callable
+from dataclasses import dataclass, make_dataclass, replace
+from functools import cache, reduce
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.flight import Flight
-from ..transport.shadow import Shadow
-from ..transport.vertex import Arrival, Kept, Numbers, Step, Walk
+from ..transport.vertex import Arrival, Flight, Kept, KeptInMedia, KnownLight, Numbers, Shadow, Walk
 from .adjoint import Replayed
 
-# Bits of Record.flags: Dr.Jit's local memory cannot hold Bool.
-HIT, DELTA, LIT, BLACK, CAMERA, EVENT, NULL = 1, 2, 4, 8, 16, 32, 64
+# Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x up to 136 bytes are 4.5 MB, and a
+# thread's stack is 8 MB. Beyond the stack the process would die without a word.
+MAX_DEPTH = 2048
+# With media a vertex takes up to 210 bytes, and null boundaries have records of their own.
+MAX_DEPTH_MEDIA = 1024
+MAX_RECORDS_MEDIA = 2000
+
+
+def deepest(walk: Walk) -> int:
+    """The largest ``max_depth`` that the sweep driver can hold in this scene."""
+    return MAX_DEPTH if walk.media is None else MAX_DEPTH_MEDIA
+
+
+def room_for(walk: Walk) -> int:
+    """How many vertices the record has room for: with media also two null boundaries at each, as convex ones need."""
+    if walk.media is None:
+        return max(walk.max_depth, 1)
+    return min(3 * walk.max_depth + 8, MAX_RECORDS_MEDIA)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the walk decides about its records."""
+
+    variant: str
+    moves: bool  # the path moves with the parameters
+    resamples: bool  # BSDFs are sampled once more
+    fixed: bool  # what emitters bring to surfaces is known
+    media: bool
+    chromatic: bool
+    emissive: bool
+    passes: bool
+    branch: bool
+
+    @staticmethod
+    def of(walk: Walk, moves: bool) -> Layout:
+        """The layout for a walk."""
+        media = walk.media
+        return Layout(
+            variant=mi.variant(),
+            moves=moves,
+            resamples=walk.resamples or media is not None,
+            fixed=media is None and not moves and not walk.traits.lights_vary,
+            media=media is not None,
+            chromatic=media is not None and media.chromatic,
+            emissive=media is not None and media.emissive,
+            passes=media is not None and media.passes,
+            branch=walk.branch,
+        )
+
+
+Condition = Callable[[Layout], bool]
+
+
+def _always(layout: Layout) -> bool:
+    return True
+
+
+def _media(layout: Layout) -> bool:
+    return layout.media
+
+
+# Where it stands in a Replayed, its type in Mitsuba, and whether it is remembered.
+FIELDS: tuple[tuple[str, str, Condition], ...] = (
+    ("at.ray.o", "Point3f", _always),
+    ("at.ray.d", "Vector3f", _always),
+    ("at.hit.t", "Float", _always),
+    ("at.hit.prim_uv", "Point2f", _always),
+    ("at.hit.prim_index", "UInt32", _always),
+    ("at.hit.shape_index", "UInt32", _always),
+    ("at.hit.shape", "ShapePtr", _always),
+    ("at.hit.instance", "ShapePtr", _always),
+    ("at.pdf", "Float", _always),
+    ("at.medium", "MediumPtr", _media),
+    ("at.behind", "Float", _media),
+    ("β", "Spectrum", _always),
+    ("rr_weight", "Float", _always),
+    ("u.light", "Point2f", lambda layout: not layout.fixed),
+    ("u.lobe", "Float", lambda layout: layout.resamples),
+    ("u.direction", "Point2f", lambda layout: layout.resamples),
+    ("kept.known.glow", "Spectrum", lambda layout: layout.fixed),
+    ("kept.known.d", "Vector3f", lambda layout: layout.fixed),
+    ("kept.known.w", "Spectrum", lambda layout: layout.fixed),
+    ("kept.pdf", "Float", lambda layout: layout.passes),
+    ("kept.media.flight.t", "Float", _media),
+    ("kept.media.flight.density", "Float", _media),
+    ("kept.media.flight.along", "Float", _media),
+    ("kept.media.flight.W", "Spectrum", lambda layout: layout.chromatic),
+    ("kept.media.flight.E", "Spectrum", lambda layout: layout.emissive),
+    ("kept.media.flight.t_emit", "Float", lambda layout: layout.emissive),
+    ("kept.media.flight.c_emit", "Spectrum", lambda layout: layout.emissive),
+    ("kept.media.flight.p", "Float", lambda layout: layout.branch),
+    ("kept.media.shadow.T", "Spectrum", _media),
+    ("kept.media.shadow.y", "Float", _media),
+    ("kept.media.shadow.medium", "MediumPtr", _media),
+    ("kept.media.shadow.length", "Float", _media),
+)
+
+# Dr.Jit's local memory cannot hold Bool: these share a word, one bit each, and the lobe takes the bits above.
+BITS: tuple[tuple[str, Condition], ...] = (
+    ("at.hit.valid", _always),
+    ("at.delta", _always),
+    ("at.camera", _always),
+    ("kept.lit", _always),
+    ("kept.black", _always),
+    ("kept.media.flight.event", _media),
+    ("kept.media.null", _media),
+)
 LOBE_SHIFT = 8
 
 
-def record_type(walk: Walk, attached: bool) -> type:
-    """The fields that the records of this walk have; ``attached`` says that the path moves with the parameters."""
-    media = walk.media
-    fixed = media is None and not attached and not walk.traits.lights_vary
-    return _record_type(
-        mi.variant(), walk.resamples or media is not None, media is not None, bool(media and media.chromatic),
-        bool(media and media.emissive), bool(media and media.passes), walk.branch, fixed,
-    )  # fmt: skip
-
-
 @cache
-def _record_type(
-    variant: str,
-    resamples: bool,
-    media: bool,
-    chromatic: bool,
-    emissive: bool,
-    passes: bool,
-    branch: bool,
-    fixed: bool,
-) -> type:
-    fields = {
-        "o": mi.Point3f,  # ray
-        "d": mi.Vector3f,
-        "t": mi.Float,  # preliminary intersection
-        "uv": mi.Point2f,
-        "prim_index": mi.UInt32,
-        "shape_index": mi.UInt32,
-        "shape": mi.UInt32,
-        "instance": mi.UInt32,
-        "pdf": mi.Float,  # of ray.d
-        "β": mi.Spectrum,  # throughput before the vertex
-        "rr_weight": mi.Float,  # 1 / survival probability after the vertex
-        "flags": mi.UInt32,
-    }
-    if fixed:
-        fields |= {"glow": mi.Spectrum, "light_d": mi.Vector3f, "light_w": mi.Spectrum}
-    else:
-        fields |= {"light": mi.Point2f}  # random numbers
-    if resamples:
-        fields |= {"lobe": mi.Float, "direction": mi.Point2f}
-    if media:
-        fields |= {
-            "medium": mi.UInt32,
-            "behind": mi.Float,
-            "t_event": mi.Float,  # flight
-            "density": mi.Float,
-            "along": mi.Float,
-            "T": mi.Spectrum,  # shadow
-            "y": mi.Float,
-            "y_medium": mi.UInt32,
-            "length": mi.Float,
-        }
-    if chromatic:
-        fields |= {"W": mi.Spectrum}
-    if emissive:
-        fields |= {"E": mi.Spectrum, "t_emit": mi.Float, "c_emit": mi.Spectrum}
-    if passes:
-        fields |= {"chance": mi.Float}  # density of the continuation, also where it passes straight through
-    if branch:
-        fields |= {"p": mi.Float}
-    return make_dataclass("Record", list(fields.items()))
+def record_type(layout: Layout) -> type:
+    """The dataclass that holds a vertex."""
+    fields = {_name(place): _plain(kind) for place, kind, remembered in FIELDS if remembered(layout)}
+    return make_dataclass("Record", [*fields.items(), ("word", mi.UInt32)])
 
 
-def record(walk: Walk, attached: bool, at: Arrival, u: Numbers, step: Step, β: Any, rr_weight: Any) -> Any:
+def record(layout: Layout, v: Replayed) -> Any:
     """A vertex, to be written."""
-    kept = step.kept
-    bits = {HIT: at.hit.valid, DELTA: at.delta, LIT: kept.lit, BLACK: kept.black, CAMERA: at.camera}
-    if walk.media is not None:
-        bits |= {EVENT: kept.flight.event, NULL: kept.null}
-    flags = kept.lobe << LOBE_SHIFT
-    for bit, value in bits.items():
-        flags |= dr.select(value, mi.UInt32(bit), 0)
-    Record = record_type(walk, attached)
-    fields = {
-        "o": at.ray.o,
-        "d": at.ray.d,
-        "t": at.hit.t,
-        "uv": at.hit.prim_uv,
-        "prim_index": at.hit.prim_index,
-        "shape_index": at.hit.shape_index,
-        "shape": dr.reinterpret_array(mi.UInt32, at.hit.shape),
-        "instance": dr.reinterpret_array(mi.UInt32, at.hit.instance),
-        "pdf": at.pdf,
-        "β": β,
-        "rr_weight": rr_weight,
-        "light": u.light,
-        "glow": kept.glow,
-        "light_d": kept.light_d,
-        "light_w": kept.light_w,
-        "flags": flags,
-        "lobe": u.lobe,
-        "direction": u.direction,
-    }
-    if walk.media is not None:
-        flight, dark = kept.flight, kept.shadow
-        fields |= {
-            "medium": dr.reinterpret_array(mi.UInt32, at.medium),
-            "behind": at.behind,
-            "t_event": flight.t,
-            "density": flight.density,
-            "along": flight.along,
-            "T": dark.T,
-            "y": dark.y,
-            "y_medium": dr.reinterpret_array(mi.UInt32, dark.medium),
-            "length": dark.length,
-            "W": flight.W,
-            "E": flight.E,
-            "t_emit": flight.t_emit,
-            "c_emit": flight.c_emit,
-            "chance": kept.pdf,
-            "p": flight.p,
-        }
-    names = Record.__dataclass_fields__  # type: ignore[attr-defined]
-    return Record(**{name: value for name, value in fields.items() if name in names})
+    fields = {}
+    for place, kind, remembered in FIELDS:
+        if remembered(layout):
+            value = reduce(getattr, place.split("."), v)
+            fields[_name(place)] = dr.reinterpret_array(mi.UInt32, value) if kind.endswith("Ptr") else value
+    word = v.kept.lobe << LOBE_SHIFT
+    for k, (place, remembered) in enumerate(BITS):
+        if remembered(layout):
+            word |= dr.select(reduce(getattr, place.split("."), v), mi.UInt32(1 << k), 0)
+    return record_type(layout)(**fields, word=word)
 
 
-@cache
-def _end_type(variant: str) -> type:
-    return make_dataclass("End", {"L": mi.Spectrum, "records": mi.UInt32}.items())
+def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, ray0: mi.Ray3f) -> Replayed:
+    """The vertex recorded at ``index``.
 
-
-def end_type() -> type:
-    """What is kept of a path that has ended, where many are recorded: its radiance, and its number of records."""
-    return _end_type(mi.variant())
-
-
-def read_back(walk: Walk, tape: Any, index: Any, last: Any, ray0: Any) -> tuple[Replayed, Any]:
-    """The vertex recorded at ``index`` (UInt32), and the throughput before it (Spectrum).
-
-    ``last`` is the index of the path's last vertex; time and wavelengths are those of the camera ray ``ray0``.
+    ``last`` is the index of the path's last vertex; time and wavelengths are those of the ray ``ray0``.
     """
-    read = tape[index]
-    onward = _arrival(walk, tape[dr.minimum(index + 1, last)], ray0)
-    vertex = Replayed(
-        at=_arrival(walk, read, ray0),
-        u=_numbers(walk, read),
-        kept=_continuation(walk, read, onward),
-        go_on=index < last,
-        hit_next=onward.hit,
-        rr_weight=read.rr_weight,
-    )
-    return vertex, read.β
+    v = _read(layout, records[index], ray0)
+    onward = _read(layout, records[dr.minimum(index + 1, last)], ray0).at
+    # The next vertex remembers how the path came to it.
+    kept = replace(v.kept, d=onward.ray.d, delta=onward.delta)
+    if layout.passes:
+        kept.delta |= kept.media.null
+    else:
+        kept.pdf = onward.pdf
+    return replace(v, kept=kept, go_on=index < last, hit_next=onward.hit)
 
 
-def _arrival(walk: Walk, read: Any, ray0: Any) -> Arrival:
-    """How the path came to the recorded vertex; time and wavelengths are those of the camera ray ``ray0``."""
-    hit = dr.zeros(mi.PreliminaryIntersection3f)
-    hit.valid = (read.flags & HIT) != 0
-    hit.t = read.t
-    hit.prim_uv = read.uv
-    hit.prim_index = read.prim_index
-    hit.shape_index = read.shape_index
-    hit.shape = dr.reinterpret_array(mi.ShapePtr, read.shape)
-    hit.instance = dr.reinterpret_array(mi.ShapePtr, read.instance)
-    at = Arrival(
-        ray=mi.Ray3f(read.o, read.d, ray0.time, ray0.wavelengths),
-        hit=hit,
-        pdf=read.pdf,
-        delta=(read.flags & DELTA) != 0,
-        camera=(read.flags & CAMERA) != 0,
-    )
-    if walk.media is not None:
-        at.medium, at.behind = dr.reinterpret_array(mi.MediumPtr, read.medium), read.behind
-    return at
+def _read(layout: Layout, read: Any, ray0: mi.Ray3f) -> Replayed:
+    v = _blank(layout, ray0)
+    for place, kind, remembered in FIELDS:
+        if remembered(layout):
+            value = getattr(read, _name(place))
+            _put(v, place, dr.reinterpret_array(getattr(mi, kind), value) if kind.endswith("Ptr") else value)
+    for k, (place, remembered) in enumerate(BITS):
+        if remembered(layout):
+            _put(v, place, (read.word & (1 << k)) != 0)
+    v.kept.lobe = read.word >> LOBE_SHIFT
+    return v
 
 
-def _numbers(walk: Walk, read: Any) -> Numbers:
-    """The random numbers that later passes need."""
-    again = walk.resamples or walk.media is not None
-    lobe, direction = (read.lobe, read.direction) if again else (mi.Float(0), mi.Point2f(0))
-    light = getattr(read, "light", mi.Point2f(0))
-    return Numbers(light=light, lobe=lobe, direction=direction, roulette=mi.Float(0))
+def _blank(layout: Layout, ray0: mi.Ray3f) -> Replayed:
+    """A vertex of which nothing is known yet; what is not remembered stays what it is here."""
+    zero, no = mi.Float(0), mi.Bool(False)
+    ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0), ray0.time, ray0.wavelengths)
+    at = Arrival(ray, dr.zeros(mi.PreliminaryIntersection3f), zero, no, no)
+    kept = Kept(mi.Vector3f(0), zero, no, no, mi.UInt32(0), no)
+    if layout.fixed:
+        kept.known = KnownLight(mi.Spectrum(0), mi.Vector3f(0), mi.Spectrum(0))
+    if layout.media:
+        flight = Flight(no, zero, zero, mi.Spectrum(1), zero)
+        kept.media = KeptInMedia(no, flight, Shadow(mi.Spectrum(0), zero, dr.zeros(mi.MediumPtr), zero))
+    u = Numbers(mi.Point2f(0), zero, mi.Point2f(0), zero)
+    return Replayed(at, u, kept, no, at.hit, zero, mi.Spectrum(0))
 
 
-def _continuation(walk: Walk, read: Any, onward: Arrival) -> Kept:
-    """What the first walk chose at the recorded vertex; ``onward`` is the arrival at the next."""
-    kept = Kept(
-        d=onward.ray.d,
-        pdf=onward.pdf,
-        delta=onward.delta,
-        black=(read.flags & BLACK) != 0,
-        lobe=read.flags >> LOBE_SHIFT,
-        lit=(read.flags & LIT) != 0,
-    )
-    if hasattr(read, "glow"):
-        kept.glow, kept.light_d, kept.light_w = read.glow, read.light_d, read.light_w
-    if walk.media is None:
-        return kept
-    kept.null = (read.flags & NULL) != 0
-    if walk.media.passes:
-        kept.pdf, kept.delta = read.chance, kept.delta | kept.null
-    kept.flight = Flight(
-        event=(read.flags & EVENT) != 0,
-        t=read.t_event,
-        density=read.density,
-        W=read.W if walk.media.chromatic else mi.Spectrum(1),
-        along=read.along,
-        p=read.p if walk.branch else None,
-    )
-    if walk.media.emissive:
-        kept.flight.E, kept.flight.t_emit, kept.flight.c_emit = read.E, read.t_emit, read.c_emit
-    y_medium = dr.reinterpret_array(mi.MediumPtr, read.y_medium)
-    kept.shadow = Shadow(T=read.T, y=read.y, medium=y_medium, length=read.length)
-    return kept
+def _put(v: Replayed, place: str, value: Any) -> None:
+    *way, name = place.split(".")
+    setattr(reduce(getattr, way, v), name, value)
+
+
+def _name(place: str) -> str:
+    return place.replace(".", "_")
+
+
+def _plain(kind: str) -> type:
+    return mi.UInt32 if kind.endswith("Ptr") else getattr(mi, kind)

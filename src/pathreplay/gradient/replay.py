@@ -8,35 +8,45 @@ Where the path moves with the parameters, `replay_attached` peels the adjoint of
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
 from ..transport.motion import path_moves
-from ..transport.path import count, first_arrival, next_arrival, repeat_step, survival, take_step
-from ..transport.vertex import Numbers, Walk, reciprocal
+from ..transport.path import PathState
+from ..transport.start import CameraStart
+from ..transport.step import repeat_step
+from ..transport.vertex import Arrival, Walk, reciprocal
 from .adjoint import LostPaths, backward
 from .branch import Branch, branch_backward
 from .primal import primal
 from .ray_jacobian import Recovery, has_smooth_lobes
+from .record import MAX_DEPTH_MEDIA
 from .replay_attached import replay_attached
-from .sweep import MAX_DEPTH_MEDIA
 
 
-def replay(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostPaths, recovery: Recovery) -> bool:
-    """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters.
+def replay(
+    walk: Walk,
+    sampler: mi.Sampler,
+    start: CameraStart,
+    δL: mi.Spectrum,
+    active: mi.Bool,
+    lost: LostPaths,
+    recovery: Recovery = Recovery(),  # noqa: B008 (it is frozen)
+) -> bool:
+    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
 
-    ``ray`` may be attached to the camera. Returns whether the path moves with the parameters; if so, ``recovery`` says
-    how ray adjoints are found, ``lost`` counts paths with one that was not finite, and a warning tells, once, of smooth
-    lobes. Not differentiated: visibility, weights that are exactly zero (the sweep driver keeps their derivatives) and,
-    with ``attach='none'``, everything that moves.
+    Returns whether the path moves with the parameters; if so, ``recovery`` says how ray adjoints are found, ``lost``
+    counts paths with one that was not finite, and a warning tells, once, of smooth lobes. Not differentiated:
+    visibility, weights that are exactly zero (the sweep driver keeps their derivatives) and, with ``attach='none'``,
+    everything that moves.
     """
     active = mi.Bool(active) & (walk.max_depth > 0)
-    moves = path_moves(walk, ray, first_arrival(walk, ray, active))
+    at = start.choose(walk, active)
+    moves = path_moves(walk, start, at)
     if not moves:
-        _replay_still(walk, sampler, ray, δL, active)
+        _replay_still(walk, sampler, start, at, δL, active)
     elif walk.media is not None:
         raise PathreplayError(
             "driver = 'replay' cannot follow paths that move through media: use driver = 'sweep', "
@@ -45,7 +55,7 @@ def replay(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: Lost
     else:
         if has_smooth_lobes(walk):
             _warn_of_smooth_lobes()
-        replay_attached(walk, sampler, ray, δL, active, lost, recovery)
+        replay_attached(walk, sampler, start, δL, active, lost, recovery)
     return moves
 
 
@@ -61,42 +71,30 @@ def _warn_of_smooth_lobes() -> None:
 
 
 @dr.syntax
-def _replay_still(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
+def _replay_still(
+    walk: Walk, sampler: mi.Sampler, start: CameraStart, at: Arrival, δL: mi.Spectrum, active: mi.Bool
+) -> None:
     """Replay a path that does not move.
 
     Peels β_{i+1} L_{i+1} = β_i L_i - β_i e_i and differentiates it as (β_i L_{i+1}) w_i through the relative
     derivative of w_i.
     """
-    L, _ = primal(walk, sampler.clone(), ray, active)  # β_i L_i, peeled on the way
-
-    β = mi.Spectrum(1)  # throughput
-    η = mi.Float(1)  # relative index of refraction since the camera
-    depth = mi.UInt32(0)  # vertices before
-    active = mi.Bool(active) & (walk.max_depth > 0)
-    at = first_arrival(walk, ray, active)
+    L, _ = primal(walk, sampler.clone(), start, active)  # β_i L_i, peeled on the way
+    path = PathState.begin(at, active)
     branch = Branch.none()
 
-    while dr.hint(active, exclude=[walk], label="pathreplay: replay"):
-        u = Numbers.draw(sampler)
-        go_on = depth + 1 < walk.max_depth
-        step = take_step(walk, at, u, sampler, β, go_on, active)
-        L -= β * step.e
+    while dr.hint(path.active, exclude=[walk], label="pathreplay: replay"):
+        u, step = path.choose(walk, sampler)
+        L -= path.β * step.e
         if dr.hint(walk.branch, mode="scalar"):
-            branch = branch.offer(at, step, β, depth, η, active)
+            branch = branch.offer(path, step)
 
         with dr.resume_grad():
-            held = repeat_step(walk, at, u, step.kept, step.active, active)
-            Lo = β * held.e + L * held.w * dr.detach(reciprocal(held.w))
+            again = repeat_step(walk, path.at, u, step.kept, step.active, path.active)
+            Lo = path.β * again.e + L * again.w * dr.detach(reciprocal(again.w))
             backward(dr.sum(δL * Lo))
 
-        β *= step.w
-        η *= step.kept.eta
-        rr_weight, survives = survival(β, η, depth, u.roulette, walk, step)
-        active = step.active & survives & (dr.max(β) != 0)
-        β *= rr_weight
-
-        at = next_arrival(walk, at, step, active)
-        depth += count(walk, step)
+        path = path.advance(walk, u, step)[0]
 
     if dr.hint(walk.branch, mode="scalar"):
-        branch_backward(walk, branch, sampler, dr.detach(ray), δL)
+        branch_backward(walk, branch, sampler, at.ray, δL)

@@ -11,117 +11,105 @@ Speierer and Jakob (2021). It is here to be compared with: the sweep driver need
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.path import first_arrival, next_arrival, survival
-from ..transport.step import surface_step
-from ..transport.vertex import Arrival, Numbers, Walk
+from ..transport.path import PathState
+from ..transport.start import CameraStart
+from ..transport.vertex import Walk
 from .adjoint import LostPaths, Replayed, backward
-from .ray_jacobian import (
-    RayFrame,
-    Recovery,
-    emission_slope,
-    length_scale,
-    linearise,
-    local_terms,
-    random_sign,
-    regularise,
-)
+from .ray_jacobian import RayFrame, Recovery, emission_slope, length_scale, linearise, local_terms, random_sign
 
 
-def _advance(
-    walk: Walk, sampler: Any, at: Arrival, β: Any, η: Any, depth: Any, active: Any
-) -> tuple[Replayed, Arrival, Any, Any, Any]:
-    """One step of the walk, the same in both passes: the vertex, the next arrival, e (Spectrum), next β and η."""
-    u = Numbers.draw(sampler)
-    step = surface_step(walk, at, u, depth + 1 < walk.max_depth, active)
-    β = β * step.w  # not in place: the caller still needs it
-    η = η * step.kept.eta
-    rr_weight, survives = survival(β, η, depth, u.roulette, walk, step)
-    go_on = step.active & survives & (dr.max(β) != 0)
-    at_next = next_arrival(walk, at, step, go_on)
-    return Replayed(at, u, step.kept, go_on, at_next.hit, rr_weight), at_next, step.e, β * rr_weight, η
-
-
-@dr.syntax
 def replay_attached(
-    walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any, lost: LostPaths, recovery: Recovery
+    walk: Walk,
+    sampler: mi.Sampler,
+    start: CameraStart,
+    δL: mi.Spectrum,
+    active: mi.Bool,
+    lost: LostPaths,
+    recovery: Recovery,
 ) -> None:
-    """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters and the camera.
+    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
 
     ``lost`` counts the paths on which a q was not finite, and what it had to tell was left out. Exact on chains of
     delta lobes. Behind smooth lobes A_i has rank two: without noise q is lost there, with noise the result is unbiased
     as long as rounding is not magnified beyond it. Not differentiated: visibility, and weights that are exactly zero.
     """
-    Spectrum, Matrix = recovery.real(mi.Spectrum), recovery.real(mi.Matrix4f)
-    Vector = recovery.real(mi.Vector4f)
     scale = length_scale(walk.scene)
-    sampler2 = sampler.clone()
-
-    # -------------- First pass: L_0 and its derivative --------------
-
-    L = Spectrum(0)  # δL is not part of it
-    q = Vector(0)  # δL·∂L_0/∂r_0
-    J = Matrix(1)  # ∂r_i/∂r_0
-    κ = [Spectrum(0) for _ in range(4)]  # ∂ log β_i / ∂r_0, by each coordinate
-    β = mi.Spectrum(1)  # throughput
-    η = mi.Float(1)  # relative index of refraction since the camera
-    depth = mi.UInt32(0)  # index of the vertex
-    camera_active = mi.Bool(active) & (walk.max_depth > 0)
-    active = mi.Bool(camera_active)
-    at = first_arrival(walk, ray, active)
-
-    while dr.hint(active, max_iterations=walk.max_depth, exclude=[walk, recovery, scale], label="pathreplay: tangents"):
-        v, at_next, e, β_next, η = _advance(walk, sampler, at, β, η, depth, active)
-        slope = emission_slope(walk, at_next, δL * β_next, v.go_on)
-        frame, frame_next = RayFrame.of(at.ray, scale), RayFrame.of(at_next.ray, scale)
-        local = linearise(walk, v, δL * β, slope, frame, frame_next, active)
-
-        L += Spectrum(β * e)
-        lit = Spectrum(δL) * Spectrum(β * e)
-        q += Vector(J.T @ Vector(local.e)) + Vector(*[dr.sum(lit * k) for k in κ])
-        κ = [κ[k] + sum(Spectrum(local.log_w[j]) * J[j, k] for j in range(4)) for k in range(4)]
-        ε = recovery.noise * random_sign(v.u)
-        J = regularise(Matrix(local.A), type(q.x)(ε), recovery.place, ~v.kept.delta) @ J
-
-        β, at, active = β_next, at_next, v.go_on
-        depth += 1
-
-    # ----------------------- Back to the camera ----------------------
-
+    again = sampler.clone()
+    path = PathState.begin(start.choose(walk, active), active)
+    L, q = _tangents(walk, sampler, dr.copy(path), δL, recovery, scale)
     overflow = ~dr.all(dr.isfinite(q))
     q = dr.select(overflow, 0, q)
     with dr.resume_grad():
-        if dr.hint(dr.grad_enabled(ray.o, ray.d), mode="scalar"):
-            x = RayFrame.of(dr.detach(ray), scale).coordinates(ray.o, ray.d)
+        o, d = start.repeat()
+        if dr.grad_enabled(o, d):
+            dr.eval(q, L, overflow)  # else each entry of a camera's matrix runs the first pass again
+            x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
             dr.eval(q0, overflow)  # as in the sweep
             backward(sum(q0[k] * x[k] for k in range(4)))
+    _peel(walk, again, path, δL, L, q, overflow, lost, recovery, scale)
 
-    # --------- Second pass: peel L and q, feed the parameters --------
 
+@dr.syntax
+def _tangents(
+    walk: Walk, sampler: mi.Sampler, path: PathState, δL: mi.Spectrum, recovery: Recovery, scale: float
+) -> tuple[mi.Spectrum, mi.Vector4f]:
+    """First pass: L_0 and δL·∂L_0/∂r_0."""
+    Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
+    L = Spectrum(0)  # δL is not part of it
+    q = Vector(0)
+    J = Matrix(1)  # ∂r_i/∂r_0
+    κ = [Spectrum(0) for _ in range(4)]  # ∂ log β_i / ∂r_0, by each coordinate
+
+    while dr.hint(path.active, exclude=[walk, recovery, scale], label="pathreplay: tangents"):
+        u, step = path.choose(walk, sampler)
+        onward, rr_weight = path.advance(walk, u, step)
+        v = Replayed.of(path, u, step, onward, rr_weight)
+        slope = emission_slope(walk, onward.at, δL * onward.β, v.go_on)
+        frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
+        local = linearise(walk, v, δL * v.β, slope, frame, frame_next, path.active)
+
+        L += Spectrum(v.β * step.e)
+        lit = Spectrum(δL) * Spectrum(v.β * step.e)
+        q += Vector(J.T @ Vector(local.e)) + Vector(*[dr.sum(lit * k) for k in κ])
+        κ = [κ[k] + sum(Spectrum(local.log_w[j]) * J[j, k] for j in range(4)) for k in range(4)]
+        J = recovery.regularised(Matrix(local.A), random_sign(u), ~v.kept.delta) @ J
+        path = onward
+
+    return L, q
+
+
+@dr.syntax
+def _peel(
+    walk: Walk,
+    sampler: mi.Sampler,
+    path: PathState,
+    δL: mi.Spectrum,
+    L: mi.Spectrum,
+    q: mi.Vector4f,
+    overflow: mi.Bool,
+    lost: LostPaths,
+    recovery: Recovery,
+    scale: float,
+) -> None:
+    """Second pass: peel L and q, feed the parameters."""
+    Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
     broken = mi.Bool(False)  # this path has been counted as lost
-    β = mi.Spectrum(1)
-    η = mi.Float(1)
-    depth = mi.UInt32(0)
-    active = mi.Bool(camera_active)
-    at = first_arrival(walk, ray, active)
 
-    while dr.hint(
-        active, max_iterations=walk.max_depth, exclude=[walk, recovery, scale, lost], label="pathreplay: replay"
-    ):
-        v, at_next, e, β_next, η = _advance(walk, sampler2, at, β, η, depth, active)
-        slope = emission_slope(walk, at_next, δL * β_next, v.go_on)
-        frame, frame_next = RayFrame.of(at.ray, scale), RayFrame.of(at_next.ray, scale)
-        L = dr.select(v.go_on, L - Spectrum(β * e), 0)
-        local = linearise(walk, v, δL * β, slope, frame, frame_next, active)
+    while dr.hint(path.active, exclude=[walk, recovery, scale, lost], label="pathreplay: replay"):
+        u, step = path.choose(walk, sampler)
+        onward, rr_weight = path.advance(walk, u, step)
+        v = Replayed.of(path, u, step, onward, rr_weight)
+        slope = emission_slope(walk, onward.at, δL * onward.β, v.go_on)
+        frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
+        L = dr.select(v.go_on, L - Spectrum(v.β * step.e), 0)
+        local = linearise(walk, v, δL * v.β, slope, frame, frame_next, path.active)
 
         p = Vector(local.e) + Vector(*[dr.sum(Spectrum(δL) * L * Spectrum(k)) for k in local.log_w])
-        ε = recovery.noise * random_sign(v.u)
-        A = regularise(Matrix(local.A), type(q.x)(ε), recovery.place, ~v.kept.delta)
+        A = recovery.regularised(Matrix(local.A), random_sign(u), ~v.kept.delta)
         q = dr.select(v.go_on, Vector(dr.rcp(A.T) @ (q - p)), 0)
         breaks = overflow | ~dr.all(dr.isfinite(q))
         q = dr.select(breaks, 0, q)
@@ -129,11 +117,10 @@ def replay_attached(
         broken |= breaks
 
         with dr.resume_grad():
-            e, w, x_next = local_terms(walk, v, at, δL * β, slope, frame_next, active)
+            e, w, x_next = local_terms(walk, v, v.at, δL * v.β, slope, frame_next, path.active)
             q_next = mi.Vector4f(q)
             target = e + dr.sum(δL * mi.Spectrum(L) * w) + sum(q_next[k] * x_next[k] for k in range(4))
             if dr.hint(dr.grad_enabled(target), mode="scalar"):  # not so where the camera alone moves
                 backward(target)
 
-        β, at, active = β_next, at_next, v.go_on
-        depth += 1
+        path = onward

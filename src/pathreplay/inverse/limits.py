@@ -13,7 +13,8 @@ import numpy as np
 from pathreplay import memory
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images import Image
-from pathreplay.render.films import MOST_SAMPLES, film_size, require_memory, require_samples
+from pathreplay.render.film import film_size
+from pathreplay.render.film_limits import MOST_SAMPLES, require_memory, require_samples
 from pathreplay.transport.traits import nodes_of
 
 if TYPE_CHECKING:

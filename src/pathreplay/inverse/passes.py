@@ -20,10 +20,11 @@ from pathreplay.inverse.losses import QUADRATIC, Loss
 from pathreplay.inverse.problem import Problem
 from pathreplay.render.path_integrator import plain_errors
 from pathreplay.scenes.parameters import keep_only
-from pathreplay.transport.traits import Tables, nodes_of, scene_tables
+from pathreplay.transport.facts import SceneFacts
+from pathreplay.transport.traits import Tables
 
-#: Integrators that look at nothing on the host while they render, by class.
-RECORDABLE = frozenset({"PathReplayIntegrator", "PRBIntegrator", "BasicPRBIntegrator"})
+#: Mitsuba's integrators that look at nothing on the host while they render, by class: they do not say. Ours do.
+RECORDABLE = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})
 
 
 #: What Dr.Jit says, whatever the cause, where a function cannot be frozen. Plugins do not show beforehand whether they
@@ -42,16 +43,16 @@ class Passes:
         self.problem, self.integrator = problem, integrator
         self.targets = [mi.TensorXf(view.target) for view in problem.views]
         # What an integrator learns of media from pass to pass is read and written between kernels.
-        nodes = nodes_of(problem.scene)
-        media = any(isinstance(node, mi.Medium) for node in nodes)
+        facts = SceneFacts(problem.scene)
         # Spectral variants look up the eye's response in tables of Mitsuba's library: no input of ours, as a recorded
         # function must have them, leads there. Recorded kernels are cut otherwise than traced ones, and round otherwise
         # in the last bit.
-        recordable = type(integrator).__name__ in RECORDABLE and not media and not mi.is_spectral
+        recordable = getattr(integrator, "recordable", type(integrator).__name__ in RECORDABLE)
+        recordable = recordable and not facts.has_media and not mi.is_spectral
         self.freezes = record and recordable
         self.swept: tuple[bool, ...] = ()  # views whose pixels can be swept; empty before the first call
         self.frozen: dict[Any, Callable[..., Any]] = {}  # recorded functions, by the shapes of the parameters
-        self.tables = scene_tables(nodes)
+        self.tables = facts.traits().tables
 
     def __call__(self, seeds: list[int], spp: int) -> float:
         """The loss, with ``spp`` samples per pixel and a seed for every view; adds its gradient to the parameters.

@@ -23,7 +23,7 @@ from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.values import Array, make_value, require_finite_array
 from pathreplay.render.edges import edges_note, moves_edges
-from pathreplay.render.films import picture_shape
+from pathreplay.render.film import picture_shape
 from pathreplay.render.integrator import EDGES
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_description

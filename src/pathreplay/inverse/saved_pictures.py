@@ -12,7 +12,7 @@ from pathreplay.files import file_problem
 from pathreplay.inverse.images import Image, read_image
 from pathreplay.inverse.problem import View
 from pathreplay.inverse.values import require_finite_array
-from pathreplay.render.films import picture_shape
+from pathreplay.render.film import picture_shape
 
 
 def saved_picture(path: Path) -> Image:

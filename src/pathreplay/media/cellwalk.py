@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from .supergrid import Bounds
 
 #: The residual collisions come this much denser than the largest residual density. Twice as many halve the exponent of
-#: the variance; four times as many cost more time than they save noise (benchmarks/gridmedium.py).
+#: the variance; four times as many cost more time than they save noise (`pathreplay bench gridmedium`).
 DENSER = 2.0
 #: Largest relative variance that crossing one cell adds to the transmittance of a ray that meets nothing in it. A ray
 #: meets 10 to 50 cells; with the mean as control density, whatever the risk, dense grids with edges have wild outliers.
@@ -100,7 +100,7 @@ def clip(box: Any, ray: Any) -> tuple[Any, Any]:
 
 
 @dataclass(frozen=True)
-class Walk:
+class CellWalk:
     """A ray in cell space: axis k is crossed at the distance cell_k · inverse_k + offset_k."""
 
     inverse: Any  # Vector3f: 1/d, 0 along axes on which the ray does not move
@@ -118,7 +118,7 @@ class Walk:
         return dr.select(crossings <= t, cell + self.stride, cell)
 
 
-def begin(cells: Cells, ray: Any, a: Any, b: Any) -> Walk:
+def begin(cells: Cells, ray: Any, a: Any, b: Any) -> CellWalk:
     """A walk along the ray from distance a to b, both inside of the bounding box."""
     o, d = _transformed(cells.to_cell, ray)
     still, forward = d == 0, d > 0
@@ -130,7 +130,7 @@ def begin(cells: Cells, ray: Any, a: Any, b: Any) -> Walk:
     # The walk ends where the last inner cell ends, as the walk itself finds it.
     last = dr.fma(dr.select(forward, inner, mi.Vector3f(1)), inverse, offset)
     stride = dr.select(forward, mi.Vector3f(1), mi.Vector3f(-1))
-    return Walk(inverse, offset, stride, start, dr.minimum(b, dr.min(last)))
+    return CellWalk(inverse, offset, stride, start, dr.minimum(b, dr.min(last)))
 
 
 def _transformed(m: NDArray[np.float64], ray: Any) -> tuple[Any, Any]:

@@ -1,35 +1,71 @@
-"""The `pathreplay` integrator plugin: chooses step and driver, and speaks Mitsuba's integrator interface."""
+"""The `pathreplay` integrator plugin: reads properties, adds up terms, keeps what they learn, and tells of problems."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..errors import PathreplayError
-from ..gradient.adjoint import LostPaths
-from ..gradient.baseline import FIRST_BRANCHING, Baseline
-from ..gradient.forward import forward
-from ..gradient.listing import listing
-from ..gradient.pixel_sweep import PixelLoss, fits, pixel_camera, pixel_sweep, sweepable
-from ..gradient.primal import primal
+from ..gradient.baseline import Baseline
+from ..gradient.pixel_sweep import PixelLoss, fits, sweepable
 from ..gradient.ray_jacobian import Recovery
-from ..gradient.replay import replay
-from ..gradient.sweep import MAX_DEPTH, deepest, sweep
-from ..transport.traits import Traits, nodes_of
+from ..gradient.record import MAX_DEPTH
+from ..transport.facts import SceneFacts
 from ..transport.vertex import Walk
-from .edges import edges_note, keys_that_move_edges
+from .camera_pass import Pass
+from .diagnostics import Diagnostics, doubts, lost_note, missing_edges, used_before_note
+from .interior import PathReplay
 from .path_integrator import UNBOUNDED, path_integrator
 from .properties import choice, deviation
+from .term import Found
 
 DRIVERS = ("auto", "sweep", "replay")
 ATTACH = ("delta", "all", "none")
-VOLUME_GRADIENTS = ("score", "listing")
 BRANCH = ("auto", True, False)
 EDGES = "edges"
 """In `told`: that edges move has been said."""
+
+
+def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
+    """The term that the properties ask for. Raises PathreplayError for what cannot be."""
+    if "volume_gradient" in props:
+        raise PathreplayError(
+            f"{name}: there is no volume_gradient: leave it out for what was 'score', and use the integrator "
+            "'pathreplay_listing' for 'listing'"
+        )
+    driver = choice(props, name, "driver", "auto", DRIVERS)
+    if driver == "sweep" and max_depth > MAX_DEPTH:
+        depth = "-1 (unbounded)" if max_depth == UNBOUNDED else max_depth
+        raise PathreplayError(
+            f"{name}: max_depth = {depth} is more than the sweep driver can hold ({MAX_DEPTH}): "
+            "use driver = 'replay', which has no limit"
+        )
+    branch = choice(props, name, "branch", "auto", BRANCH)
+    recovery = Recovery(noise=deviation(props, name, "noise", Recovery.noise))
+    auto = driver == "auto"
+    if auto:
+        driver = "sweep" if max_depth <= MAX_DEPTH else "replay"
+    return PathReplay(driver, auto, branch, recovery)
+
+
+def _pixel_loss(view: Pass, max_depth: int, offset: mi.TensorXf, slope: mi.TensorXf) -> PixelLoss:
+    """The loss by each lane's pixel. Raises PathreplayError where the pass or the tensors do not allow it."""
+    if not fits(max_depth, view.spp):
+        raise PathreplayError(
+            f"pathreplay: {view.spp} samples per pixel, of {max_depth} vertices, cannot be swept: use "
+            f"2 or more, and at most {MAX_DEPTH} vertices in all, or mi.render"
+        )
+    width, height = view.size
+    for tensor in (offset, slope):
+        if tensor.shape != (height, width, 3):
+            raise PathreplayError(
+                f"pathreplay: derivative of the loss has shape {tensor.shape}: use {(height, width, 3)}"
+            )
+    pixel = dr.arange(mi.UInt32, width * height)
+    return PixelLoss(*(dr.gather(mi.Color3f, tensor.array, pixel) for tensor in (offset, slope)))
 
 
 def _make_class() -> type:
@@ -38,15 +74,14 @@ def _make_class() -> type:
 
         Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
         (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``, ``none``), ``noise``
-        (0.01; of ray adjoints with the replay driver: see `Recovery`), ``volume_gradient`` (``score``, ``listing``)
-        and ``branch`` (``auto``, True, False). ``auto`` drivers sweep unless ``max_depth`` is more than the sweep can
-        hold. Forward mode is the same whatever the driver.
+        (0.01; of ray adjoints with the replay driver: see `Recovery`) and ``branch`` (``auto``, True, False). ``auto``
+        drivers sweep unless ``max_depth`` is more than the sweep can hold. Forward mode is the same whatever the
+        driver.
 
-        ``volume_gradient='score'`` differentiates media where paths went, less a baseline that is learned from earlier
-        gradient passes of this integrator (with other seeds); ``listing`` is delta tracking as first published.
-        ``branch`` walks one more path from where a medium might have scattered and did not, without which a gradient by
-        extinction is wrong where it is zero; ``auto`` does so where extinction with gradients varies in space or is
-        zero, which mostly takes less time for the same noise, too.
+        Media are differentiated where paths went, less a baseline that is learned from earlier gradient passes of this
+        integrator (with other seeds). ``branch`` walks one more path from where a medium might have scattered and did
+        not, without which a gradient by extinction is wrong where it is zero; ``auto`` does so where extinction with
+        gradients varies in space or is zero, which mostly takes less time for the same noise, too.
 
         Not differentiated: visibility; with ``attach='none'`` all motion of shapes, cameras and directions; by
         extinction where it is zero if ``branch`` is off; with the replay driver, by weights that are exactly zero.
@@ -54,100 +89,34 @@ def _make_class() -> type:
         """
 
         name = "pathreplay"
+        #: It looks at nothing on the host while it renders a scene without media, so that Dr.Jit can record it.
+        recordable = True
 
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.attach = choice(props, self.name, "attach", "delta", ATTACH)
-            driver = choice(props, self.name, "driver", "auto", DRIVERS)
-            if driver == "sweep" and self.max_depth > MAX_DEPTH:
-                depth = "-1 (unbounded)" if self.max_depth == UNBOUNDED else self.max_depth
-                raise PathreplayError(
-                    f"pathreplay: max_depth = {depth} is more than the sweep driver can hold ({MAX_DEPTH}): "
-                    "use driver = 'replay', which has no limit"
-                )
-            self.auto = driver == "auto"
-            if self.auto:
-                driver = "sweep" if self.max_depth <= MAX_DEPTH else "replay"
-            self.driver = driver
-            self.volume_gradient = choice(props, self.name, "volume_gradient", "score", VOLUME_GRADIENTS)
-            self.branch = choice(props, self.name, "branch", "auto", BRANCH)
-            self.recovery = Recovery(noise=deviation(props, self.name, "noise", Recovery.noise))
+            self.interior = _interior(self.name, props, self.max_depth)
+            self.driver, self.branch = self.interior.driver, self.interior.branch
             self.told: set[str] = set()  # what has been said in the log
-            self.lost: list[tuple[LostPaths, int]] = []  # of how many paths each, not told yet
-            self.baseline: tuple[int, Baseline] | None = None  # and the scene that it belongs to
-            self.learner: Baseline | None = None  # the same, in a pass that it may learn from
-            self.known: set[Any] = set()  # keys of the passes that it has learned from
+            self.untold = Diagnostics()  # of passes whose lost paths have not been told
+            self.baseline: tuple[SceneFacts, Baseline] | None = None  # and the scene that it belongs to
 
-        def sample(
-            self,
-            mode: dr.ADMode,
-            scene: Any,
-            sampler: Any,
-            ray: Any,
-            δL: Any = None,
-            active: Any = True,
-            **_: Any,
-        ) -> tuple[Any, Any, list[Any], Any]:
-            """Radiance, its tangent, or nothing (after back-propagating ``δL``): see Mitsuba's ADIntegrator."""
-            if mode == dr.ADMode.Primal and self.goes_back:
-                return mi.Spectrum(0), mi.Bool(True), [], None
-            walk = self._walk(scene, mode != dr.ADMode.Primal)
-            if mode == dr.ADMode.Primal:
-                L, valid = primal(walk, sampler, dr.detach(ray), active)
-                return L, valid, [], None
-            self._check(walk)
-            lost = LostPaths()
-            if mode == dr.ADMode.Forward:
-                tangent, valid, moves = forward(walk, sampler, ray, active, lost)
-                if moves:
-                    self._tell_edges(walk)
-                    self.lost.append((lost, dr.width(ray)))
-                return tangent, valid, [], None
-            driver = self.driver
-            if self.auto and self.max_depth > deepest(walk):
-                driver = "replay"
-            moves = False
-            if walk.media is not None and self.volume_gradient == "listing":
-                listing(walk, sampler, ray, δL, active)
-            elif driver == "sweep":
-                if walk.baseline is not None and self.baseline is not None and self.of_pass is not None:
-                    self.learner = self.baseline[1]
-                    self.known.add(self._pass_key())
-                moves = sweep(walk, sampler, ray, δL, active, lost, self.learner)
-            else:
-                moves = replay(replace(walk, baseline=None), sampler, ray, δL, active, lost, self.recovery)
-            if moves:
-                self._tell_edges(walk)
-            if moves or walk.media is not None:
-                self.lost.append((lost, dr.width(ray)))
-            return mi.Spectrum(0), mi.Bool(True), [], None
-
-        def render_backward(
-            self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
-        ) -> None:
-            """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
-
-            Warns when a part of the gradient was not finite and had to be left out.
-            """
-            self._forget_lost()
-            try:
-                super().render_backward(scene, params, grad_in, sensor, seed, spp)
-                self._tell_lost()
-                if self.learner is not None:
-                    self.learner.absorb()
-            finally:
-                self.learner = None
-
-        def sweeps_pixels(self, scene: Any, sensor: Any = 0, spp: int = 0) -> bool:
+        def sweeps_pixels(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> bool:
             """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
-            sensor, spp = self._resolved(scene, sensor, spp)
-            if self.driver != "sweep" or not sweepable(sensor, self.max_depth, spp):
+            view = Pass.of(scene, sensor, 0, spp)
+            if self.driver != "sweep" or not sweepable(view.sensor, self.max_depth, view.spp):
                 return False
-            return not any(isinstance(node, mi.Medium) for node in nodes_of(scene))
+            return not self._facts(scene).has_media
 
         def render_and_backward(
-            self, scene: Any, offset: Any, slope: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
-        ) -> Any:
+            self,
+            scene: mi.Scene,
+            offset: mi.TensorXf,
+            slope: mi.TensorXf,
+            sensor: int | mi.Sensor = 0,
+            seed: int | mi.UInt32 = 0,
+            spp: int = 0,
+        ) -> mi.TensorXf:
             """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
 
             ``offset`` and ``slope`` are tensors like the image (height x width x 3); the loss adds up over its values.
@@ -155,167 +124,80 @@ def _make_class() -> type:
             Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
             number of samples does not, or a tensor has another shape.
             """
-            sensor, spp = self._resolved(scene, sensor, spp)
-            width, height = sensor.film().crop_size()
-            if not fits(self.max_depth, spp):
-                raise PathreplayError(
-                    f"pathreplay: {spp} samples per pixel, of {self.max_depth} vertices, cannot be swept: use "
-                    f"2 or more, and at most {MAX_DEPTH} vertices in all, or mi.render"
-                )
-            for tensor in (offset, slope):
-                if tensor.shape != (height, width, 3):
-                    raise PathreplayError(
-                        f"pathreplay: derivative of the loss has shape {tensor.shape}: use {(height, width, 3)}"
-                    )
-            self._forget_lost()
-            with self._looking_through(scene, sensor, seed, spp), dr.suspend_grad(), dr.isolate_grad():
-                sampler = sensor.sampler().clone()
-                sampler.seed(seed, width * height)
-                pixel = dr.arange(mi.UInt32, width * height)
-                o, k = (dr.gather(mi.Color3f, tensor.array, pixel) for tensor in (offset, slope))
-                walk, lost = self._walk(scene, True), LostPaths()
-                self._check(walk)
-                moves, L = pixel_sweep(walk, sampler, pixel_camera(sensor, pixel), spp, PixelLoss(o, k), lost)
-                if moves:
-                    self._tell_edges(walk)
-                    self.lost.append((lost, width * height * spp))
-                dr.eval(L)  # in one kernel with the gradients
-                image = mi.TensorXf(dr.ravel(L), (height, width, 3))
-            self._tell_lost()
-            return image
+            with self._passing(scene, sensor, seed, spp) as view, dr.isolate_grad():
+                loss = _pixel_loss(view, self.max_depth, offset, slope)
+                walk = self._walk(scene, view.sensor)
+                self._learned(view, walk)
+                found = self.interior.pixels(view, walk, loss)
+            self._told(view, walk, found)
+            return found.image
 
-        def _resolved(self, scene: Any, sensor: Any, spp: int) -> tuple[Any, int]:
-            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            return sensor, spp or sensor.sampler().sample_count()
+        def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
+            """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
+            for doubt in doubts(walk):
+                self._tell_once(doubt)
+            if walk.media is None:
+                return None
+            baseline = self._baseline(walk.scene)
+            if view.key in baseline.passes:
+                self._tell_once(used_before_note(view.key[0]))
+                return None
+            return baseline
 
-        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
-            """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
+        def _baseline(self, scene: mi.Scene) -> Baseline:
+            facts = self._facts(scene)
+            if self.baseline is None or self.baseline[0] is not facts:
+                self.baseline = facts, Baseline.fresh(scene.bbox())
+            return self.baseline[1]
 
-            The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
-            from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
-            """
-            self._forget_lost()
-            tangent = super().render_forward(scene, params, sensor, seed, spp)
-            if self.lost:
-                dr.eval(tangent)  # in one kernel with the count of lost paths
-            self._tell_lost()
-            return tangent
-
-        def _walk(self, scene: Any, differentiate: bool) -> Walk:
-            walk = super()._walk(scene, differentiate)
-            if walk.media is None or not differentiate:
-                return walk
-            known = self._baseline(scene)
-            branching = None
-            if walk.media.branches if self.branch == "auto" else self.branch:
-                branching = dr.opaque(mi.Float, FIRST_BRANCHING) if known is None else known.branching
-            return replace(walk, baseline=None if known is None else known.look, branching=branching)
-
-        def learned(self) -> dict[str, Any]:
+        def learned(self) -> dict[str, np.ndarray]:
             """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
             return {} if self.baseline is None else self.baseline[1].learned()
 
-        def restore_learned(self, scene: Any, learned: Any) -> None:
+        def restore_learned(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
             """Go on with what `learned` told of the same scene, in another process. Raises PathreplayError."""
-            baseline = Baseline(scene.bbox())
-            baseline.restore(learned)
-            self.baseline = scene.ptr, baseline
-            self.known.clear()
+            self.baseline = self._facts(scene), Baseline.restored(scene.bbox(), learned)
 
-        def _baseline(self, scene: Any) -> Baseline | None:
-            """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
-            if self.baseline is None or self.baseline[0] != scene.ptr:
-                self.baseline = scene.ptr, Baseline(scene.bbox())
-                self.known.clear()
-            key = self._pass_key()
-            if key in self.known:
-                self._tell_once(
-                    f"seed {key[0]} was used before: a pass cannot serve as baseline for itself, so that this "
-                    "one goes without; give every pass a seed of its own"
-                )
-                return None
-            return self.baseline[1]
+        def _told(self, view: Pass, walk: Walk, found: Found) -> None:
+            """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see `take_lost`,
+            which tells of the passes before, too."""
+            if found.diagnostics.moves:
+                self._tell_edges(walk, view.sensor)
+            frozen = dr.flag(dr.JitFlag.FreezingScope)
+            self.untold = self.untold + found.diagnostics if frozen else found.diagnostics
+            if self.untold.counters and not frozen:
+                paths = self.untold.paths
+                self.tell_lost(self.take_lost(), paths)
+            if found.seen is not None and self.baseline is not None:
+                self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
 
-        def _check(self, walk: Walk) -> None:
-            """Refuse, or warn of, what would make the gradient of this scene wrong."""
-            traits = walk.traits
-            if traits.instances_move and self.attach != "none":
-                raise PathreplayError(
-                    "pathreplay: an instance's to_world has a gradient, but Mitsuba does not differentiate the normals "
-                    "of instances: move the vertex_positions of the shapes in its group, or use a shape of its own"
-                )
-            if traits.masks_mirrors:
-                self._tell_once(
-                    "a mask lies over delta lobes, which Mitsuba cannot sample one by one there: derivatives by what "
-                    "decides among them (an index, or a reflectance of plastic) are wrong"
-                )
-            if walk.media is not None and walk.media.passes and traits.opacity_moves:
-                self._tell_once(
-                    "the opacity of a mask has gradients in a scene with media: what it does to the light of emitters "
-                    "that shadow rays see through it is missing from the gradient"
-                )
-            if self.attach == "all":
-                self._tell_attachable(traits)
-
-        def _tell_attachable(self, traits: Traits) -> None:
-            if not traits.attachables:
-                raise PathreplayError(
-                    "pathreplay: attach = 'all', but no BSDF of the scene can be sampled attached (diffuse, "
-                    "roughconductor, roughdielectric, normal and bump maps over them can): use attach = 'delta'"
-                )
-            if traits.detached_names:
-                names = ", ".join(traits.detached_names)
-                self._tell_once(f"attach = 'all' keeps the directions of {names} fixed")
-
-        def _tell_edges(self, walk: Walk) -> None:
+        def _tell_edges(self, walk: Walk, sensor: mi.Sensor) -> None:
             if EDGES in self.told:
                 return
-            seen_from = [] if self.sensor is None else keys_that_move_edges(mi.traverse(self.sensor))
-            moving = keys_that_move_edges(mi.traverse(walk.scene)) or seen_from
-            if moving:
+            note, named = missing_edges(walk, sensor)
+            if named:
                 self.told.add(EDGES)
-                self._tell_once(edges_note(moving))
-            elif walk.traits.lobes and walk.traits.area_lights:
-                self._tell_once(
-                    "something moves in a scene with delta lobes and area lights: where the edge of a light or a "
-                    "silhouette is seen through glass or mirrors, its motion is missing from the gradient"
-                )
+            if note:
+                self._tell_once(note)
 
         def _tell_once(self, message: str) -> None:
             if message not in self.told:
                 self.told.add(message)
                 mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
 
-        def _forget_lost(self) -> None:
-            """Before a pass; but in a frozen function the passes before are still to be told of: see `take_lost`."""
-            if not dr.flag(dr.JitFlag.FreezingScope):
-                self.lost.clear()
+        def take_lost(self) -> mi.UInt32 | None:
+            """How many paths lost a part of their gradient, or None: a frozen function cannot look itself."""
+            lost, self.untold = self.untold.lost(), Diagnostics()
+            return lost
 
-        def _tell_lost(self) -> None:
-            if self.lost and not dr.flag(dr.JitFlag.FreezingScope):
-                paths = sum(number for _, number in self.lost)
-                self.tell_lost(self.take_lost(), paths)
-
-        def take_lost(self) -> Any:
-            """How many paths lost a part of their gradient (UInt32) or None: a frozen function cannot look itself."""
-            counts = [lost.count for lost, _ in self.lost]
-            self.lost.clear()
-            return sum(counts[1:], counts[0]) if counts else None
-
-        def tell_lost(self, count: Any, paths: int) -> None:
-            """Warn if paths lost a part of their gradient; ``count`` (UInt32) of so many ``paths``."""
+        def tell_lost(self, count: mi.UInt32, paths: int) -> None:
+            """Warn if paths lost a part of their gradient; ``count`` of so many ``paths``."""
             if count[0] > 0:
-                why = "a ray adjoint was not finite, or media have more boundaries on the way than the record holds"
-                share = f"{count[0] / paths:.2%}"
-                mi.Log(mi.LogLevel.Warn, f"pathreplay: {share} of the paths lost a part of their gradient: {why}")
+                mi.Log(mi.LogLevel.Warn, f"pathreplay: {lost_note(count[0], paths)}")
 
         def to_string(self) -> str:
             return self._described(
-                hide_emitters=self.hide_emitters,
-                driver=self.driver,
-                attach=self.attach,
-                volume_gradient=self.volume_gradient,
-                branch=self.branch,
+                hide_emitters=self.hide_emitters, driver=self.driver, attach=self.attach, branch=self.branch
             )
 
     return PathReplayIntegrator

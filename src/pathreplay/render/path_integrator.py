@@ -1,20 +1,27 @@
-"""What our integrators share: their common properties, the walk that they set up, and care around each pass."""
+"""What our integrators share: their common properties, Mitsuba's interface, and care around each pass."""
 
 from __future__ import annotations
 
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import reduce
+from operator import add
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..transport.media import scene_media
-from ..transport.traits import Tables, nodes_of, scene_traits
+from ..gradient.baseline import Baseline
+from ..transport.facts import SceneFacts
+from ..transport.start import CameraStart
+from ..transport.traits import Tables
 from ..transport.vertex import Walk
+from .camera_pass import Pass, mitsuba_integrator
+from .interior import Interior, image, radiance
 from .properties import flag, whole_number
+from .term import Found, Term
 
 UNBOUNDED = 0xFFFFFFFF
 
@@ -39,116 +46,177 @@ def _mendable(error: BaseException) -> BaseException:
     return cause or error
 
 
+@contextmanager
+def careful() -> Iterator[None]:
+    """Within this block, a pass, errors are plain and no garbage is collected.
+
+    Should an old scene vanish between two virtual calls, Dr.Jit counts their instances differently and writes functions
+    that both call twice ("invalid redefinition").
+    """
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        with plain_errors():
+            yield
+    finally:
+        if collecting:
+            gc.enable()
+
+
+def require_usable(name: str, props: mi.Properties) -> None:
+    """Return quietly if the plugin can be made. Raises PathreplayError for bad properties and polarised variants."""
+    if mi.is_polarized:
+        raise PathreplayError(
+            f"{name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
+            f"use {mi.variant().replace('_polarized', '')!r}"
+        )
+    # All three are Mitsuba's, too, which takes what it is given or says less.
+    whole_number(props, name, "max_depth", 6, lowest=0, unbounded=True)
+    whole_number(props, name, "rr_depth", 5, lowest=1)
+    flag(props, name, "hide_emitters", False)
+
+
 def path_integrator() -> type:
     """The base class of our integrators, for the active variant, which must be an AD variant."""
-    # The name under which Mitsuba runs its Python modules anew for every variant. Of `mitsuba.ad`, the public name, an
-    # import statement makes a copy, which stays what it was in the first variant.
-    from mitsuba.python.ad.integrators.common import RBIntegrator
 
-    class PathIntegrator(RBIntegrator):  # type: ignore[misc]
+    class PathIntegrator(mitsuba_integrator()):  # type: ignore[misc]
         """Properties ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5) and ``hide_emitters`` (False).
 
-        Classes below have a ``name`` (the plugin's), ``attach`` (as `Walk` has it) and Mitsuba's ``sample``. Raises
+        Classes below have a ``name`` (the plugin's), ``attach`` (as `Walk` has it) and the term ``interior``. Raises
         PathreplayError for unusable properties and in polarised variants.
         """
 
         name = ""
         attach = "none"
+        interior: Interior
 
-        def __init__(self, props: Any) -> None:
-            if mi.is_polarized:
-                raise PathreplayError(
-                    f"{self.name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
-                    f"use {mi.variant().replace('_polarized', '')!r}"
-                )
-            # All three are Mitsuba's, too, which takes what it is given or says less.
-            whole_number(props, self.name, "max_depth", 6, lowest=0, unbounded=True)
-            whole_number(props, self.name, "rr_depth", 5, lowest=1)
-            hide_emitters = flag(props, self.name, "hide_emitters", False)
+        def __init__(self, props: mi.Properties) -> None:
+            require_usable(self.name, props)
             super().__init__(props)
-            self.hide_emitters = hide_emitters
-            self.sensor: Any = None  # that is rendered
-            # Mitsuba asks for radiance before it goes back, for integrators that replay it. Ours find it themselves and
-            # nobody looks at this one; but tracing it takes time.
-            self.goes_back = False
+            self.hide_emitters = flag(props, self.name, "hide_emitters", False)
             self.tables: Tables | None = None  # of the scene, in a frozen function, which cannot make them
-            self.of_pass: Any = None  # what tells passes apart: seed, samples per pixel, sensor
+            self.facts: SceneFacts | None = None  # about the scene that was rendered last
 
-        def render_backward(
-            self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
-        ) -> None:
-            """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator."""
-            # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
-            with self._looking_through(scene, sensor, seed, spp), dr.isolate_grad():
-                self.goes_back = True
-                try:
-                    super().render_backward(scene, params, grad_in, sensor, seed, spp)
-                finally:
-                    self.goes_back = False
-
-        def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
-            """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator."""
-            with self._looking_through(scene, sensor, seed, spp):
-                return super().render_forward(scene, params, sensor, seed, spp)
+        @property
+        def terms(self) -> tuple[Term, ...]:
+            """What the gradient is a sum of."""
+            return (self.interior,)
 
         def render(
             self,
-            scene: Any,
-            sensor: Any = 0,
-            seed: Any = 0,
+            scene: mi.Scene,
+            sensor: int | mi.Sensor = 0,
+            seed: int | mi.UInt32 = 0,
             spp: int = 0,
             develop: bool = True,
             evaluate: bool = True,
-        ) -> Any:
-            """Render an image: see Mitsuba's ADIntegrator."""
-            with self._looking_through(scene, sensor, seed, spp):
-                return super().render(scene, sensor, seed, spp, develop, evaluate)
+        ) -> mi.TensorXf:
+            """Render an image: see Mitsuba's ADIntegrator. Nothing is differentiated: use `mi.render` for that."""
+            if not develop:
+                raise PathreplayError(f"{self.name}: develop = False is not supported: leave it out")
+            with self._passing(scene, sensor, seed, spp) as view:
+                return image(view, self._walk(scene, view.sensor))
+
+        def render_forward(
+            self,
+            scene: mi.Scene,
+            params: Any,
+            sensor: int | mi.Sensor = 0,
+            seed: int | mi.UInt32 = 0,
+            spp: int = 0,
+        ) -> mi.TensorXf:
+            """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
+
+            The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
+            from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
+            """
+            with self._passing(scene, sensor, seed, spp) as view:
+                walk = self._walk(scene, view.sensor)
+                learned = self._learned(view, walk)
+                found = reduce(add, [term.forward(view, walk, learned) for term in self.terms])
+            self._told(view, walk, found)
+            return found.image
+
+        def render_backward(
+            self,
+            scene: mi.Scene,
+            params: Any,
+            grad_in: mi.TensorXf,
+            sensor: int | mi.Sensor = 0,
+            seed: int | mi.UInt32 = 0,
+            spp: int = 0,
+        ) -> None:
+            """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
+
+            Warns of what terms tell: a part of the gradient was not finite and had to be left out, edges move.
+            """
+            # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
+            with self._passing(scene, sensor, seed, spp) as view, dr.isolate_grad():
+                walk = self._walk(scene, view.sensor)
+                learned = self._learned(view, walk)
+                found = reduce(add, [term.backward(view, walk, grad_in, learned) for term in self.terms])
+            self._told(view, walk, found)
+
+        def sample(
+            self,
+            mode: dr.ADMode,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.Ray3f,
+            δL: mi.Spectrum | None = None,
+            active: bool | mi.Bool = True,
+            **_: Any,
+        ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], Any]:
+            """Radiance along rays, its tangent, or nothing (after back-propagating ``δL``): see Mitsuba's ADIntegrator.
+
+            For those who have rays and no sensor, such as Mitsuba's `aov`: the rays start in no medium. As it is no
+            pass, nothing is learned from it and nothing is told.
+            """
+            walk, active = self._walk(scene, None), mi.Bool(active)
+            if mode == dr.ADMode.Primal:
+                return *radiance(walk, sampler, ray, active), [], None
+            if mode == dr.ADMode.Forward:
+                return *self.interior.tangent(walk, sampler, CameraStart(ray), active)[:2], [], None
+            self.interior.propagate(walk, sampler, CameraStart(ray), δL, active)
+            return mi.Spectrum(0), mi.Bool(True), [], None
+
+        def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
+            """What earlier passes found out that this one may use."""
+            return None
+
+        def _told(self, view: Pass, walk: Walk, found: Found) -> None:
+            """What is done with what terms have found."""
 
         @contextmanager
-        def _looking_through(self, scene: Any, sensor: Any, seed: Any, spp: int) -> Iterator[None]:
-            """Remember the sensor, which may be in a medium, and what tells passes apart; make errors plain.
-
-            No garbage is collected on the way: should an old scene vanish between two virtual calls, Dr.Jit counts
-            their instances differently and writes functions that both call twice ("invalid redefinition").
-            """
+        def _passing(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int | mi.UInt32, spp: int) -> Iterator[Pass]:
+            """The pass under way, in which nothing is differentiated but what asks for it: see `careful`, too."""
             if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
                 raise PathreplayError(
                     f"{self.name}: scene or integrator belongs to another variant than the active one, "
                     f"{mi.variant()!r}: load it anew, or set its variant"
                 )
-            self.sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            self.of_pass = seed, spp, self.sensor.ptr
-            collecting = gc.isenabled()
-            gc.disable()
-            try:
-                with plain_errors():
-                    yield
-            finally:
-                self.sensor = self.of_pass = None
-                if collecting:
-                    gc.enable()
+            with careful(), dr.suspend_grad():
+                yield Pass.of(scene, sensor, seed, spp)
 
-        def _pass_key(self) -> tuple[int, int, int] | None:
-            """What tells the pass under way from others (None if there is none). The seed is read: that takes time."""
-            if self.of_pass is None:
-                return None
-            seed, spp, sensor = self.of_pass
-            return seed if isinstance(seed, int) else int(seed[0]), spp, sensor
-
-        def _walk(self, scene: Any, differentiate: bool) -> Walk:
-            """How the scene is walked through; ``differentiate`` says that it is for a gradient."""
-            nodes = nodes_of(scene)
-            media = scene_media(nodes, self.sensor)
+        def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> Walk:
+            """How the scene is walked through; the sensor may be in a medium."""
+            facts = self._facts(scene)
             return Walk(
                 scene=scene,
-                traits=scene_traits(nodes, scene, media is not None, self.tables),
-                media=media,
+                traits=facts.traits(self.tables),
+                media=facts.media(sensor),  # type: ignore[arg-type]
                 attach=self.attach,
                 hide_emitters=self.hide_emitters,
                 max_depth=self.max_depth,
                 rr_depth=self.rr_depth,
                 skip_area_emitters=self.skip_area_emitters,
             )
+
+        def _facts(self, scene: mi.Scene) -> SceneFacts:
+            """The facts about a scene, those of its last pass if it has not become another."""
+            if self.facts is None or not self.facts.are_about(scene):
+                self.facts = SceneFacts(scene)
+            return self.facts
 
         def _described(self, **more: Any) -> str:
             depth = -1 if self.max_depth == UNBOUNDED else self.max_depth

@@ -1,53 +1,70 @@
-"""Integrators to compare `pathreplay` with, on the same steps: `pathreplay_tape` and `pathreplay_rb`.
+"""Integrators to compare `pathreplay` with, on the same steps: `pathreplay_tape`, `_rb` and `_listing`.
 
-They show what memory and time the other ways of differentiating a path tracer take. Nothing else is a reason to use
-them: `pathreplay` gives the same gradients for less.
+They show what memory, time and noise the other ways of differentiating a path tracer take. Nothing else is a reason to
+use them: `pathreplay` gives the same gradients for less.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
 
-import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..gradient.primal import primal
+from ..gradient.adjoint import LostPaths
+from ..gradient.baseline import Seen
+from ..gradient.driver import Driver, ForwardDriver
+from ..gradient.forward import forward
+from ..render.diagnostics import Diagnostics
+from ..render.interior import Interior
 from ..render.path_integrator import path_integrator
 from ..render.properties import choice, flag
+from ..transport.start import CameraStart
 from ..transport.vertex import Walk
+from .listing import listing
 from .radiative import radiative
 from .tape import tape_backward, tape_forward
 
 ATTACH = ("delta", "none")
 
 
-def _make_classes() -> tuple[type, type]:
-    class Rival(path_integrator()):  # type: ignore[misc]
-        """Each has its ``propagate``, which takes what a driver takes and back-propagates the adjoint radiance.
+@dataclass(frozen=True)
+class Rival(Interior):
+    """The interior term in another way, of which nothing is told.
 
-        Media are differentiated by the score, without a baseline, and where they are empty not at all.
-        """
+    Media are differentiated by the score, without a baseline, and where they are empty not at all.
+    """
 
-        def sample(
-            self, mode: dr.ADMode, scene: Any, sampler: Any, ray: Any, δL: Any = None, active: Any = True, **_: Any
-        ) -> tuple[Any, Any, list[Any], Any]:
-            """Radiance, its tangent, or nothing (after back-propagating ``δL``): see Mitsuba's ADIntegrator."""
-            if mode == dr.ADMode.Primal and self.goes_back:
-                return mi.Spectrum(0), mi.Bool(True), [], None
-            walk = self._walk(scene, mode != dr.ADMode.Primal)
-            if mode == dr.ADMode.Primal:
-                return *primal(walk, sampler, dr.detach(ray), active), [], None
-            if mode == dr.ADMode.Forward:
-                return *self.tangent(walk, sampler, ray, active), [], None
-            self.propagate(walk, sampler, ray, δL, active)
-            return mi.Spectrum(0), mi.Bool(True), [], None
+    name: str
+    backwards: Driver
+    forwards: ForwardDriver | None = None
 
-        def tangent(self, walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
-            """Tangent of the radiance (Spectrum) and whether anything was met (Bool), per ray."""
+    def tangent(
+        self, walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool
+    ) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
+        if self.forwards is None:
             raise PathreplayError(f"{self.name} has no forward mode: use the integrator 'pathreplay'")
+        δL, valid, _ = self.forwards(walk, sampler, start, active, LostPaths())
+        return δL, valid, Diagnostics()
 
-    class TapeIntegrator(Rival):
+    def propagate(
+        self,
+        walk: Walk,
+        sampler: mi.Sampler,
+        start: CameraStart,
+        δL: mi.Spectrum,
+        active: mi.Bool,
+        seen: Seen | None = None,
+    ) -> Diagnostics:
+        self.backwards(walk, sampler, start, δL, active, LostPaths())
+        return Diagnostics()
+
+
+def _make_classes() -> tuple[type, ...]:
+    base = path_integrator()
+
+    class TapeIntegrator(base):  # type: ignore[misc, valid-type]
         """Plain AD of a wavefront path tracer: for comparison only, since memory grows with the depth (see `tape`).
 
         Properties: those of `PathIntegrator` and ``attach`` (``delta``, ``none``), which means what it does for
@@ -55,20 +72,13 @@ def _make_classes() -> tuple[type, type]:
         """
 
         name = "pathreplay_tape"
+        interior = Rival(name, tape_backward, tape_forward)
 
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.attach = choice(props, self.name, "attach", "delta", ATTACH)
 
-        def propagate(self, walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
-            """Back-propagate ``δL``: see `tape_backward`."""
-            tape_backward(walk, sampler, ray, δL, active)
-
-        def tangent(self, walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
-            """Tangent of the radiance: see `tape_forward`."""
-            return tape_forward(walk, sampler, ray, active)
-
-    class RadiativeIntegrator(Rival):
+    class RadiativeIntegrator(base):  # type: ignore[misc, valid-type]
         """Radiative backpropagation: for comparison only, since time grows with the square of the depth.
 
         Properties: those of `PathIntegrator` and ``linear`` (False: unbiased; True: the biased variant in linear
@@ -77,15 +87,23 @@ def _make_classes() -> tuple[type, type]:
 
         name = "pathreplay_rb"
 
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
-            self.linear = flag(props, self.name, "linear", False)
+            linear = flag(props, self.name, "linear", False)
+            self.interior = Rival(self.name, partial(radiative, linear=linear))
 
-        def propagate(self, walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
-            """Back-propagate ``δL``: see `radiative`."""
-            radiative(walk, sampler, ray, δL, active, self.linear)
+    class ListingIntegrator(base):  # type: ignore[misc, valid-type]
+        """Delta tracking as first published: for comparison only, since it misses derivatives (see `listing`).
 
-    return TapeIntegrator, RadiativeIntegrator
+        Properties: those of `PathIntegrator`. For scenes with media; what moves raises in reverse mode. Tangents are
+        those of `pathreplay`.
+        """
+
+        name = "pathreplay_listing"
+        attach = "delta"  # so that it is noticed
+        interior = Rival(name, listing, forward)
+
+    return TapeIntegrator, RadiativeIntegrator, ListingIntegrator
 
 
 def register() -> None:

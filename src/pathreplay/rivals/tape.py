@@ -12,31 +12,38 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..gradient.adjoint import backward, tangents
+from ..gradient.adjoint import LostPaths, backward, tangents
 from ..transport.motion import path_moves
-from ..transport.path import count, first_arrival, next_arrival, repeat_step, survival, sustain, take_step
-from ..transport.vertex import Numbers, Walk
+from ..transport.path import PathState
+from ..transport.start import CameraStart
+from ..transport.step import repeat_step
+from ..transport.vertex import Walk
 
 
-def tape_backward(walk: Walk, sampler: Any, ray: Any, δL: Any, active: Any) -> None:
-    """Back-propagate the adjoint radiance ``δL`` (Spectrum per ray) into the parameters and the camera.
+def tape_backward(
+    walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectrum, active: mi.Bool, lost: LostPaths
+) -> bool:
+    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
 
     The estimator is that of the sweep driver, and with the same random numbers so is the gradient. Not differentiated:
     see `tape`. Raises PathreplayError when no parameter reaches the paths.
     """
     with dr.resume_grad(), dr.isolate_grad():
-        L, _ = tape(walk, sampler, ray, active)
+        L, _, moves = tape(walk, sampler, start, active)
         backward(dr.sum(δL * L))
+    return moves
 
 
-def tape_forward(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
-    """Tangent of the radiance along camera rays, ``(δL, valid)``: a Spectrum and a Bool per ray.
+def tape_forward(
+    walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool, lost: LostPaths
+) -> tuple[mi.Spectrum, mi.Bool, bool]:
+    """Tangent of the radiance along the rays of a ``start``, ``(δL, valid, moves)``: see `forward`.
 
     The parameters must carry their tangents already. Not differentiated: see `tape`.
     """
     with dr.resume_grad():
-        L, valid = tape(walk, sampler, ray, active)
-        return tangents(L)[0], valid
+        L, valid, moves = tape(walk, sampler, start, active)
+        return tangents(L)[0], valid, moves
 
 
 def _cut(state: tuple[Any, ...]) -> Any:
@@ -63,51 +70,42 @@ def _cut(state: tuple[Any, ...]) -> Any:
 
 
 @dr.syntax
-def tape(walk: Walk, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any]:
-    """Radiance along camera rays as an AD variable, ``(L, valid)``: L = Σ β_i e_i with all derivatives attached.
+def tape(walk: Walk, sampler: mi.Sampler, start: CameraStart, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool, bool]:
+    """Radiance along the rays of a ``start`` as an AD variable, ``(L, valid, moves)``: L = Σ β_i e_i.
 
-    ``ray`` may be attached to the camera. Every step is taken detached, to make its choices, and once more attached.
-    Not differentiated: visibility, Russian roulette and, with ``attach='none'``, everything that moves. Adjoints that
-    are not finite are not looked for. Call it under `dr.resume_grad`.
+    Every step is taken detached, to make its choices, and once more attached. Not differentiated: visibility, Russian
+    roulette and, with ``attach='none'``, everything that moves. Adjoints that are not finite are not looked for. Call
+    it under `dr.resume_grad`.
     """
     active = mi.Bool(active) & (walk.max_depth > 0)
     with dr.suspend_grad():
-        at = first_arrival(walk, ray, active)
+        at = start.choose(walk, active)
         valid = mi.Bool(walk.background_is_opaque) & active
-    attached = path_moves(walk, ray, at)
-    if dr.hint(attached, mode="scalar"):
-        at.ray.o, at.ray.d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
-
+        path = PathState.begin(at, active, sustained=True)
+    moves = path_moves(walk, start, at)
     L = mi.Spectrum(0)  # radiance so far
-    β = mi.Spectrum(1)  # throughput
-    β_alive = mi.Spectrum(1)  # throughput with one zero weight left out: what keeps the path going
-    η = mi.Float(1)  # relative index of refraction since the camera
-    depth = mi.UInt32(0)  # vertices before
+    β = mi.Spectrum(1)  # throughput, differentiable, and so the arrival: where, whence, density
+    o, d, pdf = mi.Point3f(at.ray.o), mi.Vector3f(at.ray.d), mi.Float(at.pdf)
+    if dr.hint(moves, mode="scalar"):
+        o, d = mi.Point3f(start.ray.o), mi.Vector3f(start.ray.d)
 
-    while dr.hint(active, mode="evaluated", exclude=[walk, attached], label="pathreplay: tape"):
+    while dr.hint(path.active, mode="evaluated", exclude=[walk, moves], label="pathreplay: tape"):
         with dr.suspend_grad():
-            u = Numbers.draw(sampler)
-            still = dr.detach(at)
-            step = take_step(walk, still, u, sampler, β_alive, depth + 1 < walk.max_depth, active)
-            kept = step.kept
-            β_alive = sustain(β_alive, dr.detach(β), step)
-            η *= kept.eta
-            valid |= active & step.met & ~kept.null
-            rr_weight, survives = survival(β_alive, η, depth, u.roulette, walk, step)
-            go_on = step.active & survives & (dr.max(β_alive) != 0)
-            β_alive *= rr_weight
-            depth += count(walk, step)
-            at_next = next_arrival(walk, still, step, go_on)
+            u, step = path.choose(walk, sampler)
+            valid |= path.active & step.seen
+            onward, rr_weight = path.advance(walk, u, step)
 
-        L, β, at.ray.o, at.ray.d, at.pdf = _cut((L, β, at.ray.o, at.ray.d, at.pdf))
-        step = repeat_step(walk, at, u, kept, go_on, active, attached, at_next.hit)
-        L += β * step.e
-        β *= step.w * rr_weight
-        if dr.hint(attached, mode="scalar"):
-            onward = mi.Ray3f(at_next.ray)
-            onward.o, onward.d = step.ray_next.o, step.ray_next.d
-            at_next = replace(at_next, ray=onward, pdf=step.pdf)
-        at = at_next
-        active = go_on
+        L, β, o, d, pdf = _cut((L, β, o, d, pdf))
+        ray = mi.Ray3f(path.at.ray)
+        ray.o, ray.d = o, d
+        at = replace(path.at, ray=ray, pdf=pdf)
+        again = repeat_step(walk, at, u, step.kept, onward.active, path.active, moves, onward.at.hit)
+        L += β * again.e
+        β *= again.w * rr_weight
+        if dr.hint(moves, mode="scalar"):
+            o, d, pdf = mi.Point3f(again.ray_next.o), mi.Vector3f(again.ray_next.d), mi.Float(again.pdf)
+        else:
+            o, d, pdf = mi.Point3f(onward.at.ray.o), mi.Vector3f(onward.at.ray.d), mi.Float(onward.at.pdf)
+        path = onward
 
-    return L, valid
+    return L, valid, moves

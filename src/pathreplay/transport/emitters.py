@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
@@ -11,10 +9,12 @@ from .surface import held_point
 from .vertex import Arrival, Walk, mis_weight, reciprocal
 
 
-def emission(scene: Any, at: Arrival, si: Any, attached: bool, active: Any) -> Any:
+def emission(
+    scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool
+) -> mi.Spectrum:
     """Radiance emitted towards the ray's origin by what the ray hit (the environment on a miss), MIS weighted.
 
-    Returns a Spectrum, differentiable in the emitter's radiance and, if ``attached``, in the ray, the hit point and
+    Differentiable in the emitter's radiance and, if ``attached``, in the ray, the hit point and
     the density ``at.pdf``. A path that is held fixed needs no derivative of its MIS weights: they sum to one whatever
     the parameters do.
     """
@@ -28,18 +28,22 @@ def emission(scene: Any, at: Arrival, si: Any, attached: bool, active: Any) -> A
     return mis * ds.emitter.eval(si, active)
 
 
-def draw_emitter(scene: Any, si: Any, u: Any, active: Any, visible: bool = True) -> tuple[Any, Any]:
-    """Sample a direction towards an emitter: the DirectionSample3f and Le/p (Spectrum).
+def draw_emitter(
+    scene: mi.Scene, origin: mi.Interaction3f, u: mi.Point2f, active: mi.Bool, visible: bool = True
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+    """Sample a direction towards an emitter, with Le/p.
 
     If it must be ``visible``, an occluded sample comes back with density and weight zero; else nobody looks. Nothing is
     differentiated.
     """
     with dr.suspend_grad():
-        return scene.sample_emitter_direction(si, u, visible, active)
+        return scene.sample_emitter_direction(origin, u, visible, active)
 
 
-def redraw_emitter(walk: Walk, si: Any, u: Any, light: Any, attached: bool, lit: Any) -> tuple[Any, Any]:
-    """The emitter sample of a first walk once more, differentiable: the DirectionSample3f and Le/p (Spectrum).
+def redraw_emitter(
+    walk: Walk, origin: mi.Interaction3f, u: mi.Point2f, light: mi.DirectionSample3f, attached: bool, lit: mi.Bool
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+    """The emitter sample of a first walk once more, with Le/p, differentiable.
 
     ``light`` is the sample itself, if it is still at hand, else None. If ``attached``, the point on the emitter stays
     the same in the emitter's own coordinates, so that it moves with the emitter, and everything follows; else it is
@@ -47,22 +51,22 @@ def redraw_emitter(walk: Walk, si: Any, u: Any, light: Any, attached: bool, lit:
     """
     scene = walk.scene
     if attached:
-        light, Le = scene.sample_emitter_direction(si, u, False, lit)
+        light, Le = scene.sample_emitter_direction(origin, u, False, lit)
         if walk.traits.lights_deform:
-            Le *= _mesh_growth(scene, si, light, lit)
+            Le *= _mesh_growth(scene, origin, light, lit)
         return light, Le
     if light is None:
         with dr.suspend_grad():
-            light, _ = scene.sample_emitter_direction(si, u, False, lit)
-    return light, scene.eval_emitter_direction(si, light, lit) * dr.detach(reciprocal(light.pdf))
+            light, _ = scene.sample_emitter_direction(origin, u, False, lit)
+    return light, scene.eval_emitter_direction(origin, light, lit) * dr.detach(reciprocal(light.pdf))
 
 
-def _mesh_growth(scene: Any, si: Any, light: Any, lit: Any) -> Any:
+def _mesh_growth(scene: mi.Scene, origin: mi.Interaction3f, light: mi.DirectionSample3f, lit: mi.Bool) -> mi.Float:
     """Area of the emitting triangle relative to its present one: 1, with the derivative of log area.
 
     Mitsuba samples a mesh with the areas that its triangles had, and does not differentiate them.
     """
-    ray = dr.detach(si.spawn_ray_to(light.p))
+    ray = dr.detach(origin.spawn_ray_to(light.p))
     ray.maxt = dr.largest(mi.Float)
     hit = scene.ray_intersect_preliminary(ray, active=lit)
     on_mesh = lit & hit.is_valid() & hit.shape.is_mesh() & (hit.shape.emitter() == light.emitter)

@@ -12,53 +12,20 @@ It divides by nothing that may be zero, so that it also holds where null collisi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from .media import carried, interaction, is_grid, majorant, span
-from .vertex import Arrival, Walk, reciprocal
-
-
-@dataclass
-class Flight:
-    """What a first walk found between two vertices."""
-
-    event: Any  # Bool: a real collision, before any surface
-    t: Any  # Float: distance to it
-    density: Any  # Float: probability density of a collision there, p σ̄; 1 if there was none
-    W: Any  # Spectrum: weight of the null collisions on the way; 1 where the medium is grey
-    along: Any  # Float: shifts the points at which its derivative is taken, in [0, 1) of their distance
-    p: Any = None  # Float: probability that the collision was real (if the walk branches, else None)
-    # Of walks with emission only, else None:
-    E: Any = None  # Spectrum: emission gathered on the way
-    t_emit: Any = None  # Float: distance of the tentative collision at which emission is differentiated
-    c_emit: Any = None  # Spectrum: weight of the emission there
-    # Only the first walk needs these; they are None in a record that is read back.
-    σ_s: Any = None  # Spectrum: scattering coefficient at the collision
-    null: Any = None  # NullCollision, one of those on the way, if the walk branches
-
-
-@dataclass
-class NullCollision:
-    """A null collision, kept with a probability proportional to ``mass``: see `branch_weight`."""
-
-    t: Any  # Float: distance
-    ω: Any  # Spectrum: weight of the collision and of those before, over the probability that it was kept
-    bare: Any  # Float: the same without those before
-    mass: Any  # Float: of all null collisions on the way
-    number: Any  # Float: of null collisions on the way
-    pick: Any  # Float: a random number, to choose among flights
-
+from .media import Media, carried, interaction, is_grid, majorant, span
+from .vertex import Arrival, Flight, NullCollision, Walk, reciprocal
 
 # Points of a flight at which the derivative of its transmittance is taken. Few leave a variance of their own, many take
 # time; of the cloud of `pathreplay bench media` four make the least of both.
 POINTS = 4
 
 
-def branch_weight(p: Any, c: Any) -> Any:
-    """1 / (p + c (1 - p)), where p is the probability of a real collision and c counts null ones (Floats).
+def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
+    """1 / (p + c (1 - p)), where p is the probability of a real collision and c counts null ones.
 
     The derivative of a collision, dσ_s L_s, is needed also where σ_s is zero and collisions are never real. Real ones
     estimate it with p / (p + c (1 - p)) of their weight, and null ones with c (1 - p) / (p + c (1 - p)): together all.
@@ -69,12 +36,11 @@ def branch_weight(p: Any, c: Any) -> Any:
 
 
 @dr.syntax
-def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any, visit: Any = None) -> Flight:
+def fly(walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: mi.Bool) -> Flight:
     """Sample the flight along ``at.ray``, in ``at.medium``, up to the surface ``at.hit``. Detached.
 
-    ``β`` (Spectrum) is the throughput: in chromatic media a collision is real with probability
-    p = Σ_k β_k σ_k / (σ̄ Σ_k β_k), the history of all channels. ``visit`` is called at every collision, with its
-    MediumInteraction3f, the majorant (Float), and whether it is null and whether it is real (Bool).
+    ``β`` is the throughput: in chromatic media a collision is real with probability p = Σ_k β_k σ_k / (σ̄ Σ_k β_k), the
+    history of all channels.
     """
     media = walk.media
     ray, medium = dr.detach(at.ray), at.medium
@@ -96,17 +62,8 @@ def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any, visit: Any 
     t_emit, c_emit, count = mi.Float(0), mi.Spectrum(0), mi.Float(0)
     t_null, ω_null, bare, mass, nulls = mi.Float(0), mi.Spectrum(0), mi.Float(0), mi.Float(0), mi.Float(0)
 
-    while dr.hint(flying, exclude=[walk, at, media, visit], label="pathreplay: flight"):
-        u = sampler.next_1d(flying)
-        σ_bar = mi.Float(σ_max)
-        step = dr.select(σ_bar > 0, -dr.log(1 - u) * dr.rcp(σ_bar), dr.inf)
-        for grid in media.grids:
-            mine = flying & is_grid(grid, medium)
-            onward = mi.Ray3f(ray.o + t * ray.d, ray.d, ray.time, ray.wavelengths)
-            onward.maxt = b - t
-            step_grid, σ_grid = grid.free_flight(onward, u, mine)
-            step = dr.select(mine, step_grid, step)
-            σ_bar = dr.select(mine, σ_grid, σ_bar)
+    while dr.hint(flying, exclude=[walk, at, media], label="pathreplay: flight"):
+        step, σ_bar = _tentative(media, medium, ray, t, b, sampler.next_1d(flying), σ_max, flying)
         t_next = t + step
         inside = flying & (t_next < b)
         mei = interaction(medium, ray, t_next)
@@ -124,17 +81,9 @@ def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any, visit: Any 
                     t_emit = dr.select(picked, t_next, t_emit)
                     c_emit = dr.select(picked, c, c_emit)
 
-        if dr.hint(media.chromatic, mode="scalar"):
-            βW = dr.abs(β * W)
-            total = dr.sum(βW)
-            p = dr.select(total > 0, dr.sum(βW * σ_t) / (σ_bar * total), dr.mean(σ_t) / σ_bar)
-        else:
-            p = σ_t[0] / σ_bar
-        p = dr.clip(p, 0, 1)
+        p = _reality(media, dr.abs(β * W), σ_t, σ_bar)
         real = inside & (sampler.next_1d(inside) < p)
         flying = inside & ~real
-        if dr.hint(visit is not None, mode="scalar"):
-            visit(mei, σ_bar, flying, real)
         if dr.hint(walk.branch, mode="scalar"):
             share = walk.branching * branch_weight(p, walk.branching) / σ_bar
             m = share * dr.mean(dr.abs(β) * dr.maximum(dr.abs(W), 1))
@@ -161,16 +110,46 @@ def fly(walk: Walk, at: Arrival, sampler: Any, β: Any, active: Any, visit: Any 
     return flight
 
 
+def _tentative(
+    media: Media,
+    medium: mi.MediumPtr,
+    ray: mi.Ray3f,
+    t: mi.Float,
+    b: mi.Float,
+    u: mi.Float,
+    σ_max: mi.Float,
+    active: mi.Bool,
+) -> tuple[mi.Float, mi.Float]:
+    """How far it is from ``t`` to the next tentative collision, and the majorant there."""
+    step = dr.select(σ_max > 0, -dr.log(1 - u) * dr.rcp(σ_max), dr.inf)
+    for grid in media.grids:
+        mine = active & is_grid(grid, medium)
+        onward = mi.Ray3f(ray.o + t * ray.d, ray.d, ray.time, ray.wavelengths)
+        onward.maxt = b - t
+        step_grid, σ_grid = grid.free_flight(onward, u, mine)
+        step, σ_max = dr.select(mine, step_grid, step), dr.select(mine, σ_grid, σ_max)
+    return step, mi.Float(σ_max)
+
+
+def _reality(media: Media, βW: mi.Spectrum, σ_t: mi.Spectrum, σ_bar: mi.Float) -> mi.Float:
+    """The probability that a collision is real."""
+    p = σ_t[0] / σ_bar
+    if media.chromatic:
+        total = dr.sum(βW)
+        p = dr.select(total > 0, dr.sum(βW * σ_t) / (σ_bar * total), dr.mean(σ_t) / σ_bar)
+    return dr.clip(p, 0, 1)
+
+
 @dataclass
 class Flown:
     """A flight once more, differentiable."""
 
-    mei: Any  # MediumInteraction3f of the collision
-    w: Any  # Spectrum: weight of what comes after, σ_s/density at a collision, times transmittance (1, relative)
-    e: Any  # Spectrum: emission on the way, and a control variate: value zero, derivative of mean zero
+    mei: mi.MediumInteraction3f  # of the collision
+    w: mi.Spectrum  # weight of what comes after, σ_s/density at a collision, times transmittance (1, relative)
+    e: mi.Spectrum  # emission on the way, and a control variate: value zero, derivative of mean zero
 
 
-def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: Any, attached: bool, active: Any) -> Flown:
+def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: mi.Float, attached: bool, active: mi.Bool) -> Flown:
     """The kept flight, differentiable in the coefficients of the medium and, if ``attached``, in ray and ``reach``.
 
     ``reach`` is the distance to the surface (infinity if there is none). A collision keeps its place relative to the
@@ -196,13 +175,12 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: Any, attached: boo
         length = dr.select(through, end - a, 0)
         points = [interaction(medium, ray, a + (flight.along + k) / POINTS * length) for k in range(POINTS)]
 
-    with dr.suspend_grad(when=walk.listing):
-        σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
-        σ_y = [medium.get_scattering_coefficients(y, through)[2] for y in points]
-        if walk.branch:  # The rest of the derivative of a collision, but not by its place, is left to null ones.
-            rest = 1 - flight.p * branch_weight(flight.p, walk.branching)
-            still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
-            σ_s, σ_t = (σ - rest * (σ_0 - dr.detach(σ_0)) for σ, σ_0 in ((σ_s, still[0]), (σ_t, still[2])))
+    σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
+    σ_y = [medium.get_scattering_coefficients(y, through)[2] for y in points]
+    if walk.branch:  # The rest of the derivative of a collision, but not by its place, is left to null ones.
+        rest = 1 - flight.p * branch_weight(flight.p, walk.branching)
+        still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
+        σ_s, σ_t = (σ - rest * (σ_0 - dr.detach(σ_0)) for σ, σ_0 in ((σ_s, still[0]), (σ_t, still[2])))
     w_event = σ_s * stretch * dr.rcp(flight.density)
     w = dr.select(event, w_event, 1) * flight.W
     e = mi.Spectrum(0)
@@ -237,7 +215,9 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: Any, attached: boo
     return Flown(mei=mei, w=w, e=e)
 
 
-def _guess(walk: Walk, mei: Any, σ_t: Any, σ_bar: Any, active: Any) -> Any:
+def _guess(
+    walk: Walk, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool
+) -> mi.Spectrum:
     """The baseline; where collisions are never real, and null ones not asked, it would be a bias, and is left out."""
-    b = walk.baseline(mei, σ_t, σ_bar, active)
+    b = walk.baseline(mei, σ_t, σ_bar, active)  # type: ignore[misc]
     return b if walk.branch else mi.Spectrum(dr.select(dr.detach(σ_t) != 0, b, 0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,37 +23,35 @@ class Media:
     by some extinction would miss what collisions tell where there are none. ``around`` is the sensor's.
     """
 
-    grids: tuple[Any, ...]
+    grids: tuple[mi.Medium, ...]
     plain: bool
     homogeneous: bool
     chromatic: bool
     emissive: bool
     passes: bool
     branches: bool
-    around: Any
+    around: mi.Medium | None
 
 
-def scene_media(nodes: set[Any], sensor: Any) -> Media | None:
-    """Look at all media among the objects of a scene; None if there are none. ``sensor`` (or None) may be in one."""
-    media = [node for node in nodes if isinstance(node, mi.Medium)]
+def scene_media(media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | None) -> Media | None:
+    """Look at the media of a scene; None if there are none. ``passes`` is that of `Media`; the sensor may be in one."""
     if not media:
         return None
     grids = tuple(medium for medium in media if hasattr(medium, "free_flight"))
     plain = [medium for medium in media if not hasattr(medium, "free_flight")]
-    bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
     return Media(
         grids=grids,
         plain=bool(plain),
         homogeneous=any(medium.is_homogeneous() for medium in plain),
         chromatic=any(grid.is_chromatic for grid in grids) or any(map(_is_chromatic, plain)),
         emissive=any(grid.emission is not None for grid in grids),
-        passes=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and bsdf.class_name() != "Null" for bsdf in bsdfs),
+        passes=passes,
         branches=any(map(_wants_branch, media)),
         around=None if sensor is None else _medium_around(sensor),
     )
 
 
-def _is_chromatic(medium: Any) -> bool:
+def _is_chromatic(medium: mi.Medium) -> bool:
     if dr.size_v(mi.Spectrum) == 1:
         return False
     params = mi.traverse(medium)
@@ -65,8 +64,8 @@ def _is_chromatic(medium: Any) -> bool:
     return not one_number or not all(one_number)
 
 
-def _medium_around(sensor: Any) -> Any:
-    found: list[Any] = []
+def _medium_around(sensor: mi.Sensor) -> mi.Medium | None:
+    found: list[mi.Medium] = []
 
     class Collector(mi.TraversalCallback):  # type: ignore[misc, name-defined]
         def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
@@ -77,7 +76,7 @@ def _medium_around(sensor: Any) -> Any:
     return found[0] if found else None
 
 
-def _wants_branch(medium: Any) -> bool:
+def _wants_branch(medium: mi.Medium) -> bool:
     """Whether the extinction has gradients, and varies in space or is zero."""
     moving = with_gradients(medium, "sigma_t", "scale")
     return bool(moving) and not (
@@ -85,8 +84,8 @@ def _wants_branch(medium: Any) -> bool:
     )
 
 
-def interaction(medium: Any, ray: Any, t: Any) -> Any:
-    """The MediumInteraction3f at distance ``t`` along ``ray``; it follows both."""
+def interaction(medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float) -> mi.MediumInteraction3f:
+    """The interaction at distance ``t`` along ``ray``; it follows both."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.t = t
     mei.p = ray.o + t * ray.d
@@ -98,7 +97,7 @@ def interaction(medium: Any, ray: Any, t: Any) -> Any:
     return mei
 
 
-def span(medium: Any, ray: Any, reach: Any, active: Any) -> tuple[Any, Any]:
+def span(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """The part [a, b] of the ray up to distance ``reach`` in which the medium may interact; empty (a = b = 0) outside.
 
     Differentiable in the ray and in ``reach``.
@@ -110,7 +109,7 @@ def span(medium: Any, ray: Any, reach: Any, active: Any) -> tuple[Any, Any]:
     return dr.select(met, a, 0), dr.select(met, b, 0)
 
 
-def carried(t: Any, a: Any, b: Any, where: Any) -> tuple[Any, Any]:
+def carried(t: mi.Float, a: mi.Float, b: mi.Float, where: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """A distance that keeps its place relative to the ends of [a, b] as they move, and how much that stretches.
 
     Values are those without motion, ``t`` and 1; derivatives are those of a + x (b - a) and (b - a) / (b₀ - a₀), with
@@ -123,11 +122,11 @@ def carried(t: Any, a: Any, b: Any, where: Any) -> tuple[Any, Any]:
     return moved, dr.select(held, dr.replace_grad(mi.Float(1), (b - a) * scale), 1)
 
 
-def majorant(medium: Any, ray: Any, active: Any) -> Any:
-    """An upper bound of the extinction in all channels, everywhere in the medium (Float, detached)."""
+def majorant(medium: mi.MediumPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+    """An upper bound of the extinction in all channels, everywhere in the medium. Detached."""
     return dr.max(dr.detach(medium.get_majorant(interaction(medium, dr.detach(ray), mi.Float(0)), active)))
 
 
-def is_grid(grid: Any, medium: Any) -> Any:
-    """Where an array of media points at this grid (Bool)."""
+def is_grid(grid: mi.Medium, medium: mi.MediumPtr) -> mi.Bool:
+    """Where an array of media points at this grid."""
     return medium == mi.MediumPtr(grid)

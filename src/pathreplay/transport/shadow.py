@@ -7,77 +7,80 @@ is taken at one point y, uniform over the whole length Λ of medium on the ray: 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from .media import carried, interaction, is_grid, majorant, span
-from .vertex import Walk
+from .vertex import Shadow, Walk
 
 
 @dataclass
-class Shadow:
-    """What a first walk found between a vertex and its emitter sample."""
+class Stretch:
+    """A shadow ray on its way (loop state): the stretch up to the next surface, in one medium or in none."""
 
-    T: Any  # Spectrum: estimate of the transmittance, 0 if something is in the way
-    y: Any  # Float: distance of the point where its derivative is taken
-    medium: Any  # MediumPtr: the medium there; null if there is none on the way
-    length: Any  # Float: length of medium on the ray
+    ray: mi.Ray3f  # from the last surface on
+    far: mi.Float  # length of the whole
+    gone: mi.Float  # distance from its origin
+    medium: mi.MediumPtr
+    active: mi.Bool
+
+    @staticmethod
+    def begin(ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool) -> Stretch:
+        """The first one of a ray that starts in ``medium``."""
+        return Stretch(mi.Ray3f(ray), mi.Float(ray.maxt), mi.Float(0), mi.MediumPtr(medium), mi.Bool(active))
+
+    def part(self, scene: mi.Scene) -> tuple[mi.PreliminaryIntersection3f, mi.Float, mi.Float, mi.Bool]:
+        """The surface at its end, the part [a, b] of the ray that a medium fills, and whether there is one."""
+        self.ray.maxt = self.far - self.gone
+        hit = scene.ray_intersect_preliminary(self.ray, coherent=False, reorder=False, active=self.active)
+        inside = self.active & (self.medium != None)  # noqa: E711 (an array of pointers)
+        a, b = span(self.medium, self.ray, dr.select(self.active & hit.is_valid(), hit.t, self.ray.maxt), inside)
+        return hit, a, b, inside & (a < b)
+
+    def beyond(self, hit: mi.PreliminaryIntersection3f, T: mi.Spectrum) -> tuple[Stretch, mi.Spectrum]:
+        """The stretch behind that surface, and ``T`` times what the surface lets pass."""
+        met, ray = self.active & hit.is_valid(), mi.Ray3f(self.ray)
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, met)
+        T = dr.select(met, T * si.bsdf(ray).eval_null_transmission(si, met), T)
+        medium = dr.select(met & si.is_medium_transition(), si.target_medium(ray.d), self.medium)
+        onward = si.spawn_ray(ray.d)
+        gone = self.gone + dr.select(met, dr.norm(onward.o - ray.o), 0)
+        ray.o = dr.select(met, onward.o, ray.o)
+        return Stretch(ray, self.far, gone, medium, met & (gone < self.far) & dr.any(T != 0)), T
 
 
 @dr.syntax
 def shadow(
     walk: Walk,
-    origin: Any,
-    light: Any,
-    medium: Any,
-    sampler: Any,
-    active: Any,
-    visit: Any = None,
+    origin: mi.Interaction3f,
+    light: mi.DirectionSample3f,
+    medium: mi.MediumPtr,
+    sampler: mi.Sampler,
+    active: mi.Bool,
 ) -> Shadow:
-    """Estimate the transmittance from the Interaction3f ``origin``, in ``medium``, to the emitter sample. Detached.
-
-    ``visit`` is called at every tentative collision of ratio tracking: see `ratio_tracking`.
-    """
-    scene, media = walk.scene, walk.media
-    ray = dr.detach(origin.spawn_ray_to(light.p))
-    gone = mi.Float(0)  # distance from the origin
-    far = mi.Float(ray.maxt)
-    active = mi.Bool(active)
-    medium = mi.MediumPtr(medium)
+    """Estimate the transmittance from ``origin``, in ``medium``, to the emitter sample. Detached."""
+    stretch = Stretch.begin(dr.detach(origin.spawn_ray_to(light.p)), medium, active)
     T = mi.Spectrum(1)
     y, y_medium, length = mi.Float(0), dr.zeros(mi.MediumPtr), mi.Float(0)
 
-    while dr.hint(active, exclude=[walk, scene, media, visit], label="pathreplay: shadow"):
-        ray.maxt = far - gone
-        hit = scene.ray_intersect_preliminary(ray, coherent=False, reorder=False, active=active)
-        met = active & hit.is_valid()
-
-        inside = active & (medium != None)  # noqa: E711
-        a, b = span(medium, ray, dr.select(met, hit.t, ray.maxt), inside)
-        inside &= a < b
-        T = dr.select(inside, T * _transmittance(walk, medium, ray, a, b, sampler, inside, visit), T)
+    while dr.hint(stretch.active, exclude=[walk], label="pathreplay: shadow"):
+        hit, a, b, inside = stretch.part(walk.scene)
+        T = dr.select(inside, T * _transmittance(walk, stretch.medium, stretch.ray, a, b, sampler, inside), T)
         length += b - a
         u = sampler.next_1d(inside) * length
         picked = inside & (u < b - a)
-        y = dr.select(picked, gone + a + u, y)
-        y_medium = dr.select(picked, medium, y_medium)
-
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, met)
-        T = dr.select(met, T * si.bsdf(ray).eval_null_transmission(si, met), T)
-        crossed = met & si.is_medium_transition()
-        medium = dr.select(crossed, si.target_medium(ray.d), medium)
-        onward = si.spawn_ray(ray.d)
-        gone += dr.select(met, dr.norm(onward.o - ray.o), 0)
-        ray.o = dr.select(met, onward.o, ray.o)
-        active = met & (gone < far) & dr.any(T != 0)
+        y = dr.select(picked, stretch.gone + a + u, y)
+        y_medium = dr.select(picked, stretch.medium, y_medium)
+        stretch, T = stretch.beyond(hit, T)
 
     return Shadow(T=T, y=y, medium=y_medium, length=length)
 
 
-def _transmittance(walk: Walk, medium: Any, ray: Any, a: Any, b: Any, sampler: Any, active: Any, visit: Any) -> Any:
-    """An unbiased estimate of the transmittance of one medium between the distances a and b (Spectrum)."""
+def _transmittance(
+    walk: Walk, medium: mi.MediumPtr, ray: mi.Ray3f, a: mi.Float, b: mi.Float, sampler: mi.Sampler, active: mi.Bool
+) -> mi.Spectrum:
+    """An unbiased estimate of the transmittance of one medium between the distances a and b."""
     media = walk.media
     T = mi.Spectrum(1)
     rest = mi.Bool(active)
@@ -93,34 +96,37 @@ def _transmittance(walk: Walk, medium: Any, ray: Any, a: Any, b: Any, sampler: A
         T = dr.select(same, mi.Spectrum(dr.exp(-σ_t * (b - a))), T)
         rest &= ~same
     if media.plain:
-        T = dr.select(rest, ratio_tracking(medium, ray, a, b, sampler, rest, visit), T)
+        T = dr.select(rest, ratio_tracking(medium, ray, a, b, sampler, rest), T)
     return T
 
 
 @dr.syntax
-def ratio_tracking(medium: Any, ray: Any, a: Any, b: Any, sampler: Any, active: Any, visit: Any = None) -> Any:
-    """T = Π (1 - σ_t/σ̄) over tentative collisions between a and b, with Mitsuba's majorant of the whole medium.
-
-    ``visit`` is called at every one, with its MediumInteraction3f, the majorant (Float) and where there is one (Bool).
-    """
+def ratio_tracking(
+    medium: mi.MediumPtr, ray: mi.Ray3f, a: mi.Float, b: mi.Float, sampler: mi.Sampler, active: mi.Bool
+) -> mi.Spectrum:
+    """T = Π (1 - σ_t/σ̄) over tentative collisions between a and b, with Mitsuba's majorant of the whole medium."""
     σ_bar = majorant(medium, ray, active)
     active = active & (σ_bar > 0)
     t = mi.Float(a)
     T = mi.Spectrum(1)
-    while dr.hint(active, exclude=[visit], label="pathreplay: ratio tracking"):
+    while dr.hint(active, label="pathreplay: ratio tracking"):
         t -= dr.log(1 - sampler.next_1d(active)) / σ_bar
         active &= t < b
-        mei = interaction(medium, ray, t)
-        _, _, σ_t = medium.get_scattering_coefficients(mei, active)
-        if dr.hint(visit is not None, mode="scalar"):
-            visit(mei, σ_bar, active)
+        _, _, σ_t = medium.get_scattering_coefficients(interaction(medium, ray, t), active)
         T = dr.select(active, T * (1 - dr.detach(σ_t) / σ_bar), T)
         active &= dr.any(T != 0)
     return T
 
 
-def shadow_again(walk: Walk, origin: Any, light: Any, kept: Shadow, attached: bool, active: Any) -> Any:
-    """The kept transmittance (Spectrum), differentiable in σ_t and, if ``attached``, in the two ends of the ray.
+def shadow_again(
+    walk: Walk,
+    origin: mi.Interaction3f,
+    light: mi.DirectionSample3f,
+    kept: Shadow,
+    attached: bool,
+    active: mi.Bool,
+) -> mi.Spectrum:
+    """The kept transmittance, differentiable in σ_t and, if ``attached``, in the two ends of the ray.
 
     The point y keeps its place between the two surfaces (or ends of the ray) next to it.
     """
@@ -135,15 +141,16 @@ def shadow_again(walk: Walk, origin: Any, light: Any, kept: Shadow, attached: bo
         y, growth = carried(y, a, b, walked)
     else:
         ray = dr.detach(ray)
-    with dr.suspend_grad(when=walk.listing):
-        _, _, σ_t = kept.medium.get_scattering_coefficients(interaction(kept.medium, ray, y), walked)
+    _, _, σ_t = kept.medium.get_scattering_coefficients(interaction(kept.medium, ray, y), walked)
     if not dr.grad_enabled(σ_t, growth):
         return kept.T
     log_T = dr.select(walked, -kept.length * growth * σ_t, 0)
     return kept.T * dr.replace_grad(mi.Spectrum(1), log_T)
 
 
-def _boundary(walk: Walk, ray: Any, still: Any, y: Any, sign: int, active: Any) -> Any:
+def _boundary(
+    walk: Walk, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int, active: mi.Bool
+) -> mi.Float:
     """Distance along ``ray`` of the first surface that is met from y on towards its end (sign 1) or origin (sign -1).
 
     Where none is met it is the end of the ray, or its origin (0). Differentiable in the ray and in the surface.

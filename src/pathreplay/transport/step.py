@@ -1,90 +1,93 @@
-"""The step on surfaces: what one vertex adds, how it scatters, and the derivative of both.
+"""The step: one vertex of a path, L_i = e_i + w_i L_{i+1}, made of arriving, connecting and scattering.
 
-It knows emission, next-event estimation, BSDF sampling and multiple importance sampling; loops, images and their
-gradients are its callers' business. Its sibling for scenes with media is `medium_step`.
+`choose_step` draws, in a first walk; `repeat_step` is given what was chosen and is differentiable. Loops, images and
+their gradients are their callers' business.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
-from .emitters import draw_emitter, emission, redraw_emitter
-from .lobes import scatter
-from .vertex import Arrival, Kept, Numbers, Step, Walk, is_smooth, mis_weight
+from . import arrive, connect, scatter
+from .vertex import Arrival, Chosen, Flight, Kept, KeptInMedia, KnownLight, Numbers, Signature, Step, Walk
 
 
-def surface_step(
+def choose_step(
     walk: Walk,
     at: Arrival,
     u: Numbers,
-    go_on: Any,
-    active: Any,
-    kept: Kept | None = None,
-    attached: bool = False,
-    hit_next: Any = None,
-) -> Step:
-    """Evaluate L_i = e_i + w_i L_{i+1} at one surface vertex.
+    sampler: mi.Sampler,
+    β: mi.Spectrum,
+    go_on: mi.Bool,
+    active: mi.Bool,
+    flight: Flight | None = None,
+    ctx: mi.BSDFContext | None = None,
+) -> Chosen:
+    """The step of a first walk, which draws emitter sample and continuation from the numbers ``u``.
 
-    A first walk (``kept`` is None) draws the emitter sample and the continuation from the numbers ``u``. A later pass
-    hands back what the first walk ``kept`` and gets the same values, now differentiable in emission, BSDFs and
-    textures. ``go_on`` (Bool) is False at the last vertex that ``max_depth`` allows.
-
-    If ``attached``, the results are differentiable in ``at.ray``, ``at.pdf`` and everything that moves, too: the hit
-    point follows ray and shape, and the continuation follows as `scatter` says (``hit_next`` is where it went). Else
-    vertices and directions are constants. Visibility and Russian roulette are never differentiated.
+    With media also the flight, choosing real collisions by the throughput ``β``, unless ``flight`` is given, and the
+    shadow ray, both from ``sampler``; null boundaries come back as ``null`` steps, which are not counted as vertices.
+    ``go_on`` is False at the last vertex that ``max_depth`` allows. ``ctx`` has the transport mode (radiance), and
+    Mitsuba's number of a lobe where surfaces are to scatter by that one alone.
     """
-    ctx = mi.BSDFContext()
-    with dr.suspend_grad(when=not attached):
-        si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
-    bsdf = si.bsdf(at.ray)
-    go_on = active & go_on & si.is_valid()
+    ctx = mi.BSDFContext() if ctx is None else ctx
+    v = arrive.choose(walk, at, sampler, β, active, flight)
+    link = connect.choose(walk, v, at.medium, u, sampler, go_on)
+    to = scatter.choose(walk, v, at, u, ctx, link.light.d, link.lit, go_on)
+    reached = link.reaches(to.pdf_light, False)
+    lighting = dr.select(link.lit, to.f * reached, 0)
+    kept = Kept(to.d, to.pdf, to.delta, to.black, to.lobe, link.lit, light=link.light)
+    signature = _signature(v, at, to.lobe, go_on)
+    ray_next = v.origin.spawn_ray(to.d)
+    if v.inside is None:
+        if not walk.traits.lights_vary:
+            kept.known = KnownLight(v.glow, link.light.d, reached)
+        return Chosen(v.glow + lighting, to.w, ray_next, to.pdf, signature, kept, to.eta, to.null, to.active)
+    kept.media = KeptInMedia(to.null, v.inside.flight, link.shadow)
+    crossed = (v.surface | v.inside.through) & v.si.is_medium_transition()
+    return Chosen(
+        e=v.inside.e + v.inside.w * (v.glow + lighting),
+        w=v.inside.w * to.w,
+        ray_next=ray_next,
+        pdf=to.pdf,
+        signature=signature,
+        kept=kept,
+        eta=to.eta,
+        null=to.null,
+        active=to.active,
+        medium=dr.select(crossed, v.si.target_medium(to.d), at.medium),
+    )
 
-    # ----------- Light that is known and does not change -----------
 
-    if kept is not None and kept.glow is not None and not attached:
-        f = bsdf.eval(ctx, si, si.to_local(kept.light_d), kept.lit)
-        e = kept.glow + dr.select(kept.lit, f * kept.light_w, 0)
-        w, d, pdf = scatter(walk, bsdf, si, u, kept, attached, hit_next, go_on)
-        return Step(e=e, w=w, ray_next=si.spawn_ray(d), pdf=pdf, kept=kept, met=si.is_valid(), active=go_on)
+def repeat_step(
+    walk: Walk,
+    at: Arrival,
+    u: Numbers,
+    kept: Kept,
+    go_on: mi.Bool,
+    active: mi.Bool,
+    attached: bool = False,
+    hit_next: mi.PreliminaryIntersection3f | None = None,
+    ctx: mi.BSDFContext | None = None,
+) -> Step:
+    """The same step once more, differentiable in emission, BSDFs, textures and media.
 
-    # ------------------------- Emission -------------------------
+    If ``attached``, also in ``at.ray``, ``at.pdf`` and everything that moves: the hit point follows ray and shape, and
+    the continuation follows as `scatter` says (``hit_next`` is where it went). Else vertices and directions are
+    constants. Visibility and Russian roulette are never differentiated. ``ctx`` is that of the first walk.
+    """
+    ctx = mi.BSDFContext() if ctx is None else ctx
+    v = arrive.repeat(walk, at, kept, attached, active)
+    e = v.glow + connect.repeat(walk, v, u, ctx, kept, attached)
+    w, d, pdf = scatter.repeat(walk, v, at, u, ctx, kept, attached, hit_next, go_on)
+    if v.inside is not None:
+        e, w = v.inside.e + v.inside.w * e, v.inside.w * w
+    return Step(e, w, v.origin.spawn_ray(d), pdf, _signature(v, at, kept.lobe, go_on))
 
-    seen = active & (~at.camera | si.is_valid()) if walk.hide_emitters else active
-    glow = emission(walk.scene, at, si, attached, seen)
 
-    # ---------- Next-event estimation and continuation ----------
-
-    first = kept is None
-    if kept is None:
-        lit = go_on & is_smooth(bsdf)
-        light, Le = draw_emitter(walk.scene, si, u.light, lit)
-        lit &= light.pdf != 0
-        f, pdf_light, sample, w = bsdf.eval_pdf_sample(ctx, si, si.to_local(light.d), u.lobe, u.direction, go_on)
-        kept = Kept(
-            d=si.to_world(sample.wo),
-            pdf=sample.pdf,
-            delta=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta),
-            null=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null),
-            black=dr.all(w == 0),
-            lobe=sample.sampled_component,
-            eta=sample.eta,
-            lit=lit,
-            light=light,
-        )
-        d, pdf = kept.d, kept.pdf
-    else:
-        lit = kept.lit
-        light, Le = redraw_emitter(walk, si, u.light, kept.light, attached, lit)
-        f, pdf_light = bsdf.eval_pdf(ctx, si, si.to_local(light.d), lit)
-        w, d, pdf = scatter(walk, bsdf, si, u, kept, attached, hit_next, go_on)
-
-    mis = dr.select(light.delta, 1, mis_weight(light.pdf, pdf_light))
-    light_w = Le * (mis if attached else dr.detach(mis))
-    e = glow + dr.select(lit, f * light_w, 0)
-    if first and not walk.traits.lights_vary:
-        kept.glow, kept.light_d, kept.light_w = glow, light.d, light_w
-
-    return Step(e=e, w=w, ray_next=si.spawn_ray(d), pdf=pdf, kept=kept, met=si.is_valid(), active=go_on)
+def _signature(v: arrive.Vertex, at: Arrival, lobe: mi.UInt32, go_on: mi.Bool) -> Signature:
+    met, shape = v.si.is_valid(), dr.reinterpret_array(mi.UInt32, at.hit.shape)
+    if v.inside is not None:
+        met, shape = v.surface | (v.inside.event & go_on), dr.select(v.inside.event, 0, shape)
+    return Signature(met, shape, lobe)

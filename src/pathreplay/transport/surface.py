@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,13 +15,13 @@ UMBILIC = 1e-4
 class HeldPoint:
     """A point that is glued to its surface."""
 
-    p: Any  # Point3f
-    A: Any  # Vector3f: area element, along the normal; only relative changes of its length mean something
-    n: Any  # Normal3f: the side from which κ is seen; detached
-    κ: Any  # Float: curvature of a sphere (> 0: convex), 0 of a plane, infinite of what is neither; detached
+    p: mi.Point3f
+    A: mi.Vector3f  # area element, along the normal; only relative changes of its length mean something
+    n: mi.Normal3f  # the side from which κ is seen; detached
+    κ: mi.Float  # curvature of a sphere (> 0: convex), 0 of a plane, infinite of what is neither; detached
 
 
-def held_point(hit: Any, ray: Any, active: Any) -> HeldPoint:
+def held_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> HeldPoint:
     """The point that ``ray`` hit, glued to its surface.
 
     On meshes A is taken from the triangle itself: derivatives by texture coordinates would lose it where these are
@@ -36,8 +35,8 @@ def held_point(hit: Any, ray: Any, active: Any) -> HeldPoint:
     return HeldPoint(y.p, A, dr.detach(y.n), dr.select(on_mesh, 0, _curvature(dr.detach(y))))
 
 
-def _curvature(y: Any) -> Any:
-    """κ with dn = κ dp for all tangents, infinite where there is none (Float)."""
+def _curvature(y: mi.SurfaceInteraction3f) -> mi.Float:
+    """κ with dn = κ dp for all tangents, infinite where there is none."""
     turn = dr.squared_norm(y.dn_du) + dr.squared_norm(y.dn_dv)
     κ = dr.dot(y.dn_du, y.dp_du) / dr.squared_norm(y.dp_du)
     rest = dr.squared_norm(y.dn_du - κ * y.dp_du) + dr.squared_norm(y.dn_dv - κ * y.dp_dv)

@@ -10,10 +10,12 @@ import mitsuba as mi
 
 from .velocity import blend_lengths
 
+# Classes by name: Mitsuba's objects do not tell these things of themselves.
 # Sampling is a smooth function of the random numbers, and no choice among lobes depends on a parameter.
 ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
-FLAT = frozenset({"Rectangle", "Disk"})
-FRAMES = frozenset({"NormalMap", "BumpMap", "TwoSidedBRDF"})
+MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
+FRAMES = frozenset({"NormalMap", "BumpMap", TWO_SIDED})
+INSTANCE = "Instance"
 
 
 @dataclass
@@ -23,8 +25,8 @@ class Tables:
     A frozen function cannot make such arrays: it has to be handed them.
     """
 
-    attachable: Any  # Bool: the smooth lobes of this BSDF may be sampled attached (None: nowhere)
-    blend_lengths: Any  # Float: those of `velocity`, by shape
+    attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: nowhere)
+    blend_lengths: mi.Float  # those of `velocity`, by shape
 
 
 @dataclass(frozen=True)
@@ -41,63 +43,51 @@ class Traits:
     of a surface may see where a shape, a lamp or a texture ends. ``tables`` tell of single BSDFs and shapes.
     """
 
-    mirrors: tuple[Any, ...]
+    mirrors: tuple[mi.BSDF, ...]
     lobes: int
-    attachables: tuple[Any, ...]
+    attachables: tuple[mi.BSDF, ...]
     detached_names: tuple[str, ...]
-    lights_deform: bool
-    instances_move: bool
     area_lights: bool
     two_sides: bool
     masks_mirrors: bool
-    opacity_moves: bool
-    lights_vary: bool
     outlines: bool
     tables: Tables
+    lights_deform: bool = False
+    instances_move: bool = False
+    opacity_moves: bool = False
+    lights_vary: bool = False
 
 
-def scene_traits(nodes: set[Any], scene: Any, media: bool, tables: Tables | None = None) -> Traits:
-    """Look at all BSDFs and meshes of a scene, those nested in other BSDFs and in instanced shapes included.
+def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
+    """Look at all BSDFs and shapes of a scene, those nested in other BSDFs and in instanced shapes included.
 
-    With media, null boundaries are not mirrors: the step sends light straight through them. ``tables`` are those of
-    this scene, if they are at hand.
+    What depends on gradients is left at False: see `SceneFacts`. With media, null boundaries are not mirrors: the step
+    sends light straight through them.
     """
-    bsdfs = [node for node in nodes if isinstance(node, mi.BSDF) and not (media and node.class_name() == "Null")]
+    media = any(isinstance(node, mi.Medium) for node in nodes)
+    bsdfs = [node for node in nodes if isinstance(node, mi.BSDF) and not (media and is_null(node))]
     shapes = [node for node in nodes if isinstance(node, mi.Shape)]
     attachables = _attachables(nodes, shapes)
     others = [bsdf for bsdf in bsdfs if not _is_attachable(bsdf) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
-    masks = [bsdf for bsdf in bsdfs if bsdf.class_name() == "MaskBSDF"]
     return Traits(
         mirrors=tuple(bsdf for bsdf in bsdfs if _delta_lobes(bsdf)),
         lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs), default=0),
         attachables=tuple(attachables),
         detached_names=tuple(sorted({bsdf.class_name() for bsdf in others})),
-        lights_deform=any(with_gradients(s, "vertex_positions") for s in shapes if s.is_mesh() and s.is_emitter()),
-        instances_move=any(with_gradients(s, "to_world") for s in shapes if s.class_name() == "Instance"),
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
-        two_sides=any(bsdf.class_name() == "TwoSidedBRDF" for bsdf in bsdfs),
-        masks_mirrors=any(_delta_lobes(_nested(mask)) for mask in masks),
-        opacity_moves=any(with_gradients(mask, "opacity") for mask in masks),
+        two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
+        masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         outlines=not _seamless(shapes, nodes),
-        lights_vary=any(map(with_gradients, [*scene.emitters(), *(shape for shape in shapes if shape.is_emitter())])),
-        tables=_tables(attachables, shapes) if tables is None else tables,
+        tables=Tables(_mask_by_index(attachables) if attachables else None, blend_lengths(shapes)),
     )
 
 
-def scene_tables(nodes: set[Any]) -> Tables:
-    """The tables of a scene, by its nodes."""
-    shapes = [node for node in nodes if isinstance(node, mi.Shape)]
-    return _tables(_attachables(nodes, shapes), shapes)
+def is_null(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF does nothing but let light straight through."""
+    return bool(bsdf.component_count() == 1 and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null))
 
 
-def _tables(attachables: list[Any], shapes: list[Any]) -> Tables:
-    return Tables(
-        attachable=_mask_by_index(attachables) if attachables else None,
-        blend_lengths=blend_lengths(shapes),
-    )
-
-
-def _attachables(nodes: set[Any], shapes: list[Any]) -> list[Any]:
+def _attachables(nodes: set[mi.Object], shapes: list[mi.Shape]) -> list[mi.BSDF]:
     # A lamp for which the scene names no BSDF has a diffuse one all the same: nobody asked to have that attached.
     of_lamps = {shape.bsdf() for shape in shapes if shape.is_emitter()}
     seen = {shape.bsdf() for shape in shapes if not shape.is_emitter()}
@@ -105,12 +95,12 @@ def _attachables(nodes: set[Any], shapes: list[Any]) -> list[Any]:
     return [bsdf for bsdf in bsdfs if _is_attachable(bsdf)]
 
 
-def nodes_of(root: Any) -> set[Any]:
+def nodes_of(root: mi.Object) -> set[mi.Object]:
     """All objects of a scene, or below one of its objects."""
-    seen: set[Any] = set()
+    seen: set[mi.Object] = set()
 
     class Collector(mi.TraversalCallback):  # type: ignore[misc, name-defined]
-        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
+        def put(self, name: str, value: object, flags: int, cpptype: type | None = None) -> None:
             if isinstance(value, mi.Object) and value not in seen:
                 seen.add(value)
                 value.traverse(Collector())  # one callback per node: Mitsuba forbids re-entry
@@ -119,7 +109,7 @@ def nodes_of(root: Any) -> set[Any]:
     return seen
 
 
-def _seamless(shapes: list[Any], nodes: set[Any]) -> bool:
+def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
     """Whether no point of a surface sees an end of anything: there is one shape only, which sees no end of itself.
 
     A flat shape does not see itself at all. A sphere does from the inside, where a texture would have a seam.
@@ -127,27 +117,27 @@ def _seamless(shapes: list[Any], nodes: set[Any]) -> bool:
     if len(shapes) != 1 or shapes[0].is_emitter():
         return False
     textured = any(isinstance(node, mi.Texture) and node.is_spatially_varying() for node in nodes)
-    kind = shapes[0].class_name()
-    return kind in FLAT or (kind == "Sphere" and not textured)
+    kind = shapes[0].shape_type()
+    return kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk) or (kind == mi.ShapeType.Sphere and not textured)
 
 
-def _nested(bsdf: Any) -> Any:
+def _nested(bsdf: mi.BSDF) -> mi.BSDF:
     return next(node for node in nodes_of(bsdf) if isinstance(node, mi.BSDF))
 
 
-def _delta_lobes(bsdf: Any) -> int:
+def _delta_lobes(bsdf: mi.BSDF) -> int:
     delta = [k for k in range(bsdf.component_count()) if mi.has_flag(bsdf.flags(k), mi.BSDFFlags.Delta)]
     return max(delta) + 1 if delta else 0
 
 
-def _is_attachable(bsdf: Any) -> bool:
+def _is_attachable(bsdf: mi.BSDF) -> bool:
     name = bsdf.class_name()
     if name in FRAMES:
         return all(_is_attachable(nested) for nested in nodes_of(bsdf) if isinstance(nested, mi.BSDF))
     return name in ATTACHABLE
 
 
-def _mask_by_index(bsdfs: list[Any]) -> Any:
+def _mask_by_index(bsdfs: list[mi.BSDF]) -> mi.Bool:
     index = [dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0] for bsdf in bsdfs]
     mask = [False] * (max(index) + 1)
     for i in index:
@@ -155,7 +145,7 @@ def _mask_by_index(bsdfs: list[Any]) -> Any:
     return mi.Bool(mask)
 
 
-def with_gradients(node: Any, *names: str) -> list[Any]:
+def with_gradients(node: mi.Object, *names: str) -> list[Any]:
     """The parameters of a node, and of those below it, that have gradients; with names, those that are called so.
 
     What goes on after a name with a dot is called so, too.

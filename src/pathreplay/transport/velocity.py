@@ -21,7 +21,6 @@ distance of x to it, which is constant as well and does not vanish at its limb. 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -33,8 +32,8 @@ from .surface import HeldPoint, held_point
 BLEND = 0.01
 
 
-def blend_lengths(shapes: list[Any]) -> Any:
-    """h0 of each shape (Float, by registry index): BLEND times the diagonal of its bounding box."""
+def blend_lengths(shapes: list[mi.Shape]) -> mi.Float:
+    """h0 of each shape (by registry index): BLEND times the diagonal of its bounding box."""
     lengths = {0: 0.0}
     for shape in shapes:
         size = sum(float(x) ** 2 for x in shape.bbox().extents()) ** 0.5
@@ -43,15 +42,17 @@ def blend_lengths(shapes: list[Any]) -> Any:
     return mi.Float([lengths.get(i, 0.0) for i in range(max(lengths) + 1)])
 
 
-def moved_direction(lengths: Any, si: Any, d: Any, hit: Any, active: Any) -> tuple[Any, Any]:
-    """The kept direction ``d`` and J (Float), as V moves them: their values are ``d`` and 1.
+def moved_direction(
+    lengths: mi.Float, origin: mi.Interaction3f, d: mi.Vector3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Float]:
+    """The kept direction ``d`` and J, as V moves them: their values are ``d`` and 1.
 
-    ``lengths`` are the `blend_lengths` of the scene and ``hit`` is what the continuation from ``si`` along ``d`` hit;
-    rays that left the scene keep their direction. Differentiable in ``si`` and in the shape that was hit.
+    ``lengths`` are the `blend_lengths` of the scene and ``hit`` is what the continuation from ``origin`` along ``d``
+    hit; rays that left the scene keep their direction. Differentiable in ``origin`` and in the shape that was hit.
     """
     found = active & hit.is_valid()
-    y = held_point(hit, dr.detach(si.spawn_ray(d)), found)
-    towards = y.p - si.spawn_ray(dr.detach(d)).o
+    y = held_point(hit, dr.detach(origin.spawn_ray(d)), found)
+    towards = y.p - origin.spawn_ray(dr.detach(d)).o
     facing = dr.abs(dr.dot(y.A, towards))
     ok = found & (facing > 0)
     dist2 = dr.select(ok, dr.squared_norm(towards), 1)
@@ -65,8 +66,10 @@ def moved_direction(lengths: Any, si: Any, d: Any, hit: Any, active: Any) -> tup
     return dr.select(ok, dr.replace_grad(d, φ * d_H), d), dr.replace_grad(mi.Float(1), log_J)
 
 
-def _share(h0: Any, y: HeldPoint, towards: Any, active: Any) -> tuple[Any, Any]:
-    """φ (Float), and the slope (Vector3f) that makes ∇φ·V_H = slope·d_H'; nothing here is attached."""
+def _share(
+    h0: mi.Float, y: HeldPoint, towards: mi.Vector3f, active: mi.Bool
+) -> tuple[mi.Float, mi.Vector3f]:
+    """φ, and the slope that makes ∇φ·V_H = slope·d_H'; nothing here is attached."""
     r = dr.norm(towards)
     n = dr.normalize(y.A)
     turned = dr.dot(n, towards) > 0

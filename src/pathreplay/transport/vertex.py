@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from .media import Media
 from .traits import Traits
 
 
@@ -19,25 +19,24 @@ class Walk:
     ``attach`` says what the path follows when parameters move: ``none`` nothing, ``delta`` hit points and directions
     sampled from delta lobes, ``all`` also directions from the BSDFs in ``traits.attachables``. ``hide_emitters``
     leaves out emitters that the camera sees directly. ``max_depth`` and ``rr_depth`` are Mitsuba's; an unbounded depth
-    is 2^32 - 1. ``media`` is None in a scene without media, which then walks as Mitsuba's `path` does; with media all
+    is 2^32 - 1. ``media`` is None in a scene without them, which then walks as Mitsuba's `path` does; with media all
     conventions are those of `volpath`: null boundaries are no vertices. ``baseline`` (MediumInteraction3f, extinction,
     majorant, Bool) -> Spectrum guesses the radiance that arrives at a point of a medium from beyond (None: zero); a
     better guess makes gradients less noisy, and none makes them wrong.
     """
 
-    scene: Any  # mi.Scene
+    scene: mi.Scene
     traits: Traits
     attach: str
     hide_emitters: bool
     max_depth: int
     rr_depth: int
-    skip_area_emitters: Callable[..., Any]  # Mitsuba's, an integrator's method
-    media: Any = None  # Media
-    baseline: Any = None
+    skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]  # Mitsuba's, an integrator's method
+    media: Media = None  # type: ignore[assignment]  # not in scenes without media
+    baseline: Callable[..., mi.Spectrum] | None = None
     # To keep a null collision of each path, for derivatives where collisions are never real: how much it counts (Float,
     # see `branch_weight`); else None.
-    branching: Any = None
-    listing: bool = False  # leave the coefficients of media along flights and shadow rays to the `listing` driver
+    branching: mi.Float = None
 
     @property
     def resamples(self) -> bool:
@@ -65,13 +64,13 @@ class Walk:
 class Numbers:
     """The random numbers of one vertex: an input of the step, so that a second walk repeats the first exactly."""
 
-    light: Any  # Point2f: which emitter, and where on it
-    lobe: Any  # Float: which lobe of the BSDF
-    direction: Any  # Point2f: which direction in the lobe
-    roulette: Any  # Float: whether the path goes on
+    light: mi.Point2f  # which emitter, and where on it
+    lobe: mi.Float  # which lobe of the BSDF
+    direction: mi.Point2f  # which direction in the lobe
+    roulette: mi.Float  # whether the path goes on
 
     @staticmethod
-    def draw(sampler: Any) -> Numbers:
+    def draw(sampler: mi.Sampler) -> Numbers:
         """Draw the numbers of one vertex, in the order that all drivers share."""
         return Numbers(sampler.next_2d(), sampler.next_1d(), sampler.next_2d(), sampler.next_1d())
 
@@ -80,71 +79,138 @@ class Numbers:
 class Arrival:
     """How the path came to a vertex: the ray, its nearest hit, and the density with which it was sampled."""
 
-    ray: Any  # Ray3f
-    hit: Any  # PreliminaryIntersection3f
-    pdf: Any  # Float: solid-angle density of ray.d at the previous vertex
-    delta: Any  # Bool: it was a delta lobe, or the camera
-    camera: Any  # Bool: the previous vertex is the camera
+    ray: mi.Ray3f
+    hit: mi.PreliminaryIntersection3f
+    pdf: mi.Float  # solid-angle density of ray.d at the previous vertex
+    delta: mi.Bool  # it was a delta lobe, or the camera
+    camera: mi.Bool  # the previous vertex is the camera
     # With media only, else None:
-    medium: Any = None  # MediumPtr: what the ray goes through
-    behind: Any = None  # Float: distance to the previous vertex behind the ray's origin, through null boundaries
+    medium: mi.MediumPtr = None  # what the ray goes through
+    behind: mi.Float = None  # distance to the previous vertex behind the ray's origin, through null boundaries
 
 
 @dataclass
 class Kept:
     """What a first walk chose at a vertex. Later passes hold these values while derivatives flow around them."""
 
-    d: Any  # Vector3f: sampled direction, world space
-    pdf: Any  # Float: its solid-angle density, or the probability of the delta lobe
-    delta: Any  # Bool: a delta lobe was sampled
-    black: Any  # Bool: the weight of the continuation was zero in all channels
-    lobe: Any  # UInt32: the BSDF component that was sampled
-    lit: Any  # Bool: an emitter sample was taken, and nothing is in its way
-    null: Any = None  # Bool: the lobe passes straight through (None in a record without media)
-    # With media only, else None:
-    flight: Any = None  # Flight on the way to the vertex
-    shadow: Any = None  # Shadow between the vertex and its emitter sample
-    # On surfaces, if nothing about emitters is differentiated: what later passes need not find out again. Else None.
-    glow: Any = None  # Spectrum: emission, a part of e
-    light_d: Any = None  # Vector3f: direction of the emitter sample
-    light_w: Any = None  # Spectrum: its radiance over its density, MIS weighted
+    d: mi.Vector3f  # sampled direction, world space
+    pdf: mi.Float  # its solid-angle density, or the probability of the delta lobe
+    delta: mi.Bool  # a delta lobe was sampled
+    black: mi.Bool  # the weight of the continuation was zero in all channels
+    lobe: mi.UInt32  # the BSDF component that was sampled
+    lit: mi.Bool  # an emitter sample was taken, and nothing is in its way
+    media: KeptInMedia = None  # type: ignore[assignment]  # not in scenes without media
+    known: KnownLight | None = None  # on surfaces, if nothing about emitters is differentiated, else None
+    light: mi.DirectionSample3f = None  # the emitter sample, where it is still at hand
+
+
+@dataclass
+class KeptInMedia:
+    """What was chosen besides in a scene with media."""
+
+    null: mi.Bool  # the lobe passes straight through
+    flight: Flight  # on the way to the vertex
+    shadow: Shadow  # between the vertex and its emitter sample
+
+
+@dataclass
+class Flight:
+    """What a first walk found between two vertices."""
+
+    event: mi.Bool  # a real collision, before any surface
+    t: mi.Float  # distance to it
+    density: mi.Float  # probability density of a collision there, p σ̄; 1 if there was none
+    W: mi.Spectrum  # weight of the null collisions on the way; 1 where the medium is grey
+    along: mi.Float  # shifts the points at which its derivative is taken, in [0, 1) of their distance
+    p: mi.Float = None  # probability that the collision was real (if the walk branches, else None)
+    # Of walks with emission only, else None:
+    E: mi.Spectrum = None  # emission gathered on the way
+    t_emit: mi.Float = None  # distance of the tentative collision at which emission is differentiated
+    c_emit: mi.Spectrum = None  # weight of the emission there
     # Only the first walk needs these; they are None in a record that is read back.
-    light: Any = None  # DirectionSample3f of the emitter sample
-    eta: Any = None  # Float: relative index of refraction that it crosses
-    # With media only: where the shadow ray started (Interaction3f), in what (MediumPtr), whether there was one (Bool),
-    # and what came of it (Spectrum: a part of e).
-    origin: Any = None
-    start: Any = None
-    shaded: Any = None
-    lighting: Any = None
+    σ_s: mi.Spectrum = None  # scattering coefficient at the collision
+    null: NullCollision = None  # type: ignore[assignment]  # one of those on the way, if the walk branches
+
+
+@dataclass
+class NullCollision:
+    """A null collision, kept with a probability proportional to ``mass``: see `branch_weight`."""
+
+    t: mi.Float  # distance
+    ω: mi.Spectrum  # weight of the collision and of those before, over the probability that it was kept
+    bare: mi.Float  # the same without those before
+    mass: mi.Float  # of all null collisions on the way
+    number: mi.Float  # of null collisions on the way
+    pick: mi.Float  # a random number, to choose among flights
+
+
+@dataclass
+class Shadow:
+    """What a first walk found between a vertex and its emitter sample."""
+
+    T: mi.Spectrum  # estimate of the transmittance, 0 if something is in the way
+    y: mi.Float  # distance of the point where its derivative is taken
+    medium: mi.MediumPtr  # the medium there; null if there is none on the way
+    length: mi.Float  # length of medium on the ray
+
+
+@dataclass
+class KnownLight:
+    """What emitters bring to a surface, where later passes need not find it out again."""
+
+    glow: mi.Spectrum  # emission, a part of e
+    d: mi.Vector3f  # direction of the emitter sample
+    w: mi.Spectrum  # its radiance over its density, MIS weighted
+
+
+@dataclass
+class Signature:
+    """Where a vertex lies among the discontinuities of its path: two paths that differ in it have an edge between."""
+
+    met: mi.Bool  # the ray met something: a surface or, in a medium, a particle
+    shape: mi.UInt32  # registry index of the shape, 0 for a particle or none
+    lobe: mi.UInt32  # the lobe of the continuation
 
 
 @dataclass
 class Step:
     """One vertex of a path, L_i = e_i + w_i L_{i+1}, together with the continuation r_{i+1}."""
 
-    e: Any  # Spectrum: emission (MIS weighted) + next-event estimate
-    w: Any  # Spectrum: f/p or lobe weight, before Russian roulette
-    ray_next: Any  # Ray3f
-    pdf: Any  # Float: density of the continuation, for the next vertex
+    e: mi.Spectrum  # emission (MIS weighted) + next-event estimate
+    w: mi.Spectrum  # f/p or lobe weight, before Russian roulette
+    ray_next: mi.Ray3f
+    pdf: mi.Float  # density of the continuation, for the next vertex
+    signature: Signature
+
+
+@dataclass
+class Chosen(Step):
+    """A step of a first walk, with what it chose and what the walk needs to go on."""
+
     kept: Kept
-    met: Any  # Bool: the ray met something: a surface or, in a medium, a particle
-    active: Any  # Bool: there is a continuation
-    medium: Any = None  # MediumPtr: what the continuation goes through (with media only, else None)
+    eta: mi.Float  # relative index of refraction that the continuation crosses
+    null: mi.Bool  # the continuation passes straight through
+    active: mi.Bool  # there is a continuation
+    medium: mi.MediumPtr = None  # what the continuation goes through, with media only
+
+    @property
+    def seen(self) -> mi.Bool:
+        """Mitsuba's alpha: the ray met something that does not merely let it pass."""
+        return self.signature.met & ~self.null
 
 
-def mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
+def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
     """Power heuristic of Veach, p_a² / (p_a² + p_b²); zero where that is not finite."""
     a2 = dr.square(pdf_a)
     weight = a2 / dr.fma(pdf_b, pdf_b, a2)
     return dr.select(dr.isfinite(weight), weight, 0)
 
 
-def reciprocal(x: Any) -> Any:
+def reciprocal(x: mi.Float) -> mi.Float:
     """1/x where x is not zero, else zero."""
     return dr.select(x != 0, dr.rcp(x), 0)
 
 
-def is_smooth(bsdf: Any) -> Any:
+def is_smooth(bsdf: mi.BSDFPtr) -> mi.Bool:
     """True where next-event estimation can reach a lobe of the BSDF."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)

@@ -1,0 +1,60 @@
+"""One process from its start to its second gradient: prints the seconds of each stage as one JSON list.
+
+Started by `start.py` as `python -m benchmarks.measures.first JOB`, whose one method is an integrator. For Mitsuba's own
+pathreplay is not imported, nor anything else that they do not need: they are measured as their users have them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+import time
+
+from benchmarks.measures.methods import METHODS, STOCK
+
+BEGIN = time.perf_counter()
+
+
+def _set_variant(ours: bool) -> None:
+    if ours:
+        from pathreplay import backend
+
+        backend.set_variant(None)
+    else:
+        import mitsuba as mi
+
+        mi.set_variant("llvm_ad_rgb")
+
+
+def main(text: str) -> list[float]:
+    """Seconds of: import and variant; scene, integrator and first gradient; second gradient, with another seed."""
+    (method,) = json.loads(text)["methods"]
+    _set_variant(method not in STOCK)
+    imported = time.perf_counter()
+
+    import drjit as dr
+    import mitsuba as mi
+
+    from benchmarks.measures.job import Job
+    from benchmarks.scenes import SCENES
+
+    job = Job.decode(text)
+    scene = mi.load_dict(SCENES[job.scene](job.resolution), optimize=False)
+    params = mi.traverse(scene)
+    (key,) = job.parameters
+    dr.enable_grad(params[key])
+    params.update()
+    integrator = mi.load_dict(METHODS[method] | job.limits)
+    adjoint = dr.full(mi.TensorXf, 1.0, (job.resolution, job.resolution, 3))
+    marks = [BEGIN, imported]
+    for seed in (0, 1):
+        integrator.render_backward(scene, params, adjoint, seed=seed, spp=job.spp)
+        dr.eval(dr.grad(params[key]))
+        dr.sync_thread()
+        marks.append(time.perf_counter())
+    return [later - earlier for earlier, later in itertools.pairwise(marks)]
+
+
+if __name__ == "__main__":
+    print(json.dumps(main(sys.argv[1])))

@@ -1,0 +1,33 @@
+"""What is compared: integrators, and ways to use one, by the names that the tables give them.
+
+A method is the name of an integrator, or that and a way: `sweep`, `prb, own loop`. It imports nothing: see `first.py`.
+"""
+
+#: What `mi.load_dict` makes of it. One that does not load is a row that says so.
+METHODS: dict[str, dict[str, object]] = {
+    "prb": {"type": "prb"},
+    "prb_basic": {"type": "prb_basic"},
+    "tape": {"type": "pathreplay_tape"},
+    "rb": {"type": "pathreplay_rb"},
+    "rb linear": {"type": "pathreplay_rb", "linear": True},
+    "sweep": {"type": "pathreplay", "driver": "sweep"},
+    "replay": {"type": "pathreplay", "driver": "replay"},
+    "volpath": {"type": "volpath"},
+    "prbvolpath": {"type": "prbvolpath"},
+    "score": {"type": "pathreplay"},
+    "no branch": {"type": "pathreplay", "branch": False},
+    "listing": {"type": "pathreplay_listing"},
+}
+
+#: Mitsuba's own: what ours is compared with, and not held to anything when two records are compared.
+STOCK = ("prb", "prb_basic", "prbvolpath", "volpath", "finite differences", "half steps")
+
+#: Ways: the loop of an optimisation step, and what a new process does first.
+USUAL, OWN = "usual loop", "own loop"
+STAGES = ("import", "first gradient", "second gradient")
+
+
+def parts(method: str) -> tuple[str, str]:
+    """Integrator and way, the latter empty where there is none."""
+    integrator, _, way = method.partition(", ")
+    return integrator, way

@@ -1,0 +1,113 @@
+"""Whole optimisation steps, timed: render, loss, gradient, Adam, bounds, new scene. What `iteration` measures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from drjit.opt import Adam
+
+from pathreplay.inverse.config import make_config
+from pathreplay.inverse.loop import Run, take_step
+from pathreplay.inverse.losses import l2
+from pathreplay.inverse.passes import Passes
+from pathreplay.inverse.problem import Problem, Variable, View
+from pathreplay.scenes.parameters import get_array
+
+from ..scenes import SCENES
+from .job import Job
+from .methods import METHODS, OWN, parts
+from .scene import stopwatch
+from .spread import spreads
+
+# Where steps begin. Textures are grey, so that some texels are too bright and some too dark, as in most problems: with
+# one set of paths for image and gradient the variance depends on that. Densities are half of what they should be.
+GREY = 0.5
+HALF = 0.5
+RATE = 0.02
+TARGET_SPP = 256
+
+
+class Watched(Adam):
+    """Adam that remembers the gradients of its last step."""
+
+    seen: dict[str, Any]
+
+    def step(self) -> None:
+        """Take the step of Adam."""
+        self.seen = {key: dr.grad(value) for key, value in self.items()}
+        super().step()
+
+
+class Step:
+    """A scene, its target, and for every method an optimiser; each call times one step from the start values."""
+
+    def __init__(self, job: Job) -> None:
+        self.job, (self.key,) = job, job.parameters
+        self.scene = mi.load_dict(SCENES[job.scene](job.resolution), optimize=False)
+        self.params = mi.traverse(self.scene)
+        self.params.keep([self.key])
+        judge = mi.load_dict({"type": "volpath", "max_depth": job.max_depth})
+        target = mi.render(self.scene, integrator=judge, spp=TARGET_SPP, seed=1)
+        truth = self.params[self.key]
+        texture = len(truth.shape) == 3
+        self.start = dr.full(type(truth), GREY, truth.shape) if texture else dr.detach(truth * HALF)
+        self.upper = 1.0 if texture else None  # a density has no upper bound
+        self.target = mi.TensorXf(target)
+        like, array = type(truth)(truth), get_array(self.start)
+        variable = Variable(self.key, like, 0.0, self.upper, RATE, array, None)
+        view = View("camera", 0, np.array(target))
+        self.problem = Problem(
+            self.scene, self.params, judge, None, judge, (variable,), (), (view,), l2, ()
+        )  # fmt: skip
+        self.config = make_config(
+            {
+                "scene": "cornell-box",  # not loaded: the problem has its scene
+                "parameters": [{"key": self.key}],
+                "target": {"values": {self.key: 0.5}},
+                "spp": job.spp,
+            }
+        )
+        self.runs: dict[str, Run] = {}
+
+    def forget(self) -> None:
+        """Make integrators and optimisers anew."""
+        self.runs.clear()
+
+    def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
+        """Seconds of a step, and the gradient that it took."""
+        name, loop = parts(method)
+        if method not in self.runs:
+            integrator = mi.load_dict(METHODS[name] | self.job.limits)
+            self.runs[method] = Run(Passes(self.problem, integrator), Watched(lr=RATE), [])
+        run = self.runs[method]
+        run.adam[self.key] = type(self.start)(self.start)
+        if loop != OWN:
+            self.params.update(run.adam)
+
+        def step() -> Any:
+            if loop == OWN:
+                take_step(self.problem, self.config, run, len(run.history))
+            else:
+                self._usual(run, seed)
+            return run.adam[self.key]
+
+        seconds, _ = stopwatch(step)
+        return seconds, np.ravel(np.array(run.adam.seen[self.key]))
+
+    def _usual(self, run: Run, seed: int) -> None:
+        """The loop of Mitsuba's tutorials."""
+        adam = run.adam
+        image = mi.render(self.scene, self.params, integrator=run.passes.integrator, spp=self.job.spp, seed=seed)
+        loss = dr.mean(dr.square(image - self.target), axis=None)
+        dr.backward(loss)
+        adam.step()
+        value = dr.maximum(adam[self.key], 0.0)
+        adam[self.key] = value if self.upper is None else dr.minimum(value, self.upper)
+        self.params.update(adam)
+
+    def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
+        """What the gradients of all steps say: see `spread`."""
+        return spreads(kept, None, ())

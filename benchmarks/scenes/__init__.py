@@ -1,0 +1,13 @@
+"""The scenes that are measured: all made here or by Mitsuba, nothing is read from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from .media import MEDIA_SCENES
+from .parts import SceneDict
+from .sheets import SHEET_SCENES
+from .surfaces import SURFACE_SCENES
+
+#: Scene by name: resolution -> dictionary for mi.load_dict (with optimize=False, to keep the keys).
+SCENES: dict[str, Callable[[int], SceneDict]] = SURFACE_SCENES | MEDIA_SCENES | SHEET_SCENES

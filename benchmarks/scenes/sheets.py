@@ -1,0 +1,73 @@
+"""Bent sheets face to face and bent panes of glass, under a smooth sky: chains of smooth bounces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import mitsuba as mi
+import numpy as np
+
+from .parts import SceneDict, sensor
+
+UP = (0, 0.1, 1)
+
+DIFFUSE: SceneDict = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.7, 0.9]}}
+ROUGH_METAL: SceneDict = {"type": "roughconductor", "alpha": 0.2}
+
+
+def sheet(z: float, bend: float, half_width: float, up: bool, bsdf: SceneDict, n: int = 9) -> mi.Mesh:
+    """A bent sheet of n x n vertices with shading normals, about the plane at height z."""
+    y, x = np.mgrid[-1 : 1 : n * 1j, -1 : 1 : n * 1j] * half_width
+    positions = np.stack([x, y, z + bend * np.sin(1.3 * x + 0.3) * np.cos(1.1 * y)], axis=-1)
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel()
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
+    props = mi.Properties()
+    props["mesh_bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh("sheet", n * n, len(faces), has_vertex_normals=True, props=props)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = positions.astype(np.float32).ravel()
+    params["faces"] = (faces if up else faces[:, ::-1]).astype(np.uint32).ravel()
+    params.update()
+    return mesh
+
+
+def smooth_environment(height: int = 32) -> SceneDict:
+    y, x = np.mgrid[0:height, 0 : 2 * height] * (np.pi / height)
+    waves = [np.sin(x) * np.sin(y) / 2, np.cos(x + 1) * np.sin(y) / 2, np.sin(2 * x) * np.sin(y) / 3]
+    return {"type": "envmap", "bitmap": mi.Bitmap((1 + np.stack(waves, axis=-1)).astype(np.float32))}
+
+
+def corridor(bsdf: SceneDict, resolution: int) -> SceneDict:
+    """Two sheets, seen from the side: nearly every path bounces to and fro between them."""
+    return {
+        "type": "scene",
+        "environment": smooth_environment(),
+        "camera": sensor(resolution, [0, -5, 0.3], [0, 0, -0.6], 30, up=UP),
+        "low": sheet(-1, 0.1, 2, True, bsdf),
+        "high": sheet(1, 0.1, 2, False, bsdf),
+    }
+
+
+def panes(interfaces: int, wall: SceneDict | None, resolution: int) -> SceneDict:
+    """Bent panes of glass, one behind the other, in front of a wall if there is one: chains of delta lobes."""
+    glass = {"type": "smoothdielectric", "int_ior": 1.5}
+    scene = {
+        "type": "scene",
+        "environment": smooth_environment(),
+        "camera": sensor(resolution, [0.3, -0.2, -5], [0.3, 0, 0], 30, up=UP),
+    }
+    names = ["low"] + [f"pane-{k}" for k in range(1, interfaces)]
+    scene |= {name: sheet(0.25 * k, 0.05, 4, k % 2 == 1, glass) for k, name in enumerate(names)}
+    if wall is not None:
+        scene["wall"] = sheet(0.25 * interfaces + 0.5, 0.1, 4, False, wall)
+    return scene
+
+
+SHEET_SCENES: dict[str, Callable[[int], SceneDict]] = {
+    "diffuse sheets": partial(corridor, DIFFUSE),
+    "rough metal sheets": partial(corridor, ROUGH_METAL),
+    "glass before a diffuse wall": partial(panes, 4, DIFFUSE),
+    "glass panes": partial(panes, 16, None),
+}

@@ -1,0 +1,63 @@
+"""Task `supergrid`: what a coarse grid of local majorants saves on a sparse 64³ grid, and costs on a uniform one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..measures.estimates import unpaired_ratio
+from ..measures.job import Job, Kind, Point, Record
+from ..scenes.media import DENSITY
+from ..tables import markdown, median_seconds, pooled
+
+TITLE = "supergrid"
+TAKES = (20, 165)
+WITHOUT = "one majorant"
+GRIDS = {"sparse": ("supergrid", "auto"), "thin sparse": ("auto",), "uniform": ("supergrid", "auto")}
+PASSES: tuple[Kind, ...] = ("gradient", "image")
+# A process has one medium only, since a virtual call traces every medium that there is: so the processes take turns.
+TURNS = 2
+
+
+def jobs(quick: bool) -> list[Job]:
+    """Image and gradient for each grid and choice of majorants; every process comes TURNS times, in turn."""
+    return [
+        Job(
+            scene=f"{grid}, {choice}",
+            parameters=(DENSITY,),
+            methods=("score",),
+            max_depth=32,
+            rr_depth=5,
+            resolution=32 if quick else 64,
+            spp=16 if quick else 64,  # enough that tracing the kernels does not count
+            rounds=4 if quick else 5,
+            warm_up=3,
+            measure=measure,
+            weights="wave",
+            update=True,
+        )
+        for grid, choices in GRIDS.items()
+        for measure in (PASSES[:1] if quick else PASSES)
+        for _ in range(1 if quick else TURNS)
+        for choice in ((WITHOUT, "auto") if quick else (WITHOUT, *choices))
+    ]
+
+
+def table(record: Record) -> str:
+    """Speed and noise relative to one majorant for the whole grid."""
+    found = {(point.scene, point.measure): point for point in pooled(record.points)}
+    rows = []
+    for (scene, measure), point in found.items():
+        grid, choice = scene.split(", ")
+        rows.append([grid, measure, choice, *_cells(point, found.get((f"{grid}, {WITHOUT}", measure)))])
+    return markdown(["grid", "pass", "majorants", "seconds (median)", "speed-up", "variance ratio"], rows)
+
+
+def _cells(point: Point, rival: Point | None) -> list[str]:
+    if point.error:
+        return [point.error, "", ""]
+    if rival is None or rival.error:
+        return [median_seconds(point), "", ""]
+    if rival is point:
+        return [median_seconds(point), "1", "1"]
+    variance = unpaired_ratio(point.squared_errors, rival.squared_errors, np.mean)
+    return [median_seconds(point), str(unpaired_ratio(rival.seconds, point.seconds, np.median)), str(variance)]

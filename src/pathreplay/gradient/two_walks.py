@@ -1,0 +1,79 @@
+"""The two walks of the sweep drivers: one that records a path, and one from its last vertex back to the first."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.path import PathState
+from ..transport.vertex import Walk
+from .adjoint import LostPaths, RayDerivative, Replayed, backward_step
+from .baseline import Seen
+from .branch import Branch
+from .record import Layout, read_back, record, room_for
+
+
+@dr.syntax
+def first_walk(
+    walk: Walk, sampler: mi.Sampler, path: PathState, layout: Layout, records: Any, first: mi.UInt32, lost: LostPaths
+) -> tuple[Any, mi.UInt32, mi.Spectrum, Branch]:
+    """Record a path from ``first`` on; gives the records, their number, the radiance, and the branch.
+
+    All lanes of a packet write to the same place: elsewhere writes to local memory get lost (Dr.Jit 1.5).
+    """
+    L = mi.Spectrum(0)  # radiance so far
+    count = mi.UInt32(0)  # vertices, and null boundaries
+    branch = Branch.none()
+
+    while dr.hint(path.active, exclude=[walk, layout, lost], label="pathreplay: record"):
+        u, step = path.choose(walk, sampler)
+        onward, rr_weight = path.advance(walk, u, step)
+        records[first + count] = record(layout, Replayed.of(path, u, step, onward, rr_weight))
+        if dr.hint(walk.branch, mode="scalar"):
+            branch = branch.offer(path, step)
+        L += path.β * step.e
+        path = onward
+        count += 1
+        if dr.hint(walk.media is not None, mode="scalar"):
+            full = path.active & (count >= room_for(walk))
+            lost.add(full)
+            path.active &= ~full
+
+    return records, count, L, branch
+
+
+@dr.syntax
+def walk_back(
+    walk: Walk,
+    layout: Layout,
+    records: Any,
+    first: mi.UInt32,
+    count: mi.UInt32,
+    last: mi.UInt32,
+    ray0: mi.Ray3f,
+    δL: mi.Spectrum,
+    L: mi.Spectrum,
+    q: RayDerivative,
+    lost: LostPaths,
+    seen: Seen | None = None,
+) -> tuple[mi.Spectrum, RayDerivative]:
+    """Back-propagate from the last of ``count`` records to the first; gives radiance and ray adjoint there.
+
+    ``L`` is the radiance along the ray that leaves those records, and ``q`` its adjoint: zero where the path ends with
+    them. ``last`` is the index of the path's last record, where that ray arrived or beyond.
+    """
+    broken = mi.Bool(False)  # a part of the adjoint was not finite
+
+    while dr.hint(count > 0, exclude=[walk, layout, ray0, lost, seen], label="pathreplay: sweep"):
+        count -= 1
+        v = read_back(layout, records, first + count, last, ray0)
+        L, q, breaks = backward_step(walk, v, layout.moves, δL, L, q, mi.Bool(True))
+        if dr.hint(seen is not None, mode="scalar"):
+            seen.learn(v, L)  # type: ignore[union-attr]
+        if dr.hint(layout.moves, mode="scalar"):
+            lost.add(breaks & ~broken)
+            broken |= breaks
+
+    return L, q

@@ -1,0 +1,79 @@
+"""A pass: scene, sensor, seed and samples per pixel. It gives the camera rays, and tells itself from other passes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+
+def mitsuba_integrator() -> Any:
+    """Mitsuba's ADIntegrator of the active variant: what it does to prepare a pass is what its users' seeds mean."""
+    # The name under which Mitsuba runs its Python modules anew for every variant. Of `mitsuba.ad`, the public name, an
+    # import statement makes a copy, which stays what it was in the first variant.
+    from mitsuba.python.ad.integrators.common import ADIntegrator
+
+    return ADIntegrator
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The camera rays of a pass, one for every sample of every pixel."""
+
+    sampler: mi.Sampler  # goes on where the rays' own random numbers end
+    ray: mi.RayDifferential3f  # attached to the camera, if that has gradients
+    weight: mi.Spectrum
+    position: mi.Vector2f  # on the film, in pixels: where the sample is splatted
+    spp: int  # samples per pixel: those of the pass, rounded as the sampler needs them
+
+    @property
+    def number(self) -> int:
+        return dr.width(self.ray)
+
+
+@dataclass(frozen=True)
+class Pass:
+    """Everything that decides which paths are walked, but for the integrator's options. Gives the same rays each time.
+
+    ``spp`` of 0 are the samples per pixel of the sensor's sampler.
+    """
+
+    scene: mi.Scene
+    sensor: mi.Sensor
+    seed: int | mi.UInt32
+    spp: int = 0
+
+    @staticmethod
+    def of(scene: mi.Scene, sensor: int | mi.Sensor, seed: int | mi.UInt32, spp: int) -> Pass:
+        """A pass by the arguments of Mitsuba's integrators: the sensor may be an index."""
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        return Pass(scene, sensor, seed, spp or sensor.sampler().sample_count())
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture, in pixels."""
+        width, height = self.sensor.film().crop_size()
+        return int(width), int(height)
+
+    def rays(self) -> Rays:
+        """The camera rays, as Mitsuba's integrators draw them; makes the film ready for their samples."""
+        mitsuba = mitsuba_integrator()
+        sampler, spp = mitsuba.prepare(None, self.sensor, self.seed, self.spp, [])
+        ray, weight, position = mitsuba.sample_rays(None, self.scene, self.sensor, sampler)
+        return Rays(sampler, ray, weight, position, spp)
+
+    def pixel_sampler(self) -> mi.Sampler:
+        """Random numbers for a lane per pixel, each of which draws its own camera rays."""
+        width, height = self.size
+        sampler = self.sensor.sampler().clone()
+        sampler.seed(self.seed, width * height)
+        return sampler
+
+    @cached_property
+    def key(self) -> tuple[int, int, int]:
+        """What tells the passes over one scene apart. Reads the seed, which takes time if it is an array."""
+        seed = int(self.seed) if isinstance(self.seed, int) else int(self.seed[0])
+        return seed, self.spp, self.sensor.ptr

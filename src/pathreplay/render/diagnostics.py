@@ -1,0 +1,99 @@
+"""What is to be said of a pass: paths that lost a part of their gradient, and what would make a gradient wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mitsuba as mi
+
+from ..errors import PathreplayError
+from ..gradient.adjoint import LostPaths
+from ..transport.traits import Traits
+from ..transport.vertex import Walk
+from .edges import edges_note, keys_that_move_edges
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """Of one or more terms and passes: they can be added.
+
+    ``counters`` count the paths that lost a part of their gradient, out of ``paths``; ``moves`` says that hit points,
+    directions or emitter samples depend on parameters with gradients.
+    """
+
+    counters: tuple[LostPaths, ...] = ()
+    paths: int = 0
+    moves: bool = False
+
+    def __add__(self, other: Diagnostics) -> Diagnostics:
+        return Diagnostics(self.counters + other.counters, self.paths + other.paths, self.moves or other.moves)
+
+    def lost(self) -> mi.UInt32 | None:
+        """How many paths lost a part of their gradient; None if nobody counted. Ask when the kernel has been launched:
+        counts are its side effects, and to add them up launches what is there."""
+        counts = [counter.count for counter in self.counters]
+        return sum(counts[1:], counts[0]) if counts else None
+
+
+def lost_note(lost: int, paths: int) -> str:
+    """One line that tells of paths that lost a part of their gradient."""
+    why = "a ray adjoint was not finite, or media have more boundaries on the way than the record holds"
+    return f"{lost / paths:.2%} of the paths lost a part of their gradient: {why}"
+
+
+def used_before_note(seed: int) -> str:
+    """One line that tells of a pass that was learned from already."""
+    return (
+        f"seed {seed} was used before: a pass cannot serve as baseline for itself, so that this one goes without; "
+        "give every pass a seed of its own"
+    )
+
+
+def doubts(walk: Walk) -> Iterator[str]:
+    """One line for each thing that makes the gradient of this scene wrong or incomplete, whatever moves.
+
+    Raises:
+        PathreplayError: it would be useless.
+    """
+    traits = walk.traits
+    if traits.instances_move and walk.attach != "none":
+        raise PathreplayError(
+            "pathreplay: an instance's to_world has a gradient, but Mitsuba does not differentiate the normals "
+            "of instances: move the vertex_positions of the shapes in its group, or use a shape of its own"
+        )
+    if traits.masks_mirrors:
+        yield (
+            "a mask lies over delta lobes, which Mitsuba cannot sample one by one there: derivatives by what "
+            "decides among them (an index, or a reflectance of plastic) are wrong"
+        )
+    if walk.media is not None and walk.media.passes and traits.opacity_moves:
+        yield (
+            "the opacity of a mask has gradients in a scene with media: what it does to the light of emitters "
+            "that shadow rays see through it is missing from the gradient"
+        )
+    if walk.attach == "all":
+        yield from _doubts_of_attached(traits)
+
+
+def _doubts_of_attached(traits: Traits) -> Iterator[str]:
+    if not traits.attachables:
+        raise PathreplayError(
+            "pathreplay: attach = 'all', but no BSDF of the scene can be sampled attached (diffuse, "
+            "roughconductor, roughdielectric, normal and bump maps over them can): use attach = 'delta'"
+        )
+    if traits.detached_names:
+        yield f"attach = 'all' keeps the directions of {', '.join(traits.detached_names)} fixed"
+
+
+def missing_edges(walk: Walk, sensor: mi.Sensor) -> tuple[str, bool]:
+    """One line that tells of the motion of edges where something moves (empty: none), and whether it names what."""
+    moving = keys_that_move_edges(mi.traverse(walk.scene)) or keys_that_move_edges(mi.traverse(sensor))
+    if moving:
+        return edges_note(moving), True
+    if walk.traits.lobes and walk.traits.area_lights:
+        return (
+            "something moves in a scene with delta lobes and area lights: where the edge of a light or a "
+            "silhouette is seen through glass or mirrors, its motion is missing from the gradient"
+        ), False
+    return "", False

@@ -1,0 +1,68 @@
+"""The film: how samples become an image, how an adjoint image becomes one per ray, and how large pictures are."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import PathreplayError
+from .camera_pass import Pass, Rays, mitsuba_integrator
+
+
+def splat(view: Pass, rays: Rays, L: mi.Spectrum, valid: mi.Bool) -> mi.TensorXf:
+    """The image that radiances ``L`` (and ``valid``, for alpha: one each per ray) give under the film's filter.
+
+    Differentiable in ``L``. Also takes tangents for radiances, and gives that of the image.
+    """
+    film = view.sensor.film()
+    block = film.create_block()
+    # Dr.Jit adds up the samples of a pixel before they are written, which pays only where there are some.
+    block.set_coalesce(block.coalesce() and rays.spp >= 4)
+    mitsuba_integrator()._splat_to_block(
+        block,
+        film,
+        rays.position,
+        value=L * rays.weight,
+        weight=1.0,
+        alpha=dr.select(valid, mi.Float(1), mi.Float(0)),
+        aovs=[],
+        wavelengths=rays.ray.wavelengths,
+    )
+    film.put_block(block)
+    return film.develop()
+
+
+def adjoint(view: Pass, rays: Rays, grad_in: mi.TensorXf) -> mi.Spectrum:
+    """δL of each ray: ``grad_in`` (the adjoint of the image), taken back through filter, weights and their division."""
+    with dr.resume_grad():
+        L = dr.full(mi.Spectrum, 1.0, dr.width(rays.ray))
+        dr.enable_grad(L)
+        image = splat(view, rays, L, mi.Bool(True))
+        dr.set_grad(image, grad_in)
+        dr.enqueue(dr.ADMode.Backward, image)
+        dr.traverse(dr.ADMode.Backward)
+        δL = dr.grad(L)
+    view.sensor.film().clear()  # of the ones that were splatted
+    return δL
+
+
+def film_size(sensor: mi.Sensor) -> tuple[int, int]:
+    """Width and height of what is rendered: the crop window, and the film's border where it samples one.
+
+    Raises:
+        PathreplayError: the film has no pixel.
+    """
+    film = sensor.film()
+    border = 2 * int(film.rfilter().border_size()) if film.sample_border() else 0
+    width, height = (int(n) for n in film.crop_size())
+    if width < 1 or height < 1:
+        raise PathreplayError(f"The film of sensor '{sensor.id()}' is {width} x {height}; give it at least one pixel")
+    return width + border, height + border
+
+
+def picture_shape(sensor: mi.Sensor) -> tuple[int, int, int]:
+    """Height, width and channels of the pictures that a sensor's film develops."""
+    film = sensor.film()
+    film.prepare([])  # without storage a film does not tell its channels
+    width, height = (int(n) for n in film.crop_size())
+    return height, width, film.bitmap().channel_count()

@@ -1,0 +1,78 @@
+"""Differentiable delta tracking as first published: path replay nested in the transmittance estimate.
+
+Every tentative collision is differentiated by itself, in a second walk with the same random numbers: null ones as
+dσ_n/σ_n, real ones as dσ_s/σ_s (supplement of Vicini, Speierer, Jakob 2021, listings 1 and 2). Where σ_n or σ_s is zero
+such a collision is never drawn and its derivative is missing: on a constant grid all of that of the transmittance.
+`pathreplay` has no such holes; this driver is here to compare with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import PathreplayError
+from ..gradient.adjoint import LostPaths, backward
+from ..gradient.primal import primal
+from ..transport import arrive, scatter
+from ..transport.connect import Connection, shadow_start
+from ..transport.emitters import redraw_emitter
+from ..transport.motion import path_moves
+from ..transport.path import PathState
+from ..transport.start import CameraStart
+from ..transport.vertex import Numbers, Walk, reciprocal
+from .collisions import differentiate_flight, differentiate_shadow
+
+
+@dr.syntax
+def listing(
+    walk: Walk, sampler: mi.Sampler, start: CameraStart, δL: mi.Spectrum, active: mi.Bool, lost: LostPaths
+) -> bool:
+    """Back-propagate the adjoint radiance ``δL`` into the parameters.
+
+    Uses one majorant for each medium. Not differentiated: what the listings miss (above), visibility, emission of
+    media, and everything that moves: a path that moves with the parameters raises PathreplayError, and so does a scene
+    without media.
+    """
+    if dr.hint(walk.media is None, mode="scalar"):
+        raise PathreplayError("pathreplay_listing differentiates media, and the scene has none: use 'pathreplay'")
+    # Nobody else's tracking is used, so that every collision is one that can be differentiated.
+    media = replace(walk.media, grids=(), plain=True)
+    walk = replace(walk, baseline=None, branching=None, media=media)
+    active = mi.Bool(active) & (walk.max_depth > 0)
+    at = start.choose(walk, active)
+    if dr.hint(path_moves(walk, start, at), mode="scalar"):
+        raise PathreplayError("pathreplay_listing cannot follow what moves: use 'pathreplay'")
+    L = primal(walk, sampler.clone(), start, active)[0]  # β_i L_i, peeled on the way
+    path = PathState.begin(at, active)
+    ctx = mi.BSDFContext()
+
+    while dr.hint(path.active, exclude=[walk, ctx], label="pathreplay: listing"):
+        past = sampler.clone()
+        Numbers.draw(past)
+        u, step = path.choose(walk, sampler)
+        kept = step.kept
+
+        # All that comes along the ray has passed the null collisions of its flight, or was scattered at the real one.
+        differentiate_flight(path.at, kept.media.flight, past, path.active, δL * L)
+        L -= path.β * step.e
+
+        with dr.resume_grad():
+            v = arrive.choose(walk, path.at, past, path.β, path.active, kept.media.flight)
+            light, Le = redraw_emitter(walk, v.origin, u.light, kept.light, False, kept.lit)
+            f, pdf = scatter.towards(v, ctx, light.d, kept.lit)
+            reached = Connection(light, Le * kept.media.shadow.T, kept.lit).reaches(pdf, False)
+            lighting = v.inside.w * dr.select(kept.lit, f * reached, 0)
+            w = scatter.repeat(walk, v, path.at, u, ctx, kept, False, None, step.active)[0]
+            w *= v.inside.w
+            Lo = path.β * (v.inside.e + v.inside.w * v.glow + lighting) + L * w * dr.detach(reciprocal(w))
+            if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
+                backward(dr.sum(δL * Lo))
+
+        # The same for the light of the emitter sample, along its shadow ray.
+        begins = shadow_start(v, light, path.at.medium)
+        differentiate_shadow(walk, v.origin, light, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
+        path = path.advance(walk, u, step)[0]
+    return False

@@ -1,0 +1,122 @@
+"""Arrive: what there is at the end of a ray, what comes along the ray from there by itself, and the flight before it.
+
+With media the ray may end at a particle, and the flight has a weight and emission of its own; without them it ends at
+a surface or leaves the scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .emitters import emission
+from .flight import fly, fly_again
+from .media import interaction
+from .vertex import Arrival, Flight, Kept, Walk
+
+
+@dataclass
+class Vertex:
+    """What a path arrived at. A surface scatters here, or a particle, or nothing does."""
+
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    surface: mi.Bool  # a surface that scatters
+    origin: mi.Interaction3f  # where rays leave
+    glow: mi.Spectrum  # emission towards the ray's origin, MIS weighted
+    inside: InMedium = None  # type: ignore[assignment]  # not in scenes without media
+
+
+@dataclass
+class InMedium:
+    """What there is besides in a scene with media."""
+
+    event: mi.Bool  # the flight ended at a particle
+    through: mi.Bool  # a surface that all light passes straight through, which is no vertex
+    mei: mi.MediumInteraction3f
+    phase: mi.PhaseFunctionPtr
+    flight: Flight
+    w: mi.Spectrum  # weight of all that comes from the vertex: transmittance, at a particle times σ_s over its density
+    e: mi.Spectrum  # what the flight adds by itself
+
+
+def choose(
+    walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: mi.Bool, flight: Flight | None = None
+) -> Vertex:
+    """Arrive in a first walk; with media, draw the flight from ``sampler``, unless it is given. Detached.
+
+    Real collisions are chosen by the throughput ``β``, see `fly`.
+    """
+    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+    if walk.media is None:
+        return _on_surface(walk, at, si, False, active)
+    flight = fly(walk, at, sampler, β, active) if flight is None else flight
+    event = active & flight.event
+    mei = interaction(at.medium, dr.detach(at.ray), flight.t)
+    w = dr.select(event, flight.σ_s * dr.rcp(flight.density), 1) * flight.W
+    e = mi.Spectrum(0 if flight.E is None else flight.E)
+    return _in_medium(walk, at, si, mei, flight, w, e, False, active)
+
+
+def repeat(walk: Walk, at: Arrival, kept: Kept, attached: bool, active: mi.Bool) -> Vertex:
+    """Arrive once more, differentiably in emission and the coefficients of media.
+
+    If ``attached`` the hit point follows ``at.ray`` and the shape, and the emission's MIS weight ``at.pdf``.
+    """
+    with dr.suspend_grad(when=not attached):
+        si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+    if kept.media is None:
+        known = None if kept.known is None or attached else kept.known.glow
+        return _on_surface(walk, at, si, attached, active, known)
+    reach = dr.select(si.is_valid(), si.t, dr.inf)
+    flown = fly_again(walk, at, kept.media.flight, reach, attached, active)
+    return _in_medium(walk, at, si, flown.mei, kept.media.flight, flown.w, flown.e, attached, active)
+
+
+def _on_surface(
+    walk: Walk,
+    at: Arrival,
+    si: mi.SurfaceInteraction3f,
+    attached: bool,
+    active: mi.Bool,
+    glow: mi.Spectrum | None = None,
+) -> Vertex:
+    if glow is None:
+        seen = active & (~at.camera | si.is_valid()) if walk.hide_emitters else active
+        glow = emission(walk.scene, at, si, attached, seen)
+    return Vertex(si, si.bsdf(at.ray), active & si.is_valid(), si, glow)
+
+
+def _in_medium(
+    walk: Walk,
+    at: Arrival,
+    si: mi.SurfaceInteraction3f,
+    mei: mi.MediumInteraction3f,
+    flight: Flight,
+    w: mi.Spectrum,
+    e: mi.Spectrum,
+    attached: bool,
+    active: mi.Bool,
+) -> Vertex:
+    event = active & flight.event
+    bsdf, phase = si.bsdf(at.ray), at.medium.phase_function()
+    surface = active & ~event & si.is_valid()
+    through = surface & _is_null(bsdf)
+    seen = active & ~event
+    if walk.hide_emitters:
+        seen &= ~at.camera | si.is_valid()
+    origin = dr.zeros(mi.Interaction3f)
+    origin.t, origin.time, origin.wavelengths = mi.Float(0), at.ray.time, at.ray.wavelengths
+    origin.p = dr.select(event, mei.p, si.p)
+    origin.n = dr.select(event, 0, si.n)
+    inside = InMedium(event, through, mei, phase, flight, w, e)
+    return Vertex(si, bsdf, surface & ~through, origin, emission(walk.scene, at, si, attached, seen), inside)
+
+
+def _is_null(bsdf: mi.BSDFPtr) -> mi.Bool:
+    """True where light can only pass straight through."""
+    flags = bsdf.flags()
+    reflects = mi.has_flag(flags, mi.BSDFFlags.Smooth) | mi.has_flag(flags, mi.BSDFFlags.DeltaReflection)
+    return mi.has_flag(flags, mi.BSDFFlags.Null) & ~reflects & ~mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)

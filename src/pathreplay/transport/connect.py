@@ -1,0 +1,65 @@
+"""Connect: the next-event estimate, light of an emitter sample that a vertex scatters along the path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .arrive import Vertex
+from .emitters import draw_emitter, redraw_emitter
+from .scatter import towards
+from .shadow import shadow, shadow_again
+from .vertex import Kept, Numbers, Shadow, Walk, is_smooth, mis_weight
+
+
+@dataclass
+class Connection:
+    """An emitter sample, seen from a vertex."""
+
+    light: mi.DirectionSample3f
+    Le: mi.Spectrum  # its radiance over its density, with what is left of it on the way
+    lit: mi.Bool  # there is one, and nothing is in its way
+    shadow: Shadow = None  # type: ignore[assignment]  # not in scenes without media
+
+    def reaches(self, pdf: mi.Float, attached: bool) -> mi.Spectrum:
+        """What reaches the vertex (Spectrum), MIS weighted; ``pdf`` is that of sampling its direction there."""
+        mis = dr.select(self.light.delta, 1, mis_weight(self.light.pdf, pdf))
+        # A path that is held fixed needs no derivative of its weights: they sum to one whatever the parameters do.
+        return self.Le * (mis if attached else dr.detach(mis))
+
+
+def choose(walk: Walk, v: Vertex, medium: mi.MediumPtr, u: Numbers, sampler: mi.Sampler, go_on: mi.Bool) -> Connection:
+    """Draw an emitter sample, and with media a shadow ray in ``medium``, where something can scatter it. Detached."""
+    if v.inside is None:
+        lit = go_on & v.surface & is_smooth(v.bsdf)
+        light, Le = draw_emitter(walk.scene, v.origin, u.light, lit)
+        return Connection(light, Le, lit & (light.pdf != 0))
+    event = v.inside.event
+    lit = go_on & (v.surface | event)
+    lit &= dr.select(event, medium.use_emitter_sampling(), is_smooth(v.bsdf))
+    light, Le = draw_emitter(walk.scene, v.origin, u.light, lit, visible=False)
+    lit &= light.pdf != 0
+    dark = shadow(walk, v.origin, light, shadow_start(v, light, medium), sampler, lit)
+    return Connection(light, Le * dark.T, lit & dr.any(dark.T != 0), dark)
+
+
+def shadow_start(v: Vertex, light: mi.DirectionSample3f, medium: mi.MediumPtr) -> mi.MediumPtr:
+    """What a shadow ray starts in, where the path came through ``medium``."""
+    return dr.select(v.surface & v.si.is_medium_transition(), v.si.target_medium(light.d), medium)
+
+
+def repeat(walk: Walk, v: Vertex, u: Numbers, ctx: mi.BSDFContext, kept: Kept, attached: bool) -> mi.Spectrum:
+    """The part of e that the kept emitter sample brings (Spectrum), differentiably.
+
+    If ``attached`` the point on the emitter follows the emitter. Visibility is not differentiated.
+    """
+    if kept.known is not None and not attached:
+        f = v.bsdf.eval(ctx, v.si, v.si.to_local(kept.known.d), kept.lit)
+        return dr.select(kept.lit, f * kept.known.w, 0)
+    light, Le = redraw_emitter(walk, v.origin, u.light, kept.light, attached, kept.lit)
+    if kept.media is not None:
+        Le *= shadow_again(walk, v.origin, light, kept.media.shadow, attached, kept.lit)
+    f, pdf = towards(v, ctx, light.d, kept.lit)
+    return dr.select(kept.lit, f * Connection(light, Le, kept.lit).reaches(pdf, attached), 0)

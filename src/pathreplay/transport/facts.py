@@ -1,0 +1,71 @@
+"""Facts about a scene: what it consists of is found once, and what of it has gradients is looked up in every pass."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mitsuba as mi
+
+from .media import Media, scene_media
+from .traits import INSTANCE, MASK, Tables, Traits, fixed_traits, is_null, nodes_of, with_gradients
+from .velocity import blend_lengths
+
+
+class SceneFacts:
+    """Of one scene.
+
+    It holds objects of the scene, so that none can take their place in memory unseen, but not the scene itself: who
+    has the facts may be owned by the scene. While they are kept, so are those objects.
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        nodes = nodes_of(scene)
+        self._parts = _parts(scene)
+        self._traits = fixed_traits(nodes, scene)
+        self._shapes = [node for node in nodes if isinstance(node, mi.Shape)]
+        self._boxes = [shape.bbox() for shape in self._shapes]
+        self._emitters = [*scene.emitters(), *(shape for shape in self._shapes if shape.is_emitter())]
+        self._lamps = [shape for shape in self._shapes if shape.is_mesh() and shape.is_emitter()]
+        self._instances = [shape for shape in self._shapes if shape.class_name() == INSTANCE]
+        bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
+        self._masks = [bsdf for bsdf in bsdfs if bsdf.class_name() == MASK]
+        self._passes = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_null(bsdf) for bsdf in bsdfs)
+        self._media = [node for node in nodes if isinstance(node, mi.Medium)]
+
+    def are_about(self, scene: mi.Scene) -> bool:
+        """Whether the scene is the one that they were found of, with the same BSDFs on its shapes."""
+        parts = _parts(scene)
+        return len(parts) == len(self._parts) and all(a is b for a, b in zip(parts, self._parts, strict=True))
+
+    @property
+    def has_media(self) -> bool:
+        return bool(self._media)
+
+    def media(self, sensor: mi.Sensor | None) -> Media | None:
+        """What the walk wants to know of media now; ``sensor`` (or None) may be in one."""
+        return scene_media(self._media, self._passes, sensor)
+
+    def traits(self, tables: Tables | None = None) -> Traits:
+        """What the drivers want to know now; ``tables`` are those of this scene, where they cannot be made."""
+        return replace(
+            self._traits,
+            tables=self._tables() if tables is None else tables,
+            lights_deform=any(with_gradients(lamp, "vertex_positions") for lamp in self._lamps),
+            instances_move=any(with_gradients(instance, "to_world") for instance in self._instances),
+            opacity_moves=any(with_gradients(mask, "opacity") for mask in self._masks),
+            lights_vary=any(map(with_gradients, self._emitters)),
+        )
+
+    def _tables(self) -> Tables:
+        """Made anew when shapes have changed their sizes."""
+        boxes = [shape.bbox() for shape in self._shapes]
+        if boxes != self._boxes:
+            tables = replace(self._traits.tables, blend_lengths=blend_lengths(self._shapes))
+            self._traits, self._boxes = replace(self._traits, tables=tables), boxes
+        return self._traits.tables
+
+
+def _parts(scene: mi.Scene) -> list[mi.Object]:
+    """Objects that no two scenes share all of, and all that can be exchanged."""
+    shapes = scene.shapes()
+    return [*scene.sensors(), *scene.emitters(), *shapes, *(shape.bsdf() for shape in shapes)]

@@ -1,0 +1,240 @@
+"""Scatter: the continuation of a path at a surface or a particle, its weight, and the derivatives of both.
+
+A first walk samples a lobe; later passes follow the choice. A smooth lobe is differentiated as f/p at a held place: the
+point where the continuation hit the next surface, which moves with that surface, or its direction (see `velocity`). A
+delta lobe is differentiated through its direction. With ``attach='all'`` so are the smooth lobes of BSDFs for which
+that is right, and where nothing has an outline the narrow ones in any case.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from .arrive import Vertex
+from .velocity import moved_direction
+from .vertex import Arrival, Kept, Numbers, Walk, is_smooth, reciprocal
+
+# Share by which the weight of a lobe sampled alone may differ from the weight that was drawn (and squared distance of
+# their directions) and still belong to the same lobe: float32 rounding is far below it, BSDFs without support for
+# restricted sampling (`mask`) far above.
+SAME_LOBE = 1e-3
+
+# Density in its centre above which a lobe is narrow: that of a diffuse lobe. A held lobe has noise in proportion to the
+# slope of its logarithm, a followed one to that of the light; docs/gradients.md has the variances by roughness.
+NARROW = 1 / dr.pi
+
+
+@dataclass
+class Sampled:
+    """What a first walk sampled at a vertex, and what the vertex scatters from the direction of the emitter sample."""
+
+    f: mi.Spectrum  # value for the direction of the emitter sample
+    pdf_light: mi.Float  # density of sampling that direction
+    d: mi.Vector3f  # direction of the continuation, world space
+    w: mi.Spectrum  # its weight
+    pdf: mi.Float
+    delta: mi.Bool
+    null: mi.Bool  # it passes straight through
+    black: mi.Bool  # a surface's weight was zero in all channels
+    lobe: mi.UInt32
+    eta: mi.Float
+    active: mi.Bool  # there is a continuation
+
+
+def choose(
+    walk: Walk,
+    v: Vertex,
+    at: Arrival,
+    u: Numbers,
+    ctx: mi.BSDFContext,
+    light_d: mi.Vector3f,
+    lit: mi.Bool,
+    go_on: mi.Bool,
+) -> Sampled:
+    """Sample the continuation, and evaluate the vertex for the direction of the emitter sample. Detached.
+
+    ``ctx`` has the transport mode, and the lobe where it is to be a given one.
+    """
+    at_surface = go_on & v.surface
+    if v.inside is not None and walk.media.passes:
+        at_surface |= v.surface & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.Null)
+    f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(
+        ctx, v.si, v.si.to_local(light_d), u.lobe, u.direction, at_surface
+    )
+    sampled = Sampled(
+        f=f,
+        pdf_light=pdf_light,
+        d=v.si.to_world(sample.wo),
+        w=w,
+        pdf=sample.pdf,
+        delta=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta),
+        null=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null),
+        black=dr.all(w == 0),
+        lobe=sample.sampled_component,
+        eta=sample.eta,
+        active=at_surface,
+    )
+    return sampled if v.inside is None else _in_medium(v, at, u, light_d, lit, go_on, sampled)
+
+
+def _in_medium(
+    v: Vertex, at: Arrival, u: Numbers, light_d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool, surface: Sampled
+) -> Sampled:
+    """The same where the vertex may be a particle or a null boundary instead of a ``surface``."""
+    event, through, phase, ctx = v.inside.event, v.inside.through, v.inside.phase, mi.PhaseFunctionContext(None)
+    f, pdf_light = phase.eval_pdf(ctx, v.inside.mei, light_d, lit & event)
+    wo, w, pdf = phase.sample(ctx, v.inside.mei, u.lobe, u.direction, go_on & event)
+    null = through | (v.surface & surface.null)
+    bounce = go_on & (v.surface | event) & (~event | (pdf > 0))
+    return replace(
+        surface,
+        f=dr.select(event, f, surface.f),
+        pdf_light=dr.select(event, pdf_light, surface.pdf_light),
+        d=dr.select(event, wo, dr.select(through, at.ray.d, surface.d)),
+        w=dr.select(event, dr.select(pdf > 0, w, 0), dr.select(through, 1, surface.w)),
+        pdf=dr.select(event, pdf, dr.select(through, 1, surface.pdf)),
+        delta=dr.select(event, ~at.medium.use_emitter_sampling(), surface.delta),
+        null=null,
+        lobe=dr.select(v.surface, surface.lobe, 0),
+        eta=dr.select(v.surface, surface.eta, 1),
+        active=bounce | null,
+    )
+
+
+def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
+    """What the vertex scatters from the world direction ``d`` (Spectrum), and the density of sampling it there."""
+    surface = active if v.inside is None else active & v.surface
+    f, pdf = v.bsdf.eval_pdf(ctx, v.si, v.si.to_local(d), surface)
+    if v.inside is None:
+        return f, pdf
+    event = v.inside.event
+    f_medium, pdf_medium = v.inside.phase.eval_pdf(mi.PhaseFunctionContext(None), v.inside.mei, d, active & event)
+    return dr.select(event, f_medium, f), dr.select(event, pdf_medium, pdf)
+
+
+def repeat(
+    walk: Walk,
+    v: Vertex,
+    at: Arrival,
+    u: Numbers,
+    ctx: mi.BSDFContext,
+    kept: Kept,
+    attached: bool,
+    hit_next: mi.PreliminaryIntersection3f,
+    go_on: mi.Bool,
+) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
+    """Weight w (Spectrum), world direction and density (Float) of the kept continuation, differentiably.
+
+    ``hit_next`` is where it went. Not differentiated: the choice among lobes and, unless ``attached``, direction and
+    density.
+    """
+    w, d, pdf = _at_surface(walk, v, u, ctx, kept, attached, hit_next, go_on & v.surface)
+    if v.inside is None:
+        return w, d, pdf
+    event, through = v.inside.event, v.inside.through
+    w_medium, d_medium, pdf_medium = _at_particle(walk, v, kept, attached, hit_next, go_on & event)
+    d = dr.select(event, d_medium, dr.select(through, at.ray.d, d))
+    pdf = dr.select(event, pdf_medium, dr.select(kept.media.null, at.pdf, pdf))
+    return dr.select(event, w_medium, dr.select(through, 1, w)), d, pdf
+
+
+def _at_surface(
+    walk: Walk,
+    v: Vertex,
+    u: Numbers,
+    ctx: mi.BSDFContext,
+    kept: Kept,
+    attached: bool,
+    hit_next: mi.PreliminaryIntersection3f,
+    active: mi.Bool,
+) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
+    bsdf, si = v.bsdf, v.si
+    smooth = active & ~kept.delta
+    d, J = kept.d, mi.Float(1)
+    if attached:
+        d, J = moved_direction(walk.traits.tables.blend_lengths, si, kept.d, hit_next, smooth)
+
+    if walk.resamples:
+        sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
+        if attached:
+            free = _followed(walk, v, u, ctx, smooth)
+            follows = free | (active & kept.delta)
+            d = dr.select(follows, dr.replace_grad(kept.d, si.to_world(sample.wo)), d)
+            J = dr.select(follows, 1, J)
+
+    wo = si.to_local(d)
+    if attached:
+        f, pdf = bsdf.eval_pdf(ctx, si, wo, smooth)
+        pdf = dr.replace_grad(kept.pdf, dr.select(smooth, pdf, 0))
+    else:
+        f, pdf = bsdf.eval(ctx, si, wo, smooth), kept.pdf
+    w = f * J * dr.detach(reciprocal(kept.pdf))
+    # A sample that failed (`roughdielectric` may reflect to the far side) has weight zero whatever f is there; a black
+    # BSDF has weight zero because f is, and keeps its derivative.
+    w = dr.select(kept.black & dr.any(dr.detach(f) != 0), 0, w)
+
+    if attached and walk.resamples:
+        w = dr.select(free, w_sample, w)
+    if walk.traits.lobes > 0:
+        delta = active & kept.delta
+        w = dr.select(delta, _delta_weight(walk, v, u, ctx, kept, w_sample, delta), w)
+    return w, d, pdf
+
+
+def _followed(walk: Walk, v: Vertex, u: Numbers, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:
+    """Which smooth lobes are sampled attached: decided by what the lobe is, never by the direction drawn."""
+    if not walk.follows:
+        return mi.Bool(False)
+    index = dr.reinterpret_array(mi.UInt32, v.bsdf)
+    table = walk.traits.tables.attachable
+    free = active & dr.gather(mi.Bool, table, index, active & (index < dr.width(table)))
+    if walk.attach == "all":
+        return free
+    centre, _ = v.bsdf.sample(ctx, dr.detach(v.si), u.lobe, mi.Point2f(0.5), free)
+    return free & (dr.detach(centre.pdf) > NARROW)
+
+
+def _delta_weight(
+    walk: Walk, v: Vertex, u: Numbers, ctx: mi.BSDFContext, kept: Kept, w: mi.Spectrum, active: mi.Bool
+) -> mi.Spectrum:
+    """Weight of a sampled delta lobe, with the derivative of (weight of the lobe alone) / (probability of its choice).
+
+    A BSDF that picks among lobes returns weights in which the choice has cancelled, and with it, in some plugins,
+    the derivative of Fresnel's term (``thindielectric``, ``plastic``). So the lobe is sampled once more by itself,
+    through ``BSDFContext.component``, and divided by the probability with which it was picked. Where a plugin does
+    not support that (weights or directions disagree) its own derivative stays.
+    """
+    drawn = dr.detach(w)
+    missing = mi.Bool(active)
+    for k in range(walk.traits.lobes):
+        alone = mi.BSDFContext(ctx.mode)
+        alone.component = k
+        # The lobes of a surface's back are counted from zero, too, but asked for after those of the front.
+        picked = missing if walk.traits.two_sides else missing & (kept.lobe == k)
+        sample, w_k = v.bsdf.sample(alone, v.si, u.lobe, u.direction, picked)
+        w_k *= dr.detach(reciprocal(kept.pdf))
+        same = picked & (dr.squared_norm(dr.detach(sample.wo) - v.si.to_local(kept.d)) < SAME_LOBE)
+        same &= dr.all(dr.abs(dr.detach(w_k) - drawn) <= SAME_LOBE * dr.abs(drawn))
+        w = dr.select(same, w_k, w)
+        missing &= ~same
+    return w
+
+
+def _at_particle(
+    walk: Walk, v: Vertex, kept: Kept, attached: bool, hit_next: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
+    """The direction is held as on surfaces, towards the next surface point, but only where that matters: where the
+    surface scatters or emits, and so may have seams and edges. Otherwise it is fixed in space, which is less noisy.
+    """
+    d, J = kept.d, mi.Float(1)
+    if attached:
+        shape = hit_next.shape
+        seen = is_smooth(shape.bsdf()) | (shape.emitter() != None)  # noqa: E711 (an array of pointers)
+        found = active & hit_next.is_valid() & seen
+        d, J = moved_direction(walk.traits.tables.blend_lengths, v.origin, kept.d, hit_next, found)
+    f, pdf = v.inside.phase.eval_pdf(mi.PhaseFunctionContext(None), v.inside.mei, d, active)
+    pdf = dr.replace_grad(kept.pdf, dr.select(active, pdf, 0)) if attached else kept.pdf
+    return f * J * dr.detach(reciprocal(kept.pdf)), d, pdf

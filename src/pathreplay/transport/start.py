@@ -1,0 +1,47 @@
+"""Start: where a path begins, the camera ray, and its first arrival."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .vertex import Arrival, Walk
+
+
+@dataclass
+class CameraStart:
+    """Paths that begin with camera rays. The rays are the differentiable function whose adjoint is q_0."""
+
+    ray: mi.Ray3f  # attached to the camera, if that has gradients
+
+    def choose(self, walk: Walk, active: mi.Bool) -> Arrival:
+        """The first arrival along the rays, detached; ``hide_emitters`` makes area emitters transparent."""
+        ray = mi.Ray3f(dr.detach(self.ray))
+        hit = walk.scene.ray_intersect_preliminary(ray, coherent=True, reorder=False, active=active)
+        if walk.hide_emitters:
+            hit = behind_emitters(walk, ray, hit, active)
+        at = Arrival(ray=ray, hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
+        if walk.media is not None:
+            around = walk.media.around
+            at.medium = dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)
+            at.behind = mi.Float(0)
+        return at
+
+    def repeat(self) -> tuple[mi.Point3f, mi.Vector3f]:
+        """Origin and direction once more, differentiably."""
+        return self.ray.o, self.ray.d
+
+
+def behind_emitters(
+    walk: Walk, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> mi.PreliminaryIntersection3f:
+    """The hit, or what lies behind the area emitters that were hit; distances are told along ``ray``."""
+    passed = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
+    si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, passed)
+    onward = si.spawn_ray(ray.d)
+    behind = walk.skip_area_emitters(walk.scene, onward, True, passed)
+    behind.t += dr.norm(onward.o - ray.o)
+    hit[passed] = behind
+    return hit

@@ -1,0 +1,192 @@
+"""The step and the sweep's way back: repeated is as chosen, modes and lobes reach the BSDF, signatures tell edges."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from media_scenes import constant, grid
+from pathreplay.gradient.adjoint import LostPaths, RayDerivative
+from pathreplay.gradient.record import Layout, record_type, room_for
+from pathreplay.gradient.two_walks import first_walk, walk_back
+from pathreplay.transport.motion import path_moves
+from pathreplay.transport.path import PathState
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.step import choose_step, repeat_step
+from pathreplay.transport.vertex import Numbers, Walk
+
+LANES = 256
+GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
+MIRROR = {"type": "conductor", "specular_reflectance": {"type": "spectrum", "value": 0.8}}
+
+
+def scene(bsdf: dict[str, Any], **more: Any) -> mi.Scene:
+    """A square at z = 0 under a sky and a point light."""
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.4, 0.7, 1.0]}}
+    light = {"type": "point", "position": [1, 2, 3], "intensity": {"type": "rgb", "value": 5.0}}
+    square = {"type": "rectangle", "bsdf": bsdf}
+    return mi.load_dict({"type": "scene", "sky": sky, "light": light, "square": square, **more}, optimize=False)
+
+
+def fog(bsdf: dict[str, Any]) -> mi.Scene:
+    medium = {"type": "heterogeneous", "sigma_t": grid(constant(0.8)), "albedo": 0.7}
+    cube = {"type": "cube", "bsdf": {"type": "null"}, "interior": medium}
+    return scene(bsdf, cube=cube)
+
+
+def walk_of(scene: mi.Scene, **properties: Any) -> Walk:
+    return mi.load_dict({"type": "pathreplay", **properties})._walk(scene, None)
+
+
+def sampler() -> mi.Sampler:
+    made = mi.load_dict({"type": "independent"})
+    made.seed(3, LANES)
+    return made
+
+
+def rays(spread: float = 0.9) -> mi.Ray3f:
+    """Downwards onto the square, from all over it."""
+    rng = np.random.default_rng(0)
+    x, y = (mi.Float(rng.uniform(-spread, spread, LANES)) for _ in range(2))
+    return mi.Ray3f(mi.Point3f(x, y, 0.5), dr.normalize(mi.Vector3f(0.1 * y, 0.2, -1)))
+
+
+def first_step(walk: Walk, ctx: mi.BSDFContext | None = None) -> tuple[Any, Any, Any]:
+    """An arrival, the numbers, and the step that they choose."""
+    on = mi.Bool(True)
+    at, drawn = CameraStart(rays()).choose(walk, on), sampler()
+    if walk.media is not None:
+        at.medium = mi.MediumPtr(next(filter(None, (shape.interior_medium() for shape in walk.scene.shapes()))))
+    u = Numbers.draw(drawn)
+    return at, u, choose_step(walk, at, u, drawn, mi.Spectrum(1), on, on, ctx=ctx)
+
+
+@pytest.mark.parametrize("attached", [False, True])
+@pytest.mark.parametrize(
+    "world",
+    [
+        lambda: scene({"type": "roughplastic"}),
+        lambda: scene(GLASS),
+        lambda: fog({"type": "diffuse"}),
+        lambda: fog({"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}}),
+    ],
+    ids=["plastic", "glass", "fog", "fog before gauze"],
+)
+def test_a_repeated_step_is_the_chosen_one(world: Any, attached: bool) -> None:
+    walk = walk_of(world())
+    with dr.suspend_grad():
+        at, u, chosen = first_step(walk)
+        hit_next = walk.scene.ray_intersect_preliminary(chosen.ray_next)
+        again = repeat_step(walk, at, u, chosen.kept, chosen.active, mi.Bool(True), attached, hit_next)
+    for name in ("e", "w"):
+        assert np.allclose(getattr(again, name), getattr(chosen, name), rtol=1e-4, atol=1e-6), name
+    goes_on = np.array(chosen.active)
+    assert goes_on.any()
+    for name in ("o", "d"):
+        a, b = (np.array(getattr(step.ray_next, name))[:, goes_on] for step in (again, chosen))
+        assert np.allclose(a, b, atol=1e-5), name
+    for name in ("met", "shape", "lobe"):
+        assert np.array_equal(getattr(again.signature, name), getattr(chosen.signature, name)), name
+    if walk.media is not None:
+        event = np.array(chosen.kept.media.flight.event)
+        assert 0.1 < event.mean() < 0.9  # both kinds of vertices
+        assert (np.array(chosen.signature.shape)[event] == 0).all()
+
+
+def test_the_transport_mode_reaches_the_bsdf() -> None:
+    """Radiance is squeezed on the way into glass, by the square of the index; importance is not."""
+    walk = walk_of(scene(GLASS))
+    weights = {}
+    with dr.suspend_grad():
+        for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
+            ctx = mi.BSDFContext(mode)
+            at, u, chosen = first_step(walk, ctx)
+            again = repeat_step(walk, at, u, chosen.kept, chosen.active, mi.Bool(True), ctx=ctx)
+            through = np.array(chosen.ray_next.d.z) < 0
+            weights[mode] = np.array(chosen.w)[:, through]
+            assert np.allclose(np.array(again.w)[:, through], weights[mode], rtol=1e-4)
+    assert through.any()
+    squeezed = weights[mi.TransportMode.Radiance] / weights[mi.TransportMode.Importance]
+    assert np.allclose(squeezed, 1 / 1.5**2, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("lobe", "down"), [(0, False), (1, True)])
+def test_a_lobe_can_be_asked_for(lobe: int, down: bool) -> None:
+    walk, ctx = walk_of(scene(GLASS)), mi.BSDFContext()
+    ctx.component = lobe
+    with dr.suspend_grad():
+        at, u, chosen = first_step(walk, ctx)
+        again = repeat_step(walk, at, u, chosen.kept, chosen.active, mi.Bool(True), ctx=ctx)
+    assert np.array_equal(np.array(chosen.ray_next.d.z) < 0, np.full(LANES, down))
+    assert (np.array(chosen.signature.lobe) == lobe).all()
+    assert np.allclose(again.w, chosen.w, rtol=1e-4)
+
+
+def test_signatures_tell_the_edge_of_a_shape() -> None:
+    ball = {"type": "sphere", "radius": 0.4}
+    walk = walk_of(scene({"type": "diffuse"}, ball=ball))
+    down = mi.Ray3f(mi.Point3f(mi.Float([0, 0.39, 0.41, 5]), 0, 2), mi.Vector3f(0, 0, -1))
+    with dr.suspend_grad():
+        at, drawn = CameraStart(down).choose(walk, mi.Bool(True)), mi.load_dict({"type": "independent"})
+        drawn.seed(0, 4)
+        step = choose_step(walk, at, Numbers.draw(drawn), drawn, mi.Spectrum(1), mi.Bool(True), mi.Bool(True))
+    shape = np.array(step.signature.shape)
+    assert shape[0] == shape[1] != shape[2]
+    assert list(step.signature.met) == [True, True, True, False]
+
+
+# ------------------------------ The way back, with something given beyond ------------------------------
+
+
+def back(scene: mi.Scene, L: float, q: RayDerivative, δL: float) -> mi.Spectrum:
+    """Paths onto the square, taken back from the ray that left it, along which comes ``L`` with the adjoint ``q``."""
+    walk = walk_of(scene, max_depth=2)
+    with dr.suspend_grad():
+        ray = mi.Ray3f(rays().o, mi.Vector3f(0, 0, -1))
+        start, on = CameraStart(ray), mi.Bool(True)
+        at = start.choose(walk, on)
+        layout = Layout.of(walk, path_moves(walk, start, at))
+        records = dr.alloc_local(record_type(layout), room_for(walk))
+        path, lost, first = PathState.begin(at, on, sustained=True), LostPaths(), mi.UInt32(0)
+        records, count, _, _ = first_walk(walk, sampler(), path, layout, records, first, lost)
+        given = mi.Spectrum(δL), mi.Spectrum(L), q
+        L, _ = walk_back(walk, layout, records, first, mi.UInt32(1), count - 1, at.ray, *given, lost)
+        dr.eval(L)
+    return L
+
+
+def test_a_given_radiance_comes_back() -> None:
+    """δL ρ L from a mirror: its derivative by ρ is L, and ρ L plus nothing (a mirror glows not) comes back."""
+    world = scene(MIRROR)
+    params = mi.traverse(world)
+    dr.enable_grad(params["square.bsdf.specular_reflectance.value"])
+    params.update()
+    L = back(world, 2.0, RayDerivative.zero(), 1.0)
+    assert np.allclose(L, 1.6, rtol=1e-5)
+    found = dr.grad(params["square.bsdf.specular_reflectance.value"])
+    assert np.allclose(found, 3 * 2.0 * LANES, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("adjoint", "move", "expected"),
+    [
+        ({"o": [0, 0, 1]}, lambda t: mi.Transform4f().translate(mi.Vector3f(0, 0, t)), 1.0),
+        # Turned by t, the mirror turns the ray by 2t about the same axis: d = (sin 2t, 0, cos 2t).
+        ({"d": [1, 0, 0]}, lambda t: mi.Transform4f().rotate([0, 1, 0], dr.rad2deg(t)), 2.0),
+    ],
+    ids=["origin", "direction"],
+)
+def test_a_given_ray_adjoint_goes_back(adjoint: dict[str, Any], move: Any, expected: float) -> None:
+    world = scene(MIRROR)
+    params = mi.traverse(world)
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    params["square.to_world"] = move(t)
+    params.update()
+    q = RayDerivative(mi.Point3f(adjoint.get("o", 0)), mi.Vector3f(adjoint.get("d", 0)), mi.Float(0))
+    back(world, 0.0, q, 0.0)
+    assert np.allclose(dr.grad(t), expected * LANES, rtol=1e-4)
