@@ -27,49 +27,8 @@ from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 from .adjoint import LostPaths, RayDerivative
-from .record import MAX_DEPTH, Layout, record_type, room_for
+from .record import Layout, record_type, room_for
 from .two_walks import first_walk, walk_back
-
-
-def fits(max_depth: int, spp: int) -> bool:
-    """Whether there are two paths or more, and the record of a lane can hold all of them."""
-    return 1 < spp <= MAX_DEPTH // max(max_depth, 1)
-
-
-def sweepable(sensor: mi.Sensor, max_depth: int, spp: int) -> bool:
-    """Whether pixels of a sensor can be swept: a box filter, so that each path belongs to one pixel; colours (rgb) and
-    no alpha; an independent sampler; a camera that stands still and takes no time; two paths or more (``spp``), all of
-    which fit into the record of a lane."""
-    film = sensor.film()
-    film.prepare([])
-    with dr.resume_grad():
-        ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
-    return bool(
-        film.rfilter().is_box_filter()
-        and mi.is_rgb
-        and not mi.has_flag(film.flags(), mi.FilmFlags.Special)
-        and film.bitmap().pixel_format() == mi.Bitmap.PixelFormat.RGB
-        and sensor.sampler().class_name() == "IndependentSampler"
-        and sensor.shutter_open_time() == 0
-        and not dr.grad_enabled(ray.o, ray.d)
-        and fits(max_depth, spp)
-    )
-
-
-def pixel_camera(sensor: mi.Sensor, pixel: mi.UInt32) -> Callable[..., Any]:
-    """Rays through random places of pixels (UInt32, row by row): (sampler, active) -> Ray3f and weight (Spectrum).
-
-    As in Mitsuba's RBIntegrator. Detached.
-    """
-    width, height = sensor.film().crop_size()
-    corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
-
-    def camera(sampler: mi.Sampler, active: mi.Bool) -> tuple[mi.Ray3f, mi.Spectrum]:
-        place = (corner + sampler.next_2d(active)) / mi.Point2f(width, height)
-        aperture = sampler.next_2d(active) if sensor.needs_aperture_sample() else mi.Point2f(0)
-        return sensor.sample_ray(sensor.shutter_open(), 0.0, place, aperture, active)
-
-    return camera
 
 
 @dataclass(frozen=True)
@@ -96,7 +55,8 @@ def pixel_sweep(
 ) -> tuple[bool, mi.Spectrum]:
     """Walk ``paths`` paths (two or more) in every lane and back-propagate the loss.
 
-    Returns whether the paths move with the parameters, and the mean of their radiances. ``camera`` is a `pixel_camera`.
+    Returns whether the paths move with the parameters, and the mean of their radiances. ``camera`` gives
+    rays, detached, and their weights: (sampler, active) -> (Ray3f, Spectrum).
     For scenes without media. What is not differentiated, what is counted as ``lost`` and what is raised: see `sweep`.
     """
     room = room_for(walk)

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
-from ..gradient.pixel_sweep import PixelLoss, fits, sweepable
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
 from ..transport.facts import SceneFacts
@@ -19,6 +18,7 @@ from .camera_pass import Pass
 from .diagnostics import Diagnostics, doubts, lost_note, missing_edges, used_before_note
 from .interior import PathReplay
 from .path_integrator import UNBOUNDED, path_integrator
+from .pixels import pixel_loss, sweepable
 from .properties import choice, deviation
 from .term import Found
 
@@ -49,23 +49,6 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
     if auto:
         driver = "sweep" if max_depth <= MAX_DEPTH else "replay"
     return PathReplay(driver, auto, branch, recovery)
-
-
-def _pixel_loss(view: Pass, max_depth: int, offset: mi.TensorXf, slope: mi.TensorXf) -> PixelLoss:
-    """The loss by each lane's pixel. Raises PathreplayError where the pass or the tensors do not allow it."""
-    if not fits(max_depth, view.spp):
-        raise PathreplayError(
-            f"pathreplay: {view.spp} samples per pixel, of {max_depth} vertices, cannot be swept: use "
-            f"2 or more, and at most {MAX_DEPTH} vertices in all, or mi.render"
-        )
-    width, height = view.size
-    for tensor in (offset, slope):
-        if tensor.shape != (height, width, 3):
-            raise PathreplayError(
-                f"pathreplay: derivative of the loss has shape {tensor.shape}: use {(height, width, 3)}"
-            )
-    pixel = dr.arange(mi.UInt32, width * height)
-    return PixelLoss(*(dr.gather(mi.Color3f, tensor.array, pixel) for tensor in (offset, slope)))
 
 
 def _make_class() -> type:
@@ -124,7 +107,7 @@ def _make_class() -> type:
             number of samples does not, or a tensor has another shape.
             """
             with self._passing(scene, sensor, seed, spp) as view, dr.isolate_grad():
-                loss = _pixel_loss(view, self.max_depth, offset, slope)
+                loss = pixel_loss(view, self.max_depth, offset, slope)
                 walk = self._walk(scene, view.sensor)
                 self._learned(view, walk)
                 found = self.interior.pixels(view, walk, loss)
