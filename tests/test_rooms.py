@@ -1,0 +1,233 @@
+"""The rooms of the source: who may use whom, where differentiation is called, and how large things are."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import pathreplay
+from test_architecture import FLOOR, backward, world
+
+SOURCE = Path(pathreplay.__file__).parent
+#: The files at the top, but for `cli.py`.
+FILES = "files"
+#: Each room, and the rooms that it may use. Nobody uses `cli` or `rivals`.
+ALLOWED: dict[str, set[str]] = {
+    "cli": {"inverse", "check", "scenes", FILES},
+    "inverse": {"render", "scenes", "media", FILES},
+    "check": {"render", "scenes", FILES},
+    "rivals": {"render", "gradient", "transport", FILES},
+    "render": {"gradient", "transport", "scenes", FILES},
+    "gradient": {"transport", FILES},
+    "transport": {FILES},
+    "scenes": {"media", FILES},
+    "media": {FILES},
+    "bsdfs": {FILES},
+    FILES: set(),
+}
+#: Arrows of today that ALLOWED has not. Every one has to go; nothing is to be added.
+EXCEPTIONS = {("inverse", "transport")}
+#: Closures that make a plugin's class, on the base class of a variant: their methods are looked at one by one.
+CLASS_MAKERS = {"_plugin_class", "_make_class", "_make_classes", "path_integrator"}
+#: Each driver, and the file of its own.
+DRIVERS = {
+    "sweep": "gradient/sweep.py",
+    "replay": "gradient/replay.py",
+    "replay_attached": "gradient/replay_attached.py",
+    "pixel_sweep": "gradient/pixel_sweep.py",
+    "forward": "gradient/forward.py",
+    "primal": "gradient/primal.py",
+    "tape": "rivals/tape.py",
+    "radiative": "rivals/radiative.py",
+    "listing": "rivals/listing.py",
+}
+DRIVER_LINES, FUNCTION_LINES, ANYS = 120, 80, 60
+
+
+def module_of(path: Path) -> str:
+    parts = ["pathreplay", *path.relative_to(SOURCE).with_suffix("").parts]
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+TREES = {path: ast.parse(path.read_text()) for path in sorted(SOURCE.rglob("*.py"))}
+MODULES = {module_of(path): path for path in TREES}
+
+
+def room_of(path: Path) -> str:
+    first, *rest = path.relative_to(SOURCE).parts
+    return first if rest else "cli" if first == "cli.py" else FILES
+
+
+def imports(path: Path) -> Iterator[tuple[str, int]]:
+    """Our modules that a file imports, wherever in it (functions, TYPE_CHECKING), and the line."""
+    package = module_of(path).split(".")
+    package = package if path.stem == "__init__" else package[:-1]
+    for node in ast.walk(TREES[path]):
+        named: list[str] = []
+        if isinstance(node, ast.Import):
+            named = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            whole = ".".join([*base, *([node.module] if node.module else [])])
+            of_package = [f"{whole}.{alias.name}" for alias in node.names]
+            named = [name if name in MODULES else whole for name in of_package]
+        for name in named:
+            if name in MODULES and name != module_of(path):
+                yield name, node.lineno
+
+
+def arrows() -> Iterator[tuple[str, str, str]]:
+    """From which room to which other room, and where."""
+    for path in TREES:
+        for module, line in imports(path):
+            one, other = room_of(path), room_of(MODULES[module])
+            if one != other:
+                yield one, other, f"{path.relative_to(SOURCE)}:{line} imports {module}"
+
+
+def test_every_room_has_its_place() -> None:
+    assert {room_of(path) for path in TREES} == set(ALLOWED)
+
+
+def test_no_arrow_points_back_up() -> None:
+    found = [where for one, other, where in arrows() if other not in ALLOWED[one] and (one, other) not in EXCEPTIONS]
+    assert not found, "\n".join(found)
+
+
+def test_exceptions_are_needed() -> None:
+    """One that has gone is to be struck out, so that it does not come back."""
+    assert {(one, other) for one, other, _ in arrows() if other not in ALLOWED[one]} == EXCEPTIONS
+
+
+def test_what_is_allowed_has_no_circle() -> None:
+    order = list(TopologicalSorter(ALLOWED).static_order())
+    assert order[0] == FILES and order.index("transport") < order.index("gradient") < order.index("render")
+    assert not {"rivals", "cli"} & set().union(*ALLOWED.values())
+
+
+def test_no_circle_between_modules() -> None:
+    graph = {module_of(path): {module for module, _ in imports(path)} for path in TREES}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
+
+
+def test_only_entrances_name_modules_of_other_rooms_in_strings() -> None:
+    """What is imported by name at run time has no arrow in the graph."""
+    rooms = {module: room_of(path) for module, path in MODULES.items() if module != "pathreplay"}  # also a plugin
+    found = {
+        str(path.relative_to(SOURCE))
+        for path, tree in TREES.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and rooms.get(node.value, room_of(path)) != room_of(path)
+    }
+    assert found == {"__init__.py", "plugins.py"}
+
+
+# ------------------------------ One request ------------------------------
+
+
+def test_a_gradient_request_goes_down_and_up_again() -> None:
+    """All calls from room to room while a gradient is computed go down: whoever follows one meets each room once."""
+    calls: set[tuple[str, str]] = set()
+
+    def room(frame: FrameType | None) -> str | None:
+        while frame is not None:
+            path = Path(frame.f_code.co_filename)
+            if path in TREES:
+                return room_of(path)
+            frame = frame.f_back
+        return None
+
+    def look(frame: FrameType, event: str, _: Any) -> None:
+        if event == "call" and Path(frame.f_code.co_filename) in TREES:
+            one, other = room(frame.f_back), room(frame)
+            if one is not None and other is not None and one != other:
+                calls.add((one, other))
+
+    scene, before = world(), sys.getprofile()
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    sys.setprofile(look)
+    try:
+        gradient = backward(scene, integrator, FLOOR)
+    finally:
+        sys.setprofile(before)
+    assert np.abs(gradient).min() > 0
+    assert {("render", "gradient"), ("gradient", "transport")} <= calls
+    assert calls <= {(one, other) for one, others in ALLOWED.items() for other in others}
+
+
+# ------------------------------ Sizes ------------------------------
+
+
+def functions(node: ast.AST, path: Path) -> Iterator[tuple[str, str, int]]:
+    """Place, name and lines of every function below a node."""
+    for child in ast.walk(node):
+        if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            assert child.end_lineno is not None
+            place = f"{path.relative_to(SOURCE)}:{child.lineno} {child.name}"
+            yield place, child.name, child.end_lineno - child.lineno + 1
+
+
+def test_functions_are_short() -> None:
+    long = [
+        (place, name, lines)
+        for path, tree in TREES.items()
+        for place, name, lines in functions(tree, path)
+        if lines > FUNCTION_LINES
+    ]
+    assert not [place for place, name, _ in long if name not in CLASS_MAKERS]
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_a_drivers_own_file_is_short(name: str) -> None:
+    path = SOURCE / DRIVERS[name]
+    assert name in {node.name for node in TREES[path].body if isinstance(node, ast.FunctionDef)}
+    assert len(path.read_text().splitlines()) < DRIVER_LINES
+
+
+def test_types_are_real() -> None:
+    """How often it says `Any` in the rooms between a pass and Mitsuba; imports do not count."""
+    said = [
+        f"{path.relative_to(SOURCE)}:{node.lineno}"
+        for path, tree in TREES.items()
+        if room_of(path) in ("transport", "gradient", "render")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Name) and node.id == "Any"
+    ]
+    assert len(said) < ANYS, "\n".join(said)
+
+
+# ------------------------------ Differentiation ------------------------------
+
+
+def differentiates(node: ast.AST) -> bool:
+    """Whether it calls one of Dr.Jit's functions that propagate derivatives."""
+    called = node.func if isinstance(node, ast.Call) else None
+    if not (isinstance(called, ast.Attribute) and isinstance(called.value, ast.Name) and called.value.id == "dr"):
+        return False
+    return called.attr in ("enqueue", "traverse") or called.attr.startswith(("backward", "forward"))
+
+
+def test_differentiation_is_called_in_one_place() -> None:
+    """Within the rooms of light transport; `render/film.py` does it to the film, which Mitsuba differentiates."""
+    places = {
+        str(path.relative_to(SOURCE))
+        for path, tree in TREES.items()
+        if room_of(path) in ("transport", "gradient", "rivals", "render", "bsdfs", "media")
+        for node in ast.walk(tree)
+        if differentiates(node)
+    }
+    assert places == {"gradient/adjoint.py", "render/film.py"}
