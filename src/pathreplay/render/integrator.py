@@ -14,7 +14,7 @@ from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
 from ..transport.facts import SceneFacts
 from ..transport.vertex import Walk
-from .camera_pass import Pass
+from .camera_pass import Pass, Seed, Which
 from .diagnostics import Diagnostics, doubts, lost_note, missing_edges, used_before_note
 from .interior import PathReplay
 from .path_integrator import UNBOUNDED, path_integrator
@@ -83,7 +83,7 @@ def _make_class() -> type:
             self.untold = Diagnostics()  # of passes whose lost paths have not been told
             self.baseline: tuple[SceneFacts, Baseline] | None = None  # and the scene that it belongs to
 
-        def sweeps_pixels(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> bool:
+        def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0) -> bool:
             """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
             view = Pass.of(scene, sensor, 0, spp)
             if self.driver != "sweep" or not sweepable(view.sensor, self.max_depth, view.spp):
@@ -95,8 +95,8 @@ def _make_class() -> type:
             scene: mi.Scene,
             offset: mi.TensorXf,
             slope: mi.TensorXf,
-            sensor: int | mi.Sensor = 0,
-            seed: int | mi.UInt32 = 0,
+            sensor: Which = 0,
+            seed: Seed = 0,
             spp: int = 0,
         ) -> mi.TensorXf:
             """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
