@@ -171,7 +171,7 @@ def test_every_skeleton_is_tested() -> None:
 
 
 def conforms(given: Callable[..., Any], promised: Any) -> bool:
-    """Whether a function takes what a protocol promises (and more only by default), with its types."""
+    """Whether a function takes what a protocol promises, by these names and in this order, and more only by default."""
     wanted = inspect.signature(promised.__call__ if isinstance(promised, type) else promised)
     has = inspect.signature(given)
     names = [parameter for parameter in wanted.parameters.values() if parameter.name != "self"]

@@ -97,19 +97,19 @@ def test_a_forward_driver_differentiates_still_fog(name: str) -> None:
 
 @pytest.mark.parametrize("name", FOLLOW)
 def test_a_driver_tells_that_paths_move(name: str) -> None:
-    gradient, moves = driven(BACKWARD[name], world(block=block()), BLOCK)
+    gradient, moves = driven(BACKWARD[name], world(block=block()), BLOCK, max_depth=3)
     assert moves is True and sound(gradient)
 
 
 @pytest.mark.parametrize("name", FORWARD)
 def test_a_forward_driver_tells_that_paths_move(name: str) -> None:
-    tangent, _, moves = driven_forward(FORWARD[name], world(block=block()), BLOCK)
+    tangent, _, moves = driven_forward(FORWARD[name], world(block=block()), BLOCK, max_depth=3)
     assert moves is True and sound(tangent)
 
 
 def test_what_follows_nothing_says_that_nothing_moves() -> None:
     """Beside the block that moves there is paint, or nothing would reach the paths."""
-    gradient, moves = driven(radiative, world(block=block()), FLOOR, BLOCK)
+    gradient, moves = driven(radiative, world(block=block()), FLOOR, BLOCK, max_depth=3)
     assert moves is False and sound(gradient[:3]) and not gradient[3:].any()
 
 
