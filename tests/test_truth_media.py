@@ -33,7 +33,7 @@ from pathreplay.check.objective import Move
 from pathreplay.check.statistics import gap
 from pathreplay.check.stencil import UPWARD, WIDE
 from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
-from pathreplay.gradient.baseline import Cells
+from pathreplay.gradient.baseline import BaselineCells
 from truth import Case, add, hold, random, rgb, translate
 
 MEDIUM = "object.interior_medium."
@@ -226,7 +226,7 @@ class Fixed:
 
     def __init__(self, scene: mi.Scene, b: float) -> None:
         self.b, self.branching = b, dr.opaque(mi.Float, 0.2)
-        self.cells = Cells.of(scene.bbox())
+        self.cells = BaselineCells.of(scene.bbox())
 
     def look(self, *_: Any) -> Any:
         return mi.Spectrum(self.b)

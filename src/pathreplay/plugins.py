@@ -16,7 +16,7 @@ from pathreplay.errors import PathreplayError
 #: Each has `register() -> None`, which registers its plugins for the active variant; doing so again is harmless.
 PLUGIN_MODULES = (
     "pathreplay.render.integrator",
-    "pathreplay.rivals.plugins",
+    "pathreplay.rivals.integrators",
     "pathreplay.bsdfs.smoothdielectric",
     "pathreplay.media.gridmedium",
 )

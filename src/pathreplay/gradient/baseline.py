@@ -39,16 +39,16 @@ def _channels() -> int:
 
 
 @dataclass(frozen=True)
-class Cells:
+class BaselineCells:
     """The cells of position and direction, in a box that holds all media."""
 
     low: mi.ScalarPoint3f
     scale: mi.ScalarVector3f  # cells per unit of length
 
     @staticmethod
-    def of(box: mi.ScalarBoundingBox3f) -> Cells:
+    def of(box: mi.ScalarBoundingBox3f) -> BaselineCells:
         scale = mi.ScalarVector3f(*(CELLS / max(float(e), 1e-20) for e in box.extents()))
-        return Cells(mi.ScalarPoint3f(box.min), scale)
+        return BaselineCells(mi.ScalarPoint3f(box.min), scale)
 
     def index(self, p: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
         """Index of the first average of the cell."""
@@ -65,14 +65,14 @@ class Cells:
 class Seen:
     """What gradient passes saw of the media: sums, so that those of several passes or shards can be added."""
 
-    cells: Cells
+    cells: BaselineCells
     sums: mi.Float  # Σ weight·L in three channels and Σ weight, of each average
     nulls: mi.Float  # null collisions, in parts that float32 can hold
     paths: int  # that these collisions are of
     passes: frozenset[Hashable]  # keys of the passes
 
     @staticmethod
-    def none(cells: Cells, key: Hashable) -> Seen:
+    def none(cells: BaselineCells, key: Hashable) -> Seen:
         """For the pass with that key to begin with."""
         sums, nulls = dr.zeros(mi.Float, 4 * AVERAGES), dr.zeros(mi.Float, SLOTS)
         dr.make_opaque(sums, nulls)
@@ -118,7 +118,7 @@ class Baseline:
     is to count.
     """
 
-    cells: Cells
+    cells: BaselineCells
     sums: mi.Float  # those of `Seen`, of which older passes count less
     branching: mi.Float
     passes: frozenset[Hashable] = frozenset()  # keys of the passes that were learned from: none is its own judge
@@ -131,7 +131,7 @@ class Baseline:
     @staticmethod
     def fresh(box: mi.ScalarBoundingBox3f) -> Baseline:
         """Nothing is known yet of what is in the box."""
-        return Baseline(Cells.of(box), dr.zeros(mi.Float, 4 * AVERAGES), mi.Float(FIRST_BRANCHING))
+        return Baseline(BaselineCells.of(box), dr.zeros(mi.Float, 4 * AVERAGES), mi.Float(FIRST_BRANCHING))
 
     def look(self, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool) -> mi.Spectrum:
         """The guess at an interaction, for radiance that travels along -mei.wi; σ̄ is the majorant."""
@@ -163,7 +163,7 @@ class Baseline:
                 "start the job from its config"
             )
         sums, branching = (mi.Float(np.array(learned[name], np.float32)) for name in ("sums", "branching"))
-        return Baseline(Cells.of(box), sums, branching)
+        return Baseline(BaselineCells.of(box), sums, branching)
 
 
 def _averages(sums: mi.Float) -> mi.Float:

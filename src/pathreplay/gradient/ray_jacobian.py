@@ -82,7 +82,7 @@ class Slope:
 
 
 @dataclass
-class Local:
+class Linearised:
     """A step linearised in the four coordinates of its ray."""
 
     A: mi.Matrix4f  # coordinates of the next ray by those of this ray
@@ -141,7 +141,7 @@ def local_terms(
 
 def linearise(
     walk: Walk, v: Replayed, weight: mi.Spectrum, slope: Slope, frame: RayFrame, frame_next: RayFrame, active: mi.Bool
-) -> Local:
+) -> Linearised:
     """Differentiate `local_terms` by the four coordinates of the ray, and by nothing else.
 
     Both passes call this very function, so that they see the same numbers to the last bit.
@@ -158,7 +158,7 @@ def linearise(
             e, w, x_next = local_terms(walk, v, at, weight, slope, frame_next, active)
             columns.append(tangents(e, w, *x_next))
     A = [columns[k][2 + j] for j in range(4) for k in range(4)]
-    return Local(A=mi.Matrix4f(*A), e=mi.Vector4f(*[c[0] for c in columns]), log_w=[c[1] for c in columns])
+    return Linearised(A=mi.Matrix4f(*A), e=mi.Vector4f(*[c[0] for c in columns]), log_w=[c[1] for c in columns])
 
 
 def _unit_tangent(value: mi.Float) -> mi.Float:

@@ -30,7 +30,7 @@ ATTACH = ("delta", "none")
 
 
 @dataclass(frozen=True)
-class Rival(Interior):
+class OtherInterior(Interior):
     """The interior term in another way, of which nothing is told.
 
     Media are differentiated by the score, without a baseline, and where they are empty not at all.
@@ -62,7 +62,7 @@ def _make_classes() -> tuple[type, ...]:
         """
 
         name = "pathreplay_tape"
-        interior = Rival(name, tape_backward, tape_forward)
+        interior = OtherInterior(name, tape_backward, tape_forward)
 
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
@@ -80,7 +80,7 @@ def _make_classes() -> tuple[type, ...]:
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             linear = flag(props, self.name, "linear", False)
-            self.interior = Rival(self.name, partial(radiative, linear=linear))
+            self.interior = OtherInterior(self.name, partial(radiative, linear=linear))
 
     class ListingIntegrator(base):  # type: ignore[misc, valid-type]
         """Delta tracking as first published: for comparison only, since it misses derivatives (see `listing`).
@@ -91,7 +91,7 @@ def _make_classes() -> tuple[type, ...]:
 
         name = "pathreplay_listing"
         attach = "delta"  # so that it is noticed
-        interior = Rival(name, listing, forward)
+        interior = OtherInterior(name, listing, forward)
 
     return TapeIntegrator, RadiativeIntegrator, ListingIntegrator
 
