@@ -5,7 +5,6 @@ What is remembered stands in one table, from which the type of a record, its wri
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, make_dataclass, replace
 from functools import cache, reduce
 from typing import Any
@@ -43,85 +42,70 @@ class Layout:
     moves: bool  # the path moves with the parameters
     resamples: bool  # BSDFs are sampled once more
     fixed: bool  # what emitters bring to surfaces is known
+    varies: bool  # it is not
     media: bool
     chromatic: bool
     emissive: bool
     passes: bool
     branch: bool
+    always: bool = True
 
     @staticmethod
     def of(walk: Walk, moves: bool) -> Layout:
         """The layout for a walk."""
-        media = walk.media
+        media = walk.media is not None
+        fixed = not media and not moves and not walk.traits.lights_vary
+        kinds = {name: media and getattr(walk.media, name) for name in ("chromatic", "emissive", "passes")}
         return Layout(
-            variant=mi.variant(),
-            moves=moves,
-            resamples=walk.resamples or media is not None,
-            fixed=media is None and not moves and not walk.traits.lights_vary,
-            media=media is not None,
-            chromatic=media is not None and media.chromatic,
-            emissive=media is not None and media.emissive,
-            passes=media is not None and media.passes,
-            branch=walk.branch,
+            mi.variant(), moves, walk.resamples or media, fixed, not fixed, media=media, branch=walk.branch, **kinds
         )
 
 
-Condition = Callable[[Layout], bool]
-
-
-def _always(layout: Layout) -> bool:
-    return True
-
-
-def _media(layout: Layout) -> bool:
-    return layout.media
-
-
-# Where it stands in a Replayed, its type in Mitsuba, and whether it is remembered.
-FIELDS: tuple[tuple[str, str, Condition], ...] = (
-    ("at.ray.o", "Point3f", _always),
-    ("at.ray.d", "Vector3f", _always),
-    ("at.hit.t", "Float", _always),
-    ("at.hit.prim_uv", "Point2f", _always),
-    ("at.hit.prim_index", "UInt32", _always),
-    ("at.hit.shape_index", "UInt32", _always),
-    ("at.hit.shape", "ShapePtr", _always),
-    ("at.hit.instance", "ShapePtr", _always),
-    ("at.pdf", "Float", _always),
-    ("at.medium", "MediumPtr", _media),
-    ("at.behind", "Float", _media),
-    ("β", "Spectrum", _always),
-    ("rr_weight", "Float", _always),
-    ("u.light", "Point2f", lambda layout: not layout.fixed),
-    ("u.lobe", "Float", lambda layout: layout.resamples),
-    ("u.direction", "Point2f", lambda layout: layout.resamples),
-    ("kept.known.glow", "Spectrum", lambda layout: layout.fixed),
-    ("kept.known.d", "Vector3f", lambda layout: layout.fixed),
-    ("kept.known.w", "Spectrum", lambda layout: layout.fixed),
-    ("kept.pdf", "Float", lambda layout: layout.passes),
-    ("kept.media.flight.t", "Float", _media),
-    ("kept.media.flight.density", "Float", _media),
-    ("kept.media.flight.along", "Float", _media),
-    ("kept.media.flight.W", "Spectrum", lambda layout: layout.chromatic),
-    ("kept.media.flight.E", "Spectrum", lambda layout: layout.emissive),
-    ("kept.media.flight.t_emit", "Float", lambda layout: layout.emissive),
-    ("kept.media.flight.c_emit", "Spectrum", lambda layout: layout.emissive),
-    ("kept.media.flight.p", "Float", lambda layout: layout.branch),
-    ("kept.media.shadow.T", "Spectrum", _media),
-    ("kept.media.shadow.y", "Float", _media),
-    ("kept.media.shadow.medium", "MediumPtr", _media),
-    ("kept.media.shadow.length", "Float", _media),
+# Where it stands in a Replayed, its type in Mitsuba, and what of the layout has it remembered.
+FIELDS = (
+    ("at.ray.o", "Point3f", "always"),
+    ("at.ray.d", "Vector3f", "always"),
+    ("at.hit.t", "Float", "always"),
+    ("at.hit.prim_uv", "Point2f", "always"),
+    ("at.hit.prim_index", "UInt32", "always"),
+    ("at.hit.shape_index", "UInt32", "always"),
+    ("at.hit.shape", "ShapePtr", "always"),
+    ("at.hit.instance", "ShapePtr", "always"),
+    ("at.pdf", "Float", "always"),
+    ("at.medium", "MediumPtr", "media"),
+    ("at.behind", "Float", "media"),
+    ("β", "Spectrum", "always"),
+    ("rr_weight", "Float", "always"),
+    ("u.light", "Point2f", "varies"),
+    ("u.lobe", "Float", "resamples"),
+    ("u.direction", "Point2f", "resamples"),
+    ("kept.known.glow", "Spectrum", "fixed"),
+    ("kept.known.d", "Vector3f", "fixed"),
+    ("kept.known.w", "Spectrum", "fixed"),
+    ("kept.pdf", "Float", "passes"),
+    ("kept.media.flight.t", "Float", "media"),
+    ("kept.media.flight.density", "Float", "media"),
+    ("kept.media.flight.along", "Float", "media"),
+    ("kept.media.flight.W", "Spectrum", "chromatic"),
+    ("kept.media.flight.E", "Spectrum", "emissive"),
+    ("kept.media.flight.t_emit", "Float", "emissive"),
+    ("kept.media.flight.c_emit", "Spectrum", "emissive"),
+    ("kept.media.flight.p", "Float", "branch"),
+    ("kept.media.shadow.T", "Spectrum", "media"),
+    ("kept.media.shadow.y", "Float", "media"),
+    ("kept.media.shadow.medium", "MediumPtr", "media"),
+    ("kept.media.shadow.length", "Float", "media"),
 )
 
 # Dr.Jit's local memory cannot hold Bool: these share a word, one bit each, and the lobe takes the bits above.
-BITS: tuple[tuple[str, Condition], ...] = (
-    ("at.hit.valid", _always),
-    ("at.delta", _always),
-    ("at.camera", _always),
-    ("kept.lit", _always),
-    ("kept.black", _always),
-    ("kept.media.flight.event", _media),
-    ("kept.media.null", _media),
+BITS = (
+    ("at.hit.valid", "always"),
+    ("at.delta", "always"),
+    ("at.camera", "always"),
+    ("kept.lit", "always"),
+    ("kept.black", "always"),
+    ("kept.media.flight.event", "media"),
+    ("kept.media.null", "media"),
 )
 LOBE_SHIFT = 8
 
@@ -129,7 +113,7 @@ LOBE_SHIFT = 8
 @cache
 def record_type(layout: Layout) -> type:
     """The dataclass that holds a vertex."""
-    fields = {_name(place): _plain(kind) for place, kind, remembered in FIELDS if remembered(layout)}
+    fields = {_name(place): _plain(kind) for place, kind, remembered in FIELDS if getattr(layout, remembered)}
     return make_dataclass("Record", [*fields.items(), ("word", mi.UInt32)])
 
 
@@ -137,12 +121,12 @@ def record(layout: Layout, v: Replayed) -> Any:
     """A vertex, to be written."""
     fields = {}
     for place, kind, remembered in FIELDS:
-        if remembered(layout):
+        if getattr(layout, remembered):
             value = reduce(getattr, place.split("."), v)
             fields[_name(place)] = dr.reinterpret_array(mi.UInt32, value) if kind.endswith("Ptr") else value
     word = v.kept.lobe << LOBE_SHIFT
     for k, (place, remembered) in enumerate(BITS):
-        if remembered(layout):
+        if getattr(layout, remembered):
             word |= dr.select(reduce(getattr, place.split("."), v), mi.UInt32(1 << k), 0)
     return record_type(layout)(**fields, word=word)
 
@@ -166,11 +150,11 @@ def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, r
 def _read(layout: Layout, read: Any, ray0: mi.Ray3f) -> Replayed:
     v = _blank(layout, ray0)
     for place, kind, remembered in FIELDS:
-        if remembered(layout):
+        if getattr(layout, remembered):
             value = getattr(read, _name(place))
             _put(v, place, dr.reinterpret_array(getattr(mi, kind), value) if kind.endswith("Ptr") else value)
     for k, (place, remembered) in enumerate(BITS):
-        if remembered(layout):
+        if getattr(layout, remembered):
             _put(v, place, (read.word & (1 << k)) != 0)
     v.kept.lobe = read.word >> LOBE_SHIFT
     return v
