@@ -61,14 +61,11 @@ def print_checks(results: Sequence[GradientCheck]) -> None:
         f"{first.seeds} seeds, {first.spp} spp (differences {first.fd_spp} spp)\n"
     )
     for result in results:
-        console.print(
-            Text(f"{result.verdict.upper():<6}", style=_STYLES[result.verdict]), Text(result.key, style="bold")
-        )
-        for name, estimate in (
-            ("gradient", _with_error(result.gradient, result.gradient_se)),
-            ("reference", _with_error(result.reference, math.hypot(result.reference_se, result.step_error))),
-        ):
-            console.print(f"       {name:<9}  {estimate}")
+        verdict = Text(f"{result.verdict.upper():<6}", style=_STYLES[result.verdict])
+        reference_error = math.hypot(result.reference_se, result.step_error)
+        console.print(verdict, Text(result.key, style="bold"))
+        console.print(f"       gradient   {_with_error(result.gradient, result.gradient_se)}")
+        console.print(f"       reference  {_with_error(result.reference, reference_error)}")
         console.print(f"       z = {result.z:+.2f}   {result.reason}\n")
     counts = Counter(result.verdict for result in results)
     console.print(f"{len(results)} checked: " + ", ".join(f"{n} {verdict}" for verdict, n in counts.items()))

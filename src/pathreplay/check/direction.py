@@ -130,11 +130,10 @@ def _random_entries(shape: tuple[int, ...], seed: int) -> np.ndarray:
 
 def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
     bounded = key.rsplit(".", 1)[-1] not in _SIGNED and (value >= 0).all()
-    if not bounded or (value >= np.abs(move)).all():
-        return CENTRAL
-    if (value + 2 * move >= 0).all():
-        return FORWARD
-    if (value - 2 * move >= 0).all():
-        return BACKWARD
-    # Both ways lead below zero (a given direction of mixed signs over zeros): linear parameters do not mind.
+    if bounded and not (value >= np.abs(move)).all():
+        if (value + 2 * move >= 0).all():
+            return FORWARD
+        if (value - 2 * move >= 0).all():
+            return BACKWARD
+    # Or both ways lead below zero (a given direction of mixed signs over zeros): linear parameters do not mind.
     return CENTRAL
