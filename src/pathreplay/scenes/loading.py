@@ -41,15 +41,13 @@ def load_scene_with(
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
     if str(spec) in BUILTINS:
-        description = _builtin_dict(str(spec), parameters)
         try:
-            return load_dict_with(description, plugins)
+            return load_dict_with(_builtin_dict(str(spec), parameters), plugins)
         except RuntimeError as error:
             made = f"Built-in scene '{spec}' cannot be made of {parameters}"
             raise PathreplayError(f"{made}: {one_line(error)}") from error
     path = Path(spec) if base is None else Path(base) / spec
-    problem = file_problem(path)
-    if problem == MISSING:
+    if (problem := file_problem(path)) == MISSING:
         raise PathreplayError(_unknown(str(spec), path))
     if problem:
         raise PathreplayError(f"Scene {path} {problem}; give the path of a Mitsuba XML file")
@@ -84,10 +82,7 @@ def load_scene_for(
     scene = load_scene(spec, base, **parameters)
     params = mi.traverse(scene)
     patterns = [pattern for pattern in wanted if pattern.rsplit(".", 1)[-1] == "eta"]
-    asked = [
-        key for key in _matches(params, patterns) if scene_parameters.owner_class(params, key) == "SmoothDielectric"
-    ]
-    if not asked:
+    if not any(scene_parameters.owner_class(params, key) == "SmoothDielectric" for key in _matches(params, patterns)):
         return scene, ()
     # Dr.Jit traces calls through every instance alive, so the first scene has to go before the second one comes.
     del scene, params

@@ -42,11 +42,6 @@ _WAY_OUT = {
 }
 
 
-# ------------------------------------------------------------------------------
-#  Names
-# ------------------------------------------------------------------------------
-
-
 def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> list[str]:
     """The keys that ``patterns`` name, in the order of the patterns, then of the scene; each key once.
 
@@ -60,16 +55,13 @@ def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> li
     known = list(params.keys())
     found: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        matches = [pattern] if pattern in known else _globbed(known, pattern)
+        # '[[]' is how a glob says '['.
+        literal = pattern.replace("[", "[[]")
+        matches = [pattern] if pattern in known else fnmatch.filter(known, pattern) or fnmatch.filter(known, literal)
         if not matches:
             raise PathreplayError(_no_match(known, pattern))
         found.update(dict.fromkeys(matches))
     return list(found)
-
-
-def _globbed(known: list[str], pattern: str) -> list[str]:
-    # '[[]' is how a glob says '['.
-    return fnmatch.filter(known, pattern) or fnmatch.filter(known, pattern.replace("[", "[[]"))
 
 
 def keep_only(params: Any, keys: Iterable[str]) -> None:
@@ -93,11 +85,6 @@ def owner_class(params: Any, key: str) -> str:
     return str(params.properties[key][2].class_name())
 
 
-# ------------------------------------------------------------------------------
-#  What can be differentiated, what may be used
-# ------------------------------------------------------------------------------
-
-
 def require_differentiable(params: Any, key: str, integrator: Any = None) -> None:
     """Return quietly if ``integrator`` (None: any of Mitsuba's) can carry a derivative to ``key``.
 
@@ -111,8 +98,7 @@ def require_differentiable(params: Any, key: str, integrator: Any = None) -> Non
         return
     value = params[key]
     owner = owner_class(params, key)
-    known = _WAY_OUT.get((owner, key.rsplit(".", 1)[-1]))
-    if known is not None:
+    if (known := _WAY_OUT.get((owner, key.rsplit(".", 1)[-1]))) is not None:
         raise PathreplayError(f"Parameter '{key}' carries no derivative: {known}")
     if needs_ray_adjoint(params, key):
         raise PathreplayError(
@@ -178,14 +164,8 @@ def carries_derivative(params: Any, key: str, integrator: Any = None) -> bool:
 
 # Marked NonDifferentiable by Mitsuba, whose integrators drop their derivatives. Each is held to finite differences in
 # tests/test_cameras_and_lights.py.
-_CAMERA = {
-    "to_world",
-    "x_fov",
-    "principal_point_offset_x",
-    "principal_point_offset_y",
-    "aperture_radius",
-    "focus_distance",
-}
+_PRINCIPAL_POINT = {"principal_point_offset_x", "principal_point_offset_y"}
+_CAMERA = {"to_world", "x_fov", "aperture_radius", "focus_distance"} | _PRINCIPAL_POINT
 _LIGHT = {"to_world", "position"}
 
 
@@ -248,11 +228,6 @@ def _flat(value: Any) -> Any:
     return dr.ravel(value) if dr.depth_v(value) > 1 else value
 
 
-# ------------------------------------------------------------------------------
-#  To NumPy and back
-# ------------------------------------------------------------------------------
-
-
 def get_array(value: Any) -> np.ndarray:
     """A floating-point parameter value as a NumPy array of its own precision; a copy, without derivatives.
 
@@ -296,12 +271,10 @@ def set_arrays(params: Any, arrays: Mapping[str, Any]) -> None:
     Raises:
         PathreplayError: a key does not exist, or a shape is not that of the parameter.
     """
-    values = {}
-    for key, array in arrays.items():
+    for key in arrays:
         if key not in params:
             raise PathreplayError(_no_match(list(params.keys()), key))
-        values[key] = to_value(params[key], array)
-    for key, value in values.items():
+    for key, value in {key: to_value(params[key], array) for key, array in arrays.items()}.items():
         params[key] = value
     params.update()
 
