@@ -274,7 +274,8 @@ def set_arrays(params: Any, arrays: Mapping[str, Any]) -> None:
     for key in arrays:
         if key not in params:
             raise PathreplayError(_no_match(list(params.keys()), key))
-    for key, value in {key: to_value(params[key], array) for key, array in arrays.items()}.items():
+    values = {key: to_value(params[key], array) for key, array in arrays.items()}
+    for key, value in values.items():
         params[key] = value
     params.update()
 
