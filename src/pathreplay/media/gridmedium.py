@@ -28,18 +28,11 @@ FAR = 1e6
 
 
 def register() -> None:
-    """Registers `gridmedium` for the variant that is active now. Doing so again is harmless.
-
-    Mitsuba's base class is another one in every variant, hence so is the plugin's: call this once per variant.
-
-    Raises RuntimeError (Mitsuba's) when no variant is set.
-    """
+    """Registers `gridmedium` for the variant that is active now, whose base class is like no other variant's."""
     mi.register_medium("gridmedium", _plugin_class())
 
 
 def _plugin_class() -> type:
-    """Builds the plugin's class on the medium base class of the variant that is active now."""
-
     class GridMedium(mi.Medium):
         def __init__(self, props: Any) -> None:
             super().__init__(props)
@@ -106,7 +99,7 @@ def _plugin_class() -> type:
             allowed = slice(first, last + 1)
             collisions = [float(rate[0]) for rate in rates[allowed]]
             chosen = first + cheapest(self.levels[allowed], collisions, mean_chord(self.box))
-            return cellwalk.make_cells(self.levels[chosen], list(values[chosen]))
+            return cellwalk.make_cells(self.levels[chosen], values[chosen])
 
         @property
         def uses_supergrid(self) -> bool:
@@ -167,14 +160,9 @@ def _plugin_class() -> type:
 
 
 def _volume(props: Any, name: str, default: float | None) -> Any:
-    """The volume of that name; textures, colours and numbers become a `constvolume`, without end.
-
-    None without the name and no default.
-    """
-    if name not in props and default is None:
-        return None
+    """The volume of that name, or None; textures, colours and numbers become a `constvolume`, without end."""
     value = props[name] if name in props else default
-    if isinstance(value, mi.Volume):
+    if value is None or isinstance(value, mi.Volume):
         return value
     if isinstance(value, (str, bool)) or (isinstance(value, mi.Object) and not isinstance(value, mi.Texture)):
         raise PathreplayError(f"gridmedium: {name} is {value!r:.40}; give a volume, a colour or a number")
@@ -209,8 +197,7 @@ def _look(volume: Any, needs_grid: bool) -> tuple[bool, list[Bounds]]:
         channels = values[0].shape[-1]
         if channels not in (1, 3, 4):
             raise PathreplayError(f"gridmedium: sigma_t has {channels} channels; give a grid with 1 or 3")
-        lattice = find_lattice(volume, values[0].shape)
-        if lattice is not None:
+        if (lattice := find_lattice(volume, values[0].shape)) is not None:
             return channels > 1 and not mi.is_monochromatic, all_bounds(voxel_bounds(lattice, values[0]))
     if needs_grid:
         raise PathreplayError(
@@ -218,8 +205,7 @@ def _look(volume: Any, needs_grid: bool) -> tuple[bool, list[Bounds]]:
             "at 'auto'"
         )
     grey = all(dr.is_diff_v(value) and not dr.is_vector_v(value) and dr.width(value) == 1 for value in values)
-    lowest = 0.0
-    highest = float(volume.max())
+    lowest, highest = 0.0, float(volume.max())
     if volume.class_name() == "ConstVolume" and not mi.is_spectral:
         here = dr.detach(volume.eval(dr.zeros(mi.Interaction3f)))
         lowest, highest = float(dr.min(here)[0]), float(dr.max(here)[0])
