@@ -134,7 +134,7 @@ def ensure_llvm() -> None:
     """
     current = os.environ.get(ENVIRONMENT_VARIABLE, "")
     plausible = loaded_is_plausible()
-    if plausible and current and current == libllvm.pip_library():
+    if plausible and current == libllvm.pip_library():
         return
     tried = libllvm.probe(current)
     if plausible and tried.works:

@@ -31,8 +31,7 @@ def check_all(
 ) -> list[GradientCheck]:
     """``check_gradient(scene, key, **options)`` for every key that the patterns name, with a bar on standard error.
 
-    Raises:
-        PathreplayError: see :func:`check_gradient` and :func:`resolve_differentiable`.
+    Raises what :func:`check_gradient` and :func:`resolve_differentiable` do.
     """
     tested = integrator_under_test(integrator, scene, max_depth)
     keys = resolve_differentiable(mi.traverse(scene), patterns, tested)
@@ -93,12 +92,7 @@ def write_checks(results: Sequence[GradientCheck], path: Path) -> None:
 
 
 def require_writable(path: Path) -> None:
-    """Return quietly if ``path`` can be written later.
-
-    Raises:
-        PathreplayError: it is no regular file, its name is no name of a file, its folder does not exist, or one of them
-            may not be written.
-    """
+    """Raise PathreplayError for what is no regular file, has no folder, or may not be written."""
     problem = file_problem(path)
     if problem.startswith(("is ", "cannot be reached")):
         raise PathreplayError(f"{path} {problem}; give --json the name of a file")

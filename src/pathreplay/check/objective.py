@@ -30,7 +30,7 @@ Move = Callable[[Any, Any], Any]
 def alone(params: mi.SceneParameters, key: str) -> Iterator[None]:
     """Detach all parameters, so that only ``key`` will be attached; put everything back at the end."""
     # Copies: the map hands out references to what the scene holds, and the scene is about to change.
-    held = {name: _copy(params[name]) for name in params.keys() if name == key or dr.grad_enabled(params[name])}
+    held = {name: dr.copy(params[name]) for name in params.keys() if name == key or dr.grad_enabled(params[name])}
     # Setting through the map, then update(): objects keep values derived from their parameters.
     for name, value in held.items():
         params[name] = dr.detach(value)
@@ -41,11 +41,6 @@ def alone(params: mi.SceneParameters, key: str) -> Iterator[None]:
         for name, value in held.items():
             params[name] = value
         params.update()
-
-
-def _copy(value: Any) -> Any:
-    """Another handle on the same variable, derivatives and all."""
-    return type(value)(value)
 
 
 class Objective:
@@ -60,7 +55,7 @@ class Objective:
         self.scene = scene
         self.params = params
         self.key = key
-        self.value = _copy(dr.detach(params[key]))
+        self.value = dr.copy(dr.detach(params[key]))
         self.move = move
         self.sensor = scene.sensors()[sensor]
 

@@ -46,8 +46,7 @@ def require_whole_nanovdb(path: Path) -> bool:
     Grids that are compressed by zip are unpacked, which tells whether their bytes are what was written. Values and the
     links inside of an uncompressed tree are not looked at.
 
-    Raises:
-        PathreplayError: it is no such file, of an unknown version, or damaged.
+    Raises PathreplayError if it is no such file, of an unknown version, or damaged.
     """
     if path.stat().st_size < _SEGMENT.size:
         raise _damaged(path, "its header is cut off")

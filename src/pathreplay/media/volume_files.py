@@ -95,8 +95,7 @@ def save_vol(path: str | Path, data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -
 def vol_bytes(data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -> bytes:
     """The `.vol` file of a grid; ``bounds`` is the box that it fills, used where `use_grid_bbox` is set.
 
-    Raises:
-        PathreplayError: the data have neither three nor four dimensions, or no voxels.
+    Raises PathreplayError for data of neither three nor four dimensions, or without voxels.
     """
     grid = data[..., None] if data.ndim == 3 else data
     if grid.ndim != 4 or not grid.size:
@@ -124,11 +123,9 @@ def grid_volume(path: str | Path, grid: str | None = None, **options: Any) -> di
 
 
 def require_whole_vol(path: Path) -> None:
-    """Return quietly if a `.vol` file is as long as its header says, with channels and values for a scene.
+    """Raise PathreplayError for a `.vol` file of impossible length or size, or with channels or values for no scene.
 
-    Raises:
-        PathreplayError: it is too short, of impossible size, with other channels or values beyond all extinctions.
-            Mitsuba tells of other damage.
+    Mitsuba tells of other damage.
     """
     if (header := _vol_header(path)) is None:
         return

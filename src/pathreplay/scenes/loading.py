@@ -74,10 +74,7 @@ def load_scene_for(
 
     Where a pattern that ends in ``eta`` matches the index of a ``dielectric``, the scene is loaded once more with
     `smoothdielectric` in the place of every ``dielectric``. Returns the scene and what is to be said about it, one line
-    each. Patterns that match nothing are left for others to complain about.
-
-    Raises:
-        PathreplayError: as `load_scene` does.
+    each. Patterns that match nothing are left for others to complain about. Raises what `load_scene` does.
     """
     scene = load_scene(spec, base, **parameters)
     params = mi.traverse(scene)
@@ -123,12 +120,9 @@ def _unknown(spec: str, path: Path) -> str:
 
 @contextmanager
 def told(what: str) -> Iterator[None]:
-    """What Mitsuba and Dr.Jit raise within, as one line that begins with ``what``.
+    """A RuntimeError of Mitsuba or Dr.Jit within becomes a PathreplayError, whose line begins with ``what``.
 
     A Ctrl-C that Dr.Jit has turned into such an error comes out as what it was.
-
-    Raises:
-        PathreplayError: there was a RuntimeError.
     """
     try:
         yield

@@ -49,8 +49,7 @@ def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> li
     Names may hold brackets themselves: where a glob matches nothing, its brackets are taken as they are.
     ``params`` is what ``mi.traverse(scene)`` returns.
 
-    Raises:
-        PathreplayError: a pattern matches nothing; the message suggests the nearest keys.
+    Raises PathreplayError, with the nearest keys, if a pattern matches nothing.
     """
     known = list(params.keys())
     found: dict[str, None] = {}
@@ -86,11 +85,10 @@ def owner_class(params: Any, key: str) -> str:
 
 
 def require_differentiable(params: Any, key: str, integrator: Any = None) -> None:
-    """Return quietly if ``integrator`` (None: any of Mitsuba's) can carry a derivative to ``key``.
+    """Raise PathreplayError unless ``integrator`` (None: any of Mitsuba's) can carry a derivative to ``key``.
 
-    Raises:
-        PathreplayError: the key does not exist, is a plain number, holds integers, or is marked
-            ``mi.ParamFlags.NonDifferentiable``; where there is a replacement the message names it.
+    It cannot if the key does not exist, is a plain number, holds integers, or is marked
+    ``mi.ParamFlags.NonDifferentiable``; where there is a replacement the message names it.
     """
     if key not in params:
         raise PathreplayError(_no_match(list(params.keys()), key))
@@ -119,11 +117,7 @@ def require_differentiable(params: Any, key: str, integrator: Any = None) -> Non
 
 
 def require_settable(params: Any, key: str) -> None:
-    """Return quietly if a parameter can be given a value: floating-point numbers, one or many.
-
-    Raises:
-        PathreplayError: the parameter holds integers, text or a matrix of plain numbers; names the way out, if any.
-    """
+    """Raise PathreplayError, with the way out, unless a parameter can be given floating-point numbers, one or many."""
     value = params[key]
     if isinstance(value, float) or _is_float(value):
         return
@@ -135,8 +129,7 @@ def require_settable(params: Any, key: str) -> None:
 def resolve_differentiable(params: Any, patterns: str | Iterable[str], integrator: Any = None) -> list[str]:
     """Like :func:`resolve_keys`, but a glob takes only those matches that carry a derivative.
 
-    Raises:
-        PathreplayError: a pattern matches nothing, an exact key carries no derivative, or no match of a glob does.
+    Raises PathreplayError if a pattern matches nothing, or nothing that carries one.
     """
     found: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
@@ -194,12 +187,9 @@ def is_empty(value: Any) -> bool:
 
 
 def require_finite(params: Any) -> None:
-    """Return quietly if no parameter of the scene holds a NaN or an infinity; one reduction per array.
+    """Raise PathreplayError, with the key and the index, if a parameter holds a NaN or an infinity.
 
-    A plain number may be infinite (distances are), but not NaN.
-
-    Raises:
-        PathreplayError: names the first offending key, how many of its entries are bad, and where the first one is.
+    A plain number may be infinite (distances are). Costs one reduction per array.
     """
     counts: dict[str, Any] = {}
     for key in params.keys():
@@ -245,11 +235,7 @@ def get_array(value: Any) -> np.ndarray:
 
 
 def to_value(like: Any, array: Any) -> Any:
-    """The inverse of :func:`get_array`: ``array`` as a value of the type of ``like``, and of the same shape.
-
-    Raises:
-        PathreplayError: the shapes differ.
-    """
+    """The inverse of :func:`get_array`: ``array`` as a value like ``like``. Raises PathreplayError for other shapes."""
     expected = get_array(like)
     given = np.asarray(array)
     if given.shape != expected.shape:
@@ -268,8 +254,7 @@ def to_value(like: Any, array: Any) -> Any:
 def set_arrays(params: Any, arrays: Mapping[str, Any]) -> None:
     """Write NumPy arrays into the scene, then let the scene know (``params.update()``), once for all of them.
 
-    Raises:
-        PathreplayError: a key does not exist, or a shape is not that of the parameter.
+    Raises PathreplayError for a key that does not exist, or a shape that is not that of the parameter.
     """
     for key in arrays:
         if key not in params:

@@ -29,11 +29,7 @@ LONGEST = 2**28
 
 
 def require_shallow(path: Path) -> None:
-    """Return quietly if a scene file, or one that it includes, is not too long, and no element nested too deep.
-
-    Raises:
-        PathreplayError: names the file, and the line.
-    """
+    """Raise PathreplayError where a scene file, or one that it includes, is too long, or an element nested too deep."""
     waiting, seen = [path], set()
     while waiting:
         file = waiting.pop()
@@ -76,12 +72,9 @@ def _included(path: Path) -> list[str]:
 
 
 def require_sound_files(state: Any) -> None:
-    """Return quietly if the files that a parsed scene names (`mi.parser`) can be given to Mitsuba.
+    """Raise PathreplayError where a file that a parsed scene (`mi.parser`) names cannot be given to Mitsuba.
 
     Looks at the indices of PLY and serialized meshes and at the sizes of volumes; and for groups without a shape.
-
-    Raises:
-        PathreplayError: names the file, what is wrong, and the way out.
     """
     for node in state.nodes:
         kind, name = node.props.plugin_name(), node.props.get("filename", None)

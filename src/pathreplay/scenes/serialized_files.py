@@ -19,12 +19,9 @@ _HIGHEST_RATIO = 1032
 
 
 def require_sound_serialized(path: Path, index: Any) -> None:
-    """Return quietly if the table of shapes fits into the file, and the faces of shape ``index`` have their vertices.
+    """Raise PathreplayError unless the table of shapes fits into the file, and shape ``index`` has its faces' vertices.
 
     That shape is unpacked, as Mitsuba does it once more. Damage of other kinds is left to Mitsuba, which sees it.
-
-    Raises:
-        PathreplayError: names the file, what is wrong, and the way out.
     """
     with path.open("rb") as file:
         head = file.read(4)

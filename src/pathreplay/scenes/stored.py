@@ -48,11 +48,7 @@ class Form:
         return seen
 
     def of_colours(self, key: str, colours: Array) -> Array:
-        """What is seen of linear RGB colours (or grey numbers), in an array of the shape that is seen.
-
-        Raises:
-            PathreplayError: the parameter cannot hold them.
-        """
+        """What is seen of linear RGB colours (or grey numbers), in its shape. Raises PathreplayError if it cannot."""
         return colours
 
 
