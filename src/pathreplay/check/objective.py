@@ -19,7 +19,7 @@ from pathreplay.check.statistics import relative_l1
 from pathreplay.check.stencil import CENTRAL, Stencil
 from pathreplay.check.verdict import NEGLIGIBLE, Judgement, judge
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes.loading import innermost, told
+from pathreplay.scenes.loading import told
 from pathreplay.scenes.parameters import get_array
 
 Mode = Literal["backward", "forward"]
@@ -103,8 +103,8 @@ class Objective:
 
     def derivative(self, integrator: mi.Integrator, mode: Mode, primal: int, seed: int, spp: int) -> float:
         """dF/dt at 0, through ``mi.render`` and with seeds for picture and derivative, as users have it."""
-        t = self._attached()
-        try:
+        t, name = self._attached(), integrator_name(integrator)
+        with told(f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode", (RuntimeError, TypeError)):
             self.put(t)
             image = mi.render(
                 self.scene, self.params, sensor=self.sensor, integrator=integrator,
@@ -115,11 +115,6 @@ class Objective:
                 return self.dot(np.array(dr.grad(image), np.float64))
             dr.backward(dr.sum(image * self.adjoint, axis=None))
             return float(dr.grad(t)[0])
-        except (RuntimeError, TypeError, NotImplementedError) as error:
-            name = integrator_name(integrator)
-            raise PathreplayError(
-                f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode: {innermost(error)}"
-            ) from error
 
     def forward(self, integrator: mi.Integrator, seed: int, spp: int) -> np.ndarray:
         """The derivative of the picture, by the integrator's forward pass alone."""

@@ -101,11 +101,6 @@ def _plugin_class() -> type:
             chosen = first + cheapest(self.levels[allowed], collisions, mean_chord(self.box))
             return cellwalk.make_cells(self.levels[chosen], values[chosen])
 
-        @property
-        def uses_supergrid(self) -> bool:
-            """Whether free flights walk through cells with majorants of their own."""
-            return not self.flight_cells.is_single
-
         def to_string(self) -> str:
             lines = [f"sigma_t = {self.sigma_t}", f"albedo = {self.albedo}", f"emission = {self.emission}"]
             cells = " x ".join(str(n - 2) for n in self.flight_cells.shape)

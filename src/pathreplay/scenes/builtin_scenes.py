@@ -10,25 +10,12 @@ import numpy as np
 
 SceneDict = dict[str, Any]
 
-BUILTINS: dict[str, Callable[..., SceneDict]] = {}
-"""Built-in scenes: name -> function that returns a Mitsuba scene dictionary."""
-
 COSTS: dict[str, Callable[[int], int]] = {
     "texture": lambda n: 64 * n**2,  # three numbers a texel, and copies in double precision
     "grid": lambda n: 256 * n**3,  # a voxel: its noise is summed from 12 waves, all at once
     "views": lambda n: 100_000 * n,  # a sensor with its film
 }
 """Arguments of which a scene may get too large -> bytes that making it takes, roughly."""
-
-
-def builtin(name: str) -> Callable[[Callable[..., SceneDict]], Callable[..., SceneDict]]:
-    """Decorator that makes a function's scene dictionary known under ``name``."""
-
-    def register(make: Callable[..., SceneDict]) -> Callable[..., SceneDict]:
-        BUILTINS[name] = make
-        return make
-
-    return register
 
 
 def _picture(pixels: np.ndarray, **options: Any) -> SceneDict:
@@ -41,7 +28,6 @@ def _centres(*counts: int) -> tuple[np.ndarray, ...]:
     return tuple(np.meshgrid(*((np.arange(n) + 0.5) / n for n in counts), indexing="ij"))
 
 
-@builtin("cornell-box")
 def cornell_box(resolution: int = 256) -> SceneDict:
     """Mitsuba's own Cornell box: two white boxes, a red and a green wall, one area light."""
     scene: SceneDict = mi.cornell_box()
@@ -49,7 +35,6 @@ def cornell_box(resolution: int = 256) -> SceneDict:
     return scene
 
 
-@builtin("cornell-box-photo")
 def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
     """The Cornell box with a grey picture (``texture`` x ``texture`` texels) as its back wall, seen by two sensors.
 
@@ -106,7 +91,6 @@ def _camera(origin: list[float], target: list[float], fov: float, resolution: in
     }
 
 
-@builtin("glass-pane")
 def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
     """A thick pane of glass (index 1.5) whose front is uneven, in a painted room, seen by three sensors.
 
@@ -160,7 +144,6 @@ def _bumps(size: int) -> np.ndarray:
     return ((n + 1) / 2).astype(np.float32)
 
 
-@builtin("mirror-camera")
 def mirror_camera(resolution: int = 48) -> SceneDict:
     """An old, blotched mirror that hangs in a painted room, seen by a tripod that stays and a camera that is carried.
 
@@ -190,7 +173,6 @@ def _blotches(size: int) -> np.ndarray:
     return (grey[:, :, None] * np.array([1, 0.97, 0.9])).astype(np.float32)
 
 
-@builtin("cloud")
 def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
     """A small cloud (``grid``³ voxels, albedo 0.95) under a sky with a sun, seen by ``views`` sensors around it.
 
@@ -250,3 +232,13 @@ def _sky(rows: int) -> np.ndarray:
     sun = np.array([np.cos(elevation) * np.cos(azimuth), np.sin(elevation), np.cos(elevation) * np.sin(azimuth)])
     glow = np.exp((d @ sun - 1) / (1 - np.cos(np.radians(8))))[..., None]
     return (sky + 30 * glow * np.array([1.0, 0.9, 0.75])).astype(np.float32)
+
+
+BUILTINS: dict[str, Callable[..., SceneDict]] = {
+    "cornell-box": cornell_box,
+    "cornell-box-photo": cornell_box_photo,
+    "glass-pane": glass_pane,
+    "mirror-camera": mirror_camera,
+    "cloud": cloud,
+}
+"""Built-in scenes: name -> function that returns a Mitsuba scene dictionary."""

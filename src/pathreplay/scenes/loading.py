@@ -119,23 +119,19 @@ def _unknown(spec: str, path: Path) -> str:
 
 
 @contextmanager
-def told(what: str) -> Iterator[None]:
-    """A RuntimeError of Mitsuba or Dr.Jit within becomes a PathreplayError, whose line begins with ``what``.
+def told(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -> Iterator[None]:
+    """An error of these kinds within becomes a PathreplayError, whose line begins with ``what``.
 
-    A Ctrl-C that Dr.Jit has turned into such an error comes out as what it was.
+    It tells the error that came first: Dr.Jit's calls and loops raise others that say nothing. A Ctrl-C that Dr.Jit has
+    turned into such an error comes out as what it was.
     """
     try:
         yield
-    except RuntimeError as error:
+    except kinds as error:
         first = _first(error)
         if isinstance(first, KeyboardInterrupt):
             raise first from None
         raise PathreplayError(f"{what}: {one_line(first)}") from error
-
-
-def innermost(error: BaseException) -> str:
-    """`one_line` of the error that came first: Dr.Jit's calls and loops raise others that say nothing."""
-    return one_line(_first(error))
 
 
 def _first(error: BaseException) -> BaseException:

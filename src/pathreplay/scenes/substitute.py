@@ -30,11 +30,14 @@ def load_file_with(
     PathreplayError for a file that would end the process: see `require_shallow` and `require_sound_files`.
     """
     path = Path(path)
+    parameters = parameters or {}
+    for name in {"config", "filename"}.intersection(parameters):
+        raise PathreplayError(f"Scene parameter '{name}' has a name that Mitsuba's parser keeps; rename ${name}")
     require_shallow(path)
     with _own_resolver() as resolver:
         resolver.prepend(mi.filesystem.path(str(path.parent)))
         config = _config()
-        state = mi.parser.parse_file(config, str(path), **_arguments(parameters or {}))
+        state = mi.parser.parse_file(config, str(path), **parameters)
         return _instantiate(config, state, plugins)
 
 
@@ -58,13 +61,6 @@ def _own_resolver() -> Iterator[mi.FileResolver]:
         yield inner
     finally:
         mi.set_file_resolver(outer)
-
-
-def _arguments(parameters: Mapping[str, str]) -> dict[str, str]:
-    for name in ("config", "filename"):
-        if name in parameters:
-            raise PathreplayError(f"Scene parameter '{name}' has a name that Mitsuba's parser keeps; rename ${name}")
-    return dict(parameters)
 
 
 def _require_regular_files(state: Any) -> None:
