@@ -24,7 +24,7 @@ from pathreplay.check.statistics import gap, normal
 from pathreplay.check.stencil import BACKWARD, CENTRAL, FORWARD, UPWARD, WIDE, Stencil
 from pathreplay.check.verdict import Judgement, judge
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes.parameters import get_array, set_arrays
+from pathreplay.scenes.parameters import get_array
 
 # ------------------------------------------------------------------------------
 #  Verdict
@@ -474,7 +474,9 @@ def test_bad_input_is_named(box: Any, options: dict[str, Any], message: str) -> 
 
 
 def test_a_scene_with_nan_is_refused(box: Any) -> None:
-    set_arrays(mi.traverse(box), {"green.reflectance.value": [0.1, np.nan, 0.1]})
+    params = mi.traverse(box)
+    params["green.reflectance.value"] = mi.Color3f(0.1, np.nan, 0.1)
+    params.update()
     with pytest.raises(PathreplayError, match=r"green\.reflectance\.value.*NaN"):
         check_gradient(box, "red.reflectance.value", integrator="prb", seeds=2, spp=1)
 

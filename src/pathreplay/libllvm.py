@@ -186,9 +186,9 @@ def unlinked_siblings(path: str) -> list[str]:
 
 def _reason(returncode: int, stderr: str) -> str:
     """One line that says why a trial failed, from what the process left behind."""
-    lines = [re.sub(r"^\w+\(\): ", "", line.strip()) for line in stderr.splitlines() if line.strip()]
     # We switch the kernel cache off ourselves (see `probe`), and Dr.Jit says so.
-    lines = [line for line in lines if "kernel cache" not in line]
+    told = [line.strip() for line in stderr.splitlines() if line.strip() and "kernel cache" not in line]
+    lines = [re.sub(r"^\w+\(\): ", "", line) for line in told]
     crash = returncode < 0 and returncode != -signal.SIGTERM
     wanted = next((line for line in lines if line.startswith("LLVM ERROR")), None) if crash else None
     detail = wanted or (lines[-1] if lines and "Traceback" in stderr else lines[0] if lines else "")

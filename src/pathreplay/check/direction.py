@@ -59,9 +59,8 @@ def choose_line(
     of things infinitely ``far`` away (sun, sky), which no translation moves, turn about a random axis. Coefficients of
     ``spectra`` move so that what they stand for changes by such steps: see :mod:`pathreplay.scenes.spectra`.
 
-    Raises:
-        PathreplayError: the direction has the wrong shape, is zero or is not finite; the step is not a positive number,
-            or too long or too short for the parameter.
+    Raises PathreplayError for a direction of another shape, zero or not finite, and for a step that is not a positive
+    number, or too long or too short for the parameter.
     """
     if value.size == 0:
         raise PathreplayError(f"Parameter '{key}' is empty; there is nothing to check")

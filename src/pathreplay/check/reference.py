@@ -54,8 +54,7 @@ def integrator_under_test(spec: Any, scene: Any, max_depth: int | None = None) -
     None is the scene's own integrator if that one is made for differentiation, else ``pathreplay``. A plugin given by
     name, or chosen by None, gets the path limits of the scene's own integrator; ``max_depth`` overrides them.
 
-    Raises:
-        PathreplayError: Mitsuba cannot make it, or ``max_depth`` makes no sense or is given along with a finished one.
+    Raises PathreplayError where Mitsuba cannot make it, or ``max_depth`` is no depth or given with a finished one.
     """
     if max_depth is not None and (type(max_depth) is not int or (max_depth < 1 and max_depth != -1)):
         raise PathreplayError(f"max_depth is {max_depth!r}; give a path length of at least 1, or -1 for no bound")
@@ -84,8 +83,7 @@ def reference_integrator(spec: Any, scene: Any, tested: Any) -> Any:
     Its Russian roulette is switched off where paths are short enough. That leaves the expected image alone, keeps
     decisions from flipping between +h and -h, and lets throughputs be negative, as they are beside a reflectance of 0.
 
-    Raises:
-        PathreplayError: the path length of the integrator under test cannot be read, or ``spec`` cannot be made.
+    Raises PathreplayError where the path length of the tested one cannot be read, or ``spec`` cannot be made.
     """
     if isinstance(spec, mi.Integrator):
         return spec

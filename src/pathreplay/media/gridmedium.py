@@ -36,10 +36,10 @@ def _plugin_class() -> type:
     class GridMedium(mi.Medium):
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            kind = self.phase_function().class_name()
-            if mi.has_flag(self.phase_function().flags(), mi.PhaseFunctionFlags.Microflake):
+            phase = self.phase_function()
+            if mi.has_flag(phase.flags(), mi.PhaseFunctionFlags.Microflake):
                 raise PathreplayError(
-                    f"gridmedium: with the phase function {kind} the density depends on the "
+                    f"gridmedium: with the phase function {phase.class_name()} the density depends on the "
                     "direction, and majorants do not follow that; use Mitsuba's heterogeneous"
                 )
             self.sigma_t = _volume(props, "sigma_t", 1.0)
@@ -56,11 +56,9 @@ def _plugin_class() -> type:
         # ------------------------------------------------ parameters ------------------------------------------------
 
         def traverse(self, cb: Any) -> None:
-            cb.put("scale", self.scale, mi.ParamFlags.Differentiable)
-            cb.put("albedo", self.albedo, mi.ParamFlags.Differentiable)
-            cb.put("sigma_t", self.sigma_t, mi.ParamFlags.Differentiable)
-            if self.emission is not None:
-                cb.put("emission", self.emission, mi.ParamFlags.Differentiable)
+            for name in ("scale", "albedo", "sigma_t", "emission"):
+                if getattr(self, name) is not None:
+                    cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
             cb.put("phase_function", self.phase_function(), mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: list[str]) -> None:
@@ -109,21 +107,21 @@ def _plugin_class() -> type:
 
         # -------------------------------------- what Mitsuba's integrators call --------------------------------------
 
-        def get_majorant(self, mei: Any, active: Any = True) -> Any:
+        def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
             return mi.UnpolarizedSpectrum(self.majorant)
 
         def get_scattering_coefficients(self, mei: Any, active: Any = True) -> tuple[Any, Any, Any]:
             σ_t = self.scale * self.sigma_t.eval(mei, active)
             return σ_t * self.albedo.eval(mei, active), self.majorant - σ_t, σ_t
 
-        def intersect_aabb(self, ray: Any) -> tuple[Any, Any, Any]:
+        def intersect_aabb(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
             near, far = cellwalk.through(self.box, ray)
             return near <= far, near, far
 
         # -------------------------------------------- what our own calls ---------------------------------------------
 
-        def free_flight(self, ray: Any, u: Any, active: Any = True) -> tuple[Any, Any]:
-            """Distance to the next tentative collision and the local majorant there (Floats). Detached.
+        def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool = True) -> tuple[mi.Float, mi.Float]:
+            """Distance to the next tentative collision and the local majorant there. Detached.
 
             The distance t solves ∫_0^t m ds = -log(1 - u) with m the local majorant, at least σ_t in all channels and
             0 outside of the medium's bounding box. It is infinite, and the majorant 0, if there is no such t below
@@ -132,20 +130,20 @@ def _plugin_class() -> type:
             with dr.suspend_grad():
                 return cellwalk.free_flight(self.flight_cells, self.box, dr.detach(ray), dr.detach(u), active)
 
-        def transmittance(self, ray: Any, sampler: Any, active: Any = True) -> Any:
-            """Unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) by channel (UnpolarizedSpectrum). Detached."""
+        def transmittance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+            """Unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) by channel. Detached."""
             with dr.suspend_grad():
                 ray, scale = dr.detach(ray), dr.detach(self.scale)
 
-                def density(t: Any, active: Any) -> Any:
+                def density(t: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
                     at = dr.zeros(mi.Interaction3f)
                     at.p, at.time, at.wavelengths = ray(t), ray.time, ray.wavelengths
                     return scale * dr.detach(self.sigma_t.eval(at, active))
 
                 return cellwalk.transmittance(self.shadow_cells, self.box, ray, density, sampler, active)
 
-        def emission_at(self, mei: Any, active: Any = True) -> Any:
-            """Radiance emitted per unit length at an interaction (UnpolarizedSpectrum); 0 without emission."""
+        def emission_at(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+            """Radiance emitted per unit length at an interaction; 0 without emission."""
             return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, active)
 
     return GridMedium
@@ -184,7 +182,7 @@ def _choice(props: Any) -> bool | str:
 # ----------------------------------------------- looking at the density -----------------------------------------------
 
 
-def _look(volume: Any, needs_grid: bool) -> tuple[bool, list[Bounds]]:
+def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
     """Whether the volume differs between channels, and its bounds by cell, from fine to a single cell."""
     params = mi.traverse(volume)
     values = [dr.detach(params[key]) for key in params.keys()]

@@ -62,9 +62,8 @@ def load_volume(path: str | Path, grid: str | None = None) -> Volume:
 
     ``grid`` names one of several grids in a VDB file; without it the file must hold one only.
 
-    Raises:
-        PathreplayError: no such file or grid, an unknown or damaged format, values that are not float, the extra `vdb`
-            is not installed, or the reader would give wrong values (see docs/volumes.md).
+    Raises PathreplayError for no such file or grid, an unknown or damaged format, values that are not float, without
+    the extra `vdb`, and where the reader would give wrong values (see docs/volumes.md).
     """
     path = Path(path)
     read = {".vol": _read_vol, ".vdb": _read_vdb, ".nvdb": _read_nvdb}.get(path.suffix.lower())

@@ -7,7 +7,7 @@ import gc
 import inspect
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,7 @@ def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any)
     name of a built-in scene (see ``BUILTINS``). ``parameters`` replace ``$name`` in the file, or are the arguments of
     the built-in. Needs an active Mitsuba variant.
 
-    Raises:
-        PathreplayError: no such file or built-in, a wrong parameter, a file that Mitsuba cannot read, no variant.
+    Raises PathreplayError for no such file or built-in, a wrong parameter, what Mitsuba cannot read, no variant.
     """
     return load_scene_with(spec, {}, base, **parameters)[0]
 
@@ -79,7 +78,10 @@ def load_scene_for(
     scene = load_scene(spec, base, **parameters)
     params = mi.traverse(scene)
     patterns = [pattern for pattern in wanted if pattern.rsplit(".", 1)[-1] == "eta"]
-    if not any(scene_parameters.owner_class(params, key) == "SmoothDielectric" for key in _matches(params, patterns)):
+    keys: list[str] = []
+    with suppress(PathreplayError):
+        keys = scene_parameters.resolve_keys(params, patterns)
+    if not any(scene_parameters.owner_class(params, key) == "SmoothDielectric" for key in keys):
         return scene, ()
     # Dr.Jit traces calls through every instance alive, so the first scene has to go before the second one comes.
     del scene, params
@@ -87,13 +89,6 @@ def load_scene_for(
     scene, exchanged = load_scene_with(spec, SMOOTH_GLASS, base, **parameters)
     count = "one" if len(exchanged) == 1 else f"all {len(exchanged)}"
     return scene, (f"replaced 'dielectric' by 'smoothdielectric' ({count} of them): its eta carries a derivative",)
-
-
-def _matches(params: Any, patterns: list[str]) -> list[str]:
-    try:
-        return scene_parameters.resolve_keys(params, patterns)
-    except PathreplayError:
-        return []
 
 
 def _builtin_dict(name: str, parameters: dict[str, Any]) -> SceneDict:

@@ -251,20 +251,6 @@ def to_value(like: Any, array: Any) -> Any:
     return type(like)(*(component(np.atleast_1d(row)) for row in given))
 
 
-def set_arrays(params: Any, arrays: Mapping[str, Any]) -> None:
-    """Write NumPy arrays into the scene, then let the scene know (``params.update()``), once for all of them.
-
-    Raises PathreplayError for a key that does not exist, or a shape that is not that of the parameter.
-    """
-    for key in arrays:
-        if key not in params:
-            raise PathreplayError(_no_match(list(params.keys()), key))
-    values = {key: to_value(params[key], array) for key, array in arrays.items()}
-    for key, value in values.items():
-        params[key] = value
-    params.update()
-
-
 def displaced(value: Any, direction: np.ndarray, t: Any) -> Any:
     """``value + t * direction``, for a differentiable scalar ``t`` (``mi.Float`` of size 1), in the type of ``value``.
 

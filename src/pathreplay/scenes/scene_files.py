@@ -120,8 +120,8 @@ class _Element:
     properties: list[tuple[str, ...]]
 
     @property
-    def first_list(self) -> int:
-        return [kinds[0] for kinds in self.properties].index("list")
+    def kinds(self) -> list[str]:
+        return [kinds[0] for kinds in self.properties]
 
     def triangles(self, order: str) -> np.dtype[Any]:
         """The layout of one entry, where lists have three members."""
@@ -140,9 +140,7 @@ def _require_sound_ply(path: Path) -> None:
             raise PathreplayError(f"Mesh {path} is no PLY file: it does not begin with 'ply'; get it anew")
         kind, elements = _ply_header(file)
         begin = file.tell()
-    if kind is None or [element.name for element in elements[:2]] != ["vertex", "face"]:
-        return
-    if any(kinds[0] == "list" for kinds in elements[0].properties):
+    if kind is None or [element.name for element in elements[:2]] != ["vertex", "face"] or "list" in elements[0].kinds:
         return
     vertices, faces = elements[0].count, elements[1].count
     if not vertices or not faces:
@@ -151,9 +149,8 @@ def _require_sound_ply(path: Path) -> None:
         indices = (_ascii_indices if kind == "ascii" else _binary_indices)(path, begin, elements, kind)
     except (KeyError, ValueError, IndexError):
         return  # not what we know: Mitsuba may
-    if indices is None or not indices.size:
-        return
-    require_vertices(path, indices, vertices)
+    if indices is not None and indices.size:
+        require_vertices(path, indices, vertices)
 
 
 def _ply_header(file: Any) -> tuple[str | None, list[_Element]]:
@@ -178,7 +175,7 @@ def _binary_indices(path: Path, begin: int, elements: list[_Element], kind: str)
     if path.stat().st_size < begin + face.itemsize * elements[1].count:
         return None
     entries = np.memmap(path, face, "r", begin, elements[1].count)
-    at = elements[1].first_list
+    at = elements[1].kinds.index("list")
     # Mitsuba refuses other faces.
     return entries[elements[1].properties[at][-1]] if (entries[f"count {at}"] == 3).all() else None
 
@@ -192,5 +189,5 @@ def _ascii_indices(path: Path, begin: int, elements: list[_Element], kind: str) 
     begin = elements[0].count * len(elements[0].properties)
     width = len(elements[1].properties) + 3
     entries = numbers[begin : begin + width * elements[1].count].reshape(-1, width)
-    at = elements[1].first_list
+    at = elements[1].kinds.index("list")
     return entries[:, at + 1 : at + 4] if (entries[:, at] == 3).all() else None
