@@ -13,8 +13,7 @@ import pytest
 from pathreplay import PathreplayError, check_gradient
 from pathreplay.check.statistics import gap
 from pathreplay.check.verdict import Z_LIMIT
-from pathreplay.inverse.config import Plugin
-from pathreplay.inverse.problem import load_integrator
+from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.scenes.substitute import load_dict_with
 from truth import bitmap, lit_room, noise, random, rgb, translate, under_sky
 
@@ -84,7 +83,7 @@ def test_none_is_told_where_mitsuba_would_die() -> None:
     with pytest.raises(PathreplayError, match=expected):
         check_gradient(scene, "light.emitter.radiance.value", integrator={"type": "pathreplay", "max_depth": None})
     with pytest.raises(PathreplayError, match=expected):
-        load_integrator(Plugin(type="pathreplay", max_depth=None))
+        load_integrator({"type": "pathreplay", "max_depth": None})
     with pytest.raises(PathreplayError, match="'reflectance' of 'diffuse' is None"):
         load_dict_with({"type": "scene", "paint": {"type": "diffuse", "reflectance": None}}, {})
 

@@ -12,9 +12,8 @@ import safetensors.numpy
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.grids import rmse
-from pathreplay.inverse.loop import judged, new_run, put_values, render_views
-from pathreplay.inverse.problem import build_problem
-from pathreplay.scenes.parameters import to_value
+from pathreplay.inverse.loop import judged, new_run, render_views
+from pathreplay.inverse.problem import build_problem, put_values
 from test_inverse_run import JOB, TEXTURE, interrupt_at, room, run  # noqa: F401 (room: its folder, for every test)
 
 # What the job itself has: its kernels are compiled when the rival's turn comes.
@@ -80,13 +79,13 @@ def test_judgement_is_free_of_the_noise_of_rendering(tmp_path: Path) -> None:
     """At the truth pictures differ by noise only: the judgement is far below that, and sees the gap off the truth."""
     config = make_config({**JOB, "spp": 16, "rival": RIVAL, "sensors": ["left"], "target": SHARP})
     problem = build_problem(config, Path.cwd())
-    adam = new_run(problem, problem.integrator).adam
-    put_values(problem, adam)
+    values = new_run(problem, problem.integrator).values
+    put_values(problem, values)
     gap = judged(problem, config, 0)
     for variable in problem.variables:
         assert variable.truth is not None
-        adam[variable.key] = to_value(variable.like, variable.truth)
-    put_values(problem, adam)
+        values[variable.key] = variable.truth
+    put_values(problem, values)
     noisy = rmse(render_views(problem, config)["left"], problem.views[0].target)
     left = max(judged(problem, config, i) for i in range(4))
     assert left < 0.1 * gap and left < 0.3 * noisy

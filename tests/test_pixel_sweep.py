@@ -14,11 +14,12 @@ from pathreplay.check.stencil import CENTRAL
 from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import make_config
-from pathreplay.inverse.job import build_problem
-from pathreplay.inverse.loop import new_run, put_values, take_step
+from pathreplay.inverse.evaluate import Evaluator, Shard
+from pathreplay.inverse.loop import new_run, take_step
 from pathreplay.inverse.losses import QUADRATIC, RELATIVE_FLOOR, l2
-from pathreplay.inverse.passes import _linear_derivative
-from pathreplay.inverse.problem import ITERATION, seeds
+from pathreplay.inverse.problem import build_problem
+from pathreplay.inverse.recorded import linear_derivative
+from pathreplay.inverse.seeds import ITERATION, seeds
 from truth import (
     Bench,
     Case,
@@ -166,7 +167,7 @@ def test_what_cannot_be_swept_by_pixels_is_refused(opened) -> None:
 def test_the_derivative_of_a_quadratic_loss_is_found_at_any_brightness() -> None:
     target = mi.TensorXf(np.float32([0, 0.1, 10, 1e4, 1e6]))
     for loss in QUADRATIC:
-        offset, slope = (np.array(term, dtype=np.float64) for term in _linear_derivative(loss, target))
+        offset, slope = (np.array(term, dtype=np.float64) for term in linear_derivative(loss, target))
         T = np.array(target, dtype=np.float64)
         weight = 2 / T.size if loss is l2 else 2 / T.size / (T + RELATIVE_FLOOR) ** 2
         np.testing.assert_allclose(slope, weight, rtol=1e-5)
@@ -185,12 +186,12 @@ JOB = {
 
 def steps(problem, config, passes: str) -> np.ndarray:
     """Loss and norm of the gradient of four steps, recorded (from the second on) or traced anew each time."""
-    run = new_run(problem, problem.integrator)
-    run.passes.freezes = passes == "recorded"
+    run = new_run(problem, problem.integrator, record=passes == "recorded")
     for i in range(4):
         take_step(problem, config, run, i)
-    # The first step is traced in any case; the others launch what the second recorded.
-    assert [each.n_recordings for each in run.passes.frozen.values()] == [1] * (passes == "recorded")
+    # The first step is traced in any case; the others launch what the second recorded, view by view.
+    frozen = run.executor.evaluate._recordings._frozen.values()
+    assert [each.n_recordings for each in frozen] == [1] * len(problem.views) * (passes == "recorded")
     return np.array([[entry.loss, *entry.gradient_norms.values()] for entry in run.history])
 
 
@@ -212,9 +213,9 @@ def gradient(config, folder) -> np.ndarray:
     """Of a single step, by the first variable."""
     problem = build_problem(config, folder)
     run = new_run(problem, problem.integrator)
-    put_values(problem, run.adam)
-    run.passes([seeds(config.seed, ITERATION, 0, view.sensor)[0] for view in problem.views], config.spp)
-    return np.array(dr.grad(run.adam[problem.variables[0].key]))
+    numbers = [seeds(config.seed, ITERATION, 0, view.sensor)[0] for view in problem.views]
+    shard = Shard(tuple(range(len(problem.views))), config.spp, tuple(numbers))
+    return Evaluator(problem, problem.integrator)(run.values, shard, {}).gradients[problem.variables[0].key]
 
 
 @pytest.mark.parametrize("changes", [BOXED, BOXED_POSE], ids=["colour", "pose"])

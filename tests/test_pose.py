@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize, problem
+from pathreplay.inverse import make_config, optimize, problem, targets
 from pathreplay.inverse.pose import Pose, make_pose, rotation_matrix
 from pathreplay.scenes.parameters import get_array
 
@@ -209,7 +209,7 @@ def html_text(result: Any) -> str:
 @pytest.mark.usefixtures("sheet")
 def test_the_target_scene_is_gone_when_iterations_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[weakref.ref[Any]] = []
-    load = problem.load_scene
+    load = targets.load_scene
 
     def watched(*arguments: Any, **options: Any) -> Any:
         scene = load(*arguments, **options)
@@ -217,7 +217,7 @@ def test_the_target_scene_is_gone_when_iterations_begin(monkeypatch: pytest.Monk
         seen.append(weakref.ref(glass[0]))  # an object of Python, unlike the scene
         return scene
 
-    monkeypatch.setattr(problem, "load_scene", watched)
+    monkeypatch.setattr(targets, "load_scene", watched)
     target = {**JOB["target"], "scene": "smoothdielectric.xml"}  # type: ignore[dict-item]
     problem.build_problem(make_config({**JOB, "target": target}), Path.cwd())
     assert len(seen) == 1 and seen[0]() is None

@@ -11,7 +11,7 @@ import pytest
 
 from pathreplay.inverse import progress
 from pathreplay.inverse.checkpoint import Entry
-from pathreplay.inverse.job import RunResult
+from pathreplay.inverse.result import RunResult
 
 
 def lines(total: int) -> None:

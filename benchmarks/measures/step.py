@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import drjit as dr
+import drjit.opt
 import mitsuba as mi
 import numpy as np
-from drjit.opt import Adam
 
 from pathreplay.inverse.config import make_config
+from pathreplay.inverse.evaluate import Evaluator
+from pathreplay.inverse.executor import Local
 from pathreplay.inverse.loop import Run, take_step
 from pathreplay.inverse.losses import l2
-from pathreplay.inverse.passes import Passes
+from pathreplay.inverse.optimiser import Adam
 from pathreplay.inverse.problem import Problem, Variable, View
 from pathreplay.scenes.parameters import get_array
 
@@ -33,12 +36,12 @@ TARGET_SPP = 256
 class Watched(Adam):
     """Adam that remembers the gradients of its last step."""
 
-    seen: dict[str, Any]
+    seen: Mapping[str, np.ndarray]
 
-    def step(self) -> None:
+    def step(self, values: Any, gradients: Any, rates: Any) -> dict[str, np.ndarray]:
         """Take the step of Adam."""
-        self.seen = {key: dr.grad(value) for key, value in self.items()}
-        super().step()
+        self.seen = gradients
+        return super().step(values, gradients, rates)
 
 
 class Step:
@@ -71,42 +74,47 @@ class Step:
             }
         )
         self.runs: dict[str, Run] = {}
+        self.usual: dict[str, tuple[mi.Integrator, drjit.opt.Adam]] = {}
 
     def forget(self) -> None:
         """Make integrators and optimisers anew."""
         self.runs.clear()
+        self.usual.clear()
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
         """Seconds of a step, and the gradient that it took."""
         name, loop = parts(method)
-        if method not in self.runs:
+        if method not in self.runs and method not in self.usual:
             integrator = mi.load_dict(METHODS[name] | self.job.limits)
-            self.runs[method] = Run(Passes(self.problem, integrator), Watched(lr=RATE), [])
-        run = self.runs[method]
-        run.adam[self.key] = type(self.start)(self.start)
-        if loop != OWN:
-            self.params.update(run.adam)
+            if loop == OWN:
+                self.runs[method] = Run(Local(Evaluator(self.problem, integrator)), Watched({}), {})
+            else:
+                self.usual[method] = integrator, drjit.opt.Adam(lr=RATE)
+        return self._own(self.runs[method]) if loop == OWN else self._usual(*self.usual[method], seed)
+
+    def _own(self, run: Run) -> tuple[float, np.ndarray]:
+        run.values = {self.key: get_array(self.start)}
+        seconds, _ = stopwatch(lambda: take_step(self.problem, self.config, run, len(run.history)))
+        return seconds, np.ravel(run.optimiser.seen[self.key])  # type: ignore[attr-defined]
+
+    def _usual(self, integrator: mi.Integrator, adam: drjit.opt.Adam, seed: int) -> tuple[float, np.ndarray]:
+        """The loop of Mitsuba's tutorials."""
+        adam[self.key] = type(self.start)(self.start)
+        self.params.update(adam)
 
         def step() -> Any:
-            if loop == OWN:
-                take_step(self.problem, self.config, run, len(run.history))
-            else:
-                self._usual(run, seed)
-            return run.adam[self.key]
+            image = mi.render(self.scene, self.params, integrator=integrator, spp=self.job.spp, seed=seed)
+            loss = dr.mean(dr.square(image - self.target), axis=None)
+            dr.backward(loss)
+            gradient = dr.grad(adam[self.key])
+            adam.step()
+            value = dr.maximum(adam[self.key], 0.0)
+            adam[self.key] = value if self.upper is None else dr.minimum(value, self.upper)
+            self.params.update(adam)
+            return adam[self.key], gradient
 
-        seconds, _ = stopwatch(step)
-        return seconds, np.ravel(np.array(run.adam.seen[self.key]))
-
-    def _usual(self, run: Run, seed: int) -> None:
-        """The loop of Mitsuba's tutorials."""
-        adam = run.adam
-        image = mi.render(self.scene, self.params, integrator=run.passes.integrator, spp=self.job.spp, seed=seed)
-        loss = dr.mean(dr.square(image - self.target), axis=None)
-        dr.backward(loss)
-        adam.step()
-        value = dr.maximum(adam[self.key], 0.0)
-        adam[self.key] = value if self.upper is None else dr.minimum(value, self.upper)
-        self.params.update(adam)
+        seconds, (_, gradient) = stopwatch(step)
+        return seconds, np.ravel(np.array(gradient))
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """What the gradients of all steps say: see `spread`."""

@@ -14,11 +14,11 @@ from typing import Any
 import mitsuba as mi
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from pathreplay.check.gradient import GradientCheck, check_gradient
-from pathreplay.check.reference import integrator_under_test
+from pathreplay.check.reference import Spec, integrator_under_test
 from pathreplay.errors import PathreplayError
 from pathreplay.files import file_problem
 from pathreplay.scenes.parameters import resolve_differentiable
@@ -27,7 +27,7 @@ _STYLES = {"pass": "green", "zero": "green", "fail": "bold red", "inconclusive":
 
 
 def check_all(
-    scene: Any, patterns: Sequence[str], *, integrator: Any = None, max_depth: int | None = None, **options: Any
+    scene: mi.Scene, patterns: Sequence[str], *, integrator: Spec = None, max_depth: int | None = None, **options: Any
 ) -> list[GradientCheck]:
     """``check_gradient(scene, key, **options)`` for every key that the patterns name, with a bar on standard error.
 
@@ -43,7 +43,7 @@ def check_all(
         for i, key in enumerate(keys):
             task = bar.add_task(escape(f"{key} ({i + 1}/{len(keys)})"), total=None)
 
-            def progress(done: int, total: int, task: Any = task) -> None:
+            def progress(done: int, total: int, task: TaskID = task) -> None:
                 bar.update(task, completed=done, total=total)
 
             results.append(check_gradient(scene, key, integrator=tested, progress=progress, **options))

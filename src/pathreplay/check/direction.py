@@ -10,7 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pathreplay.check.stencil import BACKWARD, CENTRAL, FORWARD, Stencil
 from pathreplay.errors import PathreplayError
@@ -36,7 +38,7 @@ class Line:
     step: float
     stencil: Stencil
 
-    def move(self, value: Any, t: Any) -> Any:
+    def move(self, value: Any, t: mi.Float) -> Any:
         """The point at t, from the parameter's own ``value``, whose type it has."""
         return displaced(value, self.direction, t)
 
@@ -44,7 +46,7 @@ class Line:
 def choose_line(
     key: str,
     value: np.ndarray,
-    direction: Any = None,
+    direction: ArrayLike | None = None,
     step: float | None = None,
     seed: int = 0,
     *,

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pathreplay.check.direction import Line, choose_line
-from pathreplay.check.objective import Mode, Objective, alone, integrator_name
-from pathreplay.check.reference import integrator_under_test, reference_integrator
+from pathreplay.check.objective import Loss, Mode, Objective, alone, integrator_name
+from pathreplay.check.reference import Spec, integrator_under_test, reference_integrator
 from pathreplay.check.verdict import Judgement
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.render.film import film_size
@@ -28,7 +28,7 @@ _MOST_SEEDS = 1_000_000
 
 @dataclass(frozen=True)
 class GradientCheck(Judgement):
-    """One directional derivative, estimated twice, and the verdict. Derivatives are those of the objective."""
+    """One directional derivative, estimated twice, and what follows. Derivatives are those of the objective."""
 
     key: str
     direction: str
@@ -68,20 +68,20 @@ class GradientCheck(Judgement):
 
 
 def check_gradient(
-    scene: Any,
+    scene: mi.Scene,
     key: str,
     *,
-    integrator: Any = None,
-    reference: Any = None,
+    integrator: Spec = None,
+    reference: Spec = None,
     max_depth: int | None = None,
     sensor: int = 0,
     seeds: int = 16,
     spp: int = 16,
     fd_spp: int | None = None,
     step: float | None = None,
-    direction: Any = None,
+    direction: ArrayLike | None = None,
     mode: Mode = "backward",
-    loss: Callable[[Any], Any] | None = None,
+    loss: Loss | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> GradientCheck:
@@ -143,7 +143,7 @@ class _Plan:
     done: int = 0
 
     def carry_out(
-        self, objective: Objective, line: Line, tested: mi.Integrator, plain: mi.Integrator, loss: Any
+        self, objective: Objective, line: Line, tested: mi.Integrator, plain: mi.Integrator, loss: Loss | None
     ) -> GradientCheck:
         n, stencil, points = self.seeds, line.stencil, line.stencil.points()
         # Distinct 32-bit words: seeds of the gradient's primal image, of its derivative, of the reference, of the
@@ -182,9 +182,11 @@ class _Plan:
         return result
 
 
-def _line(params: mi.SceneParameters, key: str, tested: mi.Integrator, step: Any, direction: Any, seed: int) -> Line:
+def _line(
+    params: mi.SceneParameters, key: str, by: mi.Integrator, step: float | None, direction: ArrayLike | None, seed: int
+) -> Line:
     """The line through the parameter that will be looked along; what cannot be differentiated or differenced raises."""
-    require_differentiable(params, key, tested)
+    require_differentiable(params, key, by)
     require_finite(params)
     value, owner = get_array(params[key]), params.properties[key][2]
     if value.dtype == np.float16:
@@ -199,7 +201,7 @@ def _line(params: mi.SceneParameters, key: str, tested: mi.Integrator, step: Any
     return choose_line(key, value.astype(np.float64), direction, step, seed, far=far, spectra=spectra)
 
 
-def _require_types(key: Any, loss: Any, **numbers: Any) -> None:
+def _require_types(key: object, loss: object, **numbers: object) -> None:
     if not isinstance(key, str):
         raise PathreplayError(f"key is {shown(key)}; give the name of one parameter, as 'wall.reflectance.data'")
     if loss is not None and not callable(loss):
@@ -210,7 +212,9 @@ def _require_types(key: Any, loss: Any, **numbers: Any) -> None:
             raise PathreplayError(f"{name} is {shown(number)}; give a whole number")
 
 
-def _require_arguments(scene: Any, sensor: int, seeds: int, spp: int, fd_spp: int | None, seed: int, mode: str) -> None:
+def _require_arguments(
+    scene: object, sensor: int, seeds: int, spp: int, fd_spp: int | None, seed: int, mode: str
+) -> None:
     if mi.variant() is None or not dr.is_diff_v(mi.Float):
         raise PathreplayError(
             f"Variant '{mi.variant()}' has no derivatives; call mi.set_variant('llvm_ad_rgb') before loading the scene"

@@ -23,7 +23,8 @@ from pathreplay.scenes.loading import told
 from pathreplay.scenes.parameters import get_array
 
 Mode = Literal["backward", "forward"]
-Move = Callable[[Any, Any], Any]
+Move = Callable[[Any, "mi.Float"], Any]
+Loss = Callable[["mi.TensorXf"], "mi.Float"]
 
 
 @contextmanager
@@ -59,7 +60,7 @@ class Objective:
         self.move = move
         self.sensor = scene.sensors()[sensor]
 
-    def put(self, t: Any) -> None:
+    def put(self, t: mi.Float) -> None:
         """Set the parameter to its value at t; update() evaluates it, so that all t share one kernel."""
         self.params[self.key] = self.move(self.value, t)
         self.params.update()
@@ -69,7 +70,7 @@ class Objective:
         self.adjoint = mi.TensorXf(weights)
         self.weights = np.array(self.adjoint, np.float64)
 
-    def weigh_by(self, loss: Any, plain: mi.Integrator, seed: int, spp: int) -> None:
+    def weigh_by(self, loss: Loss | None, plain: mi.Integrator, seed: int, spp: int) -> None:
         """Set smooth weights, or the derivative of a loss at a picture; and the scale Σ |w_k I_k| / n of F."""
         image = self._render(plain, seed, spp)
         if loss is None:

@@ -9,13 +9,15 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes.descriptions import load_description
-from pathreplay.scenes.loading import one_line
+from pathreplay.scenes.descriptions import load_integrator
+
+Spec: TypeAlias = "mi.Integrator | Mapping[str, Any] | str | None"
+"""An integrator: finished, described, by name, or left to us."""
 
 UNBOUNDED = 0xFFFFFFFF
 """What Mitsuba's Python integrators keep for ``max_depth = -1``."""
@@ -36,7 +38,7 @@ class Limits:
     hide_emitters: bool
 
 
-def read_limits(integrator: Any) -> Limits | None:
+def read_limits(integrator: mi.Integrator) -> Limits | None:
     """The limits of an integrator of Mitsuba's or ours, or None where it has no path length to read."""
     # Python integrators have attributes; C++ ones only print them.
     printed = dict(re.findall(r"(max_depth|rr_depth) = (-?\d+)", str(integrator)))
@@ -48,7 +50,7 @@ def read_limits(integrator: Any) -> Limits | None:
     return Limits(-1 if depth >= UNBOUNDED else depth, int(rr_depth), bool(getattr(integrator, "hide_emitters", False)))
 
 
-def integrator_under_test(spec: Any, scene: Any, max_depth: int | None = None) -> Any:
+def integrator_under_test(spec: Spec, scene: mi.Scene, max_depth: int | None = None) -> mi.Integrator:
     """The integrator that ``spec`` means: an object (taken as it is), a dictionary, a plugin name, or None.
 
     None is the scene's own integrator if that one is made for differentiation, else ``pathreplay``. A plugin given by
@@ -74,10 +76,10 @@ def integrator_under_test(spec: Any, scene: Any, max_depth: int | None = None) -
             description.update(vars(limits))
     if max_depth is not None:
         description["max_depth"] = max_depth
-    return _load(description)
+    return load_integrator(description)
 
 
-def reference_integrator(spec: Any, scene: Any, tested: Any) -> Any:
+def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> mi.Integrator:
     """The integrator whose images are differenced: ``spec`` if given, else ``path``, or ``volpath`` with media.
 
     Its Russian roulette is switched off where paths are short enough. That leaves the expected image alone, keeps
@@ -88,7 +90,7 @@ def reference_integrator(spec: Any, scene: Any, tested: Any) -> Any:
     if isinstance(spec, mi.Integrator):
         return spec
     if isinstance(spec, Mapping):
-        return _load(dict(spec))
+        return load_integrator(dict(spec))
     limits = read_limits(tested)
     if limits is None:
         raise PathreplayError(
@@ -98,26 +100,12 @@ def reference_integrator(spec: Any, scene: Any, tested: Any) -> Any:
     short = 0 <= limits.max_depth <= LONGEST_WITHOUT_ROULETTE
     name = spec or ("volpath" if has_media(scene) else "path")
     rr_depth = NO_ROULETTE if short else limits.rr_depth
-    return _load({"type": name, **vars(limits), "rr_depth": rr_depth})
+    return load_integrator({"type": name, **vars(limits), "rr_depth": rr_depth})
 
 
-def has_media(scene: Any) -> bool:
+def has_media(scene: mi.Scene) -> bool:
     """Whether light may be scattered between surfaces: a shape bounds a medium, or a camera stands in one."""
     if any(shape.is_medium_transition() for shape in scene.shapes()):
         return True
     # Sensors do not tell their medium to Python, but it is among their parameters.
     return any(key.startswith("medium.") for sensor in scene.sensors() for key in mi.traverse(sensor).keys())
-
-
-def _load(description: dict[str, Any]) -> Any:
-    try:
-        integrator = load_description(description)
-    except PathreplayError:
-        raise
-    except Exception as error:  # Mitsuba raises RuntimeError, plugins in Python whatever they like
-        # Mitsuba writes the whole traceback of a Python plugin into its message; its last line says what is wrong.
-        told = str(error).strip().splitlines()[-1] if "Traceback" in str(error) else one_line(error)
-        raise PathreplayError(f"Integrator '{description.get('type')}' cannot be made: {told}") from error
-    if not isinstance(integrator, mi.Integrator):
-        raise PathreplayError(f"'{description.get('type')}' is no integrator but a {type(integrator).__name__}")
-    return integrator

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import stats
 
 
@@ -21,15 +22,16 @@ class Gap(NamedTuple):
     z: Any
 
 
-def mean_and_error(samples: Any) -> tuple[Any, Any]:
+def mean_and_error(samples: ArrayLike) -> tuple[Any, Any]:
     """Mean of independent samples, and its standard error."""
     samples = np.asarray(samples, np.float64)
     return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
 
 
-def gap(a: Any, b: Any = 0.0) -> Gap:
+def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
     """mean(a) - mean(b) of independent samples (n, ...) and (m, ...); ``b`` without a first axis is known exactly."""
-    known = np.ndim(b) < np.ndim(a)
+    a, b = np.asarray(a), np.asarray(b)
+    known = b.ndim < a.ndim
     (mean_a, error_a), (mean_b, error_b) = mean_and_error(a), (b, 0) if known else mean_and_error(b)
     difference, σ = mean_a - mean_b, np.hypot(error_a, error_b)
     return Gap(difference, σ, welch(difference, σ, (error_a, len(a)), *([] if known else [(error_b, len(b))])))

@@ -15,8 +15,7 @@ second order in 1/N, by what the noise of the image and that of the derivative m
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, make_dataclass
-from functools import cache
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -27,49 +26,8 @@ from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 from .adjoint import LostPaths, RayDerivative
-from .record import MAX_DEPTH, Layout, record_type, room_for
+from .record import Layout, record_type, room_for
 from .two_walks import first_walk, walk_back
-
-
-def fits(max_depth: int, spp: int) -> bool:
-    """Whether there are two paths or more, and the record of a lane can hold all of them."""
-    return 1 < spp <= MAX_DEPTH // max(max_depth, 1)
-
-
-def sweepable(sensor: mi.Sensor, max_depth: int, spp: int) -> bool:
-    """Whether pixels of a sensor can be swept: a box filter, so that each path belongs to one pixel; colours (rgb) and
-    no alpha; an independent sampler; a camera that stands still and takes no time; two paths or more (``spp``), all of
-    which fit into the record of a lane."""
-    film = sensor.film()
-    film.prepare([])
-    with dr.resume_grad():
-        ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
-    return bool(
-        film.rfilter().is_box_filter()
-        and mi.is_rgb
-        and not mi.has_flag(film.flags(), mi.FilmFlags.Special)
-        and film.bitmap().pixel_format() == mi.Bitmap.PixelFormat.RGB
-        and sensor.sampler().class_name() == "IndependentSampler"
-        and sensor.shutter_open_time() == 0
-        and not dr.grad_enabled(ray.o, ray.d)
-        and fits(max_depth, spp)
-    )
-
-
-def pixel_camera(sensor: mi.Sensor, pixel: mi.UInt32) -> Callable[..., Any]:
-    """Rays through random places of pixels (UInt32, row by row): (sampler, active) -> Ray3f and weight (Spectrum).
-
-    As in Mitsuba's RBIntegrator. Detached.
-    """
-    width, height = sensor.film().crop_size()
-    corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
-
-    def camera(sampler: mi.Sampler, active: mi.Bool) -> tuple[mi.Ray3f, mi.Spectrum]:
-        place = (corner + sampler.next_2d(active)) / mi.Point2f(width, height)
-        aperture = sampler.next_2d(active) if sensor.needs_aperture_sample() else mi.Point2f(0)
-        return sensor.sample_ray(sensor.shutter_open(), 0.0, place, aperture, active)
-
-    return camera
 
 
 @dataclass(frozen=True)
@@ -80,24 +38,15 @@ class PixelLoss:
     slope: mi.Spectrum
 
 
-@cache
-def _end_type(variant: str) -> type:
-    return make_dataclass("End", {"L": mi.Spectrum, "records": mi.UInt32}.items())
-
-
-def end_type() -> type:
-    """What is kept of a path that has ended: its radiance, and its number of records."""
-    return _end_type(mi.variant())
-
-
 @dr.syntax
 def pixel_sweep(
     walk: Walk, sampler: mi.Sampler, camera: Callable[..., Any], paths: int, loss: PixelLoss, lost: LostPaths
 ) -> tuple[bool, mi.Spectrum]:
     """Walk ``paths`` paths (two or more) in every lane and back-propagate the loss.
 
-    Returns whether the paths move with the parameters, and the mean of their radiances. ``camera`` is a `pixel_camera`.
-    For scenes without media. What is not differentiated, what is counted as ``lost`` and what is raised: see `sweep`.
+    Returns whether the paths move with the parameters, and the mean of their radiances. ``camera`` gives rays,
+    detached, and their weights: (sampler, active) -> (Ray3f, Spectrum). For scenes without media. What is not
+    differentiated, what is counted as ``lost`` and what is raised: see `sweep`.
     """
     room = room_for(walk)
     total = mi.Spectrum(0)  # radiance of all paths
@@ -106,7 +55,8 @@ def pixel_sweep(
         start = CameraStart(ray0, sampler, mi.Bool(True))
         layout = Layout.of(walk, path_moves(walk, start, PathState.begin(walk, start).at))
     records = dr.alloc_local(record_type(layout), paths * room)
-    ends = dr.alloc_local(end_type(), paths)
+    ends = dr.alloc_local(mi.Spectrum, paths)  # of each path the radiance, and the number of its records
+    counts = dr.alloc_local(mi.UInt32, paths)
     s = mi.UInt32(0)  # number of the path
 
     while dr.hint(s < paths, exclude=[walk, camera, layout, start, lost], label="pathreplay: paths of a pixel"):
@@ -114,16 +64,15 @@ def pixel_sweep(
         path = PathState.begin(walk, CameraStart(ray, sampler, mi.Bool(True)), sustained=True)
         path.β, path.β_alive = mi.Spectrum(β), mi.Spectrum(β)
         records, count, L, _branch = first_walk(walk, sampler, path, layout, records, s * room, lost)
-        ends[s] = end_type()(L, count)
+        ends[s], counts[s] = L, count
         total += L
         s += 1
 
     while dr.hint(s > 0, exclude=[walk, ray0, lost, loss, layout, start], label="pathreplay: pixel, backwards"):
         s -= 1
-        end = ends[s]
-        δL = (loss.offset + loss.slope * ((total - end.L) / (paths - 1))) / paths
+        δL = (loss.offset + loss.slope * ((total - ends[s]) / (paths - 1))) / paths
         none, still = mi.Spectrum(0), RayDerivative.zero()
-        first, count = s * room, mi.UInt32(end.records)
+        first, count = s * room, mi.UInt32(counts[s])
         walk_back(walk, layout, records, first, count, first + count - 1, ray0, δL, none, still, lost)
 
     return layout.moves, total / paths

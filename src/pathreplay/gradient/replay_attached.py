@@ -41,7 +41,6 @@ def replay_attached(
             dr.eval(q, L, overflow)  # else each entry of a camera's matrix runs the first pass again
             x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
-            dr.eval(q0, overflow)  # as in the sweep
             backward(sum(q0[k] * x[k] for k in range(4)))
     _peel(walk, again, path, δL, L, q, overflow, lost, recovery, scale)
 

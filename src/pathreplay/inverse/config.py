@@ -14,6 +14,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import MISSING, file_problem
+from pathreplay.inverse.config_errors import first_error
 from pathreplay.inverse.pose import PARTS, PoseKind
 
 if sys.version_info >= (3, 11):
@@ -219,6 +220,15 @@ class Config(_Table):
         return self
 
 
+# Models of nested tables, by the name under which they appear in the file or in what pydantic tries.
+_TABLES: dict[str, type[BaseModel]] = {
+    "parameters": Parameter,
+    "target": Target,
+    "Picture": Picture,
+    "start": Displacement,
+}
+
+
 def load_config(path: Path) -> Config:
     """Read a job from a TOML file (or from the JSON that a run folder may hold).
 
@@ -239,7 +249,7 @@ def load_config(path: Path) -> Config:
             return Config.model_validate_json(text)
         return Config.model_validate(_toml(path, text))
     except ValidationError as error:
-        raise PathreplayError(f"{path}: {_first(error)}") from None
+        raise PathreplayError(f"{path}: {first_error(error, Config, _TABLES)}") from None
 
 
 # No job is as long: what is larger is some other file.
@@ -262,70 +272,10 @@ def make_config(values: dict[str, Any]) -> Config:
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        raise PathreplayError(f"config: {_first(error)}") from None
+        raise PathreplayError(f"config: {first_error(error, Config, _TABLES)}") from None
 
 
 def _no_file(path: Path) -> str:
     near = [str(p) for p in path.parent.glob("*.toml")] if path.parent.is_dir() else []
     close = difflib.get_close_matches(str(path), near, n=1, cutoff=0.3)
     return f"No config file {path}" + (f"; did you mean {close[0]}?" if close else "; give the path of a TOML file")
-
-
-# Model of each nested table, by the name under which it appears in the file: the source of key suggestions.
-_TABLES: dict[str, type[BaseModel]] = {"parameters": Parameter, "target": Target}
-
-
-# What to write instead, by pydantic's type of error; the other messages say it themselves.
-_INSTEAD = {
-    "int_type": "write a whole number such as 16",
-    "float_type": "write a number such as 0.5",
-    "bool_type": "write true or false",
-    "string_type": 'write it in quotes: "..."',
-    "list_type": "write a list: [...]",
-    "dict_type": "write a table: { ... }",
-    "model_type": "write a table: { ... }",
-    "finite_number": "write a finite number",
-    "json_invalid": "mend it there",
-}
-# The last key of a value that may be of several kinds -> what all of them are.
-_KINDS = {
-    "initial": "a number, a list of numbers, the name of an image or volume file, or { image = ... }",
-    "values": "a number, a list of numbers, the name of an image or volume file, or { image = ... }",
-    "scene_parameters": "a number, true, false or a text in quotes",
-    "sensors": "the names or numbers of sensors: [0, ...]",
-}
-
-
-def _first(error: ValidationError) -> str:
-    """The first thing wrong, as one line: where it is, what it is, what would be right."""
-    details = error.errors()
-    # A value that may be a number, list, name or table fails once per alternative: an unknown key says the most.
-    first = next((e for e in details if e["type"] == "extra_forbidden"), details[0])
-    where = ".".join(_path(first["loc"])) or "the job"
-    if first["type"] == "extra_forbidden":
-        key = str(first["loc"][-1])
-        table = Config if len(first["loc"]) == 1 else _TABLES.get(str(first["loc"][0]), Config)
-        if len(first["loc"]) > 1:
-            inner: dict[str, type[BaseModel]] = {"Picture": Picture, "start": Displacement}
-            table = inner.get(str(first["loc"][-2]), table)
-        close = difflib.get_close_matches(key, table.model_fields, n=1, cutoff=0.4)
-        hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(table.model_fields)}"
-        return f"unknown key '{where}'; {hint}"
-    if first["type"] == "missing":
-        return f"key '{where}' is missing; add it"
-    if first["type"] == "value_error":
-        reason = str(first["ctx"]["error"])
-        # Ours name the table that they are about; a number's does not.
-        return f"'{where}': {reason}" if isinstance(first["input"], Real) else reason
-    # The value as it was written: alternatives are judged by their parts.
-    kinds = next((kinds for key, kinds in _KINDS.items() if key in _path(first["loc"])), None)
-    if kinds is not None and len(details) > 1:
-        return f"'{where}' is {shown(first['input'])}; write {kinds}"
-    instead = _INSTEAD.get(first["type"])
-    return f"'{where}' is {shown(first['input'])}: {first['msg'].lower()}" + (f"; {instead}" if instead else "")
-
-
-def _path(loc: tuple[int | str, ...]) -> list[str]:
-    """Where an error is, as a user would say it: without the names of the alternatives that were tried."""
-    tried = ("list[", "function-", "constrained-", "nullable[")
-    return [str(p) for p in loc if p not in ("int", "float", "bool", "str", "Picture") and not str(p).startswith(tried)]

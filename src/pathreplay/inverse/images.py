@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.files import file_problem
-from pathreplay.scenes.loading import one_line
+from pathreplay.scenes.descriptions import one_line
 from pathreplay.threads import spare_thread
 
 Image = NDArray[np.float32]
@@ -127,7 +127,7 @@ def exr_bytes(image: Image) -> bytes:
 
 def png_bytes(image: Image, exposure: float = 1.0) -> bytes:
     """The image times ``exposure`` as an 8-bit sRGB PNG file."""
-    shown = np.clip(_displayable(image) * exposure, 0, 1).astype(np.float32)
+    shown = np.clip((image[:, :, :1] if image.shape[2] == 2 else image) * exposure, 0, 1).astype(np.float32)
     bitmap = mi.Bitmap(np.ascontiguousarray(shown))
     # Through memory, so that the disk is touched in one place (run_folder), which handles a full one.
     stream = mi.MemoryStream()
@@ -143,15 +143,6 @@ def exposure_for(image: Image) -> float:
 
 def difference(image: Image, target: Image) -> Image:
     """Signed difference as a picture: luminance above the target in red, below in blue, equal in black."""
-    delta = (with_channels(image, 1) if image.shape[2] != 1 else image) - (  # type: ignore[operator]
-        with_channels(target, 1) if target.shape[2] != 1 else target  # type: ignore[operator]
-    )
-    delta = delta[:, :, 0]
+    delta = (with_channels(image, 1) - with_channels(target, 1))[:, :, 0]  # type: ignore[operator]
     zero = np.zeros_like(delta)
     return np.stack([np.maximum(delta, 0), zero, np.maximum(-delta, 0)], axis=2).astype(np.float32)
-
-
-def _displayable(image: Image) -> Image:
-    if image.shape[2] == 2:
-        return image[:, :, :1]
-    return image

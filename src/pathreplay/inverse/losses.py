@@ -1,9 +1,9 @@
 """Loss functions: how far a rendered picture is from its target, as one number with a derivative.
 
 Every loss is the mean over pixels and channels of f(I, T), with I the rendered picture (noisy, differentiable) and T
-the target. No path is judged by itself (see `Passes`), hence a loss whose f' is linear in I has an unbiased gradient:
-``l2`` and ``relative-l2``. The gradients of ``l1`` and ``log`` are biased by the noise in I
-(less with more samples); they pay where outliers would rule ``l2``.
+the target. No path is judged by itself (see `recorded`), hence a loss whose f' is linear in I has an unbiased gradient:
+``l2`` and ``relative-l2``. The gradients of ``l1`` and ``log`` are biased by the noise in I (less with more samples);
+they pay where outliers would rule ``l2``.
 """
 
 from __future__ import annotations

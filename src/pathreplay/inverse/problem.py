@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,19 +15,19 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import limits
-from pathreplay.inverse.config import Config, Parameter, Plugin, Value
+from pathreplay.inverse.config import Config, Parameter, Plugin
 from pathreplay.inverse.file_names import file_names
-from pathreplay.inverse.grids import Levels, comparable, make_levels, resampled
-from pathreplay.inverse.images import Image, find_image, over_black, read_image, transparent_share, with_channels
+from pathreplay.inverse.grids import Levels, make_levels, resampled
+from pathreplay.inverse.images import Image
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
-from pathreplay.inverse.values import Array, make_value, require_finite_array
+from pathreplay.inverse.targets import read_targets, rendered_targets, target_scene, truth_of
+from pathreplay.inverse.values import Array, Arrays, make_value, seen
 from pathreplay.render.edges import edges_note, moves_edges
-from pathreplay.render.film import picture_shape
 from pathreplay.render.integrator import EDGES
 from pathreplay.scenes import parameters
-from pathreplay.scenes.descriptions import load_description
-from pathreplay.scenes.loading import load_scene, load_scene_for, one_line, told
+from pathreplay.scenes.descriptions import load_integrator
+from pathreplay.scenes.loading import load_scene_for
 from pathreplay.scenes.stored import AS_STORED, Form, form_of
 from pathreplay.threads import one_thread
 
@@ -52,6 +52,10 @@ class Variable:
     """Of a grid that is refined on the way."""
     form: Form = AS_STORED
     """How Mitsuba stores it; everything here is what people see."""
+
+    def bounds(self) -> tuple[float, float]:
+        """Lowest and highest value that a step may end at."""
+        return -np.inf if self.lower is None else self.lower, np.inf if self.upper is None else self.upper
 
 
 @dataclass(frozen=True)
@@ -82,14 +86,35 @@ class Problem:
     """What was done to the scene that the user should know of."""
 
 
-# Streams of random numbers: pictures never share a seed with iterations, nor targets with renderings.
-ITERATION, TARGET, PICTURE, JUDGEMENT = 0, 1, 2, 3
+def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
+    """The values of the variables (what people see) as Dr.Jit holds them, in memory of its own."""
+    # NumPy's memory, which Dr.Jit would take over, begins anywhere: to a frozen function that is another kind of input.
+    one = dr.opaque(mi.Float, 1)
+    variables = {
+        # A grid may have another resolution than at first.
+        v.key: (type(v.like)(values[v.key]) if dr.is_tensor_v(v.like) else parameters.to_value(v.like, values[v.key]))
+        * one
+        for v in problem.variables
+    }
+    dr.eval(variables)
+    return variables
 
 
-def seeds(seed: int, stream: int, index: int, view: int) -> tuple[int, int]:
-    """Two independent 32-bit seeds for this job's seed, stream, iteration and view."""
-    first, second = np.random.SeedSequence([seed, stream, index, view]).generate_state(2)
-    return int(first), int(second)
+def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, Any]:
+    """The scene's parameters, by key and as Mitsuba stores them; derivatives flow to the variables."""
+    parts = {name for pose in problem.poses for name in pose.parts().values()}
+    plain = {v.key: v.form.store(variables[v.key]) for v in problem.variables if v.key not in parts}
+    return plain | {pose.key: pose.value(variables) for pose in problem.poses}
+
+
+def put(problem: Problem, variables: Mapping[str, Any]) -> None:
+    """Give the scene what follows from the variables."""
+    problem.params.update(scene_values(problem, variables))
+
+
+def put_values(problem: Problem, values: Arrays) -> None:
+    """Give the scene these values of the variables, without derivatives."""
+    put(problem, variables_of(problem, values))
 
 
 def build_problem(config: Config, base: Path, targets: dict[str, Image] | None = None) -> Problem:
@@ -112,7 +137,7 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     if rival is not None:
         _keys(params, config.parameters, rival)
         _edges(params, keys, rival)  # for its log: one note is enough
-    judge = integrator if config.target.images is not None else load_integrator(config.target.integrator)
+    judge = integrator if config.target.images is not None else load_integrator(config.target.integrator.as_dict())
     # Before any target is rendered: the cheap mistakes first.
     sensors = _sensors(scene, config.sensors)
     limits.require_visible(scene, params, keys)
@@ -121,16 +146,16 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
 
     truth: dict[str, Array] = {}
     if config.target.images is None:
-        target_scene = _target_scene(config, base)
-        truth = _truth(target_scene, params, keys)
+        other = target_scene(config, base)
+        truth = truth_of(other, params, keys)
         if targets is None:
             with one_thread(config.deterministic):
-                targets = _rendered_targets(config, target_scene, sensors)
+                targets = rendered_targets(config, other, sensors)
         # Dr.Jit traces calls through every instance alive: the target scene would be in all our kernels.
-        del target_scene
+        del other
         gc.collect()
     elif targets is None:
-        targets, transparent = _target_files(config.target.images, scene, sensors, base)
+        targets, transparent = read_targets(config.target.images, scene, sensors, base)
         notes += transparent
 
     if missing := set(sensors) - set(targets):
@@ -147,24 +172,10 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
 
 
 def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
-    integrator = load_integrator(plugin)
+    integrator = load_integrator(plugin.as_dict())
     if not isinstance(integrator, mi.CppADIntegrator):
         raise PathreplayError(
             f"Integrator '{plugin.type}' computes no gradients; use 'pathreplay' or another AD integrator"
-        )
-    return integrator
-
-
-def load_integrator(plugin: Plugin) -> mi.Integrator:
-    """The integrator that the job names; an unknown type or option becomes one line."""
-    try:
-        integrator = load_description(plugin.as_dict())
-    except (RuntimeError, TypeError, ValueError, OverflowError) as error:
-        raise PathreplayError(f"Integrator '{plugin.type}' cannot be made: {one_line(error)}") from None
-    if not isinstance(integrator, mi.Integrator):
-        raise PathreplayError(
-            f"Integrator '{plugin.type}' is a {type(integrator).__name__}; name an integrator, such as 'pathreplay' "
-            "(or 'path' for targets)"
         )
     return integrator
 
@@ -202,7 +213,7 @@ def _variables(
         rate = entry.learning_rate or config.learning_rate
         if entry.pose is None:
             form = form_of(params, key)
-            like = _seen(params, key)
+            like = seen(params, key)
             start = _start(key, like, form, entry, base)
             limits.require_learning_rate(key, rate, start, (entry.lower, entry.upper))
             levels = _levels(key, entry, start)
@@ -247,10 +258,6 @@ def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:
     return make_levels(start.shape, entry.resolutions, entry.refine_at or [])
 
 
-def _seen(params: mi.SceneParameters, key: str) -> Any:
-    return form_of(params, key).see(params[key])
-
-
 def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path) -> Array:
     if not dr.is_array_v(like):
         raise PathreplayError(
@@ -291,88 +298,3 @@ def _sensors(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int]:
     if not chosen:
         raise PathreplayError("'sensors' is empty; name one, or leave the key out for all of them")
     return chosen
-
-
-def _target_scene(config: Config, base: Path) -> mi.Scene:
-    target = config.target
-    spec = config.scene if target.scene is None else target.scene
-    arguments = config.scene_parameters if target.scene_parameters is None else target.scene_parameters
-    scene = load_scene(spec, base, **arguments)
-    params = mi.traverse(scene)
-    parameters.require_finite(params)
-    values = {
-        key: _target_value(params, key, value, base)
-        for pattern, value in target.values.items()
-        for key in parameters.resolve_keys(params, pattern)
-    }
-    for key, value in values.items():
-        params[key] = value
-    params.update()
-    return scene
-
-
-def _target_value(params: mi.SceneParameters, key: str, value: Value, base: Path) -> Any:
-    parameters.require_settable(params, key)
-    form, like = form_of(params, key), _seen(params, key)
-    return form.store(parameters.to_value(like, form.of_colours(key, make_value(key, like, value, base))))
-
-
-def _truth(scene: mi.Scene, own: mi.SceneParameters, keys: dict[str, Parameter]) -> dict[str, Array]:
-    """Values of the wanted parameters in the target scene, where it has them in the same shape or as such a grid."""
-    params = mi.traverse(scene)
-    found = {key: parameters.get_array(_seen(params, key)) for key in keys if key in params}
-    shapes = {key: parameters.get_array(_seen(own, key)).shape for key in found}
-    return {key: value for key, value in found.items() if comparable(value.shape, shapes[key])}
-
-
-def _rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -> dict[str, Image]:
-    integrator = load_integrator(config.target.integrator)
-    if len(scene.sensors()) <= max(sensors.values()):
-        raise PathreplayError(
-            f"The target scene has {len(scene.sensors())} sensors, the job uses number {max(sensors.values())} (from 0)"
-        )
-    limits.require_films(scene, sensors, {"target.spp": config.target.spp})
-    targets: dict[str, Image] = {}
-    for name, index in sensors.items():
-        seed, _ = seeds(config.seed, TARGET, 0, index)
-        with told(f"Integrator '{config.target.integrator.type}' cannot render the target of sensor '{name}'"):
-            image = mi.render(scene, sensor=index, integrator=integrator, spp=config.target.spp, seed=mi.UInt32(seed))
-            targets[name] = np.array(image, dtype=np.float32)
-        require_finite_array(f"Target picture of sensor '{name}'", targets[name])
-    return targets
-
-
-def _target_files(
-    files: list[str], scene: mi.Scene, sensors: dict[str, int], base: Path
-) -> tuple[dict[str, Image], tuple[str, ...]]:
-    """The target pictures by view, and what is to be said about them."""
-    if len(files) != len(sensors):
-        raise PathreplayError(
-            f"{len(files)} target images for {len(sensors)} sensors ({', '.join(sensors)}); "
-            "name one per sensor, in this order"
-        )
-    targets: dict[str, Image] = {}
-    notes: list[str] = []
-    for (name, index), file in zip(sensors.items(), files, strict=True):
-        path = find_image(file, base)
-        image = over_black(read_image(path), path)
-        height, width, channels = picture_shape(scene.sensors()[index])
-        if image.shape[:2] != (height, width):
-            raise PathreplayError(
-                f"Target image '{file}' is {image.shape[1]} x {image.shape[0]}, "
-                f"sensor '{name}' renders {width} x {height}; resize the image or the film"
-            )
-        adapted = with_channels(image, channels)
-        if adapted is None:
-            raise PathreplayError(
-                f"Target image '{file}' has {image.shape[2]} channels, sensor '{name}' renders {channels}; convert it"
-            )
-        require_finite_array(f"Target image '{file}'", adapted)
-        share = transparent_share(image)
-        if share and channels in (1, 3):
-            notes.append(
-                f"target image '{file}' is transparent in {share:.1%} of its pixels: black is fitted there; if "
-                "the background of your scene is not black, put it behind the picture first"
-            )
-        targets[name] = adapted
-    return targets, tuple(notes)

@@ -12,6 +12,7 @@ import rich.progress
 from rich.console import Console
 
 from pathreplay.errors import plain_line
+from pathreplay.inverse.observers import Event, Refined, Started, Stepped
 
 # Between two lines, where there is no bar: a log of a long run stays readable.
 _SECONDS = 10.0
@@ -48,7 +49,7 @@ class Progress:
     def __init__(self, shown: bool) -> None:
         self._stream = cast(IO[str], _Forgiving())
         console = Console(file=self._stream, force_jupyter=False)
-        self._lines = shown and not console.is_terminal
+        self._shown, self._lines = shown, shown and not console.is_terminal
         self._told, self._begin, self._before = time.monotonic(), time.monotonic(), 0
         self._bar = rich.progress.Progress(
             rich.progress.TextColumn("{task.description}"),
@@ -83,6 +84,15 @@ class Progress:
         self._bar.console.print(
             f"pathreplay: {plain_line(text)}", markup=False, highlight=False, soft_wrap=True, emoji=False
         )
+
+    def observe(self, event: Event) -> None:
+        """Show what the run tells."""
+        if isinstance(event, Started):
+            self.start(event.done, event.wanted)
+        elif isinstance(event, Stepped):
+            self.advance(event.entry.loss)
+        elif isinstance(event, Refined) and self._shown:
+            self.note(f"{event.key} goes on with the shape {event.shape}")
 
     def start(self, done: int, total: int) -> None:
         """Begin to count iterations."""

@@ -11,10 +11,9 @@ import safetensors.numpy
 from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.images import Image
-from pathreplay.inverse.loop import Run, put_values, render_views
-from pathreplay.inverse.problem import Problem
+from pathreplay.inverse.loop import Run, render_views
+from pathreplay.inverse.problem import Problem, put_values
 from pathreplay.inverse.values import Array
-from pathreplay.scenes.parameters import get_array
 
 
 @dataclass(frozen=True)
@@ -37,6 +36,5 @@ class Rival:
 
 def finished(problem: Problem, config: Config, run: Run) -> Rival:
     """The result of a rival's run; leaves its values in the scene."""
-    put_values(problem, run.adam)
-    values = {key: get_array(value) for key, value in run.adam.items()}
-    return Rival(tuple(run.history), values, render_views(problem, config))
+    put_values(problem, run.values)
+    return Rival(tuple(run.history), run.values, render_views(problem, config))

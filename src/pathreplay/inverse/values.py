@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
@@ -13,6 +15,10 @@ from pathreplay.inverse.grids import Array, resampled
 from pathreplay.inverse.images import find_image, read_image, resized, with_channels
 from pathreplay.media.volume_files import load_volume
 from pathreplay.scenes.parameters import get_array, is_transform
+from pathreplay.scenes.stored import form_of
+
+Arrays = Mapping[str, Array]
+"""By key of the variable, or by name."""
 
 
 def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
@@ -56,6 +62,11 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
         )
     require_finite_array(f"Image '{picture.image}'", adapted)
     return resized(adapted, current.shape[0], current.shape[1], crop=picture.fit == "crop")
+
+
+def seen(params: mi.SceneParameters, key: str) -> Any:
+    """What people see of a parameter of the scene: the kind of value that jobs take, optimise and save."""
+    return form_of(params, key).see(params[key])
 
 
 def _volume(key: str, path: Path, shape: tuple[int, ...]) -> Array:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import mitsuba as mi
 
 from ..transport.start import CameraStart
+
+Seed: TypeAlias = "int | mi.UInt32"
+Which: TypeAlias = "int | mi.Sensor"
+"""A sensor, or its index in the scene."""
 
 
 def mitsuba_integrator() -> Any:
@@ -44,11 +48,11 @@ class Pass:
 
     scene: mi.Scene
     sensor: mi.Sensor
-    seed: int | mi.UInt32
+    seed: Seed
     spp: int = 0
 
     @staticmethod
-    def of(scene: mi.Scene, sensor: int | mi.Sensor, seed: int | mi.UInt32, spp: int) -> Pass:
+    def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Pass:
         """A pass by the arguments of Mitsuba's integrators: the sensor may be an index."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         return Pass(scene, sensor, seed, spp or sensor.sampler().sample_count())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +13,7 @@ from pathreplay.scenes.parameters import needs_ray_adjoint
 _PLACES = {"vertex_positions", "to_world", "control_points"}
 
 
-def moves_edges(params: Any, key: str) -> bool:
+def moves_edges(params: mi.SceneParameters, key: str) -> bool:
     """Whether silhouettes or shadows move with a parameter of ``mi.traverse(scene)``.
 
     They do with the shape of things and their place, with cameras, and with lights that cast hard shadows.
@@ -28,7 +27,7 @@ def moves_edges(params: Any, key: str) -> bool:
     return needs_ray_adjoint(params, key)
 
 
-def keys_that_move_edges(params: Any) -> list[str]:
+def keys_that_move_edges(params: mi.SceneParameters) -> list[str]:
     """The parameters with gradients that `moves_edges`."""
     with dr.resume_grad():
         return [key for key in params.keys() if moves_edges(params, key) and dr.grad_enabled(params[key])]

@@ -10,15 +10,15 @@ import numpy as np
 
 from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
-from ..gradient.pixel_sweep import PixelLoss, fits, sweepable
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
 from ..transport.facts import SceneFacts
 from ..transport.vertex import Walk
-from .camera_pass import Pass
+from .camera_pass import Pass, Seed, Which
 from .diagnostics import Diagnostics, doubts, lost_note, missing_edges, used_before_note
 from .interior import PathReplay
 from .path_integrator import UNBOUNDED, path_integrator
+from .pixels import pixel_loss, sweepable
 from .properties import choice, deviation
 from .term import Found
 
@@ -51,23 +51,6 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
     return PathReplay(driver, auto, branch, recovery)
 
 
-def _pixel_loss(view: Pass, max_depth: int, offset: mi.TensorXf, slope: mi.TensorXf) -> PixelLoss:
-    """The loss by each lane's pixel. Raises PathreplayError where the pass or the tensors do not allow it."""
-    if not fits(max_depth, view.spp):
-        raise PathreplayError(
-            f"pathreplay: {view.spp} samples per pixel, of {max_depth} vertices, cannot be swept: use "
-            f"2 or more, and at most {MAX_DEPTH} vertices in all, or mi.render"
-        )
-    width, height = view.size
-    for tensor in (offset, slope):
-        if tensor.shape != (height, width, 3):
-            raise PathreplayError(
-                f"pathreplay: derivative of the loss has shape {tensor.shape}: use {(height, width, 3)}"
-            )
-    pixel = dr.arange(mi.UInt32, width * height)
-    return PixelLoss(*(dr.gather(mi.Color3f, tensor.array, pixel) for tensor in (offset, slope)))
-
-
 def _make_class() -> type:
     class PathReplayIntegrator(path_integrator()):  # type: ignore[misc]
         """Differentiable path tracer for surfaces and media.
@@ -89,8 +72,7 @@ def _make_class() -> type:
         """
 
         name = "pathreplay"
-        #: It looks at nothing on the host while it renders a scene without media, so that Dr.Jit can record it.
-        recordable = True
+        recordable = True  # where there are no media: it looks at nothing on the host while it renders
 
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
@@ -101,7 +83,7 @@ def _make_class() -> type:
             self.untold = Diagnostics()  # of passes whose lost paths have not been told
             self.baseline: tuple[SceneFacts, Baseline] | None = None  # and the scene that it belongs to
 
-        def sweeps_pixels(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int = 0) -> bool:
+        def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0) -> bool:
             """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
             view = Pass.of(scene, sensor, 0, spp)
             if self.driver != "sweep" or not sweepable(view.sensor, self.max_depth, view.spp):
@@ -113,8 +95,8 @@ def _make_class() -> type:
             scene: mi.Scene,
             offset: mi.TensorXf,
             slope: mi.TensorXf,
-            sensor: int | mi.Sensor = 0,
-            seed: int | mi.UInt32 = 0,
+            sensor: Which = 0,
+            seed: Seed = 0,
             spp: int = 0,
         ) -> mi.TensorXf:
             """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
@@ -125,7 +107,7 @@ def _make_class() -> type:
             number of samples does not, or a tensor has another shape.
             """
             with self._passing(scene, sensor, seed, spp) as view, dr.isolate_grad():
-                loss = _pixel_loss(view, self.max_depth, offset, slope)
+                loss = pixel_loss(view, self.max_depth, offset, slope)
                 walk = self._walk(scene, view.sensor)
                 self._learned(view, walk)
                 found = self.interior.pixels(view, walk, loss)
@@ -155,8 +137,9 @@ def _make_class() -> type:
             return {} if self.baseline is None else self.baseline[1].learned()
 
         def restore_learned(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
-            """Go on with what `learned` told of the same scene, in another process. Raises PathreplayError."""
-            self.baseline = self._facts(scene), Baseline.restored(scene.bbox(), learned)
+            """Go on with what `learned` told of the same scene; where that is nothing, anew. Raises PathreplayError."""
+            box = scene.bbox()
+            self.baseline = self._facts(scene), Baseline.restored(box, learned) if learned else Baseline.fresh(box)
 
         def _told(self, view: Pass, walk: Walk, found: Found) -> None:
             """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see `take_lost`,

@@ -11,7 +11,7 @@ import mitsuba as mi
 from ..gradient.adjoint import LostPaths
 from ..gradient.baseline import FIRST_BRANCHING, Baseline, Seen
 from ..gradient.forward import forward
-from ..gradient.pixel_sweep import PixelLoss, pixel_camera, pixel_sweep
+from ..gradient.pixel_sweep import PixelLoss, pixel_sweep
 from ..gradient.primal import primal
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import deepest
@@ -22,6 +22,7 @@ from ..transport.vertex import Walk
 from .camera_pass import Pass
 from .diagnostics import Diagnostics
 from .film import adjoint, splat
+from .pixels import pixel_camera
 from .term import Found
 
 

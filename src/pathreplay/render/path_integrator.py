@@ -19,7 +19,7 @@ from ..transport.facts import SceneFacts
 from ..transport.start import CameraStart
 from ..transport.traits import Tables
 from ..transport.vertex import Walk
-from .camera_pass import Pass, mitsuba_integrator
+from .camera_pass import Pass, Seed, Which, mitsuba_integrator
 from .interior import Interior, image
 from .properties import flag, whole_number
 from .term import Found, Term
@@ -106,8 +106,8 @@ def path_integrator() -> type:
         def render(
             self,
             scene: mi.Scene,
-            sensor: int | mi.Sensor = 0,
-            seed: int | mi.UInt32 = 0,
+            sensor: Which = 0,
+            seed: Seed = 0,
             spp: int = 0,
             develop: bool = True,
             evaluate: bool = True,
@@ -119,12 +119,7 @@ def path_integrator() -> type:
                 return image(view, self._walk(scene, view.sensor))
 
         def render_forward(
-            self,
-            scene: mi.Scene,
-            params: Any,
-            sensor: int | mi.Sensor = 0,
-            seed: int | mi.UInt32 = 0,
-            spp: int = 0,
+            self, scene: mi.Scene, params: object, sensor: Which = 0, seed: Seed = 0, spp: int = 0
         ) -> mi.TensorXf:
             """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
 
@@ -139,13 +134,7 @@ def path_integrator() -> type:
             return found.image
 
         def render_backward(
-            self,
-            scene: mi.Scene,
-            params: Any,
-            grad_in: mi.TensorXf,
-            sensor: int | mi.Sensor = 0,
-            seed: int | mi.UInt32 = 0,
-            spp: int = 0,
+            self, scene: mi.Scene, params: object, grad_in: mi.TensorXf, sensor: Which = 0, seed: Seed = 0, spp: int = 0
         ) -> None:
             """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
 
@@ -189,7 +178,7 @@ def path_integrator() -> type:
             """What is done with what terms have found."""
 
         @contextmanager
-        def _passing(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int | mi.UInt32, spp: int) -> Iterator[Pass]:
+        def _passing(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Iterator[Pass]:
             """The pass under way, in which nothing is differentiated but what asks for it: see `careful`, too."""
             if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
                 raise PathreplayError(

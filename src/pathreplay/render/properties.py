@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import mitsuba as mi
+
 from ..errors import PathreplayError, shown
 
 #: What Mitsuba's own integrators can hold.
 LARGEST = 2**31 - 1
 
 
-def choice(props: Any, plugin: str, name: str, default: Any, choices: tuple[Any, ...]) -> Any:
+def choice(props: mi.Properties, plugin: str, name: str, default: Any, choices: tuple[Any, ...]) -> Any:
     """A property of ``plugin`` that has to be one of the choices. Raises PathreplayError for another."""
     value = _value(props, name, default)
     # By type, too: 1 == True.
@@ -20,7 +22,9 @@ def choice(props: Any, plugin: str, name: str, default: Any, choices: tuple[Any,
     return value
 
 
-def whole_number(props: Any, plugin: str, name: str, default: int, lowest: int, unbounded: bool = False) -> int:
+def whole_number(
+    props: mi.Properties, plugin: str, name: str, default: int, lowest: int, unbounded: bool = False
+) -> int:
     """A whole number from ``lowest`` to `LARGEST`, or -1 where it may be unbounded. Raises PathreplayError else."""
     value = _value(props, name, default)
     if type(value) is int and (lowest <= value <= LARGEST or (unbounded and value == -1)):
@@ -31,7 +35,7 @@ def whole_number(props: Any, plugin: str, name: str, default: int, lowest: int, 
     )
 
 
-def deviation(props: Any, plugin: str, name: str, default: float) -> float:
+def deviation(props: mi.Properties, plugin: str, name: str, default: float) -> float:
     """A finite standard deviation, at least 0. Raises PathreplayError for anything else."""
     value = _value(props, name, default)
     if type(value) not in (int, float) or not 0 <= value < float("inf"):
@@ -39,7 +43,7 @@ def deviation(props: Any, plugin: str, name: str, default: float) -> float:
     return float(value)
 
 
-def flag(props: Any, plugin: str, name: str, default: bool) -> bool:
+def flag(props: mi.Properties, plugin: str, name: str, default: bool) -> bool:
     """True or False. Raises PathreplayError for anything else."""
     value = _value(props, name, default)
     if type(value) is not bool:
@@ -47,5 +51,5 @@ def flag(props: Any, plugin: str, name: str, default: bool) -> bool:
     return value
 
 
-def _value(props: Any, name: str, default: Any) -> Any:
+def _value(props: mi.Properties, name: str, default: Any) -> Any:
     return props[name] if name in props else default

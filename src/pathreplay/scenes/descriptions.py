@@ -1,7 +1,8 @@
-"""Loads what a dictionary describes, after a look for what Mitsuba does not survive."""
+"""Loads what a dictionary describes, after a look for what Mitsuba does not survive; its errors as one line."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -25,3 +26,34 @@ def require_values(description: Mapping[str, Any]) -> None:
             )
         if isinstance(value, Mapping):
             require_values(value)
+
+
+def load_integrator(description: Mapping[str, Any]) -> mi.Integrator:
+    """The integrator that a dictionary describes.
+
+    Raises:
+        PathreplayError: its type or an option is unknown or unusable, or it is no integrator.
+    """
+    name = description.get("type")
+    try:
+        integrator = load_description(description)
+    except PathreplayError:
+        raise
+    except Exception as error:  # Mitsuba raises RuntimeError, plugins in Python whatever they like
+        raise PathreplayError(f"Integrator '{name}' cannot be made: {one_line(error)}") from None
+    if not isinstance(integrator, mi.Integrator):
+        raise PathreplayError(
+            f"'{name}' is a {type(integrator).__name__}, which is no integrator; name one, such as 'pathreplay' (or "
+            "'path' for targets)"
+        )
+    return integrator
+
+
+def one_line(error: BaseException) -> str:
+    """A Mitsuba or Dr.Jit error as one readable line: without C++ source positions, without a plugin's traceback."""
+    text = str(error)
+    if "PathreplayError: " in text:  # raised by a plugin of ours: it already is what the user should read
+        return " ".join(text.rsplit("PathreplayError: ", 1)[1].split())
+    text = re.sub(r"Traceback \(most recent call last\):\n(?:[ ]+.*\n)*", "", text)
+    text = re.sub(r"\[[A-Za-z_]+\.cpp:\d+\] ", "", text)
+    return " ".join(re.sub(r'(At|While loading) dictionary node "root": ', "", text).split())

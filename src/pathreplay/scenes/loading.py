@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import gc
 import inspect
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,6 +17,7 @@ from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import MISSING, file_problem
 from pathreplay.scenes import parameters as scene_parameters
 from pathreplay.scenes.builtin_scenes import BUILTINS, COSTS, SceneDict
+from pathreplay.scenes.descriptions import one_line
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
 
 
@@ -133,13 +133,3 @@ def _first(error: BaseException) -> BaseException:
     while error.__cause__ is not None:
         error = error.__cause__
     return error
-
-
-def one_line(error: BaseException) -> str:
-    """A Mitsuba or Dr.Jit error as one readable line: without C++ source positions, without a plugin's traceback."""
-    text = str(error)
-    if "PathreplayError: " in text:  # raised by a plugin of ours: it already is what the user should read
-        return " ".join(text.rsplit("PathreplayError: ", 1)[1].split())
-    text = re.sub(r"Traceback \(most recent call last\):\n(?:[ ]+.*\n)*", "", text)
-    text = re.sub(r"\[[A-Za-z_]+\.cpp:\d+\] ", "", text)
-    return " ".join(re.sub(r'(At|While loading) dictionary node "root": ', "", text).split())

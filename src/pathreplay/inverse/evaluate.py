@@ -1,0 +1,148 @@
+"""The loss of a problem and its gradient as a function of values and shard; the scene is a device that computes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.losses import QUADRATIC
+from pathreplay.inverse.problem import Problem, put, variables_of
+from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
+from pathreplay.inverse.values import Array, Arrays
+from pathreplay.render.path_integrator import plain_errors
+from pathreplay.scenes.parameters import get_array
+from pathreplay.transport.facts import SceneFacts
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A part of an iteration: views (places in the problem), samples per pixel, and a seed for each view."""
+
+    views: tuple[int, ...]
+    samples: int
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What went wrong: gradient entries that were NaN or infinite in a view and count as zero there."""
+
+    dropped: int
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a shard adds to the loss (the mean over all views) and to its gradient, by key; and what is known after it.
+
+    Unbiased for the losses in `QUADRATIC`; the loss itself carries the variance of the pictures on top.
+    """
+
+    loss: float
+    gradients: dict[str, Array]
+    diagnostics: Diagnostics
+    learned: Arrays
+
+
+Evaluate = Callable[[Arrays, Shard, Arrays], Evaluation]
+"""evaluate(values, shard, learned): a pure function, but for rounding where threads add.
+
+The values are those of all variables, as people see them; ``learned`` is what evaluations before have learned, by name.
+"""
+
+
+def total(evaluations: Sequence[Evaluation]) -> Evaluation:
+    """The sum, added up in the order given; what is known is what the last one knows."""
+    return Evaluation(
+        sum(each.loss for each in evaluations),
+        {key: reduce(np.add, [each.gradients[key] for each in evaluations]) for key in evaluations[0].gradients},
+        Diagnostics(sum(each.diagnostics.dropped for each in evaluations)),
+        evaluations[-1].learned,
+    )
+
+
+class Evaluator:
+    """Evaluates shards of a problem by one integrator, in its scene, which keeps the values of the last shard.
+
+    One view is rendered and back-propagated after the other: memory holds the graph of one.
+    """
+
+    def __init__(self, problem: Problem, integrator: mi.Integrator, record: bool = True) -> None:
+        self.problem, self.integrator = problem, integrator
+        facts = SceneFacts(problem.scene)
+        # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
+        self.freezes = record and is_recordable(integrator, facts.has_media)
+        self._targets = [mi.TensorXf(view.target) for view in problem.views]
+        self._tables = facts.traits().tables
+        self._recordings = Recordings()
+        self._sweeps: dict[int, bool] = {}  # of each view that was seen: whether its pixels can be swept
+        self._learned: Arrays = {}  # what the integrator knows
+
+    def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
+        """See `Evaluate`. Raises what the integrator raises; warns as it does."""
+        self._know(learned)
+        found = [self._view(values, *each, shard.samples) for each in zip(shard.views, shard.seeds, strict=True)]
+        return total(found)
+
+    def _know(self, learned: Arrays) -> None:
+        """Go on with what an evaluation has learned. Raises PathreplayError if it is none of this integrator's."""
+        if learned is self._learned or not (learned or self._learned):
+            return
+        if not hasattr(self.integrator, "restore_learned"):
+            raise PathreplayError(
+                "The checkpoint holds what another integrator has learned of media; set the config's 'integrator' "
+                "back, or start a new run"
+            )
+        self.integrator.restore_learned(self.problem.scene, learned)
+        self._learned = learned
+
+    def _view(self, values: Arrays, view: int, seed: int, spp: int) -> Evaluation:
+        variables = variables_of(self.problem, values)
+        dr.enable_grad(variables)
+        put(self.problem, variables)
+        try:
+            loss = self._differentiated(view, seed, spp)
+        except NotRecordable:  # a part of the gradient may be there: once more, with variables of its own
+            self.freezes = False
+            return self._view(values, view, seed, spp)
+        gradients = {key: get_array(dr.grad(value)) for key, value in variables.items()}
+        fine = {key: np.isfinite(gradient) for key, gradient in gradients.items()}
+        # One bad path does not end a long run.
+        dropped = sum(int((~each).sum()) for each in fine.values())
+        if dropped:
+            gradients = {key: np.where(fine[key], gradient, 0) for key, gradient in gradients.items()}
+        if hasattr(self.integrator, "learned"):
+            self._learned = self.integrator.learned()
+        return Evaluation(loss, gradients, Diagnostics(dropped), self._learned)
+
+    def _differentiated(self, view: int, seed: int, spp: int) -> float:
+        """What the view adds to the loss; its gradient is added to the scene's parameters."""
+        problem, target = self.problem, self._targets[view]
+        sensor = problem.views[view].sensor
+        # The first call is not recorded: scenes make some of their parts when they are first rendered.
+        records = self.freezes and view in self._sweeps
+        if view not in self._sweeps:
+            self._sweeps[view] = self._can_sweep(sensor, spp)
+        # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
+        number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
+        share = 1 / len(problem.views)
+        with plain_errors():
+            value, lost = (self._recordings.differentiate if records else differentiate)(
+                problem.params, problem.scene, sensor, self.integrator, target, number, spp, problem.loss, share,
+                self._sweeps[view], self._tables,
+            )  # fmt: skip
+        if lost is not None:
+            self.integrator.tell_lost(lost, target.shape[0] * target.shape[1] * spp)
+        return float(value[0]) if dr.width(value) else float("nan")
+
+    def _can_sweep(self, sensor: int, spp: int) -> bool:
+        if self.problem.loss not in QUADRATIC or not hasattr(self.integrator, "sweeps_pixels"):
+            return False
+        scene = self.problem.scene
+        return bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))

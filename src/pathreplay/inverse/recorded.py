@@ -1,0 +1,131 @@
+"""The loss of one view and its gradient by the scene's parameters: traced anew, or recorded as a frozen function.
+
+A loss whose derivative is linear in each pixel can be back-propagated while its image is rendered, see `pixel_sweep`;
+for the others an image is rendered first, and paths of their own are differentiated. Where Dr.Jit can record all that
+as a frozen function, later calls launch its kernels without tracing them again.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.inverse.losses import Loss
+from pathreplay.scenes.parameters import keep_only
+from pathreplay.transport.traits import Tables
+
+# Integrators of Mitsuba's that look at nothing on the host while they render; they do not say so. Ours does.
+_OF_MITSUBA = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})
+
+# What Dr.Jit says, whatever the cause, where a function cannot be frozen. Plugins do not show beforehand whether they
+# can: the arrays of some (Mitsuba 3.9.1: `orthographic`, `thinlens`) are hidden from it.
+_RECORDING = "while recording a frozen function"
+
+
+class NotRecordable(Exception):
+    """A plugin of the scene keeps Dr.Jit from recording a pass."""
+
+
+def is_recordable(integrator: mi.Integrator, has_media: bool) -> bool:
+    """Whether passes of the integrator can be recorded in a scene with or without media, as far as that is known."""
+    # What an integrator learns of media from pass to pass is read and written between kernels. Spectral variants look
+    # up the eye's response in tables of Mitsuba's library: no input of ours, as a recorded function must have them,
+    # leads there.
+    if mi.is_spectral or has_media:
+        return False
+    return getattr(integrator, "recordable", type(integrator).__name__ in _OF_MITSUBA)
+
+
+class Recordings:
+    """Frozen functions for `differentiate`, by view and shapes of the parameters."""
+
+    def __init__(self) -> None:
+        self._frozen: dict[Any, Callable[..., Any]] = {}
+
+    def differentiate(self, params: mi.SceneParameters, scene: mi.Scene, sensor: int, *args: Any) -> Any:
+        """As the function of that name. Raises NotRecordable; a part of the gradient may be there, then."""
+        keys = list(params.keys())
+        # By view, since Dr.Jit thinks that something is wrong with a function that it has to record often.
+        which = (sensor, *(dr.shape(params[key]) for key in keys))
+        if which not in self._frozen:
+            gc.collect()  # scenes of the past would be traced, too
+            self._frozen[which] = _recording(keys)
+        try:
+            return self._frozen[which](scene, sensor, *args)
+        except RuntimeError as error:
+            if _RECORDING not in str(error):
+                raise
+            raise NotRecordable from error
+
+
+def _recording(keys: list[str]) -> Callable[..., Any]:
+    """`differentiate` as a frozen function, which holds neither scene nor problem when the run is over."""
+
+    def frozen(scene: Any, *args: Any) -> tuple[Any, Any]:
+        params = mi.traverse(scene)
+        keep_only(params, keys)
+        return differentiate(params, scene, *args)
+
+    return dr.freeze(frozen)
+
+
+def differentiate(
+    params: mi.SceneParameters,
+    scene: mi.Scene,
+    sensor: int,
+    integrator: mi.Integrator,
+    target: mi.TensorXf,
+    seed: int | mi.UInt32,
+    spp: int,
+    loss: Loss,
+    share: float,
+    sweeps: bool,
+    tables: Tables,
+) -> tuple[Any, Any]:
+    """``share`` times the loss of a view, whose gradient is added to the parameters; ``sweeps``: in one pass.
+
+    Also how many paths lost a part of their gradient (None if nobody counts, or it has been told).
+    """
+    with _handed(integrator, tables):
+        if sweeps:
+            offset, slope = (term * share for term in linear_derivative(loss, target))
+            image = integrator.render_and_backward(scene, offset, slope, scene.sensors()[sensor], seed, spp)
+            value = loss(image, target).array * share
+        else:
+            image = mi.render(scene, params, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
+            value = loss(image, target).array * share
+            if dr.grad_enabled(value):
+                dr.backward(value)
+    return dr.detach(value), integrator.take_lost() if hasattr(integrator, "take_lost") else None
+
+
+@contextmanager
+def _handed(integrator: Any, tables: Tables) -> Iterator[None]:
+    """Within this block an integrator of ours has the tables: inputs of a frozen function, which cannot make them."""
+    if not hasattr(integrator, "tables"):
+        yield
+        return
+    integrator.tables = tables
+    try:
+        yield
+    finally:
+        integrator.tables = None
+
+
+def linear_derivative(loss: Loss, target: Any) -> tuple[Any, Any]:
+    """Offset and slope of the derivative of a quadratic loss by the image, from two images far apart."""
+    bright = 1 + dr.abs(target)
+    offset = _derivative(loss, dr.zeros(mi.TensorXf, target.shape), target)
+    return offset, (_derivative(loss, mi.TensorXf(bright), target) - offset) / bright
+
+
+def _derivative(loss: Loss, image: Any, target: Any) -> Any:
+    """Derivative of a loss by the image, a tensor like it."""
+    dr.enable_grad(image)
+    dr.backward(loss(image, target))
+    return dr.grad(image)

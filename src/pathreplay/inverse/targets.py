@@ -1,0 +1,108 @@
+"""The pictures to match, rendered from a scene of their own or read from files, and the truth where it is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse import limits
+from pathreplay.inverse.config import Config, Value
+from pathreplay.inverse.grids import comparable
+from pathreplay.inverse.images import Image, find_image, over_black, read_image, transparent_share, with_channels
+from pathreplay.inverse.seeds import TARGET, seeds
+from pathreplay.inverse.values import Array, make_value, require_finite_array, seen
+from pathreplay.render.film import picture_shape
+from pathreplay.scenes import parameters
+from pathreplay.scenes.descriptions import load_integrator
+from pathreplay.scenes.loading import load_scene, told
+from pathreplay.scenes.stored import form_of
+
+
+def target_scene(config: Config, base: Path) -> mi.Scene:
+    target = config.target
+    spec = config.scene if target.scene is None else target.scene
+    arguments = config.scene_parameters if target.scene_parameters is None else target.scene_parameters
+    scene = load_scene(spec, base, **arguments)
+    params = mi.traverse(scene)
+    parameters.require_finite(params)
+    values = {
+        key: _target_value(params, key, value, base)
+        for pattern, value in target.values.items()
+        for key in parameters.resolve_keys(params, pattern)
+    }
+    for key, value in values.items():
+        params[key] = value
+    params.update()
+    return scene
+
+
+def _target_value(params: mi.SceneParameters, key: str, value: Value, base: Path) -> Any:
+    parameters.require_settable(params, key)
+    form, like = form_of(params, key), seen(params, key)
+    return form.store(parameters.to_value(like, form.of_colours(key, make_value(key, like, value, base))))
+
+
+def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> dict[str, Array]:
+    """Values of the wanted parameters in the target scene, where it has them in the same shape or as such a grid."""
+    params = mi.traverse(scene)
+    found = {key: parameters.get_array(seen(params, key)) for key in keys if key in params}
+    shapes = {key: parameters.get_array(seen(own, key)).shape for key in found}
+    return {key: value for key, value in found.items() if comparable(value.shape, shapes[key])}
+
+
+def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -> dict[str, Image]:
+    integrator = load_integrator(config.target.integrator.as_dict())
+    if len(scene.sensors()) <= max(sensors.values()):
+        raise PathreplayError(
+            f"The target scene has {len(scene.sensors())} sensors, the job uses number {max(sensors.values())} (from 0)"
+        )
+    limits.require_films(scene, sensors, {"target.spp": config.target.spp})
+    targets: dict[str, Image] = {}
+    for name, index in sensors.items():
+        seed, _ = seeds(config.seed, TARGET, 0, index)
+        with told(f"Integrator '{config.target.integrator.type}' cannot render the target of sensor '{name}'"):
+            image = mi.render(scene, sensor=index, integrator=integrator, spp=config.target.spp, seed=mi.UInt32(seed))
+            targets[name] = np.array(image, dtype=np.float32)
+        require_finite_array(f"Target picture of sensor '{name}'", targets[name])
+    return targets
+
+
+def read_targets(
+    files: list[str], scene: mi.Scene, sensors: dict[str, int], base: Path
+) -> tuple[dict[str, Image], tuple[str, ...]]:
+    """The target pictures by view, and what is to be said about them."""
+    if len(files) != len(sensors):
+        raise PathreplayError(
+            f"{len(files)} target images for {len(sensors)} sensors ({', '.join(sensors)}); "
+            "name one per sensor, in this order"
+        )
+    targets: dict[str, Image] = {}
+    notes: list[str] = []
+    for (name, index), file in zip(sensors.items(), files, strict=True):
+        path = find_image(file, base)
+        image = over_black(read_image(path), path)
+        height, width, channels = picture_shape(scene.sensors()[index])
+        if image.shape[:2] != (height, width):
+            raise PathreplayError(
+                f"Target image '{file}' is {image.shape[1]} x {image.shape[0]}, "
+                f"sensor '{name}' renders {width} x {height}; resize the image or the film"
+            )
+        adapted = with_channels(image, channels)
+        if adapted is None:
+            raise PathreplayError(
+                f"Target image '{file}' has {image.shape[2]} channels, sensor '{name}' renders {channels}; convert it"
+            )
+        require_finite_array(f"Target image '{file}'", adapted)
+        share = transparent_share(image)
+        if share and channels in (1, 3):
+            notes.append(
+                f"target image '{file}' is transparent in {share:.1%} of its pixels: black is fitted there; if "
+                "the background of your scene is not black, put it behind the picture first"
+            )
+        targets[name] = adapted
+    return targets, tuple(notes)

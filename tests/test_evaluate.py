@@ -1,0 +1,133 @@
+"""Evaluations as a function of values and shard: they add up in any order of computing, and views cost no memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from pathreplay.inverse import make_config
+from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard, total
+from pathreplay.inverse.loop import iterate, new_run, take_step
+from pathreplay.inverse.observers import Event, Refined, Started, Stepped, Stopped
+from pathreplay.inverse.problem import Problem, build_problem
+from pathreplay.inverse.stopping import Stop
+from pathreplay.threads import one_thread
+from test_deterministic import CLOUD
+from test_inverse_run import JOB, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
+
+SWEEP = {"integrator": {"type": "pathreplay", "max_depth": 3}}
+POSE = {
+    "parameters": [{"key": "wall.to_world", "pose": "rigid", "start": {"translation": [0.1, 0, 0]}}],
+    "target": {"values": {}, "scene": "room.xml", "spp": 8},
+}
+KINDS: dict[str, dict[str, Any]] = {
+    "sweep": SWEEP,
+    "prb": {},
+    "l1": {**SWEEP, "loss": "l1"},
+    "pose": {**SWEEP, **POSE},
+    "medium": {**CLOUD, "scene_parameters": {**CLOUD["scene_parameters"], "views": 2}},
+}
+
+
+def problem_of(**changes: Any) -> Problem:
+    return build_problem(make_config({**JOB, **changes}), Path.cwd())
+
+
+def bits(evaluation: Evaluation) -> dict[str, bytes]:
+    arrays = {**evaluation.gradients, **{f"learned {name}": value for name, value in evaluation.learned.items()}}
+    return {"loss": np.float64(evaluation.loss).tobytes()} | {key: value.tobytes() for key, value in arrays.items()}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_shards_add_up_whatever_was_computed_before(kind: str) -> None:
+    """Two views at once, one by one, and in the other order: the same bits, since the sum has an order of its own."""
+    problem = problem_of(**KINDS[kind])
+    values = new_run(problem, problem.integrator).values
+    other = {key: value * np.float32(0.9) for key, value in values.items()}
+    left, right, both = Shard((0,), 4, (1,)), Shard((1,), 4, (2,)), Shard((0, 1), 4, (1, 2))
+    with one_thread(True):
+        evaluate = Evaluator(problem, problem.integrator, record=False)
+        known = evaluate(other, Shard((0,), 4, (7,)), {}).learned
+        assert bool(known) == (kind == "medium")
+        first = total([evaluate(values, left, known), evaluate(values, right, known)])
+        late, early = evaluate(values, right, known), evaluate(values, left, known)
+        assert bits(total([early, late])) == bits(first)
+        at_once = evaluate(values, both, known)
+    assert all(np.abs(gradient).max() > 0 for gradient in first.gradients.values())
+    assert early.loss != late.loss
+    if kind != "medium":  # there the second view of a shard knows what the first one has learned
+        assert bits(at_once) == bits(first)
+    np.testing.assert_allclose(at_once.loss, first.loss, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["sweep", "medium"])
+def test_what_was_never_learned_is_forgotten(kind: str) -> None:
+    """An evaluator that has learned evaluates as a new one does, where it is told to know nothing."""
+    problem = problem_of(**KINDS[kind])
+    values, shard = new_run(problem, problem.integrator).values, Shard((0, 1), 4, (1, 2))
+    with one_thread(True):
+        evaluate = Evaluator(problem, problem.integrator, record=False)
+        first, again = evaluate(values, shard, {}), evaluate(values, shard, {})
+    assert bits(again) == bits(first)
+
+
+@pytest.mark.parametrize("kind", ["prb", "l1"])
+def test_the_graph_holds_one_view(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Variables under differentiation where a loss goes back: as many for four views as for one."""
+    problem = problem_of(**KINDS[kind])
+    values = new_run(problem, problem.integrator).values
+    backward, held = dr.backward, []
+
+    def counting(*arguments: Any, **options: Any) -> None:
+        held.append(len(dr.whos_ad(as_string=True).splitlines()))
+        backward(*arguments, **options)
+
+    monkeypatch.setattr(dr, "backward", counting)
+    evaluate = Evaluator(problem, problem.integrator, record=False)
+    evaluate(values, Shard((0, 1), 4, (1, 2)), {})
+    held.clear()
+    evaluate(values, Shard((0, 1, 0, 1), 4, (1, 2, 3, 4)), {})
+    print(f"{kind}: AD variables where each view goes back: {held}")
+    assert len(held) == 4 and max(held) == held[0]
+
+
+COLOURS = [*(f"{wall}.reflectance.value" for wall in ("red", "green", "white")), "light.emitter.radiance.value"]
+BOX = {
+    "scene": "cornell-box-photo",
+    "scene_parameters": {"resolution": 8, "texture": 8},
+    "parameters": [{"key": key} for key in COLOURS],
+    "target": {"values": {COLOURS[0]: 0.5}, "spp": 4},
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "records"), [(SWEEP, True), ({}, True), ({**SWEEP, "loss": "l1"}, True), (KINDS["medium"], False)]
+)
+def test_each_view_is_recorded_once_where_it_can_be(changes: dict[str, Any], records: bool) -> None:
+    """Whatever memory NumPy has put the values in, which differs from step to step."""
+    config = make_config({**JOB, **BOX, **changes})
+    problem = build_problem(config, Path.cwd())
+    run = new_run(problem, problem.integrator)
+    for i in range(6):
+        take_step(problem, config, run, i)
+    recordings = run.executor.evaluate._recordings._frozen.values()  # type: ignore[attr-defined]
+    assert [each.n_recordings for each in recordings] == [1, 1] * records
+
+
+def test_observers_hear_of_everything_in_order() -> None:
+    grid = [{"key": TEXTURE, "initial": 0.5, "resolutions": [2, 4], "refine_at": [2]}]
+    config = make_config({**JOB, "iterations": 3, "parameters": grid})
+    problem = build_problem(config, Path.cwd())
+    run, heard = new_run(problem, problem.integrator), []
+
+    class Listener:
+        def observe(self, event: Event) -> None:
+            heard.append(event)
+
+    iterate(problem, config, run, None, Stop(), [Listener()])
+    first, second, third = (Stepped(entry) for entry in run.history)
+    assert heard == [Started(0, 3), first, second, Refined(TEXTURE, (4, 4, 3)), third, Stopped(3)]

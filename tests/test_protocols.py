@@ -1,0 +1,107 @@
+"""What takes the place of an optimiser or an executor: every one of them keeps its promise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pathreplay import backend
+from pathreplay.inverse.evaluate import Diagnostics, Evaluate, Evaluation, Shard
+from pathreplay.inverse.executor import Executor, Local
+from pathreplay.inverse.optimiser import Adam, Optimiser
+
+OPTIMISERS = [Adam]
+EXECUTORS = [Local]
+
+GOAL = {"colour": np.float32([0.2, -0.4, 0.9]), "grid": np.linspace(-1, 1, 24, dtype=np.float32).reshape(2, 3, 4, 1)}
+RATES = {"colour": 0.05, "grid": 0.1}
+Arrays = dict[str, np.ndarray]
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    backend.set_variant("llvm_ad_rgb")
+
+
+def start() -> Arrays:
+    return {key: np.zeros_like(value) for key, value in GOAL.items()}
+
+
+def go_on(optimiser: Optimiser, values: Arrays, steps: int) -> Arrays:
+    """That many steps down Σ (v - goal)²."""
+    for _ in range(steps):
+        values = optimiser.step(values, {key: 2 * (value - GOAL[key]) for key, value in values.items()}, RATES)
+    return values
+
+
+def bits(values: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    return {key: (value.dtype, value.shape, value.tobytes()) for key, value in values.items()}
+
+
+@pytest.mark.parametrize("make", OPTIMISERS)
+def test_an_optimiser_gets_there(make: type[Adam]) -> None:
+    values = go_on(make(start()), start(), 200)
+    for key, goal in GOAL.items():
+        assert values[key].shape == goal.shape and values[key].dtype == np.float32
+        np.testing.assert_allclose(values[key], goal, atol=0.02)
+
+
+@pytest.mark.parametrize("make", OPTIMISERS)
+def test_an_optimiser_leaves_what_it_was_given(make: type[Adam]) -> None:
+    values = start()
+    go_on(make(values), values, 1)
+    assert bits(values) == bits(start())
+
+
+@pytest.mark.parametrize("make", OPTIMISERS)
+@pytest.mark.parametrize("done", [0, 3])
+def test_a_restored_optimiser_goes_on_bit_for_bit(make: type[Adam], done: int) -> None:
+    optimiser = make(start())
+    values = go_on(optimiser, start(), done)
+    state = optimiser.state()
+    assert state.steps == dict.fromkeys(GOAL, done)
+    other = make(start())
+    other.restore(state, values)
+    assert bits(other.state().arrays) == bits(state.arrays)
+    assert bits(go_on(other, values, 3)) == bits(go_on(optimiser, values, 3))
+
+
+@pytest.mark.parametrize("make", OPTIMISERS)
+def test_an_optimiser_begins_anew_on_another_shape_only_there(make: type[Adam]) -> None:
+    optimiser = make({"grid": np.zeros(2, np.float32), "colour": start()["colour"]})
+    old = {"grid": np.zeros(2, np.float32), "colour": start()["colour"]}
+    optimiser.step(old, {"grid": np.ones(2, np.float32), "colour": -GOAL["colour"]}, RATES)
+    values = go_on(optimiser, start(), 1)
+    assert optimiser.state().steps == {"grid": 1, "colour": 2}
+    assert bits({"grid": values["grid"]}) == bits({"grid": go_on(make(start()), start(), 1)["grid"]})
+
+
+@pytest.mark.parametrize("make", OPTIMISERS)
+def test_a_state_of_other_variables_is_refused(make: type[Adam]) -> None:
+    optimiser = make(start())
+    go_on(optimiser, start(), 1)
+    for values in ({"grid": np.zeros(5, np.float32)}, {"other": np.zeros(3, np.float32)}):
+        with pytest.raises((KeyError, ValueError)):
+            make(values).restore(optimiser.state(), values)
+
+
+def counting(values: Mapping[str, np.ndarray], shard: Shard, learned: Mapping[str, np.ndarray], /) -> Evaluation:
+    """The view as loss; the seeds of all shards so far as what was learned."""
+    seen = np.concatenate([learned.get("seeds", np.zeros(0)), np.float64(shard.seeds)])
+    gradients = {"a": values["a"] * shard.samples}
+    return Evaluation(float(shard.views[0]), gradients, Diagnostics(shard.views[0]), {"seeds": seen})
+
+
+@pytest.mark.parametrize("make", EXECUTORS)
+def test_an_executor_gives_results_in_the_order_of_the_shards(make: type[Local]) -> None:
+    evaluate: Evaluate = counting
+    executor: Executor = make(evaluate)
+    shards = [Shard((view,), 2 + view, (10 * view,)) for view in (3, 0, 2)]
+    found = executor.run({"a": np.float32([1, 2])}, shards, {"seeds": np.float64([7])})
+    assert [each.loss for each in found] == [3, 0, 2]
+    assert [each.gradients["a"].tolist() for each in found] == [[5, 10], [2, 4], [4, 8]]
+    assert sorted(found[-1].learned["seeds"]) == [0, 7, 20, 30]
+    assert executor.run({"a": np.float32([1, 2])}, [], {}) == []

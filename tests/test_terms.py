@@ -1,0 +1,199 @@
+"""Terms of the gradient: each keeps its promise, they add up, and what is known of a scene keeps up with it."""
+
+from __future__ import annotations
+
+import gc
+import inspect
+import weakref
+from collections.abc import Callable
+from dataclasses import fields
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from media_scenes import cloud, heterogeneous, smooth
+from pathreplay import PathreplayError
+from pathreplay.gradient.baseline import Baseline, Seen
+from pathreplay.render.camera_pass import Pass
+from pathreplay.render.term import Found, Term
+from pathreplay.transport.facts import SceneFacts
+from truth import lit_room, rgb
+
+DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}
+COLOUR, DENSITY = "object.bsdf.reflectance.value", "object.interior_medium.sigma_t.data"
+SPP = 4
+METHODS = ("forward", "backward")
+# Every plugin's terms, in a scene for which all of them are.
+PLUGINS = ("pathreplay", "pathreplay_tape", "pathreplay_rb", "pathreplay_listing")
+
+
+def foggy() -> dict:
+    return cloud(heterogeneous(smooth(0.5, 3), 0.8))
+
+
+@pytest.fixture
+def load() -> Callable[[dict, str], tuple[mi.Scene, mi.SceneParameters]]:
+    """Loads a scene with gradients by a key, which are released in the end."""
+    loaded = []
+
+    def open_scene(description: dict, key: str) -> tuple[mi.Scene, mi.SceneParameters]:
+        gc.collect()
+        scene = mi.load_dict(description, optimize=False)
+        params = mi.traverse(scene)
+        dr.enable_grad(params[key])
+        params.update()
+        loaded.append((params, key))
+        return scene, params
+
+    yield open_scene
+    for params, key in loaded:
+        dr.disable_grad(params[key])
+        params.update()
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_a_term_has_the_methods_of_the_protocol_and_gives_what_it_says(plugin: str, load) -> None:
+    scene, params = load(foggy(), DENSITY)
+    integrator = mi.load_dict({"type": plugin, "max_depth": 3})
+    view = Pass.of(scene, 0, 1, SPP)
+    adjoint = dr.ones(mi.TensorXf, (16, 16, 3))
+    for term in integrator.terms:
+        for name in METHODS:
+            promised = list(inspect.signature(getattr(Term, name)).parameters)[1:]
+            given = list(inspect.signature(getattr(term, name)).parameters.values())
+            assert [p.name for p in given[: len(promised)]] == promised
+            assert all(p.default is not p.empty for p in given[len(promised) :])
+        walk = integrator._walk(scene, view.sensor)
+        with dr.suspend_grad(), dr.isolate_grad():
+            found = term.backward(view, walk, adjoint, None)
+        assert isinstance(found, Found) and found.image is None and found.seen is None
+        assert np.abs(np.array(dr.grad(params[DENSITY]))).max() > 0
+        dr.set_grad(params[DENSITY], 1)
+        with dr.suspend_grad():
+            if plugin == "pathreplay_rb":
+                with pytest.raises(PathreplayError, match="no forward mode"):
+                    term.forward(view, walk, None)
+            else:
+                assert term.forward(view, walk, None).image.shape == (16, 16, 3)
+
+
+def test_terms_add_up(load, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the interior listed twice, gradient and tangent are twice as large."""
+    scene, params = load(lit_room(DIFFUSE), COLOUR)
+    adjoint, found = dr.ones(mi.TensorXf, (16, 16, 3)), []
+    for times in (1, 2):
+        integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+        monkeypatch.setattr(type(integrator), "terms", property(lambda self, n=times: n * (self.interior,)))
+        dr.clear_grad(params[COLOUR])
+        integrator.render_backward(scene, params, adjoint, seed=1, spp=SPP)
+        gradient = np.array(dr.grad(params[COLOUR])).ravel()
+        dr.set_grad(params[COLOUR], 1)
+        params.update()
+        tangent = np.array(integrator.render_forward(scene, params, seed=1, spp=SPP))
+        found.append((gradient, tangent))
+    (once, tangent), (twice, double) = found
+    assert np.abs(once).min() > 0 and np.abs(tangent).max() > 0
+    np.testing.assert_allclose(twice, 2 * once, rtol=1e-5)
+    np.testing.assert_allclose(double, 2 * tangent, rtol=1e-5)
+
+
+def test_sample_gives_what_it_says(load) -> None:
+    """As Mitsuba's `aov` asks for it, it is the radiance of the image; nothing is learned, and it is no pass."""
+    scene, params = load(foggy(), DENSITY)
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    rays = Pass.of(scene, 0, 3, SPP).rays()
+    L, _, aovs, _ = integrator.sample(dr.ADMode.Primal, scene, rays.sampler, rays.ray)
+    image = np.array(integrator.render(scene, seed=3, spp=SPP))
+    np.testing.assert_allclose(np.array(L).T.reshape(16, 16, SPP, 3).mean(2), image, rtol=1e-4, atol=1e-6)
+    assert aovs == []
+    rays = Pass.of(scene, 0, 3, SPP).rays()
+    with dr.suspend_grad():
+        integrator.sample(dr.ADMode.Backward, scene, rays.sampler, rays.ray, δL=mi.Spectrum(1))
+    assert np.abs(np.array(dr.grad(params[DENSITY]))).max() > 0
+    assert integrator.learned() == {}
+
+
+def test_what_shards_have_seen_can_be_added(load) -> None:
+    scene, _ = load(foggy(), DENSITY)
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "branch": True})
+    walk = integrator._walk(scene, scene.sensors()[0])
+    nothing = Baseline.fresh(scene.bbox())
+
+    def seen(seed: int) -> Seen:
+        with dr.suspend_grad(), dr.isolate_grad():
+            term, view = integrator.interior, Pass.of(scene, 0, seed, SPP)
+            return term.backward(view, walk, dr.ones(mi.TensorXf, (16, 16, 3)), nothing).seen
+
+    one, other = seen(1), seen(2)
+    both = one + other
+    assert both.paths == one.paths + other.paths == 2 * 16 * 16 * SPP
+    for name in ("sums", "nulls"):
+        parts = [np.array(getattr(each, name)) for each in (one, other)]
+        assert min(part.max() for part in parts) > 0
+        np.testing.assert_allclose(np.array(getattr(both, name)), sum(parts), rtol=1e-6)
+    after, again = nothing.after(both), nothing.after(other + one)
+    assert after.passes == again.passes and len(after.passes) == 2
+    for name, value in after.learned().items():
+        np.testing.assert_allclose(again.learned()[name], value, rtol=1e-5)
+    restored = Baseline.restored(scene.bbox(), after.learned())
+    np.testing.assert_allclose(np.array(restored.known), np.array(after.known))
+
+
+def test_facts_are_found_once_and_keep_up_with_the_scene(load) -> None:
+    glow = lit_room(DIFFUSE)
+    scene, params = load(glow, COLOUR)
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    before = integrator._walk(scene, None)
+    facts = integrator.facts
+    assert not before.traits.lights_vary
+    light = "light.emitter.radiance.value"
+    dr.enable_grad(params[light])
+    params.update()
+    assert integrator._walk(scene, None).traits.lights_vary
+    dr.disable_grad(params[light])
+    params.update()
+    after = integrator._walk(scene, None).traits
+    assert integrator.facts is facts
+    changed = [f.name for f in fields(after) if getattr(after, f.name) is not getattr(before.traits, f.name)]
+    assert changed == []
+    # A shape that grows: the distance within which directions are held grows with it.
+    key = "object.to_world"
+    params[key] = mi.Transform4f().scale(3) @ mi.Transform4f(params[key])
+    params.update()
+    grown = integrator._walk(scene, None).traits.tables.blend_lengths
+    assert np.array(grown).max() >= np.array(before.traits.tables.blend_lengths).max()
+    assert not np.array_equal(np.array(grown), np.array(before.traits.tables.blend_lengths))
+    # Another BSDF on a shape, and another scene.
+    scene.shapes()[0].set_bsdf(mi.load_dict({"type": "conductor"}))
+    assert integrator._walk(scene, None).traits.lobes == 1
+    other = mi.load_dict(lit_room({"type": "smoothdielectric"}))
+    assert integrator._walk(other, None).traits.lobes == 2
+    assert not integrator.facts.are_about(scene)
+
+
+def test_facts_tell_of_gradients_and_values_of_media(load) -> None:
+    scene, params = load(foggy(), DENSITY)
+    sensor = scene.sensors()[0]
+    facts = SceneFacts(scene)
+    assert facts.has_media and facts.media(sensor).branches
+    dr.disable_grad(params[DENSITY])
+    params.update()
+    assert not facts.media(sensor).branches
+    assert not facts.media(sensor).chromatic
+    params[DENSITY] = mi.TensorXf(np.ones((4, 4, 4, 3), np.float32))
+    params.update()
+    assert facts.media(sensor).chromatic
+
+
+def test_a_scene_is_released_with_an_integrator_of_its_own() -> None:
+    """Which knows facts about it."""
+    scene = mi.load_dict({**lit_room(DIFFUSE), "integrator": {"type": "pathreplay", "max_depth": 2}})
+    dr.eval(scene.integrator().render(scene, spp=1))
+    assert scene.integrator().facts.are_about(scene)
+    integrator = weakref.ref(scene.integrator())
+    assert integrator() is not None
+    del scene
+    gc.collect()
+    assert integrator() is None
