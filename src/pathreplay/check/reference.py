@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.descriptions import load_integrator
+from pathreplay.transport.facts import SceneFacts
 
 Spec: TypeAlias = "mi.Integrator | Mapping[str, Any] | str | None"
 """An integrator: finished, described, by name, or left to us."""
@@ -98,14 +99,6 @@ def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> 
             "the same image, such as reference={'type': 'path', 'max_depth': 6}"
         )
     short = 0 <= limits.max_depth <= LONGEST_WITHOUT_ROULETTE
-    name = spec or ("volpath" if has_media(scene) else "path")
+    name = spec or ("volpath" if SceneFacts(scene).has_media else "path")
     rr_depth = NO_ROULETTE if short else limits.rr_depth
     return load_integrator({"type": name, **vars(limits), "rr_depth": rr_depth})
-
-
-def has_media(scene: mi.Scene) -> bool:
-    """Whether light may be scattered between surfaces: a shape bounds a medium, or a camera stands in one."""
-    if any(shape.is_medium_transition() for shape in scene.shapes()):
-        return True
-    # Sensors do not tell their medium to Python, but it is among their parameters.
-    return any(key.startswith("medium.") for sensor in scene.sensors() for key in mi.traverse(sensor).keys())
