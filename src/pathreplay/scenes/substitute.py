@@ -34,9 +34,8 @@ def load_file_with(
     for name in {"config", "filename"}.intersection(parameters):
         raise PathreplayError(f"Scene parameter '{name}' has a name that Mitsuba's parser keeps; rename ${name}")
     require_shallow(path)
-    with _own_resolver() as resolver:
-        resolver.prepend(mi.filesystem.path(str(path.parent)))
-        config = _config()
+    with _parsing() as config:
+        mi.file_resolver().prepend(mi.filesystem.path(str(path.parent)))
         state = mi.parser.parse_file(config, str(path), **parameters)
         return _instantiate(config, state, plugins)
 
@@ -47,18 +46,20 @@ def load_dict_with(scene: Mapping[str, Any], plugins: Mapping[str, str]) -> tupl
     Objects that stand in the dictionary already loaded stay what they are. Raises PathreplayError for a None.
     """
     require_values(scene)
-    with _own_resolver():
-        config = _config()
+    with _parsing() as config:
         return _instantiate(config, mi.parser.parse_dict(config, dict(scene)), plugins)
 
 
 @contextmanager
-def _own_resolver() -> Iterator[mi.FileResolver]:
+def _parsing() -> Iterator[mi.parser.ParserConfig]:
+    """How to parse, which within this block finds files by a resolver of its own."""
+    config = mi.parser.ParserConfig(mi.variant())
+    # Merging equal objects would rename parameters.
+    config.merge_equivalent = config.merge_meshes = False
     outer = mi.file_resolver()
-    inner = mi.FileResolver(outer)
-    mi.set_file_resolver(inner)
+    mi.set_file_resolver(mi.FileResolver(outer))
     try:
-        yield inner
+        yield config
     finally:
         mi.set_file_resolver(outer)
 
@@ -71,13 +72,6 @@ def _require_regular_files(state: Any) -> None:
         if problem not in ("", MISSING):  # Mitsuba says what is missing
             where = mi.parser.file_location(state, node)
             raise PathreplayError(f"File '{name}' of the scene {problem}; name a regular file ({where})")
-
-
-def _config() -> Any:
-    config = mi.parser.ParserConfig(mi.variant())
-    # Merging equal objects would rename parameters.
-    config.merge_equivalent = config.merge_meshes = False
-    return config
 
 
 def _instantiate(config: Any, state: Any, plugins: Mapping[str, str]) -> tuple[Any, list[str]]:
