@@ -19,12 +19,12 @@ from pathreplay import cli
 from pathreplay.check import check_gradient
 from pathreplay.check.direction import choose_line
 from pathreplay.check.objective import smooth_weights
-from pathreplay.check.reference import has_media, integrator_under_test, read_limits, reference_integrator
+from pathreplay.check.reference import integrator_under_test, read_limits, reference_integrator
 from pathreplay.check.statistics import gap, normal
 from pathreplay.check.stencil import BACKWARD, CENTRAL, FORWARD, UPWARD, WIDE, Stencil
 from pathreplay.check.verdict import Judgement, judge
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes.parameters import get_array, set_arrays
+from pathreplay.scenes.parameters import get_array
 
 # ------------------------------------------------------------------------------
 #  Verdict
@@ -207,12 +207,14 @@ def test_choice_of_integrators() -> None:
     assert integrator_under_test(None, scene) is scene.integrator()
     assert read_limits(integrator_under_test("prb_basic", scene)).max_depth == 3  # type: ignore[union-attr]
     assert read_limits(integrator_under_test("prb", scene, max_depth=7)).max_depth == 7  # type: ignore[union-attr]
-    assert has_media(scene)
     assert reference_integrator(None, scene, scene.integrator()).class_name() == "VolumetricPathIntegrator"
     with pytest.raises(PathreplayError, match="does not say its max_depth"):
         reference_integrator(None, scene, mi.load_dict({"type": "direct"}))
     in_fog = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "medium": {"type": "homogeneous"}}})
-    assert has_media(in_fog)
+    in_it = reference_integrator(None, in_fog, scene.integrator())
+    assert in_it.class_name() == "VolumetricPathIntegrator"
+    clear = reference_integrator(None, mi.load_dict({"type": "scene"}), scene.integrator())
+    assert clear.class_name() == "PathIntegrator"
 
 
 # ------------------------------------------------------------------------------
@@ -474,7 +476,9 @@ def test_bad_input_is_named(box: Any, options: dict[str, Any], message: str) -> 
 
 
 def test_a_scene_with_nan_is_refused(box: Any) -> None:
-    set_arrays(mi.traverse(box), {"green.reflectance.value": [0.1, np.nan, 0.1]})
+    params = mi.traverse(box)
+    params["green.reflectance.value"] = mi.Color3f(0.1, np.nan, 0.1)
+    params.update()
     with pytest.raises(PathreplayError, match=r"green\.reflectance\.value.*NaN"):
         check_gradient(box, "red.reflectance.value", integrator="prb", seeds=2, spp=1)
 

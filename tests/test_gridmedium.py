@@ -154,7 +154,7 @@ def crossed(cells: Any, box: Any, o: np.ndarray, d: np.ndarray, stop: float) -> 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 def test_free_flight_covers_the_optical_depth_that_was_drawn(layout: dict[str, Any], supergrid: bool) -> None:
     grid = medium(spikes(), 300, layout=layout, supergrid=supergrid)
-    assert grid.uses_supergrid == supergrid
+    assert grid.flight_cells.is_single != supergrid
     ray = probe_rays(grid)
     u = np.random.default_rng(6).random(RAYS).astype(np.float32)
     u[:4] = [0, 0, np.nextafter(np.float32(1), np.float32(0)), 0.5]
@@ -483,7 +483,7 @@ def test_emission_is_radiance_per_length_and_not_scaled() -> None:
     ids=["sparse", "cloud", "thin", "uniform", "noise"],
 )
 def test_the_supergrid_is_used_where_it_pays(values: np.ndarray, scale: float, pays: bool) -> None:
-    assert medium(values, scale).uses_supergrid == pays
+    assert medium(values, scale).flight_cells.is_single != pays
 
 
 # -------------------------------------------- bad input, other variants ---------------------------------------------

@@ -20,10 +20,6 @@ from pathreplay.libllvm import ENVIRONMENT_VARIABLE, OLDEST_USABLE_MAJOR
 
 logger = logging.getLogger("pathreplay")
 
-# ----------------------------------------------------------------------------------------------------------------------
-#  libLLVM
-# ----------------------------------------------------------------------------------------------------------------------
-
 
 def point_drjit() -> None:
     """Make Dr.Jit load a libLLVM that works, without a trial. Raises nothing.
@@ -33,14 +29,13 @@ def point_drjit() -> None:
     known to fail, tells it to load another one (`reload_llvm`).
     """
     if "drjit" in sys.modules:
-        if not loaded_is_plausible() and (path := _untried_choice()) is not None:
-            if not reload_llvm(path) and not loaded_version():
-                logger.warning("drjit was imported before pathreplay and found no libLLVM: %s", _way_out(path))
+        path = None if loaded_is_plausible() else _untried_choice()
+        if path is not None and not reload_llvm(path) and not loaded_version():
+            logger.warning("drjit was imported before pathreplay and found no libLLVM: %s", _way_out(path))
         return
     asked_for = os.environ.get(ENVIRONMENT_VARIABLE, "")
     problem = _known_problem(asked_for) if asked_for else ""
-    path = _untried_choice()
-    if path is not None and (problem or not asked_for):
+    if (path := _untried_choice()) is not None and (problem or not asked_for):
         if problem:
             logger.warning("%s=%s: %s; using %s", ENVIRONMENT_VARIABLE, asked_for, problem, path)
         os.environ[ENVIRONMENT_VARIABLE] = path
@@ -62,11 +57,8 @@ def _way_out(path: str | None) -> str:
 
 
 def _untried_choice() -> str | None:
-    pip = libllvm.pip_library()
-    if pip is not None:
-        return pip
     usable = (path for path in libllvm.system_libraries() if libllvm.version_in_path(path) >= (OLDEST_USABLE_MAJOR,))
-    return next(usable, None)
+    return libllvm.pip_library() or next(usable, None)
 
 
 def _preload(paths: list[str]) -> str:
@@ -101,10 +93,9 @@ def reload_llvm(path: str) -> bool:
     import drjit as dr
 
     active = bool(dr.has_backend(dr.JitBackend.LLVM))
-    if active:
-        in_use = "No variables registered" not in (dr.whos(as_string=True) or "")
-        if in_use or dr.has_backend(dr.JitBackend.CUDA):
-            return False
+    in_use = active and "No variables registered" not in (dr.whos(as_string=True) or "")
+    if in_use or (active and dr.has_backend(dr.JitBackend.CUDA)):
+        return False
     before = os.environ.get(ENVIRONMENT_VARIABLE)
     os.environ[ENVIRONMENT_VARIABLE] = path
     _preload(libllvm.unlinked_siblings(path))
@@ -129,12 +120,10 @@ def reload_llvm(path: str) -> bool:
 def warn_of_bad_llvm() -> None:
     """Log a warning if the libLLVM in this process is one that aborts it; for the moment an LLVM variant is set."""
     if not loaded_is_plausible():
-        version = ".".join(str(number) for number in loaded_version())
         logger.warning(
             "Dr.Jit has loaded libLLVM %s, which aborts the process at the first minimum or maximum: %s",
-            version,
-            _way_out(_untried_choice()),
-        )
+            ".".join(map(str, loaded_version())), _way_out(_untried_choice()),
+        )  # fmt: skip
 
 
 def ensure_llvm() -> None:
@@ -145,7 +134,7 @@ def ensure_llvm() -> None:
     """
     current = os.environ.get(ENVIRONMENT_VARIABLE, "")
     plausible = loaded_is_plausible()
-    if plausible and current and current == libllvm.pip_library():
+    if plausible and current == libllvm.pip_library():
         return
     tried = libllvm.probe(current)
     if plausible and tried.works:
@@ -158,11 +147,6 @@ def ensure_llvm() -> None:
             f"Dr.Jit has loaded {current or 'a libLLVM'} that does not work ({tried.message or 'back end inactive'}), "
             f"and cannot change it any more: start again with {ENVIRONMENT_VARIABLE}={library.path}"
         )
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-#  Variants
-# ----------------------------------------------------------------------------------------------------------------------
 
 
 def is_usable_variant(name: str) -> bool:
@@ -207,14 +191,11 @@ def _check_name(name: str, known: list[str]) -> None:
     usable = [variant for variant in known if is_usable_variant(variant)]
     if name in usable:
         return
+    use, plain = f"use one of {', '.join(usable)}", name.removesuffix("_polarized")
     if name in known and "_ad_" in name:
-        raise PathreplayError(
-            f"variant {name} is polarised, which pathreplay does not support: use {name.removesuffix('_polarized')}"
-            if name.removesuffix("_polarized") in usable
-            else f"variant {name} is polarised, which pathreplay does not support: use one of {', '.join(usable)}"
-        )
+        use = f"use {plain}" if plain in usable else use
+        raise PathreplayError(f"variant {name} is polarised, which pathreplay does not support: {use}")
     if name in known:
-        raise PathreplayError(f"variant {name} has no derivatives: use one of {', '.join(usable)}")
+        raise PathreplayError(f"variant {name} has no derivatives: {use}")
     near = difflib.get_close_matches(name, usable, n=1)
-    hint = f"did you mean {near[0]}?" if near else f"use one of {', '.join(usable)}"
-    raise PathreplayError(f"there is no variant {name!r}: {hint}")
+    raise PathreplayError(f"there is no variant {name!r}: {f'did you mean {near[0]}?' if near else use}")

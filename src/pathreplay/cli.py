@@ -45,9 +45,7 @@ class _Commands(typer.core.TyperGroup):
 def _end(interrupt: BaseException) -> NoReturn:
     interrupts.ignored()  # a second signal finds the process on its way out
     with contextlib.suppress(OSError):  # the terminal may be gone
-        print(
-            f"pathreplay: {interrupt}" if str(interrupt) else "pathreplay: ended by Ctrl-C", file=sys.stderr, flush=True
-        )
+        print(f"pathreplay: {str(interrupt) or 'ended by Ctrl-C'}", file=sys.stderr, flush=True)
     raise SystemExit(128 + getattr(interrupt, "number", signal.SIGINT))
 
 
@@ -176,14 +174,12 @@ def bench(context: typer.Context) -> None:
     raise typer.Exit(subprocess.run(command, env=environment).returncode)
 
 
-def _require_text(argument: str) -> None:
+def _require_text_and_folder(arguments: list[str]) -> None:
     try:
-        argument.encode()
+        for argument in arguments:
+            argument.encode()
     except UnicodeEncodeError:  # Python's stand-ins for bytes that are no UTF-8, which no report or JSON can hold
         raise PathreplayError(f"argument '{argument}' is not UTF-8; rename the file or folder") from None
-
-
-def _require_folder() -> None:
     try:
         os.getcwd()
     except OSError:  # Mitsuba would bring the process down
@@ -229,9 +225,7 @@ def _run() -> NoReturn:
             stream.reconfigure(errors="backslashreplace")  # a terminal without ± should not end a run
     try:
         with interrupts.raised():
-            for argument in sys.argv[1:]:
-                _require_text(argument)
-            _require_folder()
+            _require_text_and_folder(sys.argv[1:])
             status = app(sys.argv[1:] or ["--help"], prog_name="pathreplay", standalone_mode=False)
     except _UsageError as error:
         command = error.ctx.command_path if error.ctx else "pathreplay"

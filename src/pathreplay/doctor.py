@@ -59,8 +59,7 @@ class DoctorReport:
         def verdict(works: bool) -> tuple[str, str]:
             return ("  ok    ", "green") if works else ("  fails ", "red")
 
-        line(("Versions", "bold"))
-        line(f"  pathreplay {self.pathreplay}, Mitsuba {self.mitsuba}, Dr.Jit {self.drjit}")
+        line(("Versions", "bold"), f"\n  pathreplay {self.pathreplay}, Mitsuba {self.mitsuba}, Dr.Jit {self.drjit}")
         line(f"  Python {self.python}, {self.platform}")
         line(("libLLVM", "bold"), " (in the order in which they are looked for)")
         for library in self.libraries:
@@ -74,21 +73,13 @@ class DoctorReport:
         if not self.variants:
             line("  none tried")
         if self.ways_out:
-            line(("Ways out", "bold"))
-            for way_out in self.ways_out:
-                line("  - ", way_out)
+            line(("Ways out", "bold"), *("\n  - " + way_out for way_out in self.ways_out))
         usable = ", ".join(variant.name for variant in self.variants if variant.works)
         line(("Verdict", "bold"), f": pathreplay runs here ({usable})" if usable else ": pathreplay does not run here")
 
 
 #: A sphere under a constant light: ray tracing, virtual calls and a gradient that is known to be positive.
 _PROBE = """
-import json, sys
-task = json.loads(sys.argv[1])
-sys.path[:] = task["sys_path"]
-import ctypes
-for path in task["preload"]:
-    ctypes.CDLL(path)
 import drjit as dr, mitsuba as mi
 mi.set_variant(task["variant"])
 scene = mi.load_dict({
@@ -127,24 +118,18 @@ def _versions() -> tuple[str, str, list[str], list[str]]:
 
 def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[VariantVerdict]:
     """Try each variant; once one of a back end fails to start, its others are not tried."""
-    environment = dict(os.environ)
-    if library is not None:
-        environment[ENVIRONMENT_VARIABLE] = library.path
-    preload = libllvm.unlinked_siblings(library.path) if library is not None else []
+    environment = os.environ | ({ENVIRONMENT_VARIABLE: library.path} if library else {})
+    preload = libllvm.unlinked_siblings(library.path) if library else []
     verdicts = []
-    dead: dict[str, str] = {}
+    dead = {} if library else {"llvm": "no libLLVM works"}
     for name in names:
         backend = name.split("_")[0]
-        if backend == "llvm" and library is None:
-            dead["llvm"] = "no libLLVM works"
-        if backend not in dead:
-            task = {"sys_path": sys.path, "preload": preload, "variant": name}
-            _, message = libllvm.run_trial(_PROBE, task, environment)
-            verdicts.append(VariantVerdict(name, not message, message))
+        message = dead.get(backend)
+        if message is None:
+            _, message = libllvm.run_trial(_PROBE, {"preload": preload, "variant": name}, environment)
             if message:
                 dead[backend] = f"as {name}"
-        else:
-            verdicts.append(VariantVerdict(name, False, dead[backend]))
+        verdicts.append(VariantVerdict(name, not message, message))
     return verdicts
 
 

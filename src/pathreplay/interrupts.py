@@ -17,7 +17,6 @@ ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP")
 # Two signals that are closer than this are one wish to end: the second may not disturb what the first one set going.
 ONE_WISH_S = 1.0
 
-
 _raised_at: list[float] = []  # when a signal last raised something
 
 

@@ -8,6 +8,7 @@ their own (0.2-0.3 s each). Their order: DRJIT_LIBLLVM_PATH, the one that `pip i
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import glob
 import importlib.metadata
@@ -53,11 +54,6 @@ class LlvmLibrary:
     message: str
 
 
-# ------------------------------------------------------------------------------------------------------------
-#  Candidates
-# ------------------------------------------------------------------------------------------------------------
-
-
 def pip_library() -> str | None:
     """Path of the libLLVM that the wheel karellen-llvm-core installed, None without it.
 
@@ -69,12 +65,8 @@ def pip_library() -> str | None:
     except importlib.metadata.PackageNotFoundError:
         return None
     # The plain file, not one of its symbolic links: those appear only at the first start of Python after the install.
-    for file in files:
-        if re.fullmatch(r"libLLVM\.so\.[\d.]+", file.name):
-            path = Path(str(file.locate())).resolve()
-            if path.is_file():
-                return str(path)
-    return None
+    found = (Path(str(f.locate())).resolve() for f in files if re.fullmatch(r"libLLVM\.so\.[\d.]+", f.name))
+    return next((str(path) for path in found if path.is_file()), None)
 
 
 _SYSTEM_PATTERNS = {
@@ -106,73 +98,61 @@ def version_in_path(path: str) -> tuple[int, ...]:
     digit after .so is the version of the interface, not LLVM's.
     """
     name = os.path.basename(path)
-    for pattern in (
-        r"^libLLVM-(\d+(?:\.\d+)*)",
-        r"^libLLVM\.so\.(\d+(?:\.\d+)+|\d\d+)",
-        r"^libLLVM\.(\d+(?:\.\d+)*)\.dylib",
+    for text, pattern in (
+        (name, r"^libLLVM-(\d+(?:\.\d+)*)"),
+        (name, r"^libLLVM\.so\.(\d+(?:\.\d+)+|\d\d+)"),
+        (name, r"^libLLVM\.(\d+(?:\.\d+)*)\.dylib"),
+        (path, r"llvm[^/]*/(\d+(?:\.\d+)+)/"),
+        (path, r"llvm[-@]?(\d+(?:\.\d+)*)/"),
     ):
-        if match := re.search(pattern, name):
-            return tuple(int(number) for number in match[1].split("."))
-    if match := re.search(r"llvm[^/]*/(\d+(?:\.\d+)+)/", path) or re.search(r"llvm[-@]?(\d+(?:\.\d+)*)/", path):
-        return tuple(int(number) for number in match[1].split("."))
+        if match := re.search(pattern, text):
+            return tuple(map(int, match[1].split(".")))
     return ()
 
 
 def _known_to_linker() -> list[str]:
     """What ldconfig lists, so that folders which only this system knows are found as well."""
-    if sys.platform != "linux":
-        return []
-    for program in ("ldconfig", "/sbin/ldconfig", "/usr/sbin/ldconfig"):
-        try:
+    for program in ("ldconfig", "/sbin/ldconfig", "/usr/sbin/ldconfig") if sys.platform == "linux" else ():
+        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
             listing = subprocess.run([program, "-p"], capture_output=True, text=True, timeout=10, check=False).stdout
-        except (OSError, subprocess.TimeoutExpired):
-            continue
-        return re.findall(r"^\s*libLLVM\S* .*=> (\S+)$", listing, re.MULTILINE)
+            return re.findall(r"^\s*libLLVM\S* .*=> (\S+)$", listing, re.MULTILINE)
     return []
 
 
 def system_libraries() -> list[str]:
     """The system's libLLVM files, from new to old, each file once."""
-    found = _known_to_linker()
-    for pattern in _SYSTEM_PATTERNS.get(sys.platform, ()):
-        found += glob.glob(pattern)
-    files = {os.path.realpath(path) for path in found if os.path.isfile(path)}
+    found = [path for pattern in _SYSTEM_PATTERNS.get(sys.platform, ()) for path in glob.glob(pattern)]
+    files = {os.path.realpath(path) for path in _known_to_linker() + found if os.path.isfile(path)}
     return sorted(files, key=lambda path: (version_in_path(path), path), reverse=True)
 
 
 def candidates() -> Iterator[tuple[str, str]]:
     """(path, origin) of every libLLVM worth a look, best first, each file once."""
-    pip = pip_library()
-    seen = set()
-    if ASKED_FOR:
-        seen.add(os.path.realpath(ASKED_FOR))
-        # A process that we started has inherited the variable from us; then the library is still pip's.
-        yield ASKED_FOR, "pip" if ASKED_FOR == pip else ENVIRONMENT_VARIABLE
-    if pip and os.path.realpath(pip) not in seen:
-        seen.add(os.path.realpath(pip))
-        yield pip, "pip"
-    for path in system_libraries():
-        if path not in seen:
-            seen.add(path)
-            yield path, "system"
+    pip = pip_library() or ""
+    # A process that we started has inherited the variable from us; then the library is still pip's.
+    named = ((ASKED_FOR, "pip" if ASKED_FOR == pip else ENVIRONMENT_VARIABLE), (pip, "pip"))
+    seen = {""}
+    for path, origin in (*named, *((path, "system") for path in system_libraries())):
+        file = path and os.path.realpath(path)
+        if file not in seen:
+            seen.add(file)
+            yield path, origin
 
 
-# ------------------------------------------------------------------------------------------------------------
-#  Trial in a process of its own
-# ------------------------------------------------------------------------------------------------------------
-
-_PROBE = """
-import json, sys
+#: What every trial begins with: Python as it is here, no core dump (an abort is an answer), the library's siblings.
+_BEGIN = """
+import ctypes, json, sys
 task = json.loads(sys.argv[1])
 sys.path[:] = task["sys_path"]
 try:
     import resource
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # an abort is an answer here, not a case for a core dump
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 except ImportError:
     pass
-import ctypes
 for path in task["preload"]:
     ctypes.CDLL(path)
+"""
+_PROBE = """
 import drjit as dr
 if not dr.has_backend(dr.JitBackend.LLVM):
     print("refused by Dr.Jit", file=sys.stderr)
@@ -206,15 +186,14 @@ def unlinked_siblings(path: str) -> list[str]:
 
 def _reason(returncode: int, stderr: str) -> str:
     """One line that says why a trial failed, from what the process left behind."""
-    lines = [re.sub(r"^\w+\(\): ", "", line.strip()) for line in stderr.splitlines() if line.strip()]
     # We switch the kernel cache off ourselves (see `probe`), and Dr.Jit says so.
-    lines = [line for line in lines if "kernel cache" not in line]
+    told = [line.strip() for line in stderr.splitlines() if line.strip() and "kernel cache" not in line]
+    lines = [re.sub(r"^\w+\(\): ", "", line) for line in told]
     crash = returncode < 0 and returncode != -signal.SIGTERM
     wanted = next((line for line in lines if line.startswith("LLVM ERROR")), None) if crash else None
     detail = wanted or (lines[-1] if lines and "Traceback" in stderr else lines[0] if lines else "")
     detail = re.sub(r"0x[0-9a-f]+(: |, )?", "", detail).strip(" ,")
-    if len(detail) > 200:
-        detail = detail[:200] + " ..."
+    detail = detail if len(detail) <= 200 else detail[:200] + " ..."
     if crash:
         try:
             name = signal.Signals(-returncode).name
@@ -225,7 +204,7 @@ def _reason(returncode: int, stderr: str) -> str:
 
 
 def run_trial(code: str, task: Mapping[str, object], environment: Mapping[str, str]) -> tuple[str, str]:
-    """Run `code` in a Python of its own, with `task` as JSON in its first argument.
+    """Run `code` in a Python of its own, in which `task` is known and its "preload" is loaded.
 
     Returns what it printed, and why it failed in one line ("" if it did not). Raises nothing.
     """
@@ -233,7 +212,7 @@ def run_trial(code: str, task: Mapping[str, object], environment: Mapping[str, s
         return "", "cannot be tried: this Python does not know its own executable"
     try:
         done = subprocess.run(
-            [sys.executable, "-c", code, json.dumps(task)],
+            [sys.executable, "-c", _BEGIN + code, json.dumps({"sys_path": sys.path, "preload": [], **task})],
             env=environment,
             stdin=subprocess.DEVNULL,
             capture_output=True,
@@ -256,27 +235,18 @@ def probe(path: str, origin: str = "") -> LlvmLibrary:
     An empty `path` tries what Dr.Jit chooses by itself.
     The verdict is kept for the life of this process. Nothing is raised: whatever happens is in `works` and `message`.
     """
-    version = ".".join(str(number) for number in version_in_path(os.path.realpath(path)))
-    task = {"sys_path": sys.path, "preload": unlinked_siblings(path)}
-    environment = {
-        **os.environ,
-        ENVIRONMENT_VARIABLE: path,
-        # A kernel from the cache would never meet the compiler that is on trial.
-        "DRJIT_CACHE_DIR": os.devnull,
-    }
-    stdout, message = run_trial(_PROBE, task, environment)
+    version = ".".join(map(str, version_in_path(os.path.realpath(path))))
+    # A kernel from the cache would never meet the compiler that is on trial.
+    environment = os.environ | {ENVIRONMENT_VARIABLE: path, "DRJIT_CACHE_DIR": os.devnull}
+    stdout, message = run_trial(_PROBE, {"preload": unlinked_siblings(path)}, environment)
     return LlvmLibrary(path, origin, stdout.strip() or version, not message, message)
 
 
 def find_llvm() -> LlvmLibrary:
-    """The first candidate that works.
-
-    Raises PathreplayError if none does.
-    """
+    """The first candidate that works. Raises PathreplayError if none does."""
     failed = []
     for path, origin in candidates():
-        library = probe(path, origin)
-        if library.works:
+        if (library := probe(path, origin)).works:
             return library
         failed.append(library)
     looked_at = "; ".join(f"{library.path}: {library.message}" for library in failed) or "none found"

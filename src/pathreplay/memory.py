@@ -37,13 +37,8 @@ def _cached(statistics: str) -> int:
 
 
 def require(needed: int, thing: str, way_out: str) -> None:
-    """Return quietly if ``needed`` bytes are available.
-
-    Raises:
-        PathreplayError: they are not; the line begins with ``thing`` and ends with ``way_out``.
-    """
-    left = available()
-    if needed > left:
+    """Raise PathreplayError, from ``thing`` to ``way_out``, unless ``needed`` bytes are available."""
+    if needed > (left := available()):
         asked = f"needs about {_readable(needed)} of memory"
         raise PathreplayError(f"{thing} {asked}, {_readable(left)} are left; {way_out}")
 

@@ -32,14 +32,9 @@ PLUGINS = {
 }
 
 
-def has_derivatives(variant: str) -> bool:
-    """Whether a variant of Mitsuba can differentiate at all."""
-    return "_ad_" in variant
-
-
 def register(variant: str) -> None:
     """Register all plugins for the active variant, whose name is `variant`; stand-ins where it has no derivatives."""
-    if not has_derivatives(variant):
+    if "_ad_" not in variant:
         _register_stand_ins(variant)
         return
     if variant.startswith("llvm"):
@@ -69,14 +64,10 @@ def _register_stand_ins(variant: str) -> None:
         getattr(mi, how)(plugin, stand_in(plugin))
 
 
-def _on_variant(_old: str | None, new: str) -> None:
-    register(new)
-
-
 def install() -> None:
     """Register for the active variant, if any, and from now on for each one that is set. Sets no variant."""
     import mitsuba as mi
 
-    mi.detail.add_variant_callback(_on_variant)
+    mi.detail.add_variant_callback(lambda _old, new: register(new))
     if (active := mi.variant()) is not None:
         register(active)

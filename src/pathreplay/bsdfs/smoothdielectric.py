@@ -28,15 +28,13 @@ from ..errors import PathreplayError
 
 #: Highest probability of reflection from the denser side, unless it is total.
 MAX_REFLECTION = 0.75
+TINTS = ("specular_reflectance", "specular_transmittance")
 
 
 def register() -> None:
-    """Registers `smoothdielectric` for the variant that is active now. Doing so again is harmless.
+    """Registers `smoothdielectric` for the variant that is active now, whose base class is like no other variant's.
 
-    Mitsuba's base class is another one in every variant, hence so is the plugin's: call this once per variant.
-
-    Raises RuntimeError (Mitsuba's) when no variant is set. In a polarised variant the plugin is registered as well, and
-    refuses when a scene asks for it.
+    In a polarised variant the plugin is registered as well, and refuses when a scene asks for it.
     """
     mi.register_bsdf("smoothdielectric", _plugin_class())
 
@@ -53,8 +51,6 @@ def _index(props: Any, name: str, default: str) -> float:
 
 
 def _plugin_class() -> type:
-    """Builds the plugin's class on the BSDF base class of the variant that is active now."""
-
     class SmoothDielectric(mi.BSDF):
         def __init__(self, props: Any) -> None:
             super().__init__(props)
@@ -64,9 +60,9 @@ def _plugin_class() -> type:
                     f"{mi.variant().replace('_polarized', '')}, or Mitsuba's dielectric without derivatives"
                 )
             self.eta = mi.Float(_index(props, "int_ior", "bk7") / _index(props, "ext_ior", "air"))
-            self.specular_reflectance = _texture(props, "specular_reflectance")
-            self.specular_transmittance = _texture(props, "specular_transmittance")
-
+            # None stands for one, at no cost.
+            for name in TINTS:
+                setattr(self, name, props.get_texture(name, 1.0) if name in props else None)
             both_sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             self.m_components = [
                 mi.BSDFFlags.DeltaReflection | both_sides,
@@ -80,7 +76,7 @@ def _plugin_class() -> type:
         def traverse(self, cb: Any) -> None:
             # Discontinuous, as in Mitsuba's other dielectrics: moving refracted light moves the edges seen in it.
             cb.put("eta", self.eta, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
-            for name in ("specular_reflectance", "specular_transmittance"):
+            for name in TINTS:
                 if getattr(self, name) is not None:
                     cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
@@ -89,7 +85,7 @@ def _plugin_class() -> type:
 
         def to_string(self) -> str:
             lines = [f"  eta = {self.eta},"]
-            for name in ("specular_reflectance", "specular_transmittance"):
+            for name in TINTS:
                 if getattr(self, name) is not None:
                     lines.append(f"  {name} = {getattr(self, name)},".replace("\n", "\n  "))
             return "\n".join(["SmoothDielectric[", *lines, "]"])
@@ -150,8 +146,3 @@ def _plugin_class() -> type:
             return mi.Spectrum(0), mi.Float(0)
 
     return SmoothDielectric
-
-
-def _texture(props: Any, name: str) -> Any:
-    """The tint of that name, or None where the scene gives none (which stands for one, at no cost)."""
-    return props.get_texture(name, 1.0) if name in props else None

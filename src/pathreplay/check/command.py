@@ -31,8 +31,7 @@ def check_all(
 ) -> list[GradientCheck]:
     """``check_gradient(scene, key, **options)`` for every key that the patterns name, with a bar on standard error.
 
-    Raises:
-        PathreplayError: see :func:`check_gradient` and :func:`resolve_differentiable`.
+    Raises what :func:`check_gradient` and :func:`resolve_differentiable` do.
     """
     tested = integrator_under_test(integrator, scene, max_depth)
     keys = resolve_differentiable(mi.traverse(scene), patterns, tested)
@@ -61,14 +60,11 @@ def print_checks(results: Sequence[GradientCheck]) -> None:
         f"{first.seeds} seeds, {first.spp} spp (differences {first.fd_spp} spp)\n"
     )
     for result in results:
-        console.print(
-            Text(f"{result.verdict.upper():<6}", style=_STYLES[result.verdict]), Text(result.key, style="bold")
-        )
-        for name, estimate in (
-            ("gradient", _with_error(result.gradient, result.gradient_se)),
-            ("reference", _with_error(result.reference, math.hypot(result.reference_se, result.step_error))),
-        ):
-            console.print(f"       {name:<9}  {estimate}")
+        verdict = Text(f"{result.verdict.upper():<6}", style=_STYLES[result.verdict])
+        reference_error = math.hypot(result.reference_se, result.step_error)
+        console.print(verdict, Text(result.key, style="bold"))
+        console.print(f"       gradient   {_with_error(result.gradient, result.gradient_se)}")
+        console.print(f"       reference  {_with_error(result.reference, reference_error)}")
         console.print(f"       z = {result.z:+.2f}   {result.reason}\n")
     counts = Counter(result.verdict for result in results)
     console.print(f"{len(results)} checked: " + ", ".join(f"{n} {verdict}" for verdict, n in counts.items()))
@@ -96,12 +92,7 @@ def write_checks(results: Sequence[GradientCheck], path: Path) -> None:
 
 
 def require_writable(path: Path) -> None:
-    """Return quietly if ``path`` can be written later.
-
-    Raises:
-        PathreplayError: it is no regular file, its name is no name of a file, its folder does not exist, or one of them
-            may not be written.
-    """
+    """Raise PathreplayError for what is no regular file, has no folder, or may not be written."""
     problem = file_problem(path)
     if problem.startswith(("is ", "cannot be reached")):
         raise PathreplayError(f"{path} {problem}; give --json the name of a file")

@@ -61,9 +61,8 @@ def choose_line(
     of things infinitely ``far`` away (sun, sky), which no translation moves, turn about a random axis. Coefficients of
     ``spectra`` move so that what they stand for changes by such steps: see :mod:`pathreplay.scenes.spectra`.
 
-    Raises:
-        PathreplayError: the direction has the wrong shape, is zero or is not finite; the step is not a positive number,
-            or too long or too short for the parameter.
+    Raises PathreplayError for a direction of another shape, zero or not finite, and for a step that is not a positive
+    number, or too long or too short for the parameter.
     """
     if value.size == 0:
         raise PathreplayError(f"Parameter '{key}' is empty; there is nothing to check")
@@ -132,11 +131,10 @@ def _random_entries(shape: tuple[int, ...], seed: int) -> np.ndarray:
 
 def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
     bounded = key.rsplit(".", 1)[-1] not in _SIGNED and (value >= 0).all()
-    if not bounded or (value >= np.abs(move)).all():
-        return CENTRAL
-    if (value + 2 * move >= 0).all():
-        return FORWARD
-    if (value - 2 * move >= 0).all():
-        return BACKWARD
-    # Both ways lead below zero (a given direction of mixed signs over zeros): linear parameters do not mind.
+    if bounded and not (value >= np.abs(move)).all():
+        if (value + 2 * move >= 0).all():
+            return FORWARD
+        if (value - 2 * move >= 0).all():
+            return BACKWARD
+    # Or both ways lead below zero (a given direction of mixed signs over zeros): linear parameters do not mind.
     return CENTRAL

@@ -54,12 +54,10 @@ class GradientCheck(Judgement):
         return self.verdict in ("pass", "zero")
 
     def __str__(self) -> str:
+        tracer = self.reference_integrator
         rows = (
             (f"gradient ({self.integrator}, {self.mode})", f"{self.gradient:+.6g} ± {self.gradient_se:.2g}"),
-            (
-                f"reference ({self.reference_integrator}, {self.stencil})",
-                f"{self.reference:+.6g} ± {self.reference_se:.2g}",
-            ),
+            (f"reference ({tracer}, {self.stencil})", f"{self.reference:+.6g} ± {self.reference_se:.2g}"),
             ("step, error left by it", f"{self.step:.3g}, {self.step_error:.2g}"),
             ("seeds, spp, reference spp", f"{self.seeds}, {self.spp}, {self.fd_spp}"),
             ("z", f"{self.z:+.2f}"),
@@ -190,20 +188,17 @@ def _line(
     """The line through the parameter that will be looked along; what cannot be differentiated or differenced raises."""
     require_differentiable(params, key, by)
     require_finite(params)
-    if get_array(params[key]).dtype == np.float16:
+    value, owner = get_array(params[key]), params.properties[key][2]
+    if value.dtype == np.float16:
         raise PathreplayError(
             f"Parameter '{key}' is stored in half precision, too coarse for finite differences; give the texture the "
             "option format='variant'"
         )
-    value = get_array(params[key]).astype(np.float64)
-    far, spectra = _is_far(params.properties[key][2]), coefficient_channels(params, key) > 0
-    return choose_line(key, value, direction, step, seed, far=far, spectra=spectra)
-
-
-def _is_far(owner: mi.Object) -> bool:
-    """Whether a light stands infinitely far away, where only its orientation counts."""
-    flags = mi.EmitterFlags.Infinite | mi.EmitterFlags.DeltaDirection
-    return isinstance(owner, mi.Emitter) and bool(mi.has_flag(owner.flags(), flags))
+    # Infinitely far away only the orientation of a light counts.
+    infinite = mi.EmitterFlags.Infinite | mi.EmitterFlags.DeltaDirection
+    far = isinstance(owner, mi.Emitter) and bool(mi.has_flag(owner.flags(), infinite))
+    spectra = coefficient_channels(params, key) > 0
+    return choose_line(key, value.astype(np.float64), direction, step, seed, far=far, spectra=spectra)
 
 
 def _require_types(key: object, loss: object, **numbers: object) -> None:
@@ -212,9 +207,8 @@ def _require_types(key: object, loss: object, **numbers: object) -> None:
     if loss is not None and not callable(loss):
         raise PathreplayError(f"loss is {shown(loss)}; give a function from the image to a number, or leave it out")
     for name, number in numbers.items():
-        if name == "fd_spp" and number is None:
-            continue
-        if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
+        absent = name == "fd_spp" and number is None
+        if not absent and (isinstance(number, bool) or not isinstance(number, (int, np.integer))):
             raise PathreplayError(f"{name} is {shown(number)}; give a whole number")
 
 
@@ -225,12 +219,11 @@ def _require_arguments(
         raise PathreplayError(
             f"Variant '{mi.variant()}' has no derivatives; call mi.set_variant('llvm_ad_rgb') before loading the scene"
         )
+    if type(scene).__name__ == "Scene" and isinstance(scene, mi.Object) and not isinstance(scene, mi.Scene):
+        raise PathreplayError(
+            f"scene belongs to another variant than the active one, '{mi.variant()}': load it anew, or set its variant"
+        )
     if not isinstance(scene, mi.Scene):
-        if type(scene).__name__ == "Scene" and isinstance(scene, mi.Object):
-            raise PathreplayError(
-                f"scene belongs to another variant than the active one, '{mi.variant()}': load it anew, or set its "
-                "variant"
-            )
         raise PathreplayError(
             f"scene is a {type(scene).__name__}, not a mitsuba.Scene; load it with mi.load_file or load_dict"
         )
@@ -240,13 +233,11 @@ def _require_arguments(
         raise PathreplayError(f"seeds is {shown(seeds)}; give up to {_MOST_SEEDS}, and take more samples instead")
     if seeds < 2:
         raise PathreplayError(f"seeds is {seeds}; a standard error needs at least 2, and 8 or more make sense")
-    for name, count in (("spp", spp), ("fd_spp", fd_spp)):
-        if count is not None and count < 1:
-            raise PathreplayError(f"{name} is {count}; give at least 1 sample per pixel")
     film = film_size(scene.sensors()[sensor])
-    for name, count in (("spp", spp), ("fd_spp", fd_spp)):
-        if count is not None:
-            require_samples(name, count, film, f"sensor {sensor}")
+    for name, count in (("spp", spp), ("fd_spp", spp if fd_spp is None else fd_spp)):
+        if count < 1:
+            raise PathreplayError(f"{name} is {count}; give at least 1 sample per pixel")
+        require_samples(name, count, film, f"sensor {sensor}")
     require_memory(film, f"sensor {sensor}")
     if seed < 0:
         raise PathreplayError(f"seed is {seed}; give a whole number from 0 on")

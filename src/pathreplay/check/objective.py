@@ -19,7 +19,7 @@ from pathreplay.check.statistics import relative_l1
 from pathreplay.check.stencil import CENTRAL, Stencil
 from pathreplay.check.verdict import NEGLIGIBLE, Judgement, judge
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes.loading import innermost, told
+from pathreplay.scenes.loading import told
 from pathreplay.scenes.parameters import get_array
 
 Mode = Literal["backward", "forward"]
@@ -31,7 +31,7 @@ Loss = Callable[["mi.TensorXf"], "mi.Float"]
 def alone(params: mi.SceneParameters, key: str) -> Iterator[None]:
     """Detach all parameters, so that only ``key`` will be attached; put everything back at the end."""
     # Copies: the map hands out references to what the scene holds, and the scene is about to change.
-    held = {name: _copy(params[name]) for name in params.keys() if name == key or dr.grad_enabled(params[name])}
+    held = {name: dr.copy(params[name]) for name in params.keys() if name == key or dr.grad_enabled(params[name])}
     # Setting through the map, then update(): objects keep values derived from their parameters.
     for name, value in held.items():
         params[name] = dr.detach(value)
@@ -42,11 +42,6 @@ def alone(params: mi.SceneParameters, key: str) -> Iterator[None]:
         for name, value in held.items():
             params[name] = value
         params.update()
-
-
-def _copy(value: Any) -> Any:
-    """Another handle on the same variable, derivatives and all."""
-    return type(value)(value)
 
 
 class Objective:
@@ -61,7 +56,7 @@ class Objective:
         self.scene = scene
         self.params = params
         self.key = key
-        self.value = _copy(dr.detach(params[key]))
+        self.value = dr.copy(dr.detach(params[key]))
         self.move = move
         self.sensor = scene.sensors()[sensor]
 
@@ -109,8 +104,8 @@ class Objective:
 
     def derivative(self, integrator: mi.Integrator, mode: Mode, primal: int, seed: int, spp: int) -> float:
         """dF/dt at 0, through ``mi.render`` and with seeds for picture and derivative, as users have it."""
-        t = self._attached()
-        try:
+        t, name = self._attached(), integrator_name(integrator)
+        with told(f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode", (RuntimeError, TypeError)):
             self.put(t)
             image = mi.render(
                 self.scene, self.params, sensor=self.sensor, integrator=integrator,
@@ -121,11 +116,6 @@ class Objective:
                 return self.dot(np.array(dr.grad(image), np.float64))
             dr.backward(dr.sum(image * self.adjoint, axis=None))
             return float(dr.grad(t)[0])
-        except (RuntimeError, TypeError, NotImplementedError) as error:
-            name = integrator_name(integrator)
-            raise PathreplayError(
-                f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode: {innermost(error)}"
-            ) from error
 
     def forward(self, integrator: mi.Integrator, seed: int, spp: int) -> np.ndarray:
         """The derivative of the picture, by the integrator's forward pass alone."""

@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.descriptions import load_integrator
+from pathreplay.transport.facts import SceneFacts
 
 Spec: TypeAlias = "mi.Integrator | Mapping[str, Any] | str | None"
 """An integrator: finished, described, by name, or left to us."""
@@ -56,8 +57,7 @@ def integrator_under_test(spec: Spec, scene: mi.Scene, max_depth: int | None = N
     None is the scene's own integrator if that one is made for differentiation, else ``pathreplay``. A plugin given by
     name, or chosen by None, gets the path limits of the scene's own integrator; ``max_depth`` overrides them.
 
-    Raises:
-        PathreplayError: Mitsuba cannot make it, or ``max_depth`` makes no sense or is given along with a finished one.
+    Raises PathreplayError where Mitsuba cannot make it, or ``max_depth`` is no depth or given with a finished one.
     """
     if max_depth is not None and (type(max_depth) is not int or (max_depth < 1 and max_depth != -1)):
         raise PathreplayError(f"max_depth is {max_depth!r}; give a path length of at least 1, or -1 for no bound")
@@ -86,8 +86,7 @@ def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> 
     Its Russian roulette is switched off where paths are short enough. That leaves the expected image alone, keeps
     decisions from flipping between +h and -h, and lets throughputs be negative, as they are beside a reflectance of 0.
 
-    Raises:
-        PathreplayError: the path length of the integrator under test cannot be read, or ``spec`` cannot be made.
+    Raises PathreplayError where the path length of the tested one cannot be read, or ``spec`` cannot be made.
     """
     if isinstance(spec, mi.Integrator):
         return spec
@@ -100,14 +99,6 @@ def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> 
             "the same image, such as reference={'type': 'path', 'max_depth': 6}"
         )
     short = 0 <= limits.max_depth <= LONGEST_WITHOUT_ROULETTE
-    name = spec or ("volpath" if has_media(scene) else "path")
+    name = spec or ("volpath" if SceneFacts(scene).has_media else "path")
     rr_depth = NO_ROULETTE if short else limits.rr_depth
     return load_integrator({"type": name, **vars(limits), "rr_depth": rr_depth})
-
-
-def has_media(scene: mi.Scene) -> bool:
-    """Whether light may be scattered between surfaces: a shape bounds a medium, or a camera stands in one."""
-    if any(shape.is_medium_transition() for shape in scene.shapes()):
-        return True
-    # Sensors do not tell their medium to Python, but it is among their parameters.
-    return any(key.startswith("medium.") for sensor in scene.sensors() for key in mi.traverse(sensor).keys())

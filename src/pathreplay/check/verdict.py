@@ -52,12 +52,7 @@ class Judgement:
 
 
 def judge(
-    gradient: np.ndarray,
-    full_step: np.ndarray,
-    half_step: np.ndarray,
-    *,
-    rounding: float = 0.0,
-    negligible: float = 0.0,
+    gradient: np.ndarray, full_step: np.ndarray, half_step: np.ndarray, *, rounding: float = 0, negligible: float = 0
 ) -> Judgement:
     """Compare n gradient samples with n finite differences of step h and n of step h/2 (same seeds for these two).
 
@@ -88,7 +83,8 @@ def judge(
     resolution = σ / scale if scale > 0 else math.inf
     verdict: Verdict
     if abs(z) >= Z_LIMIT:
-        verdict, reason = "fail", _disagreement(g, r)
+        ratio = "differs from a reference of zero" if r == 0 else f"differs: {g / r:.4g} times the reference"
+        verdict, reason = "fail", ratio
     elif resolution <= RESOLUTION:
         verdict, reason = "pass", f"agrees; an error above {100 * Z_LIMIT * resolution:.2g} % would have shown"
     elif scale <= Z_LIMIT * σ <= negligible or scale == σ == 0:
@@ -96,12 +92,6 @@ def judge(
     else:
         verdict, reason = "inconclusive", _unresolved(resolution, known.step_error, σ)
     return replace(known, z=z, resolution=resolution, verdict=verdict, reason=reason)
-
-
-def _disagreement(g: float, r: float) -> str:
-    if r == 0:
-        return "differs from a reference of zero"
-    return f"differs: {g / r:.4g} times the reference"
 
 
 def _unresolved(resolution: float, step_error: float, σ: float) -> str:

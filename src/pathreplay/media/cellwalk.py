@@ -9,7 +9,7 @@ All of this is detached, and runs inside symbolic loops.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,21 +40,21 @@ class Cells:
     """
 
     to_cell: NDArray[np.float64]
-    shape: tuple[int, int, int]
-    table: Any
+    shape: tuple[int, ...]
+    table: mi.Float
 
     @property
     def is_single(self) -> bool:
         return self.shape == (3, 3, 3)
 
-    def lookup(self, kind: Any, cell: Any, active: Any) -> Any:
+    def lookup(self, kind: Any, cell: mi.Vector3f, active: mi.Bool) -> Any:
         """The numbers of a cell (Vector3f of whole numbers), as a Float or as a vector."""
         index = mi.UInt32(dr.fma(dr.fma(cell.z, self.shape[1], cell.y), self.shape[0], cell.x))
         return dr.gather(kind, self.table, index, active)
 
 
-def make_cells(bounds: Bounds, values: list[Any]) -> Cells:
-    """Cells with these numbers (each a Float, one entry per cell of ``bounds``)."""
+def make_cells(bounds: Bounds, values: Sequence[mi.Float]) -> Cells:
+    """Cells with these numbers (each with one entry per cell of ``bounds``)."""
     shape = tuple(n + 2 for n in bounds.shape)
     count = int(np.prod(bounds.shape))
     i = dr.arange(mi.UInt32, count)
@@ -67,13 +67,13 @@ def make_cells(bounds: Bounds, values: list[Any]) -> Cells:
     dr.make_opaque(table)
     to_cell = bounds.to_cell.copy()
     to_cell[:, 3] += 1
-    return Cells(to_cell, (shape[0], shape[1], shape[2]), table)
+    return Cells(to_cell, shape, table)
 
 
 # ----------------------------------------------------- the walk -----------------------------------------------------
 
 
-def through(box: Any, ray: Any) -> tuple[Any, Any]:
+def through(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
     """Distances at which the line of a ray enters and leaves a box; the first is larger where it misses. Attached.
 
     What Mitsuba's `ray_intersect` of boxes finds: that one knows only the rays of the first variant of the process.
@@ -91,7 +91,7 @@ def through(box: Any, ray: Any) -> tuple[Any, Any]:
     return near, far
 
 
-def clip(box: Any, ray: Any) -> tuple[Any, Any]:
+def clip(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
     """The part [a, b] of the ray that lies in a box (a = 0, b = -1 if there is none). Never NaN for a finite ray."""
     near, far = through(box, ray)
     a, b = dr.fmax(near, 0), dr.fmin(far, ray.maxt)
@@ -103,53 +103,53 @@ def clip(box: Any, ray: Any) -> tuple[Any, Any]:
 class CellWalk:
     """A ray in cell space: axis k is crossed at the distance cell_k · inverse_k + offset_k."""
 
-    inverse: Any  # Vector3f: 1/d, 0 along axes on which the ray does not move
-    offset: Any  # Vector3f: ([d > 0] - o)/d, infinite there
-    stride: Any  # Vector3f: the step from cell to cell, ±1
-    start: Any  # Vector3f: the cell at the first distance
-    end: Any  # Float: the distance at which the walk is over
+    inverse: mi.Vector3f  # 1/d, 0 along axes on which the ray does not move
+    offset: mi.Vector3f  # ([d > 0] - o)/d, infinite there
+    stride: mi.Vector3f  # the step from cell to cell, ±1
+    start: mi.Vector3f  # the cell at the first distance
+    end: mi.Float  # the distance at which the walk is over
 
-    def crossing(self, cell: Any) -> Any:
-        """Distances at which the three axes are crossed next (Vector3f)."""
+    def crossing(self, cell: mi.Vector3f) -> mi.Vector3f:
+        """Distances at which the three axes are crossed next."""
         return dr.fma(cell, self.inverse, self.offset)
 
-    def onward(self, cell: Any, crossings: Any, t: Any) -> Any:
+    def onward(self, cell: mi.Vector3f, crossings: mi.Vector3f, t: mi.Float) -> mi.Vector3f:
         """The cell after the distance ``t``, which is at most the least of the crossings of this one."""
         return dr.select(crossings <= t, cell + self.stride, cell)
 
 
-def begin(cells: Cells, ray: Any, a: Any, b: Any) -> CellWalk:
+def begin(cells: Cells, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> CellWalk:
     """A walk along the ray from distance a to b, both inside of the bounding box."""
     o, d = _transformed(cells.to_cell, ray)
     still, forward = d == 0, d > 0
     inverse = dr.select(still, 0, dr.rcp(d))
-    side = dr.select(forward, mi.Vector3f(1), mi.Vector3f(0))
-    offset = dr.select(still, dr.inf, (side - mi.Vector3f(o)) * inverse)
+    offset = dr.select(still, dr.inf, (dr.select(forward, mi.Vector3f(1), mi.Vector3f(0)) - o) * inverse)
     inner = mi.Vector3f([n - 2 for n in cells.shape])
-    start = dr.clip(dr.floor(dr.fma(d, a, mi.Vector3f(o))), 1, inner)
+    start = dr.clip(dr.floor(dr.fma(d, a, o)), 1, inner)
     # The walk ends where the last inner cell ends, as the walk itself finds it.
     last = dr.fma(dr.select(forward, inner, mi.Vector3f(1)), inverse, offset)
     stride = dr.select(forward, mi.Vector3f(1), mi.Vector3f(-1))
     return CellWalk(inverse, offset, stride, start, dr.minimum(b, dr.min(last)))
 
 
-def _transformed(m: NDArray[np.float64], ray: Any) -> tuple[Any, Any]:
+def _transformed(m: NDArray[np.float64], ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Origin and direction of a ray under an affine map, whose zeros cost nothing."""
 
-    def linear(row: NDArray[np.float64], v: Any) -> Any:
+    def linear(row: NDArray[np.float64], v: mi.Vector3f) -> mi.Float:
         terms = [float(row[k]) * v[k] for k in range(3) if row[k] != 0]
         return sum(terms[1:], terms[0])
 
-    o = mi.Point3f([linear(row, ray.o) + float(row[3]) for row in m])
-    d = mi.Vector3f([linear(row, ray.d) for row in m])
-    return o, d
+    o = mi.Vector3f([linear(row, ray.o) + float(row[3]) for row in m])
+    return o, mi.Vector3f([linear(row, ray.d) for row in m])
 
 
 # ---------------------------------------------------- free flight ----------------------------------------------------
 
 
-def free_flight(cells: Cells, box: Any, ray: Any, u: Any, active: Any) -> tuple[Any, Any]:
-    """Distance of the next tentative collision, and the majorant there (Floats); infinity and 0 where there is none.
+def free_flight(
+    cells: Cells, box: mi.BoundingBox3f, ray: mi.Ray3f, u: mi.Float, active: mi.Bool
+) -> tuple[mi.Float, mi.Float]:
+    """Distance of the next tentative collision, and the majorant there; infinity and 0 where there is none.
 
     The distance t solves ∫_0^t m ds = -log(1 - u), m the number of the cell (1 / unit length), 0 outside of ``box``.
     """
@@ -175,19 +175,17 @@ def free_flight(cells: Cells, box: Any, ray: Any, u: Any, active: Any) -> tuple[
         return active, cell, dr.select(hit, t, t_next), dr.select(hit, τ, τ - depth), dr.select(hit, m, 0)
 
     state = (active & (a < walk.end), walk.start, a, τ, mi.Float(0))
-    _, _, t, τ, m = _loop(step, state, ("active", "cell", "t", "τ", "m"), "gridmedium: free flight")
+    labels = ("active", "cell", "t", "τ", "m")
+    going = dr.while_loop(state, lambda active, *_: active, step, labels=labels, label="gridmedium: free flight")
+    _, _, t, τ, m = going
     hit = m > 0
     return dr.select(hit, t + τ / m, dr.inf), m
-
-
-def _loop(body: Callable[..., Any], state: tuple[Any, ...], labels: tuple[str, ...], label: str) -> Any:
-    return dr.while_loop(state, lambda active, *_: active, body, labels=labels, label=label)
 
 
 # --------------------------------------------------- transmittance ---------------------------------------------------
 
 
-def control(bounds: Bounds, scale: Any) -> tuple[Any, Any]:
+def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Control density c and rate m of the residual collisions, by cell, for the density ``scale`` times the volume.
 
     The relative variance of the estimate is exp(∫ (σ - c)²/m ds) - 1. The mean density is the best control on average,
@@ -201,12 +199,12 @@ def control(bounds: Bounds, scale: Any) -> tuple[Any, Any]:
     return c, DENSER * dr.fmax(highest - c, c - lowest)
 
 
-def majorants(bounds: Bounds, scale: Any) -> Any:
+def majorants(bounds: Bounds, scale: mi.Float) -> mi.Float:
     """Upper bound of the density by cell, 0 where that is negative (an optimiser may overshoot)."""
     return dr.fmax(_scaled(bounds, scale)[1], 0)
 
 
-def _scaled(bounds: Bounds, scale: Any) -> tuple[Any, Any]:
+def _scaled(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
     a, b = bounds.lowest * scale, bounds.highest * scale
     return dr.fmin(a, b), dr.fmax(a, b)
 

@@ -28,25 +28,18 @@ FAR = 1e6
 
 
 def register() -> None:
-    """Registers `gridmedium` for the variant that is active now. Doing so again is harmless.
-
-    Mitsuba's base class is another one in every variant, hence so is the plugin's: call this once per variant.
-
-    Raises RuntimeError (Mitsuba's) when no variant is set.
-    """
+    """Registers `gridmedium` for the variant that is active now, whose base class is like no other variant's."""
     mi.register_medium("gridmedium", _plugin_class())
 
 
 def _plugin_class() -> type:
-    """Builds the plugin's class on the medium base class of the variant that is active now."""
-
     class GridMedium(mi.Medium):
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            kind = self.phase_function().class_name()
-            if mi.has_flag(self.phase_function().flags(), mi.PhaseFunctionFlags.Microflake):
+            phase = self.phase_function()
+            if mi.has_flag(phase.flags(), mi.PhaseFunctionFlags.Microflake):
                 raise PathreplayError(
-                    f"gridmedium: with the phase function {kind} the density depends on the "
+                    f"gridmedium: with the phase function {phase.class_name()} the density depends on the "
                     "direction, and majorants do not follow that; use Mitsuba's heterogeneous"
                 )
             self.sigma_t = _volume(props, "sigma_t", 1.0)
@@ -63,11 +56,9 @@ def _plugin_class() -> type:
         # ------------------------------------------------ parameters ------------------------------------------------
 
         def traverse(self, cb: Any) -> None:
-            cb.put("scale", self.scale, mi.ParamFlags.Differentiable)
-            cb.put("albedo", self.albedo, mi.ParamFlags.Differentiable)
-            cb.put("sigma_t", self.sigma_t, mi.ParamFlags.Differentiable)
-            if self.emission is not None:
-                cb.put("emission", self.emission, mi.ParamFlags.Differentiable)
+            for name in ("scale", "albedo", "sigma_t", "emission"):
+                if getattr(self, name) is not None:
+                    cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
             cb.put("phase_function", self.phase_function(), mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: list[str]) -> None:
@@ -106,12 +97,7 @@ def _plugin_class() -> type:
             allowed = slice(first, last + 1)
             collisions = [float(rate[0]) for rate in rates[allowed]]
             chosen = first + cheapest(self.levels[allowed], collisions, mean_chord(self.box))
-            return cellwalk.make_cells(self.levels[chosen], list(values[chosen]))
-
-        @property
-        def uses_supergrid(self) -> bool:
-            """Whether free flights walk through cells with majorants of their own."""
-            return not self.flight_cells.is_single
+            return cellwalk.make_cells(self.levels[chosen], values[chosen])
 
         def to_string(self) -> str:
             lines = [f"sigma_t = {self.sigma_t}", f"albedo = {self.albedo}", f"emission = {self.emission}"]
@@ -121,21 +107,21 @@ def _plugin_class() -> type:
 
         # -------------------------------------- what Mitsuba's integrators call --------------------------------------
 
-        def get_majorant(self, mei: Any, active: Any = True) -> Any:
+        def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
             return mi.UnpolarizedSpectrum(self.majorant)
 
         def get_scattering_coefficients(self, mei: Any, active: Any = True) -> tuple[Any, Any, Any]:
             σ_t = self.scale * self.sigma_t.eval(mei, active)
             return σ_t * self.albedo.eval(mei, active), self.majorant - σ_t, σ_t
 
-        def intersect_aabb(self, ray: Any) -> tuple[Any, Any, Any]:
+        def intersect_aabb(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
             near, far = cellwalk.through(self.box, ray)
             return near <= far, near, far
 
         # -------------------------------------------- what our own calls ---------------------------------------------
 
-        def free_flight(self, ray: Any, u: Any, active: Any = True) -> tuple[Any, Any]:
-            """Distance to the next tentative collision and the local majorant there (Floats). Detached.
+        def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool = True) -> tuple[mi.Float, mi.Float]:
+            """Distance to the next tentative collision and the local majorant there. Detached.
 
             The distance t solves ∫_0^t m ds = -log(1 - u) with m the local majorant, at least σ_t in all channels and
             0 outside of the medium's bounding box. It is infinite, and the majorant 0, if there is no such t below
@@ -144,20 +130,20 @@ def _plugin_class() -> type:
             with dr.suspend_grad():
                 return cellwalk.free_flight(self.flight_cells, self.box, dr.detach(ray), dr.detach(u), active)
 
-        def transmittance(self, ray: Any, sampler: Any, active: Any = True) -> Any:
-            """Unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) by channel (UnpolarizedSpectrum). Detached."""
+        def transmittance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+            """Unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) by channel. Detached."""
             with dr.suspend_grad():
                 ray, scale = dr.detach(ray), dr.detach(self.scale)
 
-                def density(t: Any, active: Any) -> Any:
+                def density(t: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
                     at = dr.zeros(mi.Interaction3f)
                     at.p, at.time, at.wavelengths = ray(t), ray.time, ray.wavelengths
                     return scale * dr.detach(self.sigma_t.eval(at, active))
 
                 return cellwalk.transmittance(self.shadow_cells, self.box, ray, density, sampler, active)
 
-        def emission_at(self, mei: Any, active: Any = True) -> Any:
-            """Radiance emitted per unit length at an interaction (UnpolarizedSpectrum); 0 without emission."""
+        def emission_at(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+            """Radiance emitted per unit length at an interaction; 0 without emission."""
             return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, active)
 
     return GridMedium
@@ -167,14 +153,9 @@ def _plugin_class() -> type:
 
 
 def _volume(props: Any, name: str, default: float | None) -> Any:
-    """The volume of that name; textures, colours and numbers become a `constvolume`, without end.
-
-    None without the name and no default.
-    """
-    if name not in props and default is None:
-        return None
+    """The volume of that name, or None; textures, colours and numbers become a `constvolume`, without end."""
     value = props[name] if name in props else default
-    if isinstance(value, mi.Volume):
+    if value is None or isinstance(value, mi.Volume):
         return value
     if isinstance(value, (str, bool)) or (isinstance(value, mi.Object) and not isinstance(value, mi.Texture)):
         raise PathreplayError(f"gridmedium: {name} is {value!r:.40}; give a volume, a colour or a number")
@@ -201,7 +182,7 @@ def _choice(props: Any) -> bool | str:
 # ----------------------------------------------- looking at the density -----------------------------------------------
 
 
-def _look(volume: Any, needs_grid: bool) -> tuple[bool, list[Bounds]]:
+def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
     """Whether the volume differs between channels, and its bounds by cell, from fine to a single cell."""
     params = mi.traverse(volume)
     values = [dr.detach(params[key]) for key in params.keys()]
@@ -209,8 +190,7 @@ def _look(volume: Any, needs_grid: bool) -> tuple[bool, list[Bounds]]:
         channels = values[0].shape[-1]
         if channels not in (1, 3, 4):
             raise PathreplayError(f"gridmedium: sigma_t has {channels} channels; give a grid with 1 or 3")
-        lattice = find_lattice(volume, values[0].shape)
-        if lattice is not None:
+        if (lattice := find_lattice(volume, values[0].shape)) is not None:
             return channels > 1 and not mi.is_monochromatic, all_bounds(voxel_bounds(lattice, values[0]))
     if needs_grid:
         raise PathreplayError(
@@ -218,8 +198,7 @@ def _look(volume: Any, needs_grid: bool) -> tuple[bool, list[Bounds]]:
             "at 'auto'"
         )
     grey = all(dr.is_diff_v(value) and not dr.is_vector_v(value) and dr.width(value) == 1 for value in values)
-    lowest = 0.0
-    highest = float(volume.max())
+    lowest, highest = 0.0, float(volume.max())
     if volume.class_name() == "ConstVolume" and not mi.is_spectral:
         here = dr.detach(volume.eval(dr.zeros(mi.Interaction3f)))
         lowest, highest = float(dr.min(here)[0]), float(dr.max(here)[0])

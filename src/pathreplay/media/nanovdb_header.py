@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
+from typing import NamedTuple
 
 from pathreplay.errors import PathreplayError
 
@@ -32,8 +32,7 @@ _TREE = struct.Struct("<4Q3I")
 _FLOAT, _FLOAT_SIZES = 1, (2144, 33856, 270400)
 
 
-@dataclass(frozen=True)
-class _Place:
+class _Place(NamedTuple):
     grid_size: int
     file_size: int
     kind: int
@@ -41,21 +40,22 @@ class _Place:
     codec: int
 
 
-def require_whole_nanovdb(path: Path) -> None:
-    """Return quietly if headers, sizes and the places of the trees in a NanoVDB file agree with each other.
+def require_whole_nanovdb(path: Path) -> bool:
+    """Whether a NanoVDB file's first grid is compressed, once headers, sizes and the places of its trees agree.
 
     Grids that are compressed by zip are unpacked, which tells whether their bytes are what was written. Values and the
     links inside of an uncompressed tree are not looked at.
 
-    Raises:
-        PathreplayError: it is no such file, of an unknown version, or damaged.
+    Raises PathreplayError if it is no such file, of an unknown version, or damaged.
     """
     if path.stat().st_size < _SEGMENT.size:
         raise _damaged(path, "its header is cut off")
     try:
         with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
-            for place in _places(path, content):
+            places = _places(path, content)
+            for place in places:
                 _require_grid(path, content, place)
+            return places[0].codec != NONE
     except (struct.error, UnicodeDecodeError):
         raise _damaged(path, "a header is cut off or holds no text where a name should be") from None
 

@@ -12,9 +12,10 @@ Nothing here is differentiated.
 
 from __future__ import annotations
 
+import operator
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -24,6 +25,8 @@ from numpy.typing import NDArray
 
 #: Voxels along the side of the smallest cell. Half of it makes eight times the cells, and more steps between them.
 BASE = 4
+#: Lowest, mean and highest (Floats), one entry for each voxel or cell.
+Values = tuple[Any, Any, Any]
 #: Cost of a step from cell to cell over that of a tentative collision: see `pathreplay bench supergrid`.
 STEP_COST = 0.15
 
@@ -38,10 +41,10 @@ class Lattice:
     """
 
     to_voxel: NDArray[np.float64]
-    size: tuple[int, int, int]
+    size: tuple[int, ...]
     channels: int
-    low: tuple[int, int, int]
-    high: tuple[int, int, int]
+    low: tuple[int, ...]
+    high: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -53,10 +56,10 @@ class Bounds:
     """
 
     to_cell: NDArray[np.float64]
-    shape: tuple[int, int, int]
-    lowest: Any
-    mean: Any
-    highest: Any
+    shape: tuple[int, ...]
+    lowest: mi.Float
+    mean: mi.Float
+    highest: mi.Float
 
     @property
     def faces_per_length(self) -> float:
@@ -71,7 +74,7 @@ class Bounds:
 # ----------------------------------------------- where the voxels are -----------------------------------------------
 
 
-def find_lattice(volume: Any, shape: tuple[int, ...]) -> Lattice | None:
+def find_lattice(volume: mi.Volume, shape: tuple[int, ...]) -> Lattice | None:
     """The lattice of a `gridvolume` with data of that shape (z, y, x, channels), or None if it cannot be made out.
 
     Mitsuba keeps the volume's `to_world` to itself; it is read from what the volume prints, the translation from the
@@ -86,14 +89,13 @@ def find_lattice(volume: Any, shape: tuple[int, ...]) -> Lattice | None:
     if np.linalg.matrix_rank(to_local) < 3:
         return None
     linear = np.linalg.inv(to_local)  # its columns are the edges of the grid in the world
-    box = volume.bbox()
-    low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
+    low, high = _corners(volume)
     corner = low - np.minimum(linear, 0).sum(axis=1)
     extent = high - low
     if not np.allclose(corner + np.maximum(linear, 0).sum(axis=1), high, atol=1e-4 * np.abs(extent).max()):
         return None
 
-    size = (int(shape[2]), int(shape[1]), int(shape[0]))
+    size = tuple(int(n) for n in shape[2::-1])
     to_voxel = np.concatenate([to_local, -(to_local @ corner)[:, None]], axis=1) * np.array(size)[:, None]
     corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1)
     reached = to_voxel[:, :3] @ corners + to_voxel[:, 3:]
@@ -106,53 +108,37 @@ def find_lattice(volume: Any, shape: tuple[int, ...]) -> Lattice | None:
 # -------------------------------------------------- bounds by cell --------------------------------------------------
 
 
-def constant_bounds(volume: Any, lowest: float, mean: float, highest: float) -> Bounds:
-    """One cell for a volume of which no more is known than its extreme values."""
+def _corners(volume: mi.Volume) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     box = volume.bbox()
-    low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
+    return np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
+
+
+def constant_bounds(volume: mi.Volume, lowest: float, mean: float, highest: float) -> Bounds:
+    """One cell for a volume of which no more is known than its extreme values."""
+    low, high = _corners(volume)
     scale = 1 / np.maximum(high - low, 1e-30)
     to_cell = np.concatenate([np.diag(scale), (-low * scale)[:, None]], axis=1)
     return Bounds(to_cell, (1, 1, 1), mi.Float(lowest), mi.Float(mean), mi.Float(highest))
 
 
-def voxel_bounds(lattice: Lattice, data: Any) -> Bounds:
-    """Bounds of the values ``data`` (TensorXf, z y x channels) in cells of BASE³ voxels."""
-    values, size = dr.detach(data).array, lattice.size
-    lowest, mean, highest = _channels(values, lattice.channels)
-    shape = tuple(-(-(h - l) // BASE) for l, h in zip(lattice.low, lattice.high, strict=True))
-    counts = list(size)
-    for axis in range(3):
-        low, high = lattice.low[axis], lattice.high[axis]
-        near, inside = _support(low, high, size[axis]), _support(low, high, size[axis], neighbours=False)
-        lowest = _pool(lowest, counts, axis, near, dr.fmin)
-        highest = _pool(highest, counts, axis, near, dr.fmax)
-        mean = _pool(mean, counts, axis, inside, lambda a, b: a + b) / inside.shape[1]
-        counts[axis] = near.shape[0]
-        dr.eval(lowest, mean, highest)
+def voxel_bounds(lattice: Lattice, data: mi.TensorXf) -> Bounds:
+    """Bounds of the values ``data`` (z y x channels) in cells of BASE³ voxels."""
+    values, counts = _channels(dr.detach(data).array, lattice.channels), list(lattice.size)
+    for axis, span in enumerate(zip(lattice.low, lattice.high, lattice.size, strict=True)):
+        values = _merged(values, counts, axis, _support(*span), _support(*span, neighbours=False))
+        dr.eval(values)
     to_cell = lattice.to_voxel.copy()
     to_cell[:, 3] -= lattice.low
-    return Bounds(to_cell / BASE, (shape[0], shape[1], shape[2]), lowest, mean, highest)
+    return Bounds(to_cell / BASE, tuple(counts), *values)
 
 
 def coarser(bounds: Bounds) -> Bounds:
     """The same bounds for cells twice as large along every axis."""
-    lowest, mean, highest = bounds.lowest, bounds.mean, bounds.highest
-    counts = list(bounds.shape)
-    for axis in range(3):
-        n = counts[axis]
+    values, counts = (bounds.lowest, bounds.mean, bounds.highest), list(bounds.shape)
+    for axis, n in enumerate(bounds.shape):
         pairs = np.minimum(np.arange(0, n, 2)[:, None] + [0, 1], n - 1)
-        lowest = _pool(lowest, counts, axis, pairs, dr.fmin)
-        highest = _pool(highest, counts, axis, pairs, dr.fmax)
-        mean = _pool(mean, counts, axis, pairs, lambda a, b: a + b) / 2
-        counts[axis] = len(pairs)
-    return replace(
-        bounds,
-        to_cell=bounds.to_cell / 2,
-        shape=(counts[0], counts[1], counts[2]),
-        lowest=lowest,
-        mean=mean,
-        highest=highest,
-    )
+        values = _merged(values, counts, axis, pairs, pairs)
+    return Bounds(bounds.to_cell / 2, tuple(counts), *values)
 
 
 def all_bounds(bounds: Bounds) -> list[Bounds]:
@@ -164,7 +150,7 @@ def all_bounds(bounds: Bounds) -> list[Bounds]:
     return found
 
 
-def _channels(values: Any, channels: int) -> tuple[Any, Any, Any]:
+def _channels(values: mi.Float, channels: int) -> Values:
     """Lowest, mean and highest of the channels of every voxel."""
     if channels == 1:
         return values, values, values
@@ -187,10 +173,8 @@ def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np
     """
     rows = []
     for start in range(low, high, BASE):
-        stop = min(start + BASE, high)
-        beyond = 1 if neighbours else 0
         used: list[int] = []
-        for i in range(start - beyond, stop + beyond):
+        for i in range(start - neighbours, min(start + BASE, high) + neighbours):
             clamped, repeated, mirrored = min(max(i, 0), n - 1), i % n, i % (2 * n)
             used.append(clamped)
             if neighbours and clamped != i:
@@ -200,7 +184,19 @@ def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np
     return np.array([(row * longest)[:longest] for row in rows])
 
 
-def _pool(values: Any, counts: list[int], axis: int, table: NDArray[np.int64], merge: Callable[[Any, Any], Any]) -> Any:
+def _merged(values: Values, counts: list[int], axis: int, near: NDArray[np.int64], inside: NDArray[np.int64]) -> Values:
+    """Merge along one axis: extremes by the table ``near``, means by ``inside``. Brings ``counts`` up to date."""
+    lowest, mean, highest = values
+    found = (
+        _pool(lowest, counts, axis, near, dr.fmin),
+        _pool(mean, counts, axis, inside, operator.add) / inside.shape[1],
+        _pool(highest, counts, axis, near, dr.fmax),
+    )
+    counts[axis] = len(near)
+    return found
+
+
+def _pool(values: mi.Float, counts: list[int], axis: int, table: NDArray[np.int64], merge: Callable) -> mi.Float:
     """Merge along one axis of a flat array (x runs fastest, ``counts`` entries along x, y, z) as the table says."""
     inner = int(np.prod(counts[:axis]))
     cells, length = table.shape
@@ -233,7 +229,7 @@ def cheapest(levels: list[Bounds], rates: list[float], chord: float) -> int:
     return int(np.argmin(costs))
 
 
-def mean_chord(box: Any) -> float:
+def mean_chord(box: mi.BoundingBox3f) -> float:
     """Mean length of a random line in a box: four times the volume over the surface (Cauchy)."""
     x, y, z = (float(e) for e in box.extents())
     return 0.0 if x * y * z == 0 else 2 * x * y * z / (x * y + y * z + z * x)

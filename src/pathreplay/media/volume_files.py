@@ -53,8 +53,8 @@ class Volume:
     def bounds(self) -> Bounds:
         """Smallest and largest corner of the volume in the world."""
         corners = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ self.to_world.T
-        low, high = corners[:, :3].min(axis=0), corners[:, :3].max(axis=0)
-        return _point(low), _point(high)
+        (x, y, z), (X, Y, Z) = corners[:, :3].min(axis=0).tolist(), corners[:, :3].max(axis=0).tolist()
+        return (x, y, z), (X, Y, Z)
 
 
 def load_volume(path: str | Path, grid: str | None = None) -> Volume:
@@ -62,9 +62,8 @@ def load_volume(path: str | Path, grid: str | None = None) -> Volume:
 
     ``grid`` names one of several grids in a VDB file; without it the file must hold one only.
 
-    Raises:
-        PathreplayError: no such file or grid, an unknown or damaged format, values that are not float, the extra `vdb`
-            is not installed, or the reader would give wrong values (see docs/volumes.md).
+    Raises PathreplayError for no such file or grid, an unknown or damaged format, values that are not float, without
+    the extra `vdb`, and where the reader would give wrong values (see docs/volumes.md).
     """
     path = Path(path)
     read = {".vol": _read_vol, ".vdb": _read_vdb, ".nvdb": _read_nvdb}.get(path.suffix.lower())
@@ -80,8 +79,7 @@ def load_volume(path: str | Path, grid: str | None = None) -> Volume:
 
 
 def _require_small(path: Path, data: NDArray[np.float32]) -> None:
-    extreme = float(max(data.max(), -data.min()))
-    if extreme > _LARGEST:
+    if (extreme := float(max(data.max(), -data.min()))) > _LARGEST:
         raise PathreplayError(
             f"Volume {path} holds values up to {extreme:g}, through which no path would come to an end; scale it "
             f"below {_LARGEST:g}"
@@ -96,8 +94,7 @@ def save_vol(path: str | Path, data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -
 def vol_bytes(data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -> bytes:
     """The `.vol` file of a grid; ``bounds`` is the box that it fills, used where `use_grid_bbox` is set.
 
-    Raises:
-        PathreplayError: the data have neither three nor four dimensions, or no voxels.
+    Raises PathreplayError for data of neither three nor four dimensions, or without voxels.
     """
     grid = data[..., None] if data.ndim == 3 else data
     if grid.ndim != 4 or not grid.size:
@@ -124,29 +121,16 @@ def grid_volume(path: str | Path, grid: str | None = None, **options: Any) -> di
     }
 
 
-# ------------------------------------------------------------------------------
-#  Mitsuba
-# ------------------------------------------------------------------------------
-
-
 def require_whole_vol(path: Path) -> None:
-    """Return quietly if a `.vol` file is as long as its header says, with channels and values for a scene.
+    """Raise PathreplayError for a `.vol` file of impossible length or size, or with channels or values for no scene.
 
-    Raises:
-        PathreplayError: it is too short, of impossible size, with other channels or values beyond all extinctions.
-            Mitsuba tells of other damage.
+    Mitsuba tells of other damage.
     """
-    with path.open("rb") as file:
-        header = file.read(_VOL_HEADER.size)
-    if header[:4] != _VOL_MAGIC or len(header) < _VOL_HEADER.size:
+    if (header := _vol_header(path)) is None:
         return
-    _, encoding, *shape = _VOL_HEADER.unpack(header)[:6]
+    encoding, *shape = header[:5]
     if encoding == _FLOAT32 and (min(shape) < 1 or path.stat().st_size < _VOL_HEADER.size + 4 * math.prod(shape)):
-        x, y, z, channels = shape
-        raise PathreplayError(
-            f"Volume {path} should hold {x} x {y} x {z} x {channels} numbers and has {path.stat().st_size} bytes; "
-            "it is damaged, get it anew"
-        )
+        raise _wrong_length(path, shape)
     if shape[3] not in _CHANNELS:
         raise PathreplayError(f"Volume {path} has {shape[3]} channels, and scenes take 1, 3 or 6; convert it")
     if encoding == _FLOAT32:
@@ -157,33 +141,40 @@ _CHANNELS = (1, 3, 6)
 """Numbers, colours, and what SGGX phase functions take."""
 
 
+def _vol_header(path: Path) -> tuple[Any, ...] | None:
+    """Encoding, size and box of a `.vol` file; None for another file, or a stump of one."""
+    with path.open("rb") as file:
+        header = file.read(_VOL_HEADER.size)
+    whole = len(header) == _VOL_HEADER.size and header.startswith(_VOL_MAGIC)
+    return _VOL_HEADER.unpack(header)[1:] if whole else None
+
+
+def _wrong_length(path: Path, shape: list[int]) -> PathreplayError:
+    numbers, size = " x ".join(map(str, shape)), path.stat().st_size
+    return PathreplayError(
+        f"Volume {path} should hold {numbers} numbers and has {size} bytes; it is damaged, get it anew"
+    )
+
+
 def _read_vol(path: Path, grid: str | None) -> Volume:
     if grid is not None:
         raise PathreplayError(f"Volume {path} is asked for its grid '{grid}', but a .vol file holds one without name")
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        header = file.read(_VOL_HEADER.size)
-    if header[:4] != _VOL_MAGIC or len(header) < _VOL_HEADER.size:
+    if (header := _vol_header(path)) is None:
         raise PathreplayError(f"Volume {path} is no Mitsuba volume of version 3; write it with mi.VolumeGrid.write")
-    _, encoding, x, y, z, channels, *box = _VOL_HEADER.unpack(header)
+    encoding, x, y, z, channels, *box = header
     if encoding != _FLOAT32:
         raise PathreplayError(f"Volume {path} has encoding {encoding}; write it as float32 (encoding 1)")
-    count = x * y * z * channels
-    if min(x, y, z, channels) < 1 or size != _VOL_HEADER.size + 4 * count:
-        raise PathreplayError(
-            f"Volume {path} should hold {x} x {y} x {z} x {channels} numbers and has {size} bytes; "
-            "it is damaged, get it anew"
-        )
+    if min(x, y, z, channels) < 1 or path.stat().st_size != _VOL_HEADER.size + 4 * x * y * z * channels:
+        raise _wrong_length(path, [x, y, z, channels])
     values = np.fromfile(path, "<f4", offset=_VOL_HEADER.size).astype(np.float32)
-    low, high = np.array(box[:3]), np.array(box[3:])
-    to_world = np.diag([*(high - low), 1.0])
-    to_world[:3, 3] = low
-    return Volume(values.reshape(z, y, x, channels), to_world, "")
+    return Volume(values.reshape(z, y, x, channels), _scaled(np.subtract(box[3:], box[:3]), box[:3]), "")
 
 
-# ------------------------------------------------------------------------------
-#  OpenVDB and NanoVDB
-# ------------------------------------------------------------------------------
+def _scaled(scale: Any, translation: Any) -> NDArray[np.float64]:
+    """The matrix (4 x 4, for columns) that scales along the axes, then translates."""
+    matrix = np.diag([*map(float, scale), 1.0])
+    matrix[:3, 3] = translation
+    return matrix
 
 
 def _read_vdb(path: Path, grid: str | None) -> Volume:
@@ -219,27 +210,23 @@ def _require_all_voxels(where: str, source: Any, read: int) -> None:
 
 def _index_to_world(transform: dict[str, Any]) -> NDArray[np.float64]:
     """Index space to world as a matrix that acts on columns."""
-    kind = transform["type"]
-    if "affine" in kind:
+    if "affine" in transform["type"]:
         return np.array(transform["matrix"]).T  # OpenVDB's vectors are rows
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.diag(transform["scale"])
-    matrix[:3, 3] = transform["translation"]
-    return matrix
+    return _scaled(transform["scale"], transform["translation"])
 
 
 def _read_nvdb(path: Path, grid: str | None) -> Volume:
     with _vdb_reader(path):
         from tinyvdb._tinyvdb_nanovdb import NanoVDBFile
 
-        require_whole_nanovdb(path)
+        packed = require_whole_nanovdb(path)
         file = NanoVDBFile(str(path))
         index = _chosen(path, grid, [file.grid_name(i) for i in range(file.grid_count())])
         where = f"Grid '{file.grid_name(index)}' of {path}"
         if file.grid_type(index) != "Float":
             raise PathreplayError(f"{where} is of type {file.grid_type(index)}; only grids of Float can be read")
         # Seen with tinyvdb 0.9: wrong values in all but the first grid of such files.
-        if index > 0 and _codec(path) == 0:
+        if index > 0 and not packed:
             raise PathreplayError(f"{where} lies uncompressed behind another, which cannot be read; save it with zip")
         low, high = (np.array(corner, np.int64) for corner in file.bbox(index))
         shape = _size(where, low, high, _MOST_ASKED_FOR)
@@ -251,10 +238,8 @@ def _read_nvdb(path: Path, grid: str | None) -> Volume:
         x, y, z = (range(a, b + 1) for a, b in zip(low.tolist(), high.tolist(), strict=True))
         values = (file.get(index, i, j, k) for i in x for j in y for k in z)
         data = np.fromiter(values, np.float32, int(np.prod(shape))).reshape(shape)
-        matrix = np.diag([*voxel, 1.0])
         # World box: from the lower corner of the first voxel's index to that of the one after the last.
-        matrix[:3, 3] = first - low * voxel
-        return _placed(data, matrix, low, file.grid_name(index))
+        return _placed(data, _scaled(voxel, first - low * voxel), low, file.grid_name(index))
 
 
 @contextmanager
@@ -292,16 +277,5 @@ def _size(where: str, low: NDArray[Any], high: NDArray[Any], most: int = _MOST_V
 
 def _placed(data: NDArray[np.float32], index_to_world: NDArray[np.float64], low: NDArray[Any], name: str) -> Volume:
     """``data`` by index (x, y, z) from ``low`` on; sample (i, j, k) is the centre of a voxel at index (i, j, k)."""
-    box = np.diag([*map(float, data.shape), 1.0])
-    box[:3, 3] = low - 0.5
+    box = _scaled(data.shape, low - 0.5)
     return Volume(np.ascontiguousarray(data.transpose(2, 1, 0)[..., None]), index_to_world @ box, name)
-
-
-def _codec(path: Path) -> int:
-    """Compression of a NanoVDB file: 0 none, 1 zip, 2 blosc (its header: magic, version, grid count, codec)."""
-    with path.open("rb") as file:
-        return int(struct.unpack("<8sIHH", file.read(16))[3])
-
-
-def _point(v: NDArray[np.float64]) -> tuple[float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2])

@@ -10,9 +10,6 @@ import numpy as np
 
 SceneDict = dict[str, Any]
 
-BUILTINS: dict[str, Callable[..., SceneDict]] = {}
-"""Built-in scenes: name -> function that returns a Mitsuba scene dictionary."""
-
 COSTS: dict[str, Callable[[int], int]] = {
     "texture": lambda n: 64 * n**2,  # three numbers a texel, and copies in double precision
     "grid": lambda n: 256 * n**3,  # a voxel: its noise is summed from 12 waves, all at once
@@ -21,17 +18,16 @@ COSTS: dict[str, Callable[[int], int]] = {
 """Arguments of which a scene may get too large -> bytes that making it takes, roughly."""
 
 
-def builtin(name: str) -> Callable[[Callable[..., SceneDict]], Callable[..., SceneDict]]:
-    """Decorator that makes a function's scene dictionary known under ``name``."""
-
-    def register(make: Callable[..., SceneDict]) -> Callable[..., SceneDict]:
-        BUILTINS[name] = make
-        return make
-
-    return register
+def _picture(pixels: np.ndarray, **options: Any) -> SceneDict:
+    """A texture of numbers that are used as they are."""
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, **options}
 
 
-@builtin("cornell-box")
+def _centres(*counts: int) -> tuple[np.ndarray, ...]:
+    """Coordinates in [0, 1] of the middles of a grid's cells, one array for each axis."""
+    return tuple(np.meshgrid(*((np.arange(n) + 0.5) / n for n in counts), indexing="ij"))
+
+
 def cornell_box(resolution: int = 256) -> SceneDict:
     """Mitsuba's own Cornell box: two white boxes, a red and a green wall, one area light."""
     scene: SceneDict = mi.cornell_box()
@@ -39,7 +35,6 @@ def cornell_box(resolution: int = 256) -> SceneDict:
     return scene
 
 
-@builtin("cornell-box-photo")
 def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
     """The Cornell box with a grey picture (``texture`` x ``texture`` texels) as its back wall, seen by two sensors.
 
@@ -51,28 +46,15 @@ def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
     overview = scene.pop("sensor")
     # A texel is little wider than a pixel: a wider filter would blur neighbours into each other, slow to undo.
     overview["film"]["rfilter"] = {"type": "box"}
-    scene["overview"] = overview
-    scene["closeup"] = {
-        **overview,
-        # 1.3 from the wall, whose half side is 1: tan(fov / 2) = 1 / 1.3 and a margin of one per cent.
-        "to_world": T().look_at(origin=[0, 0, 0.3], target=[0, 0, -1], up=[0, 1, 0]),
-        "fov": 75.8,
-    }
+    # 1.3 from the wall, whose half side is 1: tan(fov / 2) = 1 / 1.3 and a margin of one per cent.
+    near = T().look_at(origin=[0, 0, 0.3], target=[0, 0, -1], up=[0, 1, 0])
+    scene |= {"overview": overview, "closeup": {**overview, "to_world": near, "fov": 75.8}}
     scene["large-box"]["to_world"] = T().translate([-0.45, -0.65, 0.42]).rotate([0, 1, 0], 18).scale([0.26, 0.35, 0.26])
     scene["small-box"]["to_world"] = T().translate([0.45, -0.78, 0.5]).rotate([0, 1, 0], -17).scale(0.22)
-    grey = mi.Bitmap(np.full((texture, texture, 3), 0.5, np.float32))
-    scene["back"]["bsdf"] = {
-        "type": "diffuse",
-        # raw: the texels are linear reflectances, which is what is optimised.
-        # to_uv turns v round: the first row of an image belongs at the top of the wall.
-        "reflectance": {
-            "type": "bitmap",
-            "bitmap": grey,
-            "raw": True,
-            "wrap_mode": "clamp",
-            "to_uv": T().translate([0, 1, 0]).scale([1, -1, 1]),
-        },
-    }
+    # v is turned round: the first row of an image belongs at the top of the wall.
+    upright = T().translate([0, 1, 0]).scale([1, -1, 1])
+    grey = _picture(np.full((texture, texture, 3), 0.5, np.float32), wrap_mode="clamp", to_uv=upright)
+    scene["back"]["bsdf"] = {"type": "diffuse", "reflectance": grey}
     return scene
 
 
@@ -82,10 +64,8 @@ def _room(radius: float) -> SceneDict:
     Smooth, so that a picture tells which way to move from far away; of finite size, so that it also tells where from.
     Radiance towards direction d, colour c: 0.6 + 0.08 Σ_j cos(k_cj · d + φ_cj), waves of 30 to 90 degrees.
     """
-    rows, columns = 64, 128
-    θ, φ = np.meshgrid(
-        np.pi * (np.arange(rows) + 0.5) / rows, 2 * np.pi * (np.arange(columns) + 0.5) / columns, indexing="ij"
-    )
+    v, u = _centres(64, 128)
+    θ, φ = np.pi * v, 2 * np.pi * u
     d = np.stack([np.sin(θ) * np.cos(φ), np.sin(θ) * np.sin(φ), np.cos(θ)], axis=-1)
     random = np.random.default_rng(7)  # any fixed pattern will do
     k = random.normal(size=(3, 6, 3))
@@ -97,26 +77,20 @@ def _room(radius: float) -> SceneDict:
         "flip_normals": True,
         "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(radius),
         "bsdf": {"type": "diffuse", "reflectance": 0.0},
-        "emitter": {"type": "area", "radiance": {"type": "bitmap", "bitmap": mi.Bitmap(radiance), "raw": True}},
+        "emitter": {"type": "area", "radiance": _picture(radiance)},
     }
 
 
 def _camera(origin: list[float], target: list[float], fov: float, resolution: int) -> SceneDict:
+    film = {"type": "hdrfilm", "width": resolution, "height": resolution, "pixel_format": "rgb"}
     return {
         "type": "perspective",
         "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=target, up=[0, 1, 0]),
         "fov": fov,
-        "film": {
-            "type": "hdrfilm",
-            "width": resolution,
-            "height": resolution,
-            "pixel_format": "rgb",
-            "rfilter": {"type": "box"},
-        },
+        "film": {**film, "rfilter": {"type": "box"}},
     }
 
 
-@builtin("glass-pane")
 def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
     """A thick pane of glass (index 1.5) whose front is uneven, in a painted room, seen by three sensors.
 
@@ -131,13 +105,8 @@ def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
     side = [float(distance * np.sin(angle)), 0.0, float(distance * np.cos(angle))]
     # The picture of the normals covers -0.8 to 0.8 in x and y; around it, in view too, its flat edge goes on.
     middle = T().translate([0.5, 0.5, 0]).scale([half[0] / 0.8, half[1] / 0.8, 1]).translate([-0.5, -0.5, 0])
-    normals = {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(_bumps(texture)),
-        "raw": True,
-        "wrap_mode": "clamp",
-        "to_uv": middle,
-    }
+    normals = _picture(_bumps(texture), wrap_mode="clamp", to_uv=middle)
+    glass = {"type": "ref", "id": "glass"}
     return {
         "type": "scene",
         "front": _camera([0, 0, distance], [0, 0, 0], 44, resolution),
@@ -149,19 +118,19 @@ def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
         "front_face": {
             "type": "rectangle",
             "to_world": T().translate([0, 0, thick / 2]).scale(half),
-            "bsdf": {"type": "normalmap", "normalmap": normals, "bsdf": {"type": "ref", "id": "glass"}},
+            "bsdf": {"type": "normalmap", "normalmap": normals, "bsdf": glass},
         },
         "back_face": {
             "type": "rectangle",
             "to_world": T().translate([0, 0, -thick / 2]).rotate([0, 1, 0], 180).scale(half),
-            "bsdf": {"type": "ref", "id": "glass"},
+            "bsdf": glass,
         },
     }
 
 
 def _bumps(size: int) -> np.ndarray:
     """Normals of h(x, y) = 0.03 w (sin 5x cos 4y + cos(3x + 5y)), w = (1 - x²)²(1 - y²)², flat towards the rim."""
-    x, y = np.meshgrid((np.arange(size) + 0.5) / size * 2 - 1, (np.arange(size) + 0.5) / size * 2 - 1)
+    y, x = (2 * each - 1 for each in _centres(size, size))
 
     def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         window = np.square((1 - x * x) * (1 - y * y))
@@ -175,14 +144,14 @@ def _bumps(size: int) -> np.ndarray:
     return ((n + 1) / 2).astype(np.float32)
 
 
-@builtin("mirror-camera")
 def mirror_camera(resolution: int = 48) -> SceneDict:
     """An old, blotched mirror that hangs in a painted room, seen by a tripod that stays and a camera that is carried.
 
     Both see the mirror with some of the room around it. The blotches tell where in its plane the mirror is. Keys:
     ``camera.to_world`` and ``mirror.to_world``.
     """
-    T = mi.ScalarTransform4f
+    place = mi.ScalarTransform4f().translate([-0.4, -0.1, -1.0])
+    blotches = _picture(_blotches(32))
     return {
         "type": "scene",
         "camera": _camera([0.9, 0.4, 1.9], [-0.3, 0.0, -1.0], 75, resolution),
@@ -191,52 +160,33 @@ def mirror_camera(resolution: int = 48) -> SceneDict:
         "room": _room(3.0),
         "mirror": {
             "type": "rectangle",
-            "to_world": T()
-            .translate([-0.4, -0.1, -1.0])
-            .rotate([0, 1, 0], 15)
-            .rotate([1, 0, 0], -8)
-            .scale([1.3, 1.1, 1]),
-            "bsdf": {
-                "type": "conductor",
-                "material": "none",
-                "specular_reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(_blotches(32)), "raw": True},
-            },
+            "to_world": place.rotate([0, 1, 0], 15).rotate([1, 0, 0], -8).scale([1.3, 1.1, 1]),
+            "bsdf": {"type": "conductor", "material": "none", "specular_reflectance": blotches},
         },
     }
 
 
 def _blotches(size: int) -> np.ndarray:
     """Reflectance 0.7 + 0.15 (cos 9x sin 7y + sin(5x - 8y)), less in blue."""
-    x, y = np.meshgrid((np.arange(size) + 0.5) / size * 2 - 1, (np.arange(size) + 0.5) / size * 2 - 1)
+    y, x = (2 * each - 1 for each in _centres(size, size))
     grey = 0.7 + 0.15 * (np.cos(9 * x) * np.sin(7 * y) + np.sin(5 * x - 8 * y))
     return (grey[:, :, None] * np.array([1, 0.97, 0.9])).astype(np.float32)
 
 
-@builtin("cloud")
 def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
     """A small cloud (``grid``³ voxels, albedo 0.95) under a sky with a sun, seen by ``views`` sensors around it.
 
     The medium fills a cube of side 2 without surface of its own. Key of the density (extinction per length):
     ``cloud.interior_medium.sigma_t.data``.
     """
-    T = mi.ScalarTransform4f
+    place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
+    density = {"type": "gridvolume", "grid": mi.VolumeGrid(_cumulus(grid)), "to_world": place}
+    droplets = {"type": "heterogeneous", "albedo": 0.95, "sigma_t": density}
     scene: SceneDict = {
         "type": "scene",
         "integrator": {"type": "volpath", "max_depth": 64},
         "sky": {"type": "envmap", "bitmap": mi.Bitmap(_sky(32))},
-        "cloud": {
-            "type": "cube",
-            "bsdf": {"type": "null"},
-            "interior": {
-                "type": "heterogeneous",
-                "albedo": 0.95,
-                "sigma_t": {
-                    "type": "gridvolume",
-                    "grid": mi.VolumeGrid(_cumulus(grid)),
-                    "to_world": T().translate([-1, -1, -1]).scale(2),
-                },
-            },
-        },
+        "cloud": {"type": "cube", "bsdf": {"type": "null"}, "interior": droplets},
     }
     for view in range(views):
         angle = 2 * np.pi * (view + 0.3) / views
@@ -253,18 +203,12 @@ def _cumulus(size: int) -> np.ndarray:
     Six balls, cut off below by b to a flat base; the noise n is a sum of 12 plane waves of wavelengths 0.5 to 1.2. The
     shape is (z, y, x, 1).
     """
-    centres = (np.arange(size) + 0.5) / size * 2 - 1
-    z, y, x = np.meshgrid(centres, centres, centres, indexing="ij")
-    balls = [
-        ((0.0, -0.05, 0.0), 0.46),
-        ((0.5, -0.2, 0.12), 0.36),
-        ((-0.5, -0.22, -0.1), 0.38),
-        ((0.12, 0.42, -0.14), 0.32),
-        ((-0.14, -0.15, 0.52), 0.34),
-        ((0.3, -0.2, -0.5), 0.3),
-    ]
+    z, y, x = (2 * each - 1 for each in _centres(size, size, size))
     shape = np.zeros_like(x)
-    for (cx, cy, cz), radius in balls:
+    for cx, cy, cz, radius in (
+        (0.0, -0.05, 0.0, 0.46), (0.5, -0.2, 0.12, 0.36), (-0.5, -0.22, -0.1, 0.38),
+        (0.12, 0.42, -0.14, 0.32), (-0.14, -0.15, 0.52, 0.34), (0.3, -0.2, -0.5, 0.3),
+    ):  # fmt: skip
         shape += np.exp(-(np.square(x - cx) + np.square(y - cy) + np.square(z - cz)) / radius**2)
     shape *= 1 / (1 + np.exp(-(y + 0.45) / 0.06))  # the flat base
     random = np.random.default_rng(5)  # any fixed pattern will do
@@ -278,7 +222,7 @@ def _cumulus(size: int) -> np.ndarray:
 
 def _sky(rows: int) -> np.ndarray:
     """Blue above, dim below, and a sun 50 degrees above the horizon, spread over 8 degrees so that it can be met."""
-    v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(2 * rows) + 0.5) / (2 * rows), indexing="ij")
+    v, u = _centres(rows, 2 * rows)
     θ, φ = np.pi * v, 2 * np.pi * u
     d = np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], axis=-1)  # Mitsuba's envmap
     up = 0.5 + 0.5 * d[..., 1:2]
@@ -288,3 +232,13 @@ def _sky(rows: int) -> np.ndarray:
     sun = np.array([np.cos(elevation) * np.cos(azimuth), np.sin(elevation), np.cos(elevation) * np.sin(azimuth)])
     glow = np.exp((d @ sun - 1) / (1 - np.cos(np.radians(8))))[..., None]
     return (sky + 30 * glow * np.array([1.0, 0.9, 0.75])).astype(np.float32)
+
+
+BUILTINS: dict[str, Callable[..., SceneDict]] = {
+    "cornell-box": cornell_box,
+    "cornell-box-photo": cornell_box_photo,
+    "glass-pane": glass_pane,
+    "mirror-camera": mirror_camera,
+    "cloud": cloud,
+}
+"""Built-in scenes: name -> function that returns a Mitsuba scene dictionary."""

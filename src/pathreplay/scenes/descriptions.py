@@ -11,12 +11,6 @@ import mitsuba as mi
 from pathreplay.errors import PathreplayError
 
 
-def load_description(description: Mapping[str, Any]) -> Any:
-    """`mi.load_dict`, where a None is told instead of ending the process. Raises that, and what Mitsuba raises."""
-    require_values(description)
-    return mi.load_dict(dict(description))
-
-
 def require_values(description: Mapping[str, Any]) -> None:
     """Raise PathreplayError if a value of a dictionary, or of one in it, is None: Mitsuba dies of that (SIGSEGV)."""
     for name, value in description.items():
@@ -29,14 +23,11 @@ def require_values(description: Mapping[str, Any]) -> None:
 
 
 def load_integrator(description: Mapping[str, Any]) -> mi.Integrator:
-    """The integrator that a dictionary describes.
-
-    Raises:
-        PathreplayError: its type or an option is unknown or unusable, or it is no integrator.
-    """
+    """The integrator that a dictionary describes. Raises PathreplayError if it describes none that Mitsuba can make."""
+    require_values(description)
     name = description.get("type")
     try:
-        integrator = load_description(description)
+        integrator = mi.load_dict(dict(description))
     except PathreplayError:
         raise
     except Exception as error:  # Mitsuba raises RuntimeError, plugins in Python whatever they like

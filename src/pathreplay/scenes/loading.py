@@ -6,7 +6,7 @@ import difflib
 import gc
 import inspect
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,7 @@ def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any)
     name of a built-in scene (see ``BUILTINS``). ``parameters`` replace ``$name`` in the file, or are the arguments of
     the built-in. Needs an active Mitsuba variant.
 
-    Raises:
-        PathreplayError: no such file or built-in, a wrong parameter, a file that Mitsuba cannot read, no variant.
+    Raises PathreplayError for no such file or built-in, a wrong parameter, what Mitsuba cannot read, no variant.
     """
     return load_scene_with(spec, {}, base, **parameters)[0]
 
@@ -41,15 +40,13 @@ def load_scene_with(
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
     if str(spec) in BUILTINS:
-        description = _builtin_dict(str(spec), parameters)
         try:
-            return load_dict_with(description, plugins)
+            return load_dict_with(_builtin_dict(str(spec), parameters), plugins)
         except RuntimeError as error:
             made = f"Built-in scene '{spec}' cannot be made of {parameters}"
             raise PathreplayError(f"{made}: {one_line(error)}") from error
     path = Path(spec) if base is None else Path(base) / spec
-    problem = file_problem(path)
-    if problem == MISSING:
+    if (problem := file_problem(path)) == MISSING:
         raise PathreplayError(_unknown(str(spec), path))
     if problem:
         raise PathreplayError(f"Scene {path} {problem}; give the path of a Mitsuba XML file")
@@ -76,18 +73,15 @@ def load_scene_for(
 
     Where a pattern that ends in ``eta`` matches the index of a ``dielectric``, the scene is loaded once more with
     `smoothdielectric` in the place of every ``dielectric``. Returns the scene and what is to be said about it, one line
-    each. Patterns that match nothing are left for others to complain about.
-
-    Raises:
-        PathreplayError: as `load_scene` does.
+    each. Patterns that match nothing are left for others to complain about. Raises what `load_scene` does.
     """
     scene = load_scene(spec, base, **parameters)
     params = mi.traverse(scene)
     patterns = [pattern for pattern in wanted if pattern.rsplit(".", 1)[-1] == "eta"]
-    asked = [
-        key for key in _matches(params, patterns) if scene_parameters.owner_class(params, key) == "SmoothDielectric"
-    ]
-    if not asked:
+    keys: list[str] = []
+    with suppress(PathreplayError):
+        keys = scene_parameters.resolve_keys(params, patterns)
+    if not any(scene_parameters.owner_class(params, key) == "SmoothDielectric" for key in keys):
         return scene, ()
     # Dr.Jit traces calls through every instance alive, so the first scene has to go before the second one comes.
     del scene, params
@@ -95,13 +89,6 @@ def load_scene_for(
     scene, exchanged = load_scene_with(spec, SMOOTH_GLASS, base, **parameters)
     count = "one" if len(exchanged) == 1 else f"all {len(exchanged)}"
     return scene, (f"replaced 'dielectric' by 'smoothdielectric' ({count} of them): its eta carries a derivative",)
-
-
-def _matches(params: Any, patterns: list[str]) -> list[str]:
-    try:
-        return scene_parameters.resolve_keys(params, patterns)
-    except PathreplayError:
-        return []
 
 
 def _builtin_dict(name: str, parameters: dict[str, Any]) -> SceneDict:
@@ -127,26 +114,19 @@ def _unknown(spec: str, path: Path) -> str:
 
 
 @contextmanager
-def told(what: str) -> Iterator[None]:
-    """What Mitsuba and Dr.Jit raise within, as one line that begins with ``what``.
+def told(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -> Iterator[None]:
+    """An error of these kinds within becomes a PathreplayError, whose line begins with ``what``.
 
-    A Ctrl-C that Dr.Jit has turned into such an error comes out as what it was.
-
-    Raises:
-        PathreplayError: there was a RuntimeError.
+    It tells the error that came first: Dr.Jit's calls and loops raise others that say nothing. A Ctrl-C that Dr.Jit has
+    turned into such an error comes out as what it was.
     """
     try:
         yield
-    except RuntimeError as error:
+    except kinds as error:
         first = _first(error)
         if isinstance(first, KeyboardInterrupt):
             raise first from None
         raise PathreplayError(f"{what}: {one_line(first)}") from error
-
-
-def innermost(error: BaseException) -> str:
-    """`one_line` of the error that came first: Dr.Jit's calls and loops raise others that say nothing."""
-    return one_line(_first(error))
 
 
 def _first(error: BaseException) -> BaseException:

@@ -42,11 +42,6 @@ _WAY_OUT = {
 }
 
 
-# ------------------------------------------------------------------------------
-#  Names
-# ------------------------------------------------------------------------------
-
-
 def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> list[str]:
     """The keys that ``patterns`` name, in the order of the patterns, then of the scene; each key once.
 
@@ -54,22 +49,18 @@ def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> li
     Names may hold brackets themselves: where a glob matches nothing, its brackets are taken as they are.
     ``params`` is what ``mi.traverse(scene)`` returns.
 
-    Raises:
-        PathreplayError: a pattern matches nothing; the message suggests the nearest keys.
+    Raises PathreplayError, with the nearest keys, if a pattern matches nothing.
     """
     known = list(params.keys())
     found: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        matches = [pattern] if pattern in known else _globbed(known, pattern)
+        # '[[]' is how a glob says '['.
+        literal = pattern.replace("[", "[[]")
+        matches = [pattern] if pattern in known else fnmatch.filter(known, pattern) or fnmatch.filter(known, literal)
         if not matches:
             raise PathreplayError(_no_match(known, pattern))
         found.update(dict.fromkeys(matches))
     return list(found)
-
-
-def _globbed(known: list[str], pattern: str) -> list[str]:
-    # '[[]' is how a glob says '['.
-    return fnmatch.filter(known, pattern) or fnmatch.filter(known, pattern.replace("[", "[[]"))
 
 
 def keep_only(params: Any, keys: Iterable[str]) -> None:
@@ -93,17 +84,11 @@ def owner_class(params: Any, key: str) -> str:
     return str(params.properties[key][2].class_name())
 
 
-# ------------------------------------------------------------------------------
-#  What can be differentiated, what may be used
-# ------------------------------------------------------------------------------
-
-
 def require_differentiable(params: Any, key: str, integrator: Any = None) -> None:
-    """Return quietly if ``integrator`` (None: any of Mitsuba's) can carry a derivative to ``key``.
+    """Raise PathreplayError unless ``integrator`` (None: any of Mitsuba's) can carry a derivative to ``key``.
 
-    Raises:
-        PathreplayError: the key does not exist, is a plain number, holds integers, or is marked
-            ``mi.ParamFlags.NonDifferentiable``; where there is a replacement the message names it.
+    It cannot if the key does not exist, is a plain number, holds integers, or is marked
+    ``mi.ParamFlags.NonDifferentiable``; where there is a replacement the message names it.
     """
     if key not in params:
         raise PathreplayError(_no_match(list(params.keys()), key))
@@ -111,8 +96,7 @@ def require_differentiable(params: Any, key: str, integrator: Any = None) -> Non
         return
     value = params[key]
     owner = owner_class(params, key)
-    known = _WAY_OUT.get((owner, key.rsplit(".", 1)[-1]))
-    if known is not None:
+    if (known := _WAY_OUT.get((owner, key.rsplit(".", 1)[-1]))) is not None:
         raise PathreplayError(f"Parameter '{key}' carries no derivative: {known}")
     if needs_ray_adjoint(params, key):
         raise PathreplayError(
@@ -133,11 +117,7 @@ def require_differentiable(params: Any, key: str, integrator: Any = None) -> Non
 
 
 def require_settable(params: Any, key: str) -> None:
-    """Return quietly if a parameter can be given a value: floating-point numbers, one or many.
-
-    Raises:
-        PathreplayError: the parameter holds integers, text or a matrix of plain numbers; names the way out, if any.
-    """
+    """Raise PathreplayError, with the way out, unless a parameter can be given floating-point numbers, one or many."""
     value = params[key]
     if isinstance(value, float) or _is_float(value):
         return
@@ -149,8 +129,7 @@ def require_settable(params: Any, key: str) -> None:
 def resolve_differentiable(params: Any, patterns: str | Iterable[str], integrator: Any = None) -> list[str]:
     """Like :func:`resolve_keys`, but a glob takes only those matches that carry a derivative.
 
-    Raises:
-        PathreplayError: a pattern matches nothing, an exact key carries no derivative, or no match of a glob does.
+    Raises PathreplayError if a pattern matches nothing, or nothing that carries one.
     """
     found: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
@@ -178,14 +157,8 @@ def carries_derivative(params: Any, key: str, integrator: Any = None) -> bool:
 
 # Marked NonDifferentiable by Mitsuba, whose integrators drop their derivatives. Each is held to finite differences in
 # tests/test_cameras_and_lights.py.
-_CAMERA = {
-    "to_world",
-    "x_fov",
-    "principal_point_offset_x",
-    "principal_point_offset_y",
-    "aperture_radius",
-    "focus_distance",
-}
+_PRINCIPAL_POINT = {"principal_point_offset_x", "principal_point_offset_y"}
+_CAMERA = {"to_world", "x_fov", "aperture_radius", "focus_distance"} | _PRINCIPAL_POINT
 _LIGHT = {"to_world", "position"}
 
 
@@ -214,12 +187,9 @@ def is_empty(value: Any) -> bool:
 
 
 def require_finite(params: Any) -> None:
-    """Return quietly if no parameter of the scene holds a NaN or an infinity; one reduction per array.
+    """Raise PathreplayError, with the key and the index, if a parameter holds a NaN or an infinity.
 
-    A plain number may be infinite (distances are), but not NaN.
-
-    Raises:
-        PathreplayError: names the first offending key, how many of its entries are bad, and where the first one is.
+    A plain number may be infinite (distances are). Costs one reduction per array.
     """
     counts: dict[str, Any] = {}
     for key in params.keys():
@@ -248,11 +218,6 @@ def _flat(value: Any) -> Any:
     return dr.ravel(value) if dr.depth_v(value) > 1 else value
 
 
-# ------------------------------------------------------------------------------
-#  To NumPy and back
-# ------------------------------------------------------------------------------
-
-
 def get_array(value: Any) -> np.ndarray:
     """A floating-point parameter value as a NumPy array of its own precision; a copy, without derivatives.
 
@@ -270,11 +235,7 @@ def get_array(value: Any) -> np.ndarray:
 
 
 def to_value(like: Any, array: Any) -> Any:
-    """The inverse of :func:`get_array`: ``array`` as a value of the type of ``like``, and of the same shape.
-
-    Raises:
-        PathreplayError: the shapes differ.
-    """
+    """The inverse of :func:`get_array`: ``array`` as a value like ``like``. Raises PathreplayError for other shapes."""
     expected = get_array(like)
     given = np.asarray(array)
     if given.shape != expected.shape:
@@ -288,22 +249,6 @@ def to_value(like: Any, array: Any) -> Any:
         return type(like)(given)
     component = dr.value_t(like)
     return type(like)(*(component(np.atleast_1d(row)) for row in given))
-
-
-def set_arrays(params: Any, arrays: Mapping[str, Any]) -> None:
-    """Write NumPy arrays into the scene, then let the scene know (``params.update()``), once for all of them.
-
-    Raises:
-        PathreplayError: a key does not exist, or a shape is not that of the parameter.
-    """
-    values = {}
-    for key, array in arrays.items():
-        if key not in params:
-            raise PathreplayError(_no_match(list(params.keys()), key))
-        values[key] = to_value(params[key], array)
-    for key, value in values.items():
-        params[key] = value
-    params.update()
 
 
 def displaced(value: Any, direction: np.ndarray, t: Any) -> Any:

@@ -19,22 +19,17 @@ from numpy.typing import NDArray
 from pathreplay.errors import PathreplayError
 from pathreplay.files import MISSING, file_problem
 from pathreplay.media.volume_files import require_whole_vol
-from pathreplay.scenes.serialized_files import require_sound_serialized
+from pathreplay.scenes.serialized_files import require_sound_serialized, require_vertices
 
 DEEPEST = 64
 """Elements inside each other in a scene file. Real ones have ten; Mitsuba's parser runs out of stack at some 10 000."""
-
 
 LONGEST = 2**28
 """Bytes of a scene file. Mitsuba takes some ten times as much memory to read one."""
 
 
 def require_shallow(path: Path) -> None:
-    """Return quietly if a scene file, or one that it includes, is not too long, and no element nested too deep.
-
-    Raises:
-        PathreplayError: names the file, and the line.
-    """
+    """Raise PathreplayError where a scene file, or one that it includes, is too long, or an element nested too deep."""
     waiting, seen = [path], set()
     while waiting:
         file = waiting.pop()
@@ -77,12 +72,9 @@ def _included(path: Path) -> list[str]:
 
 
 def require_sound_files(state: Any) -> None:
-    """Return quietly if the files that a parsed scene names (`mi.parser`) can be given to Mitsuba.
+    """Raise PathreplayError where a file that a parsed scene (`mi.parser`) names cannot be given to Mitsuba.
 
     Looks at the indices of PLY and serialized meshes and at the sizes of volumes; and for groups without a shape.
-
-    Raises:
-        PathreplayError: names the file, what is wrong, and the way out.
     """
     for node in state.nodes:
         kind, name = node.props.plugin_name(), node.props.get("filename", None)
@@ -114,10 +106,6 @@ def _require_shapes(state: Any, group: Any) -> None:
     raise PathreplayError(f"Shape group '{group.props.id()}' holds no shape; put one into it, or leave it out")
 
 
-# ------------------------------------------------------------------------------
-#  PLY
-# ------------------------------------------------------------------------------
-
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -130,6 +118,10 @@ class _Element:
     name: str
     count: int
     properties: list[tuple[str, ...]]
+
+    @property
+    def kinds(self) -> list[str]:
+        return [kinds[0] for kinds in self.properties]
 
     def triangles(self, order: str) -> np.dtype[Any]:
         """The layout of one entry, where lists have three members."""
@@ -148,26 +140,17 @@ def _require_sound_ply(path: Path) -> None:
             raise PathreplayError(f"Mesh {path} is no PLY file: it does not begin with 'ply'; get it anew")
         kind, elements = _ply_header(file)
         begin = file.tell()
-    by_name = {element.name: element for element in elements}
-    if kind is None or [element.name for element in elements[:2]] != ["vertex", "face"]:
+    if kind is None or [element.name for element in elements[:2]] != ["vertex", "face"] or "list" in elements[0].kinds:
         return
-    if any(kinds[0] == "list" for kinds in by_name["vertex"].properties):
-        return
-    vertices, faces = by_name["vertex"].count, by_name["face"].count
+    vertices, faces = elements[0].count, elements[1].count
     if not vertices or not faces:
         raise PathreplayError(f"Mesh {path} has {vertices} vertices and {faces} faces; give it some, or leave it out")
     try:
         indices = (_ascii_indices if kind == "ascii" else _binary_indices)(path, begin, elements, kind)
     except (KeyError, ValueError, IndexError):
         return  # not what we know: Mitsuba may
-    if indices is None or not indices.size:
-        return
-    low, high = int(indices.min()), int(indices.max())
-    if low < 0 or high >= vertices:
-        raise PathreplayError(
-            f"Mesh {path} has a face with vertex {low if low < 0 else high}, but its {vertices} vertices count from 0 "
-            f"to {vertices - 1}; it is damaged, write it anew"
-        )
+    if indices is not None and indices.size:
+        require_vertices(path, indices, vertices)
 
 
 def _ply_header(file: Any) -> tuple[str | None, list[_Element]]:
@@ -192,7 +175,9 @@ def _binary_indices(path: Path, begin: int, elements: list[_Element], kind: str)
     if path.stat().st_size < begin + face.itemsize * elements[1].count:
         return None
     entries = np.memmap(path, face, "r", begin, elements[1].count)
-    return _triangle_indices(entries, elements[1])
+    at = elements[1].kinds.index("list")
+    # Mitsuba refuses other faces.
+    return entries[elements[1].properties[at][-1]] if (entries[f"count {at}"] == 3).all() else None
 
 
 def _ascii_indices(path: Path, begin: int, elements: list[_Element], kind: str) -> NDArray[Any] | None:
@@ -204,10 +189,5 @@ def _ascii_indices(path: Path, begin: int, elements: list[_Element], kind: str) 
     begin = elements[0].count * len(elements[0].properties)
     width = len(elements[1].properties) + 3
     entries = numbers[begin : begin + width * elements[1].count].reshape(-1, width)
-    before = next(i for i, kinds in enumerate(elements[1].properties) if kinds[0] == "list")
-    return entries[:, before + 1 : before + 4] if (entries[:, before] == 3).all() else None
-
-
-def _triangle_indices(entries: NDArray[Any], face: _Element) -> NDArray[Any] | None:
-    at, name = next((i, kinds[-1]) for i, kinds in enumerate(face.properties) if kinds[0] == "list")
-    return entries[name] if (entries[f"count {at}"] == 3).all() else None  # Mitsuba refuses other faces
+    at = elements[1].kinds.index("list")
+    return entries[:, at + 1 : at + 4] if (entries[:, at] == 3).all() else None

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
 
@@ -18,12 +19,9 @@ _HIGHEST_RATIO = 1032
 
 
 def require_sound_serialized(path: Path, index: Any) -> None:
-    """Return quietly if the table of shapes fits into the file, and the faces of shape ``index`` have their vertices.
+    """Raise PathreplayError unless the table of shapes fits into the file, and shape ``index`` has its faces' vertices.
 
     That shape is unpacked, as Mitsuba does it once more. Damage of other kinds is left to Mitsuba, which sees it.
-
-    Raises:
-        PathreplayError: names the file, what is wrong, and the way out.
     """
     with path.open("rb") as file:
         head = file.read(4)
@@ -32,8 +30,7 @@ def require_sound_serialized(path: Path, index: Any) -> None:
         version, size = struct.unpack("<HH", head)[1], path.stat().st_size
         offset = struct.Struct("<Q" if version == 4 else "<I")
         file.seek(max(size - 4, 4))
-        last = file.read(4)
-        if len(last) < 4:
+        if len(last := file.read(4)) < 4:
             return
         (count,) = struct.unpack("<I", last)
         table = size - 4 - offset.size * count
@@ -64,9 +61,14 @@ def _require_sound_faces(path: Path, packed: bytes, version: int) -> None:
     if not vertices or not faces or vertices >= 2**32 or end > _HIGHEST_RATIO * len(packed):
         return
     content = zlib.decompressobj().decompress(packed, end)
-    largest = int(np.frombuffer(content, "<u4", 3 * faces, begin).max())
-    if largest >= vertices:
+    require_vertices(path, np.frombuffer(content, "<u4", 3 * faces, begin), vertices)
+
+
+def require_vertices(path: Path, indices: NDArray[Any], vertices: int) -> None:
+    """Raise PathreplayError if the faces of a mesh name a vertex that it does not have."""
+    low, high = int(indices.min()), int(indices.max())
+    if low < 0 or high >= vertices:
         raise PathreplayError(
-            f"Mesh {path} has a face with vertex {largest}, but its {vertices} vertices count from 0 to "
-            f"{vertices - 1}; it is damaged, write it anew"
+            f"Mesh {path} has a face with vertex {low if low < 0 else high}, but its {vertices} vertices count from 0 "
+            f"to {vertices - 1}; it is damaged, write it anew"
         )

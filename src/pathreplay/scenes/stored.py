@@ -48,11 +48,7 @@ class Form:
         return seen
 
     def of_colours(self, key: str, colours: Array) -> Array:
-        """What is seen of linear RGB colours (or grey numbers), in an array of the shape that is seen.
-
-        Raises:
-            PathreplayError: the parameter cannot hold them.
-        """
+        """What is seen of linear RGB colours (or grey numbers), in its shape. Raises PathreplayError if it cannot."""
         return colours
 
 
@@ -120,8 +116,7 @@ class Spectra(Form):
                 f"Parameter '{key}' is a spectrum in variant {mi.variant()} and takes colours from 0{most}, not "
                 f"{colours.min():g} to {colours.max():g}; change them, or use an rgb variant"
             )
-        channels = colours.reshape(3) if colours.ndim == 1 else colours.reshape(-1, 3)
-        rows = np.atleast_2d(channels).astype(np.float64)
+        rows = colours.reshape(-1, 3).astype(np.float64)
         factor = np.maximum(2 * rows.max(axis=1), 1e-8) if self.scaled else np.ones(len(rows))
         fetched = [mi.srgb_model_fetch(mi.ScalarColor3f(*row)) for row in rows / factor[:, None]]
         c = [mi.Float(np.array(column, np.float32)) for column in zip(*fetched, strict=True)]
@@ -155,9 +150,8 @@ def form_of(params: Any, key: str) -> Form:
 
 def _entries(value: Any, channels: int) -> Any:
     """The channels of a colour or of a tensor, one flat array each."""
-    if not dr.is_tensor_v(value):
-        return value
-    return dr.unravel(mi.Vector3f if channels == 3 else mi.Vector4f, value.array)
+    kind = mi.Vector3f if channels == 3 else mi.Vector4f
+    return dr.unravel(kind, value.array) if dr.is_tensor_v(value) else value
 
 
 def _like(value: Any, entries: Any) -> Any:

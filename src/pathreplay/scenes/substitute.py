@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,58 +17,51 @@ from pathreplay.threads import spare_thread
 
 
 def load_file_with(
-    path: str | Path,
-    plugins: Mapping[str, str],
-    parameters: Mapping[str, str] | None = None,
-    *,
-    optimize: bool = False,
+    path: str | Path, plugins: Mapping[str, str], parameters: Mapping[str, str] | None = None
 ) -> tuple[Any, list[str]]:
-    """`mi.load_file(path, optimize=optimize, **parameters)` with plugins exchanged, included files' plugins too.
+    """`mi.load_file(path, optimize=False, **parameters)` with plugins exchanged, included files' plugins too.
 
     `plugins` maps the type named in the scene to the type to load in its place, {"dielectric": "smoothdielectric"} for
     one. The new plugin has to be registered and is given the properties and the id of the old one, so that parameter
-    keys stay what they were (with `optimize=False`; Mitsuba's merging of equal objects renames things).
+    keys stay what they were.
 
     Returns the scene (or object) and one line per exchanged plugin, its id and where it stands in the file.
     Raises RuntimeError (Mitsuba's) for a file that cannot be read or holds a property unknown to the new plugin, and
     PathreplayError for a file that would end the process: see `require_shallow` and `require_sound_files`.
     """
     path = Path(path)
+    parameters = parameters or {}
+    for name in {"config", "filename"}.intersection(parameters):
+        raise PathreplayError(f"Scene parameter '{name}' has a name that Mitsuba's parser keeps; rename ${name}")
     require_shallow(path)
-    config = _config(optimize)
-    outer = mi.file_resolver()
-    inner = mi.FileResolver(outer)
-    inner.prepend(mi.filesystem.path(str(path.parent)))
-    mi.set_file_resolver(inner)
-    try:
-        state = mi.parser.parse_file(config, str(path), **_arguments(parameters or {}))
+    with _parsing() as config:
+        mi.file_resolver().prepend(mi.filesystem.path(str(path.parent)))
+        state = mi.parser.parse_file(config, str(path), **parameters)
         return _instantiate(config, state, plugins)
-    finally:
-        mi.set_file_resolver(outer)
 
 
-def load_dict_with(
-    scene: Mapping[str, Any], plugins: Mapping[str, str], *, optimize: bool = False
-) -> tuple[Any, list[str]]:
-    """`mi.load_dict(scene, optimize=optimize)` with plugins exchanged; otherwise as `load_file_with`.
+def load_dict_with(scene: Mapping[str, Any], plugins: Mapping[str, str]) -> tuple[Any, list[str]]:
+    """`mi.load_dict(scene, optimize=False)` with plugins exchanged; otherwise as `load_file_with`.
 
     Objects that stand in the dictionary already loaded stay what they are. Raises PathreplayError for a None.
     """
     require_values(scene)
-    config = _config(optimize)
+    with _parsing() as config:
+        return _instantiate(config, mi.parser.parse_dict(config, dict(scene)), plugins)
+
+
+@contextmanager
+def _parsing() -> Iterator[mi.parser.ParserConfig]:
+    """How to parse, which within this block finds files by a resolver of its own."""
+    config = mi.parser.ParserConfig(mi.variant())
+    # Merging equal objects would rename parameters.
+    config.merge_equivalent = config.merge_meshes = False
     outer = mi.file_resolver()
     mi.set_file_resolver(mi.FileResolver(outer))
     try:
-        return _instantiate(config, mi.parser.parse_dict(config, dict(scene)), plugins)
+        yield config
     finally:
         mi.set_file_resolver(outer)
-
-
-def _arguments(parameters: Mapping[str, str]) -> dict[str, str]:
-    for name in ("config", "filename"):
-        if name in parameters:
-            raise PathreplayError(f"Scene parameter '{name}' has a name that Mitsuba's parser keeps; rename ${name}")
-    return dict(parameters)
 
 
 def _require_regular_files(state: Any) -> None:
@@ -80,17 +74,10 @@ def _require_regular_files(state: Any) -> None:
             raise PathreplayError(f"File '{name}' of the scene {problem}; name a regular file ({where})")
 
 
-def _config(optimize: bool) -> Any:
-    config = mi.parser.ParserConfig(mi.variant())
-    config.merge_equivalent = config.merge_meshes = optimize
-    return config
-
-
 def _instantiate(config: Any, state: Any, plugins: Mapping[str, str]) -> tuple[Any, list[str]]:
     exchanged = []
     for node in state.nodes:
-        new = plugins.get(node.props.plugin_name())
-        if new is not None:
+        if (new := plugins.get(node.props.plugin_name())) is not None:
             exchanged.append(f"{node.props.id() or 'unnamed'} ({mi.parser.file_location(state, node)})")
             node.props.set_plugin_name(new)
     _require_regular_files(state)
