@@ -383,7 +383,8 @@ MEDIUM = "object.interior_medium."
 FOG = tuple(MEDIUM + key for key in ("sigma_t.value.value", "albedo.value.value", "phase_function.g"))
 LISTED = tuple(MEDIUM + key for key in ("sigma_t.data", "albedo.data", "scale", "phase_function.g"))
 CLOUD = (*LISTED, MEDIUM + "emission.data")
-STEADY = tuple(key for key in CLOUD if not key.endswith(".g"))  # that one cancels: threads alone make 8e-6 of it
+# Its derivative by g cancels, so that threads alone make 8e-6 of it.
+STEADY = (*(key for key in CLOUD if not key.endswith(".g")), "kernel.bsdf.reflectance.value", "sky.data")
 RAINBOW = ("outer.sigma_t.data", "inner.sigma_t.value.value", "outer.albedo.data", "sky.data")
 STILL = ("bulb.intensity.value", "sun.irradiance.value", "gauze.bsdf.opacity.value",
          "faces.bsdf.brdf_1.diffuse_reflectance.value", FLOOR)  # fmt: skip
