@@ -128,6 +128,6 @@ def test_observers_hear_of_everything_in_order() -> None:
         def observe(self, event: Event) -> None:
             heard.append(event)
 
-    iterate(problem, config, run, None, Stop(), [Listener()])
+    iterate(problem, config, run, Stop(), [Listener()])
     first, second, third = (Stepped(entry) for entry in run.history)
     assert heard == [Started(0, 3), first, second, Refined(TEXTURE, (4, 4, 3)), third, Stopped(3)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from pathreplay.inverse.checkpoint import Entry
+from pathreplay.inverse.outcome import Contestant
 
 # Colours that read on light and dark ground alike.
 OURS, RIVAL, GREY = "#3b82f6", "#e07b39", "#808080"
@@ -32,19 +33,21 @@ def loss_figure(history: Sequence[Entry]) -> Figure:
     return figure
 
 
-def comparison_figure(runs: Mapping[str, Sequence[Entry]], keys: Sequence[str]) -> Figure:
-    """Errors against seconds of two runs (name -> history): of the pictures, and of the first keys."""
-    panels = [None, *keys[:PANELS]]
+def comparison_figure(contestants: Sequence[Contestant]) -> Figure:
+    """Errors against seconds of two runs: of the pictures, and of the first keys."""
+    panels = [None, *list(contestants[0].errors)[:PANELS]]
     figure = Figure(figsize=(4.4 * len(panels), 3.0), layout="constrained")
     for axes, key in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        for (name, history), colour in zip(runs.items(), (OURS, RIVAL), strict=True):
+        for contestant, colour in zip(contestants, (OURS, RIVAL), strict=True):
+            history = contestant.run.history
             seconds = np.cumsum([entry.seconds for entry in history])
             if key is None:
                 found = [(s, e.picture_error) for s, e in zip(seconds, history, strict=True) if e.picture_error]
             else:
                 found = [(s, e.errors[key]) for s, e in zip(seconds, history, strict=True)]
             marker = "o" if key is None else None
-            axes.plot(*zip(*found, strict=True), color=colour, linewidth=1.5, marker=marker, markersize=3, label=name)
+            points = zip(*found, strict=True)
+            axes.plot(*points, color=colour, linewidth=1.5, marker=marker, markersize=3, label=contestant.name)
         axes.set_ylim(bottom=0)
         axes.set_xlabel("seconds")
         axes.set_title("error of the pictures" if key is None else f"error of {key}", fontsize=9, color=GREY)

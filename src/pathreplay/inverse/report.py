@@ -21,9 +21,9 @@ from pathreplay.inverse.outcome import Outcome
 def report_files(outcome: Outcome) -> dict[str, bytes]:
     """report.html, the curves (SVG, PNG) and summary.png, as file name -> content."""
     curves = {"loss": loss_figure(outcome.history)}
-    runs = outcome.comparison()
-    if runs:
-        curves["comparison"] = comparison_figure({run.name: run.history for run in runs}, list(runs[0].errors))
+    contestants = outcome.comparison()
+    if contestants:
+        curves["comparison"] = comparison_figure(contestants)
     drawings = {f"{name}.{kind}": drawn(curve, kind) for name, curve in curves.items() for kind in ("svg", "png")}
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pathreplay.inverse", "."),
@@ -37,7 +37,7 @@ def report_files(outcome: Outcome) -> dict[str, bytes]:
         outcome=outcome,
         data_uri=_data_uri,
         curves={name: _uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves},
-        runs=runs,
+        contestants=contestants,
         judge=outcome.judge(),
         versions=versions(outcome.variant),
     )
