@@ -65,7 +65,7 @@ def _run(
         if start.folder is not None:
             stack.callback(start.folder.close)
         with undisturbed():
-            variant = backend.set_variant(start.config.variant)
+            backend.set_variant(start.config.variant)
         if start.config.deterministic:
             require_one_thread_possible()
         bar = stack.enter_context(Progress(progress))
@@ -89,9 +89,7 @@ def _run(
         with one_thread(start.config.deterministic), told(_failing(start.config)):
             after = render_views(problem, start.config, run.values)
             theirs = render_views(problem, start.config, run.rival.values) if run.rival else {}
-        outcome = outcome_of(
-            start.config, start.source, folder.path, problem, run, before, after, theirs, variant
-        )  # fmt: skip
+        outcome = outcome_of(start.config, start.source, folder.path, problem, run, before, after, theirs)
         folder.write(result_files(outcome))
         return result_of(outcome, stop.by())
 

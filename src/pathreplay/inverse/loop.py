@@ -95,7 +95,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     seconds = time.perf_counter() - begin
     norms = {key: float(np.linalg.norm(gradient)) for key, gradient in found.gradients.items()}
     errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
-    run.history.append(Entry(i, found.loss, seconds, norms, found.diagnostics.dropped, errors))
+    run.history.append(Entry(i, found.loss, seconds, norms, found.dropped, errors))
     return refined
 
 

@@ -46,4 +46,3 @@ class Observer(Protocol):
 
     def observe(self, event: Event) -> None:
         """Called between iterations."""
-        ...

@@ -177,7 +177,6 @@ class Outcome:
     run: Run
     values: dict[str, Array]
     """Variables as people see them, and what poses make of the scene, by key."""
-    variant: str
     notes: tuple[str, ...]
 
     @property

@@ -9,6 +9,7 @@ import platform
 from importlib.metadata import version
 
 import jinja2
+import mitsuba as mi
 import numpy as np
 import PIL.Image
 from matplotlib.figure import Figure
@@ -39,7 +40,7 @@ def report_files(outcome: Outcome) -> dict[str, bytes]:
         curves={name: _uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves},
         contestants=contestants,
         judge=outcome.judge(),
-        versions=versions(outcome.variant),
+        versions=versions(),
     )
     return {"report.html": html.encode(), **drawings, "summary.png": summary(outcome)}
 
@@ -73,13 +74,13 @@ def _short(name: str) -> str:
     return name if len(name) <= 24 else f"…{name[-23:]}"
 
 
-def versions(variant: str) -> dict[str, str]:
+def versions() -> dict[str, str]:
     """What a run depends on besides its config."""
     return {
         "pathreplay": version("pathreplay"),
         "Mitsuba": version("mitsuba"),
         "Dr.Jit": version("drjit"),
-        "variant": variant,
+        "variant": mi.variant(),
         "Python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }

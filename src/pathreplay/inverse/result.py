@@ -75,7 +75,6 @@ def outcome_of(
     before: dict[str, Image],
     after: dict[str, Image],
     rivals: dict[str, Image],
-    variant: str,
 ) -> Outcome:
     """All that is told of a run; ``before``, ``after`` and the ``rivals`` are pictures by view."""
     theirs = run.rival.values if run.rival else {}
@@ -93,7 +92,7 @@ def outcome_of(
         for v in problem.variables
         if v.key not in parts
     )
-    return Outcome(config, source, folder, views, recovered, poses, run, values, variant, problem.notes)
+    return Outcome(config, source, folder, views, recovered, poses, run, values, problem.notes)
 
 
 def result_files(outcome: Outcome) -> dict[str, bytes]:
