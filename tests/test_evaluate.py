@@ -11,8 +11,7 @@ import pytest
 
 from pathreplay.inverse import make_config
 from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard, total
-from pathreplay.inverse.loop import iterate, new_run, take_step
-from pathreplay.inverse.observers import Event, Refined, Started, Stepped, Stopped
+from pathreplay.inverse.loop import Event, Refined, Started, Stepped, Stopped, iterate, new_run, take_step
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.stopping import Stop
 from pathreplay.threads import one_thread

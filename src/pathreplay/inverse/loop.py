@@ -1,10 +1,11 @@
-"""The optimisation loop: evaluate, step, project; interruptible and resumable, and told of to observers."""
+"""The optimisation loop: evaluate, step, project; interruptible and resumable, and what observers hear of it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -17,7 +18,6 @@ from pathreplay.inverse.evaluate import Evaluator, Shard, total
 from pathreplay.inverse.executor import Local
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
-from pathreplay.inverse.observers import Event, Observer, Refined, Started, Stepped, Stopped
 from pathreplay.inverse.optimiser import Adam
 from pathreplay.inverse.problem import Problem, put_values
 from pathreplay.inverse.seeds import ITERATION, JUDGEMENT, PICTURE, seeds
@@ -27,6 +27,46 @@ from pathreplay.scenes.parameters import get_array, to_value
 
 # How often the pictures are judged in a job with a rival: enough for a curve, at some per cent of its time.
 JUDGEMENTS = 10
+
+
+@dataclass(frozen=True)
+class Started:
+    """Iterations begin: so many are done, of so many."""
+
+    done: int
+    wanted: int
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A grid goes on in another resolution."""
+
+    key: str
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """An iteration is done."""
+
+    entry: Entry
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """No more iterations: so many are done."""
+
+    done: int
+
+
+Event = Started | Refined | Stepped | Stopped
+
+
+class Observer(Protocol):
+    """Hears of everything in the order in which it happens; what it raises ends the run."""
+
+    def observe(self, event: Event) -> None:
+        """Called between iterations."""
 
 
 def new_run(problem: Problem, integrator: mi.Integrator, record: bool = True) -> Run:

@@ -9,7 +9,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.images import Image, exr_bytes, read_image
-from pathreplay.inverse.observers import Event, Started, Stepped, Stopped
+from pathreplay.inverse.loop import Event, Started, Stepped, Stopped
 from pathreplay.inverse.problem import Problem
 from pathreplay.inverse.run_folder import CHECKPOINT, RIVAL_CHECKPOINT, RunFolder
 from pathreplay.inverse.values import require_finite_array
