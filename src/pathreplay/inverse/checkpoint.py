@@ -89,23 +89,20 @@ def save(run: Run) -> bytes:
 def restore(path: Path, run: Run, levels: Mapping[str, Levels | None]) -> None:
     """Bring a run to where it was when ``path`` was saved; ``levels`` are those of its grids, by key.
 
-    Raises:
-        PathreplayError: the file is damaged, holds what no run has written, or belongs to other variables.
+    Raises PathreplayError if the file is damaged, holds what no run has written, or belongs to other variables.
     """
     try:
         values, state, history, learned = _read(path, run.values, levels)
         run.optimiser.restore(state, values)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise _unusable(path, f"{where}: {first['msg'].lower()}") from None
+        why = f"{'.'.join(map(str, first['loc']))}: {first['msg'].lower()}"
     except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
-        raise _unusable(path, str(error)) from None
-    run.values, run.history, run.learned = values, history, learned
-
-
-def _unusable(path: Path, why: str) -> PathreplayError:
-    return PathreplayError(f"Checkpoint {path} cannot be read ({why}); start the job from its config")
+        why = str(error)
+    else:
+        run.values, run.history, run.learned = values, history, learned
+        return
+    raise PathreplayError(f"Checkpoint {path} cannot be read ({why}); start the job from its config")
 
 
 def _read(

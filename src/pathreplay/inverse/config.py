@@ -222,8 +222,7 @@ _TABLES: dict[str, type[BaseModel]] = {
 def load_config(path: Path) -> Config:
     """Read a job from a TOML file (or from the JSON that a run folder may hold).
 
-    Raises:
-        PathreplayError: missing or unreadable file, unknown key (names the nearest), value out of its range.
+    Raises PathreplayError for an unreadable file, an unknown key (names the nearest), a value out of its range.
     """
     problem = file_problem(path, _LONGEST_FILE)
     if problem == MISSING:

@@ -111,8 +111,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     interpolated before that, and returned; the optimiser starts anew on it. What is differentiated is decided by the
     integrator; targets, bounds and the seeds' choice of paths are not.
 
-    Raises:
-        PathreplayError: the loss is no longer finite.
+    Raises PathreplayError where the loss is no longer finite.
     """
     begin, i = time.perf_counter(), len(run.history)
     refined = _refine(problem, run, position)

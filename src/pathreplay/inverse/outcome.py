@@ -123,8 +123,12 @@ class RecoveredPose:
     result: dict[str, Array]
     value: Array
     """The transform (4 x 4) or the vertices in the result."""
-    error: PoseError | None
-    error_at_start: PoseError | None
+    value_at_start: Array
+
+    def errors(self) -> dict[str, PoseError]:
+        """How far it is from the truth, and was at the start; empty where that is not known."""
+        values = {"error": self.value, "error_at_start": self.value_at_start}
+        return {kind: error for kind, value in values.items() if (error := self.pose.error(value)) is not None}
 
     def rows(self) -> dict[str, str]:
         """Readable rows: what was moved by how much, and how far it is from the truth."""
@@ -133,10 +137,7 @@ class RecoveredPose:
             for part, array in parts.items():
                 unit = "°" if part == "rotation" else ""
                 table[f"{kind}, {part}"] = ", ".join(f"{v:.4g}{unit}" for v in array)
-        if self.error is not None and self.error_at_start is not None:
-            table["error at the start"] = str(self.error_at_start)
-            table["error"] = str(self.error)
-        return table
+        return table | {kind.replace("_at_", " at the "): str(e) for kind, e in reversed(self.errors().items())}
 
     def as_dict(self) -> dict[str, Any]:
         """Everything for parameters.json."""
@@ -147,9 +148,7 @@ class RecoveredPose:
             table["value"] = self.value.tolist()
             if self.pose.truth is not None:
                 table["truth"] = self.pose.truth.tolist()
-        for kind, error in (("error", self.error), ("error_at_start", self.error_at_start)):
-            if error is not None:
-                table[kind] = asdict(error)
+        table |= {kind: asdict(error) for kind, error in self.errors().items()}
         if self.pose.distance is not None:
             table["distance"] = self.pose.distance
         return table

@@ -106,8 +106,7 @@ class PoseError:
 def make_pose(key: str, value: Any, kind: PoseKind, pivot: list[float] | None, distance: float | None) -> Pose:
     """A pose for the parameter ``key``; the default pivot is the origin of the object's own frame (a mesh: its centre).
 
-    Raises:
-        PathreplayError: the parameter is neither a transform nor a mesh's vertices.
+    Raises PathreplayError where the parameter is neither a transform nor a mesh's vertices.
     """
     array = get_array(value)
     if is_transform(value):

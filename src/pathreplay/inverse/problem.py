@@ -116,9 +116,7 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     """Load and check everything that the job names; relative paths start at ``base``.
 
     ``targets`` (by view name) are the pictures of an earlier part of the same run; otherwise they are read or rendered.
-
-    Raises:
-        PathreplayError: whatever in the job cannot work, as one line.
+    Raises PathreplayError for whatever in the job cannot work.
     """
     loss = find_loss(config.loss)
     wanted = [entry.key for entry in config.parameters]

@@ -48,7 +48,6 @@ def report_files(outcome: Outcome) -> dict[str, bytes]:
         data_uri=_data_uri,
         curves={name: _uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves},
         contestants=contestants,
-        judge=outcome.judge(),
         versions=versions(),
     )
     return {"report.html": html.encode(), **drawings, "summary.png": summary(outcome)}

@@ -129,7 +129,7 @@ def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
         history=tuple(outcome.history),
         parameters=outcome.values,
         errors={item.key: error for item in outcome.recovered if (error := item.error()) is not None},
-        poses={item.pose.key: item.error for item in outcome.poses if item.error is not None},
+        poses={item.pose.key: errors["error"] for item in outcome.poses if (errors := item.errors())},
     )
 
 
@@ -146,8 +146,7 @@ def _recovered_pose(problem: Problem, pose: Pose, values: dict[str, Array]) -> R
         start={part: seen(part, variables[name].start) for part, name in names.items()},
         result={part: seen(part, values[name]) for part, name in names.items()},
         value=values[pose.key],
-        error=pose.error(values[pose.key]),
-        error_at_start=pose.error(get_array(pose.value(at_start))),
+        value_at_start=get_array(pose.value(at_start)),
     )
 
 

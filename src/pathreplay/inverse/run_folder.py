@@ -138,8 +138,7 @@ class _Origin(BaseModel):
 def open_run_folder(path: Path) -> tuple[RunFolder, Config, str | None]:
     """An existing run folder, locked; its job, and the config path that it was started with.
 
-    Raises:
-        PathreplayError: it is no run folder, holds no checkpoint to go on from, is damaged, or is in use.
+    Raises PathreplayError if it is no run folder, holds no checkpoint to go on from, is damaged, or is in use.
     """
     require_writable_name(path, "--resume")
     copy = next((path / name for name in ("config.toml", "config.json") if (path / name).is_file()), None)

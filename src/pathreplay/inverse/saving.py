@@ -55,8 +55,7 @@ def saved_targets(folder: Path) -> dict[str, Image]:
 def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
     """Bring a run to where the folder's checkpoint was; returns the pictures of its start.
 
-    Raises:
-        PathreplayError: a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
+    Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
     """
     _require_pictures(folder, "target", problem, {view.name: view.target for view in problem.views})
     before = {view.name: _read(folder / _picture("start", view.name)) for view in problem.views}

@@ -28,8 +28,7 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
     resampled to the texture's size, and its channels are adapted; a volume is resampled to the grid's. Relative paths
     start at ``base``.
 
-    Raises:
-        PathreplayError: the value does not fit the parameter, or the file is missing, unreadable or not finite.
+    Raises PathreplayError where the value does not fit the parameter, or the file is missing, unreadable or not finite.
     """
     if is_transform(like):
         raise PathreplayError(
