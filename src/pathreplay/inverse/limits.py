@@ -69,7 +69,8 @@ def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> 
     most = min(memory.available() // _A_VALUE, MOST_SAMPLES)
     if cells(wanted) <= most:
         return
-    fits = bisect.bisect_right(range(wanted), most, key=cells) - 1
+    # A resolution has at least as many cells.
+    fits = bisect.bisect_right(range(min(wanted, most + 1)), most, key=cells) - 1
     way_out = f"take up to {fits}" if fits > 0 else "free some memory"
     raise PathreplayError(
         f"Parameter '{key}' has the resolution {wanted}: {cells(wanted)} values, of which {most} fit the memory "
