@@ -11,8 +11,7 @@ import pytest
 
 from pathreplay.inverse import make_config
 from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard, total
-from pathreplay.inverse.loop import iterate, new_run, take_step
-from pathreplay.inverse.observers import Event, Refined, Started, Stepped, Stopped
+from pathreplay.inverse.loop import Event, Refined, Started, Stepped, Stopped, iterate, new_run, take_step
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.stopping import Stop
 from pathreplay.threads import one_thread
@@ -128,6 +127,6 @@ def test_observers_hear_of_everything_in_order() -> None:
         def observe(self, event: Event) -> None:
             heard.append(event)
 
-    iterate(problem, config, run, None, Stop(), [Listener()])
+    iterate(problem, config, run, Stop(), [Listener()])
     first, second, third = (Stepped(entry) for entry in run.history)
     assert heard == [Started(0, 3), first, second, Refined(TEXTURE, (4, 4, 3)), third, Stopped(3)]

@@ -13,7 +13,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.grids import rmse
 from pathreplay.inverse.loop import judged, new_run, render_views
-from pathreplay.inverse.problem import build_problem, put_values
+from pathreplay.inverse.problem import build_problem
 from test_inverse_run import JOB, TEXTURE, interrupt_at, room, run  # noqa: F401 (room: its folder, for every test)
 
 # What the job itself has: its kernels are compiled when the rival's turn comes.
@@ -80,14 +80,12 @@ def test_judgement_is_free_of_the_noise_of_rendering(tmp_path: Path) -> None:
     config = make_config({**JOB, "spp": 16, "rival": RIVAL, "sensors": ["left"], "target": SHARP})
     problem = build_problem(config, Path.cwd())
     values = new_run(problem, problem.integrator).values
-    put_values(problem, values)
-    gap = judged(problem, config, 0)
+    gap = judged(problem, config, values, 0)
     for variable in problem.variables:
         assert variable.truth is not None
         values[variable.key] = variable.truth
-    put_values(problem, values)
-    noisy = rmse(render_views(problem, config)["left"], problem.views[0].target)
-    left = max(judged(problem, config, i) for i in range(4))
+    noisy = rmse(render_views(problem, config, values)["left"], problem.views[0].target)
+    left = max(judged(problem, config, values, i) for i in range(4))
     assert left < 0.1 * gap and left < 0.3 * noisy
 
 

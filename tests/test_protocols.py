@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pathreplay import backend
-from pathreplay.inverse.evaluate import Diagnostics, Evaluate, Evaluation, Shard
+from pathreplay.inverse.evaluate import Evaluate, Evaluation, Shard
 from pathreplay.inverse.executor import Executor, Local
 from pathreplay.inverse.optimiser import Adam, Optimiser
 
@@ -92,7 +92,7 @@ def counting(values: Mapping[str, np.ndarray], shard: Shard, learned: Mapping[st
     """The view as loss; the seeds of all shards so far as what was learned."""
     seen = np.concatenate([learned.get("seeds", np.zeros(0)), np.float64(shard.seeds)])
     gradients = {"a": values["a"] * shard.samples}
-    return Evaluation(float(shard.views[0]), gradients, Diagnostics(shard.views[0]), {"seeds": seen})
+    return Evaluation(float(shard.views[0]), gradients, shard.views[0], {"seeds": seen})
 
 
 @pytest.mark.parametrize("make", EXECUTORS)

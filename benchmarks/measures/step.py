@@ -10,10 +10,11 @@ import drjit.opt
 import mitsuba as mi
 import numpy as np
 
+from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import make_config
 from pathreplay.inverse.evaluate import Evaluator
 from pathreplay.inverse.executor import Local
-from pathreplay.inverse.loop import Run, take_step
+from pathreplay.inverse.loop import take_step
 from pathreplay.inverse.losses import l2
 from pathreplay.inverse.optimiser import Adam
 from pathreplay.inverse.problem import Problem, Variable, View

@@ -1,4 +1,4 @@
-"""Checkpoints: all that a run goes on from as if it had never been stopped, in one safetensors file."""
+"""A run under way, and its checkpoints: all that it goes on from as if never stopped, in one safetensors file."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import safetensors.numpy
 from pydantic import ConfigDict, Field, NonNegativeInt, TypeAdapter, ValidationError
 
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.executor import Executor
 from pathreplay.inverse.grids import Levels
 from pathreplay.inverse.optimiser import Optimiser, State
 from pathreplay.inverse.values import Array, Arrays
@@ -42,62 +43,72 @@ class Entry:
     picture_error: float | None = None
 
 
+@dataclass
+class Run:
+    """An optimisation under way: who computes and who steps, where it is, and what happened so far."""
+
+    executor: Executor
+    optimiser: Optimiser
+    values: dict[str, Array]
+    """Of the variables, by key: what people see."""
+    learned: Arrays = field(default_factory=dict)
+    """By the evaluations, from one to the next."""
+    history: list[Entry] = field(default_factory=list)
+    rival: Run | None = None
+    """Solves the same problem from the same start by another integrator in the same time."""
+
+    def seconds(self) -> float:
+        return sum(entry.seconds for entry in self.history)
+
+    def picture_error(self) -> float:
+        """The one that was measured last; NaN where none was."""
+        return next((e.picture_error for e in reversed(self.history) if e.picture_error is not None), float("nan"))
+
+
 _HISTORY = TypeAdapter(list[Entry])
 _STEPS = TypeAdapter(dict[str, NonNegativeInt])
 
 _VALUE, _LEARNED = "value:", "learned:"
 
 
-def save(values: Arrays, state: State, history: list[Entry], learned: Arrays) -> bytes:
-    """All that is known after the iterations of ``history``, as the bytes of a safetensors file."""
+def save(run: Run) -> bytes:
+    """All that is known after the iterations so far, as the bytes of a safetensors file."""
+    state = run.optimiser.state()
     tensors = {
-        **{_LEARNED + name: value for name, value in learned.items()},
-        **{_VALUE + key: value for key, value in values.items()},
+        **{_LEARNED + name: value for name, value in run.learned.items()},
+        **{_VALUE + key: value for key, value in run.values.items()},
         **state.arrays,
     }
     metadata = {
         "steps": json.dumps(state.steps),
-        "history": json.dumps([asdict(entry) for entry in history]),
+        "history": json.dumps([asdict(entry) for entry in run.history]),
     }
     return safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata)
 
 
-@dataclass(frozen=True)
-class Saved:
-    """What a checkpoint holds: values by key, what the optimiser remembers, history, and what was learned by name."""
+def restore(path: Path, run: Run, levels: Mapping[str, Levels | None]) -> None:
+    """Bring a run to where it was when ``path`` was saved; ``levels`` are those of its grids, by key.
 
-    values: dict[str, Array]
-    state: State
-    history: list[Entry]
-    learned: dict[str, Array]
-
-
-def restore(path: Path, optimiser: Optimiser, values: Arrays, levels: Mapping[str, Levels]) -> Saved:
-    """Read what was saved, and bring the optimiser back to it.
-
-    ``values`` are like those that were saved, but for the shapes of those in ``levels``.
-
-    Raises:
-        PathreplayError: the file is damaged, holds what no run has written, or belongs to other variables.
+    Raises PathreplayError if the file is damaged, holds what no run has written, or belongs to other variables.
     """
     try:
-        saved = _read(path, values, levels)
-        optimiser.restore(saved.state, saved.values)
+        values, state, history, learned = _read(path, run.values, levels)
+        run.optimiser.restore(state, values)
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise _unusable(path, f"{where}: {first['msg'].lower()}") from None
+        why = f"{'.'.join(map(str, first['loc']))}: {first['msg'].lower()}"
     except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
-        raise _unusable(path, str(error)) from None
-    return saved
+        why = str(error)
+    else:
+        run.values, run.history, run.learned = values, history, learned
+        return
+    raise PathreplayError(f"Checkpoint {path} cannot be read ({why}); start the job from its config")
 
 
-def _unusable(path: Path, why: str) -> PathreplayError:
-    return PathreplayError(f"Checkpoint {path} cannot be read ({why}); start the job from its config")
-
-
-def _read(path: Path, values: Arrays, levels: Mapping[str, Levels]) -> Saved:
-    """What the file holds, checked; raises what `restore` makes plain."""
+def _read(
+    path: Path, values: Arrays, levels: Mapping[str, Levels | None]
+) -> tuple[dict[str, Array], State, list[Entry], Arrays]:
+    """Values, state of the optimiser, history and what was learned; raises what `restore` makes plain."""
     if not path.is_file():
         raise ValueError("no such file")
     with safetensors.safe_open(str(path), framework="numpy") as file:
@@ -118,12 +129,12 @@ def _read(path: Path, values: Arrays, levels: Mapping[str, Levels]) -> Saved:
             raise ValueError(f"'{name}' holds NaN or infinite values")
     for key, value in values.items():
         # Optimisers begin anew on a grid that was refined.
-        if steps[key] > len(history) or (steps[key] < len(history) and key not in levels):
+        if steps[key] > len(history) or (steps[key] < len(history) and levels[key] is None):
             raise ValueError(f"{steps[key]} steps of '{key}' in {len(history)} iterations")
-        _require_like(tensors[_VALUE + key], key, value, levels.get(key))
+        _require_like(tensors[_VALUE + key], key, value, levels[key])
     found = {key: tensors.pop(_VALUE + key) for key in values}
     learned = {name.removeprefix(_LEARNED): tensors.pop(name) for name in list(tensors) if name.startswith(_LEARNED)}
-    return Saved(found, State(steps, tensors), history, learned)
+    return found, State(steps, tensors), history, learned
 
 
 def _require_like(found: Array, key: str, value: Array, levels: Levels | None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import sys
+from collections.abc import Callable
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -99,47 +100,36 @@ class Parameter(_Table):
         posed = {"start", "pivot", "distance", "rotation_learning_rate"} & self.model_fields_set
         if self.pose is None:
             if posed:
-                raise ValueError(
-                    f"parameter '{self.key}': '{min(posed)}' belongs to a pose; "
-                    "add pose = 'translation', 'rotation' or 'rigid'"
-                )
+                self._refuse(f"'{min(posed)}' belongs to a pose; add pose = 'translation', 'rotation' or 'rigid'")
             return self
         if plain := {"lower", "upper", "initial", "resolutions", "refine_at"} & self.model_fields_set:
-            raise ValueError(
-                f"parameter '{self.key}': '{min(plain)}' does not go with a pose; displace its start with 'start'"
-            )
+            self._refuse(f"'{min(plain)}' does not go with a pose; displace its start with 'start'")
         parts = PARTS[self.pose]
         given = [] if self.start is None else sorted(self.start.model_fields_set)
         wrong = [f"start.{part}" for part in given if part not in parts]
         if self.rotation_learning_rate is not None and "rotation" not in parts:
             wrong.append("rotation_learning_rate")
         if wrong:
-            raise ValueError(
-                f"parameter '{self.key}': '{wrong[0]}' is not part of pose = '{self.pose}'; take pose = 'rigid', or "
-                "leave it out"
-            )
+            self._refuse(f"'{wrong[0]}' is not part of pose = '{self.pose}'; take pose = 'rigid', or leave it out")
         return self
 
     @model_validator(mode="after")
-    def _coarse_to_fine(self) -> Parameter:
+    def _in_order(self) -> Parameter:
         sizes, begins = self.resolutions or [], self.refine_at or []
         if len(begins) != max(0, len(sizes) - 1):
-            raise ValueError(
-                f"parameter '{self.key}': {len(sizes)} resolutions and {len(begins)} entries in refine_at; give the "
-                "iteration at which each resolution after the first begins"
+            self._refuse(
+                f"{len(sizes)} resolutions and {len(begins)} entries in refine_at; give the iteration at which each "
+                "resolution after the first begins"
             )
         if sorted(set(begins)) != begins:
-            raise ValueError(f"parameter '{self.key}': refine_at {begins} does not increase; put it in order")
+            self._refuse(f"refine_at {begins} does not increase; put it in order")
+        if self.lower is not None and self.upper is not None and self.upper <= self.lower:
+            bounds = f"upper bound {self.upper:g} is not above lower bound {self.lower:g}"
+            self._refuse(f"{bounds}; swap or widen them")
         return self
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Parameter:
-        if self.lower is not None and self.upper is not None and self.upper <= self.lower:
-            raise ValueError(
-                f"parameter '{self.key}': upper bound {self.upper:g} is not above lower bound {self.lower:g}; "
-                "swap or widen them"
-            )
-        return self
+    def _refuse(self, why: str) -> None:
+        raise ValueError(f"parameter '{self.key}': {why}")
 
 
 class Plugin(BaseModel):
@@ -213,9 +203,9 @@ class Config(_Table):
     def _refined_in_time(self) -> Config:
         for entry in self.parameters:
             if entry.refine_at and entry.refine_at[-1] >= self.iterations:
-                raise ValueError(
-                    f"parameter '{entry.key}': refine_at {entry.refine_at[-1]} is not before the end of the "
-                    f"{self.iterations} iterations; refine earlier, or raise 'iterations'"
+                entry._refuse(
+                    f"refine_at {entry.refine_at[-1]} is not before the end of the {self.iterations} iterations; "
+                    "refine earlier, or raise 'iterations'"
                 )
         return self
 
@@ -232,8 +222,7 @@ _TABLES: dict[str, type[BaseModel]] = {
 def load_config(path: Path) -> Config:
     """Read a job from a TOML file (or from the JSON that a run folder may hold).
 
-    Raises:
-        PathreplayError: missing or unreadable file, unknown key (names the nearest), value out of its range.
+    Raises PathreplayError for an unreadable file, an unknown key (names the nearest), a value out of its range.
     """
     problem = file_problem(path, _LONGEST_FILE)
     if problem == MISSING:
@@ -244,12 +233,9 @@ def load_config(path: Path) -> Config:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise PathreplayError(f"Config {path} cannot be read ({error}); give a TOML file in UTF-8") from None
-    try:
-        if path.suffix == ".json":
-            return Config.model_validate_json(text)
-        return Config.model_validate(_toml(path, text))
-    except ValidationError as error:
-        raise PathreplayError(f"{path}: {first_error(error, Config, _TABLES)}") from None
+    if path.suffix == ".json":
+        return _checked(str(path), Config.model_validate_json, text)
+    return _checked(str(path), Config.model_validate, _toml(path, text))
 
 
 # No job is as long: what is larger is some other file.
@@ -269,10 +255,14 @@ def _toml(path: Path, text: str) -> dict[str, Any]:
 
 def make_config(values: dict[str, Any]) -> Config:
     """A job from a dictionary, with the same checks and messages as a file."""
+    return _checked("config", Config.model_validate, values)
+
+
+def _checked(name: str, validate: Callable[[Any], Config], job: Any) -> Config:
     try:
-        return Config.model_validate(values)
+        return validate(job)
     except ValidationError as error:
-        raise PathreplayError(f"config: {first_error(error, Config, _TABLES)}") from None
+        raise PathreplayError(f"{name}: {first_error(error, Config, _TABLES)}") from None
 
 
 def _no_file(path: Path) -> str:

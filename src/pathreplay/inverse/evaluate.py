@@ -13,12 +13,11 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.losses import QUADRATIC
-from pathreplay.inverse.problem import Problem, put, variables_of
+from pathreplay.inverse.problem import Problem, scene_values, variables_of
 from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.values import Array, Arrays
-from pathreplay.render.path_integrator import plain_errors
+from pathreplay.render.path_integrator import SceneFacts, plain_errors
 from pathreplay.scenes.parameters import get_array
-from pathreplay.transport.facts import SceneFacts
 
 
 @dataclass(frozen=True)
@@ -31,13 +30,6 @@ class Shard:
 
 
 @dataclass(frozen=True)
-class Diagnostics:
-    """What went wrong: gradient entries that were NaN or infinite in a view and count as zero there."""
-
-    dropped: int
-
-
-@dataclass(frozen=True)
 class Evaluation:
     """What a shard adds to the loss (the mean over all views) and to its gradient, by key; and what is known after it.
 
@@ -46,7 +38,8 @@ class Evaluation:
 
     loss: float
     gradients: dict[str, Array]
-    diagnostics: Diagnostics
+    dropped: int
+    """Gradient entries that were NaN or infinite in a view, and count as zero there."""
     learned: Arrays
 
 
@@ -62,7 +55,7 @@ def total(evaluations: Sequence[Evaluation]) -> Evaluation:
     return Evaluation(
         sum(each.loss for each in evaluations),
         {key: reduce(np.add, [each.gradients[key] for each in evaluations]) for key in evaluations[0].gradients},
-        Diagnostics(sum(each.diagnostics.dropped for each in evaluations)),
+        sum(each.dropped for each in evaluations),
         evaluations[-1].learned,
     )
 
@@ -105,7 +98,7 @@ class Evaluator:
     def _view(self, values: Arrays, view: int, seed: int, spp: int) -> Evaluation:
         variables = variables_of(self.problem, values)
         dr.enable_grad(variables)
-        put(self.problem, variables)
+        self.problem.params.update(scene_values(self.problem, variables))
         try:
             loss = self._differentiated(view, seed, spp)
         except NotRecordable:  # a part of the gradient may be there: once more, with variables of its own
@@ -119,7 +112,7 @@ class Evaluator:
             gradients = {key: np.where(fine[key], gradient, 0) for key, gradient in gradients.items()}
         if hasattr(self.integrator, "learned"):
             self._learned = self.integrator.learned()
-        return Evaluation(loss, gradients, Diagnostics(dropped), self._learned)
+        return Evaluation(loss, gradients, dropped, self._learned)
 
     def _differentiated(self, view: int, seed: int, spp: int) -> float:
         """What the view adds to the loss; its gradient is added to the scene's parameters."""

@@ -14,7 +14,6 @@ class Executor(Protocol):
 
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
         """One evaluation for each shard, in their order; the last one has learned from all of them."""
-        ...
 
 
 class Local:

@@ -25,8 +25,7 @@ class FolderLock:
     The file stays when nobody holds it; what counts is the lock on it (flock), which the end of the process, however
     violent, takes away. Where the file system or the operating system has no such locks, nothing is locked.
 
-    Raises:
-        PathreplayError: another process (or thread) holds it; or the folder cannot be written.
+    Raises PathreplayError where another process (or thread) holds it, or the folder cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:

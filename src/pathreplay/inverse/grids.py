@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.ndimage
 from numpy.typing import NDArray
 
 from pathreplay.inverse.images import Image
@@ -42,16 +43,8 @@ def resampled(grid: Array, shape: Sequence[int]) -> Array:
     That is how Mitsuba looks grids and textures up, so a doubled resolution changes the function by no more than the
     bends between the old centres. It keeps bounds. Where entries get fewer than half, some are passed over.
     """
-    for axis, size in enumerate(shape[:-1]):
-        have = grid.shape[axis]
-        if size == have:
-            continue
-        at = np.clip((np.arange(size) + 0.5) * (have / size) - 0.5, 0, have - 1)
-        low = np.minimum(at.astype(np.intp), max(have - 2, 0))
-        share = (at - low).reshape(-1, *[1] * (grid.ndim - axis - 1))
-        upper = np.take(grid, np.minimum(low + 1, have - 1), axis)
-        grid = np.take(grid, low, axis) * (1 - share) + upper * share
-    return np.ascontiguousarray(grid, np.float32)
+    factors = [new / old for new, old in zip((*shape[:-1], grid.shape[-1]), grid.shape, strict=True)]
+    return scipy.ndimage.zoom(grid, factors, np.float32, order=1, mode="nearest", grid_mode=True)
 
 
 def comparable(shape: Sequence[int], other: Sequence[int]) -> bool:

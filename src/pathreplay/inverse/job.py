@@ -10,27 +10,17 @@ from pathlib import Path
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
 from pathreplay.interrupts import undisturbed
-from pathreplay.inverse import checkpoint
+from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config, load_config
-from pathreplay.inverse.images import Image, exr_bytes
+from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
-from pathreplay.inverse.loop import Run, iterate, new_run, render_views
+from pathreplay.inverse.loop import iterate, new_run, render_views
 from pathreplay.inverse.outcome import resume_command
-from pathreplay.inverse.problem import Problem, build_problem, put_values
+from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
 from pathreplay.inverse.result import RunResult, outcome_of, result_files, result_of
-from pathreplay.inverse.rival import finished
-from pathreplay.inverse.run_folder import (
-    CHECKPOINT,
-    RIVAL_CHECKPOINT,
-    RunFolder,
-    create_run_folder,
-    default_output,
-    open_run_folder,
-    require_output,
-)
-from pathreplay.inverse.saved_pictures import require_pictures, saved_picture
-from pathreplay.inverse.saving import Saving, checkpoints
+from pathreplay.inverse.run_folder import RunFolder, create_run_folder, default_output, open_run_folder, require_output
+from pathreplay.inverse.saving import Saving, first_files, go_on, saved_targets
 from pathreplay.inverse.stopping import Stop, stopping
 from pathreplay.scenes.loading import told
 from pathreplay.threads import one_thread, require_one_thread_possible
@@ -75,78 +65,65 @@ def _run(
         if start.folder is not None:
             stack.callback(start.folder.close)
         with undisturbed():
-            variant = backend.set_variant(start.config.variant)
+            backend.set_variant(start.config.variant)
         if start.config.deterministic:
             require_one_thread_possible()
         bar = stack.enter_context(Progress(progress))
         bar.say("preparing")
-        problem = build_problem(start.config, start.base, start.targets())
+        targets = None if start.folder is None else saved_targets(start.folder.path)
+        problem = build_problem(start.config, start.base, targets)
         for note in problem.notes:
             bar.note(note)
         record = not start.config.deterministic
         run = new_run(problem, problem.integrator, record)
-        rival = None if problem.rival is None else new_run(problem, problem.rival, record)
-        if start.folder is None:
-            before, folder = _begun(start, problem, run, rival)
-            stack.callback(folder.close)
-        else:
-            folder = start.folder
-            before = _went_on(folder, start.config, problem, run, rival)
+        if problem.rival is not None:
+            run.rival = new_run(problem, problem.rival, record)
+        before, folder = (
+            _begun(start, problem, run) if start.folder is None else _went_on(start, start.folder, problem, run)
+        )
+        stack.callback(folder.close)
         way_out = f"aborted; go on from the last checkpoint with: {resume_command(folder.path)}"
         stop = stack.enter_context(stopping(bar.say, way_out))
-        _iterate(start, folder, problem, run, rival, stop, bar)
+        _iterate(start, folder, problem, run, stop, bar)
         bar.say("writing")
         with one_thread(start.config.deterministic), told(_failing(start.config)):
-            after = render_views(problem, start.config)
-            theirs = None if rival is None else finished(problem, start.config, rival)
-        outcome = outcome_of(
-            start.config, start.source, folder.path, problem, run, before, after, theirs, variant
-        )  # fmt: skip
+            after = render_views(problem, start.config, run.values)
+            theirs = render_views(problem, start.config, run.rival.values) if run.rival else {}
+        outcome = outcome_of(start.config, start.source, folder.path, problem, run, before, after, theirs)
         folder.write(result_files(outcome))
         return result_of(outcome, stop.by())
 
 
-def _begun(start: _Start, problem: Problem, run: Run, rival: Run | None) -> tuple[dict[str, Image], RunFolder]:
-    """A new folder for a run at its start; and the pictures there."""
+def _begun(start: _Start, problem: Problem, run: Run) -> tuple[dict[str, Image], RunFolder]:
+    """The pictures of a run at its start, and a new folder for it."""
     with one_thread(start.config.deterministic), told(_failing(start.config)):
-        put_values(problem, run.values)
-        before = render_views(problem, start.config)
+        before = render_views(problem, start.config, run.values)
     for view in problem.views:
         require_finite_loss(problem.loss, view.name, view.target, before[view.name])
-    files = {**_first_files(problem, before), **checkpoints(run, rival)}
+    files = first_files(problem, before, run)
     return before, create_run_folder(start.output, start.config, start.source, start.base, files)
 
 
-def _went_on(folder: RunFolder, config: Config, problem: Problem, run: Run, rival: Run | None) -> dict[str, Image]:
-    """Bring a run to where the folder's checkpoint was; returns the pictures of its start."""
-    require_pictures(folder.path, "target", problem.scene, problem.views, {v.name: v.target for v in problem.views})
-    before = {view.name: saved_picture(folder.path / f"images/start-{view.name}.exr") for view in problem.views}
-    require_pictures(folder.path, "start", problem.scene, problem.views, before)
-    levels = {v.key: v.levels for v in problem.variables if v.levels is not None}
-    for each, name in ((run, CHECKPOINT), (rival, RIVAL_CHECKPOINT)):
-        if each is not None:
-            saved = checkpoint.restore(folder.path / name, each.optimiser, each.values, levels)
-            each.values, each.history, each.learned = saved.values, saved.history, saved.learned
+def _went_on(start: _Start, folder: RunFolder, problem: Problem, run: Run) -> tuple[dict[str, Image], RunFolder]:
+    before = go_on(folder.path, problem, run)
     # All iterations but no report: the disk was full at the end. Then only the end is done again.
-    if len(run.history) >= config.iterations and (folder.path / "report.html").exists():
+    if len(run.history) >= start.config.iterations and (folder.path / "report.html").exists():
         raise PathreplayError(
             f"Run {folder.path} has all its {len(run.history)} iterations; raise 'iterations' in its config"
         )
-    return before
+    return before, folder
 
 
-def _iterate(
-    start: _Start, folder: RunFolder, problem: Problem, run: Run, rival: Run | None, stop: Stop, bar: Progress
-) -> None:
+def _iterate(start: _Start, folder: RunFolder, problem: Problem, run: Run, stop: Stop, bar: Progress) -> None:
     """Do the iterations that are left, with a checkpoint now and then and one at the end.
 
     A new folder goes again where not even the first iteration can be done; one that is resumed never does.
     """
     config = start.config
-    saving = Saving(folder, run, rival, config.checkpoint_every)
+    saving = Saving(folder, run, config.checkpoint_every)
     try:
         with one_thread(config.deterministic), told(_failing(config)):
-            iterate(problem, config, run, rival, stop, (bar, saving))
+            iterate(problem, config, run, stop, (bar, saving))
     except PathreplayError:
         if start.folder is None and not run.history and not stop.aborted:
             folder.remove()
@@ -165,12 +142,7 @@ class _Start:
     base: Path
     output: Path
     folder: RunFolder | None
-
-    def targets(self) -> dict[str, Image] | None:
-        if self.folder is None:
-            return None
-        pictures = sorted((self.folder.path / "images").glob("target-*.exr"))
-        return {path.stem.removeprefix("target-"): saved_picture(path) for path in pictures}
+    """That is gone on with."""
 
 
 def _fresh(config: str | Path | Config | None, output: str | Path | None) -> _Start:
@@ -192,8 +164,3 @@ def _resumed(resume: str | Path, config: object, output: object) -> _Start:
         raise PathreplayError("--resume takes config and output from the run folder; leave CONFIG and --output out")
     folder, job, source = open_run_folder(Path(resume))
     return _Start(job, None if source is None else Path(source), folder.origin, folder.path, folder)
-
-
-def _first_files(problem: Problem, before: dict[str, Image]) -> dict[str, bytes]:
-    files = {f"images/target-{view.name}.exr": exr_bytes(view.target) for view in problem.views}
-    return files | {f"images/start-{name}.exr": exr_bytes(image) for name, image in before.items()}

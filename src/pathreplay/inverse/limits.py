@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Iterable, Mapping, Sequence
 from math import prod
 from typing import TYPE_CHECKING, Any
@@ -12,10 +13,11 @@ import numpy as np
 
 from pathreplay import memory
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config import Displacement, Parameter
 from pathreplay.inverse.images import Image
+from pathreplay.inverse.values import Array
 from pathreplay.render.film import film_size
 from pathreplay.render.film_limits import MOST_SAMPLES, require_memory, require_samples
-from pathreplay.transport.traits import nodes_of
 
 if TYPE_CHECKING:
     from pathreplay.inverse.losses import Loss
@@ -30,11 +32,7 @@ _FARTHEST = 1e4
 
 
 def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str, int]) -> None:
-    """Return quietly if every sensor (name -> index) can be rendered with each of ``spp`` (key -> count).
-
-    Raises:
-        PathreplayError: there are too many samples for one kernel, or too many pixels for the memory.
-    """
+    """Raise PathreplayError unless memory and a kernel hold every sensor (name -> index) at each ``spp`` (by key)."""
     total = 0
     for name, index in sensors.items():
         size = film_size(scene.sensors()[index])
@@ -45,14 +43,12 @@ def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str,
 
 
 def require_visible(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:
-    """Return quietly if the scene has shapes, or else all ``keys`` of ``params`` belong to lights and sensors.
-
-    Raises:
-        PathreplayError: no picture can depend on one of them.
-    """
+    """Raise PathreplayError unless the scene has shapes, or all ``keys`` of ``params`` belong to lights and sensors."""
     if scene.shapes():
         return
-    seen = {node for thing in [*scene.emitters(), *scene.sensors()] for node in (thing, *nodes_of(thing))}
+    seen = {
+        owner[2] for thing in [*scene.emitters(), *scene.sensors()] for owner in mi.traverse(thing).properties.values()
+    }
     for key in keys:
         if params.properties[key][2] not in seen:
             raise PathreplayError(
@@ -61,11 +57,7 @@ def require_visible(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[
 
 
 def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> None:
-    """Return quietly if a grid of ``shape`` (axes, then channels) fits the memory in its largest resolution.
-
-    Raises:
-        PathreplayError: it does not; names the largest resolution that does.
-    """
+    """Raise PathreplayError unless a grid of ``shape`` (axes, then channels) fits the memory in every resolution."""
     *axes, channels = (int(n) for n in shape)
     largest = max(axes)
 
@@ -77,11 +69,9 @@ def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> 
     most = min(memory.available() // _A_VALUE, MOST_SAMPLES)
     if cells(wanted) <= most:
         return
-    fits, too_much = 0, wanted
-    while too_much - fits > 1:
-        middle = (fits + too_much) // 2
-        fits, too_much = (middle, too_much) if cells(middle) <= most else (fits, middle)
-    way_out = f"take up to {fits}" if fits else "free some memory"
+    # A resolution has at least as many cells.
+    fits = bisect.bisect_right(range(min(wanted, most + 1)), most, key=cells) - 1
+    way_out = f"take up to {fits}" if fits > 0 else "free some memory"
     raise PathreplayError(
         f"Parameter '{key}' has the resolution {wanted}: {cells(wanted)} values, of which {most} fit the memory "
         f"that is left; {way_out}"
@@ -89,11 +79,7 @@ def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> 
 
 
 def require_learning_rate(key: str, rate: float, start: np.ndarray, bounds: Sequence[float | None] = ()) -> None:
-    """Return quietly unless a step of ``rate`` is a million times the largest value and bound of the parameter.
-
-    Raises:
-        PathreplayError: it is; the run could only end in infinities.
-    """
+    """Raise PathreplayError if a step of ``rate`` is a million times the largest value and bound of the parameter."""
     scale = max(1.0, float(np.abs(start).max(initial=0.0)), *(abs(bound) for bound in bounds if bound is not None))
     if rate > _LONGEST_STEP * scale:
         raise PathreplayError(
@@ -102,36 +88,30 @@ def require_learning_rate(key: str, rate: float, start: np.ndarray, bounds: Sequ
         )
 
 
-def require_near(key: str, extent: float, lengths: Mapping[str, Sequence[float] | None]) -> None:
-    """Return quietly if no number of ``lengths`` (config key -> vector) is ten thousand times the scene's ``extent``.
+def require_near(scene: mi.Scene, key: str, value: Array, entry: Parameter) -> None:
+    """Raise PathreplayError if pivot or start of a pose (of ``value``) lie ten thousand times as far as the scene goes.
 
     Beyond, the rounding of single precision (1e-7 of the number) is a thousandth of the scene and grows from there.
-
-    Raises:
-        PathreplayError: one is.
+    Starts that are turned by more than once around are refused, too.
     """
-    for name, vector in lengths.items():
+    box = scene.bbox()
+    corners = [np.array(box.min), np.array(box.max)] if box.valid() else []
+    points = [*corners, value[:3, 3] if value.shape == (4, 4) else value]
+    extent = max(float(np.abs(point).max(initial=0.0)) for point in points) or 1.0
+    start = entry.start or Displacement()
+    for name, vector in (("pivot", entry.pivot), ("start.translation", start.translation)):
         largest = max(map(abs, vector or [0.0]))
         if largest > _FARTHEST * extent:
             raise PathreplayError(
                 f"Parameter '{key}': '{name}' goes to {largest:g}, and the scene to {extent:.3g}; give "
                 f"numbers up to {_FARTHEST * extent:.3g}"
             )
-
-
-def extent_of(scene: mi.Scene, *points: np.ndarray) -> float:
-    """The largest coordinate of the scene's bounding box and ``points``; 1 where there is none."""
-    box = scene.bbox()
-    corners = [np.array(box.min), np.array(box.max)] if box.valid() else []
-    return max((float(np.abs(point).max(initial=0.0)) for point in [*corners, *points]), default=0.0) or 1.0
+    if (turn := start.rotation) and max(map(abs, turn)) > 360:
+        raise PathreplayError(f"Parameter '{key}' starts turned by {turn} degrees; give angles between -360 and 360")
 
 
 def require_finite_loss(loss: Loss, name: str, target: Image, picture: Image | None = None) -> None:
-    """Return quietly if the loss of ``picture`` (default: black) against ``target``, and its derivative, are finite.
-
-    Raises:
-        PathreplayError: they are not; names the brightest value.
-    """
+    """Raise PathreplayError unless loss and derivative of ``picture`` (default: black) by ``target`` are finite."""
     image: Any = mi.TensorXf(np.zeros_like(target) if picture is None else picture)
     dr.enable_grad(image)
     value = loss(image, mi.TensorXf(target))

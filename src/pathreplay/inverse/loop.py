@@ -1,48 +1,72 @@
-"""The optimisation loop: evaluate, step, project; interruptible and resumable, and told of to observers."""
+"""The optimisation loop: evaluate, step, project; interruptible and resumable, and what observers hear of it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.checkpoint import Entry
+from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.evaluate import Evaluator, Shard, total
-from pathreplay.inverse.executor import Executor, Local
+from pathreplay.inverse.executor import Local
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
-from pathreplay.inverse.observers import Event, Observer, Refined, Started, Stepped, Stopped
-from pathreplay.inverse.optimiser import Adam, Optimiser
+from pathreplay.inverse.optimiser import Adam
 from pathreplay.inverse.problem import Problem, put_values
 from pathreplay.inverse.seeds import ITERATION, JUDGEMENT, PICTURE, seeds
 from pathreplay.inverse.stopping import Stop
-from pathreplay.inverse.values import Array, Arrays
+from pathreplay.inverse.values import Arrays
 from pathreplay.scenes.parameters import get_array, to_value
 
 # How often the pictures are judged in a job with a rival: enough for a curve, at some per cent of its time.
 JUDGEMENTS = 10
 
 
-@dataclass
-class Run:
-    """An optimisation under way: who computes and who steps, where it is, and what happened so far."""
+@dataclass(frozen=True)
+class Started:
+    """Iterations begin: so many are done, of so many."""
 
-    executor: Executor
-    optimiser: Optimiser
-    values: dict[str, Array]
-    """Of the variables, by key: what people see."""
-    learned: Arrays = field(default_factory=dict)
-    """By the evaluations, from one to the next."""
-    history: list[Entry] = field(default_factory=list)
+    done: int
+    wanted: int
 
-    def seconds(self) -> float:
-        return sum(entry.seconds for entry in self.history)
+
+@dataclass(frozen=True)
+class Refined:
+    """A grid goes on in another resolution."""
+
+    key: str
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """An iteration is done."""
+
+    entry: Entry
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """No more iterations: so many are done."""
+
+    done: int
+
+
+Event = Started | Refined | Stepped | Stopped
+
+
+class Observer(Protocol):
+    """Hears of everything in the order in which it happens; what it raises ends the run."""
+
+    def observe(self, event: Event) -> None:
+        """Called between iterations."""
 
 
 def new_run(problem: Problem, integrator: mi.Integrator, record: bool = True) -> Run:
@@ -51,12 +75,10 @@ def new_run(problem: Problem, integrator: mi.Integrator, record: bool = True) ->
     return Run(Local(Evaluator(problem, integrator, record)), Adam(values), values)
 
 
-def iterate(
-    problem: Problem, config: Config, run: Run, rival: Run | None, stop: Stop, observers: Sequence[Observer]
-) -> None:
+def iterate(problem: Problem, config: Config, run: Run, stop: Stop, observers: Sequence[Observer]) -> None:
     """Take steps from ``len(run.history)`` to ``config.iterations``, and tell of them.
 
-    After each step the ``rival`` takes as many as bring it to the same number of seconds. Taking turns, both have the
+    After each step the run's rival takes as many as bring it to the same number of seconds. Taking turns, both have the
     same share of a machine whose load changes. Its learning rate and resolutions are those of the job's iteration.
     """
 
@@ -68,17 +90,16 @@ def iterate(
     for i in range(len(run.history), config.iterations):
         for refined in take_step(problem, config, run, i):
             tell(refined)
-        if rival is not None:
+        if rival := run.rival:
             while rival.seconds() < run.seconds():
                 take_step(problem, config, rival, i)
             if _due(i, config.iterations):
                 for each in (run, rival):
-                    put_values(problem, each.values)
-                    each.history[-1] = replace(each.history[-1], picture_error=judged(problem, config, i))
+                    error = judged(problem, config, each.values, i)
+                    each.history[-1] = replace(each.history[-1], picture_error=error)
         tell(Stepped(run.history[-1]))
         if stop.wanted():
             break
-    put_values(problem, run.values)
     tell(Stopped(len(run.history)))
 
 
@@ -90,8 +111,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     interpolated before that, and returned; the optimiser starts anew on it. What is differentiated is decided by the
     integrator; targets, bounds and the seeds' choice of paths are not.
 
-    Raises:
-        PathreplayError: the loss is no longer finite.
+    Raises PathreplayError where the loss is no longer finite.
     """
     begin, i = time.perf_counter(), len(run.history)
     refined = _refine(problem, run, position)
@@ -114,12 +134,13 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     seconds = time.perf_counter() - begin
     norms = {key: float(np.linalg.norm(gradient)) for key, gradient in found.gradients.items()}
     errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
-    run.history.append(Entry(i, found.loss, seconds, norms, found.diagnostics.dropped, errors))
+    run.history.append(Entry(i, found.loss, seconds, norms, found.dropped, errors))
     return refined
 
 
-def render_views(problem: Problem, config: Config) -> dict[str, Image]:
-    """Pictures of all views with the scene as it is now, by the job's integrator; same noise at every call."""
+def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:
+    """Pictures of all views with these values in the scene, by the job's integrator; same noise at every call."""
+    put_values(problem, values)
     pictures: dict[str, Image] = {}
     for view in problem.views:
         seed, _ = seeds(config.seed, PICTURE, 0, view.sensor)
@@ -127,13 +148,14 @@ def render_views(problem: Problem, config: Config) -> dict[str, Image]:
     return pictures
 
 
-def judged(problem: Problem, config: Config, iteration: int) -> float:
-    """Root mean square error of the pictures of the scene as it is now, without the noise of rendering them.
+def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> float:
+    """Root mean square error of the pictures with these values in the scene, without the noise of rendering them.
 
     With two independent renderings A and B of a view, E[(A - T)(B - T)] = (I - T)², where a square would add the
     variance; the mean over pixels and views is taken before the root (negative ones count as zero). The noise of the
     targets stays in.
     """
+    put_values(problem, values)
     total = 0.0
     for view in problem.views:
         a, b = (

@@ -30,15 +30,12 @@ class Optimiser(Protocol):
 
     def step(self, values: Arrays, gradients: Arrays, rates: Mapping[str, float]) -> dict[str, Array]:
         """The values after a step against the gradients; ``rates`` are about its length in each variable."""
-        ...
 
     def state(self) -> State:
         """All that later steps depend on, besides the values."""
-        ...
 
     def restore(self, state: State, values: Arrays) -> None:
         """Go on from ``state`` at ``values``, bit for bit. Raises KeyError or ValueError if they do not belong."""
-        ...
 
 
 class Adam:

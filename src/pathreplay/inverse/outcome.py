@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from pathreplay.inverse.checkpoint import Entry
+from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.grids import matched, rmse, slices
 from pathreplay.inverse.images import Image, difference
 from pathreplay.inverse.pose import Pose, PoseError
-from pathreplay.inverse.rival import Rival
 from pathreplay.inverse.values import Array
 
 # Differences are shown brighter than the pictures: a converged one would be black otherwise.
@@ -45,12 +44,9 @@ class ViewPictures:
             return found
         return {**found, "rival": self.rival, "rival-difference": difference(self.rival, self.target) * DIFFERENCE_GAIN}
 
-    def error(self) -> float:
-        """Root mean square difference of result and target; includes the noise of both."""
-        return rmse(self.result, self.target)
-
-    def error_at_start(self) -> float:
-        return rmse(self.start, self.target)
+    def error(self, picture: Image) -> float:
+        """Root mean square difference of a picture and the target; includes the noise of both."""
+        return rmse(picture, self.target)
 
 
 @dataclass(frozen=True)
@@ -65,12 +61,15 @@ class Recovered:
     truth: Array | None
     rival: Array | None = None
 
+    def known(self, *kinds: str) -> dict[str, Array]:
+        """What there is of these kinds: 'start', 'result', 'rival', 'truth'."""
+        return {kind: value for kind in kinds if (value := getattr(self, kind)) is not None}
+
     def textures(self) -> dict[str, Image]:
         """Start, result and truth as images; empty for what is no texture of one to four channels."""
         if self.result.ndim != 3 or self.result.shape[2] > 4:
             return {}
-        images = {"start": self.start, "result": self.result}
-        return images if self.truth is None else {**images, "truth": self.truth}
+        return self.known("start", "result", "truth")
 
     def volumes(self) -> dict[str, Image]:
         """Middle slices of start, result, rival's result and truth, white at the largest value of the last of them.
@@ -79,8 +78,7 @@ class Recovered:
         """
         if self.result.ndim != 4 or self.result.shape[3] > 4:
             return {}
-        kinds = {"start": self.start, "result": self.result, "rival": self.rival, "truth": self.truth}
-        given = {kind: volume for kind, volume in kinds.items() if volume is not None}
+        given = self.known("start", "result", "rival", "truth")
         finest = max(given.values(), key=lambda volume: volume.size)
         white = float((self.result if self.truth is None else self.truth).max()) or 1.0
         return {kind: slices(matched(volume, finest)) / white for kind, volume in given.items()}
@@ -89,15 +87,12 @@ class Recovered:
         """Start, result and truth as numbers; empty for what has more of them than one reads (over 16)."""
         if self.result.ndim > 1 or self.result.size > 16:
             return {}
-        rows = {"start": self.start.tolist(), "result": self.result.tolist()}
-        return rows if self.truth is None else {**rows, "truth": self.truth.tolist()}
+        return {kind: value.tolist() for kind, value in self.known("start", "result", "truth").items()}
 
-    def error(self) -> float | None:
-        """Root mean square error against the truth."""
-        return None if self.truth is None else rmse(self.result, self.truth)
-
-    def error_at_start(self) -> float | None:
-        return None if self.truth is None else rmse(self.start, self.truth)
+    def error(self, kind: str = "result") -> float | None:
+        """Root mean square error of 'start', 'result' or 'rival' against the truth; None where there is none."""
+        value = getattr(self, kind)
+        return None if self.truth is None or value is None else rmse(value, self.truth)
 
     def relative_error(self) -> float | None:
         """|result - truth| / |truth| (L2 norms); None where the truth is unknown or zero."""
@@ -105,21 +100,35 @@ class Recovered:
             return None
         return float(np.linalg.norm(matched(self.result, self.truth) - self.truth) / np.linalg.norm(self.truth))
 
-    def rival_error(self) -> float | None:
-        return None if self.truth is None or self.rival is None else rmse(self.rival, self.truth)
+    def as_dict(self) -> dict[str, Any]:
+        """For parameters.json: small values in full, large ones by shape, mean and range."""
+        value = self.result
+        table: dict[str, Any] = {"shape": list(value.shape)}
+        if value.size <= 16:
+            table["value"] = value.tolist()
+            table |= {kind: array.tolist() for kind, array in self.known("start", "truth").items()}
+        else:
+            table |= {"mean": float(value.mean()), "min": float(value.min()), "max": float(value.max())}
+        if self.truth is not None:
+            table |= {"rmse": self.error(), "rmse_at_start": self.error("start")}
+        return table
 
 
 @dataclass(frozen=True)
 class RecoveredPose:
-    """One pose: translation and rotation vector (radians) at the start and in the result, by part, and their errors."""
+    """One pose: translation and rotation vector (degrees) at the start and in the result, by part, and their errors."""
 
     pose: Pose
     start: dict[str, Array]
     result: dict[str, Array]
     value: Array
     """The transform (4 x 4) or the vertices in the result."""
-    error: PoseError | None
-    error_at_start: PoseError | None
+    value_at_start: Array
+
+    def errors(self) -> dict[str, PoseError]:
+        """How far it is from the truth, and was at the start; empty where that is not known."""
+        values = {"error": self.value, "error_at_start": self.value_at_start}
+        return {kind: error for kind, value in values.items() if (error := self.pose.error(value)) is not None}
 
     def rows(self) -> dict[str, str]:
         """Readable rows: what was moved by how much, and how far it is from the truth."""
@@ -127,25 +136,19 @@ class RecoveredPose:
         for kind, parts in (("start", self.start), ("recovered", self.result)):
             for part, array in parts.items():
                 unit = "°" if part == "rotation" else ""
-                numbers = np.degrees(array) if part == "rotation" else array
-                table[f"{kind}, {part}"] = ", ".join(f"{v:.4g}{unit}" for v in numbers)
-        if self.error is not None and self.error_at_start is not None:
-            table["error at the start"] = str(self.error_at_start)
-            table["error"] = str(self.error)
-        return table
+                table[f"{kind}, {part}"] = ", ".join(f"{v:.4g}{unit}" for v in array)
+        return table | {kind.replace("_at_", " at the "): str(e) for kind, e in reversed(self.errors().items())}
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything for parameters.json; rotations in degrees."""
+        """Everything for parameters.json."""
         table: dict[str, Any] = {"pose": self.pose.kind, "pivot": list(self.pose.pivot)}
         for kind, parts in (("start", self.start), ("result", self.result)):
-            table[kind] = {p: (np.degrees(a) if p == "rotation" else a).tolist() for p, a in parts.items()}
+            table[kind] = {part: array.tolist() for part, array in parts.items()}
         if self.value.shape == (4, 4):
             table["value"] = self.value.tolist()
             if self.pose.truth is not None:
                 table["truth"] = self.pose.truth.tolist()
-        for kind, error in (("error", self.error), ("error_at_start", self.error_at_start)):
-            if error is not None:
-                table[kind] = asdict(error)
+        table |= {kind: asdict(error) for kind, error in self.errors().items()}
         if self.pose.distance is not None:
             table["distance"] = self.pose.distance
         return table
@@ -153,21 +156,11 @@ class RecoveredPose:
 
 @dataclass(frozen=True)
 class Contestant:
-    """One of two integrators that had the same time: iterations, seconds, and the errors that they ended with."""
+    """One of two integrators that had the same time, and the errors of the parameters that it ended with."""
 
     name: str
-    history: tuple[Entry, ...]
-    picture_error: float
-    """Root mean square over all views, noise taken out, at the last judgement; NaN where none was made."""
+    run: Run
     errors: dict[str, float]
-
-    def seconds(self) -> float:
-        return sum(entry.seconds for entry in self.history)
-
-
-def _contestant(name: str, history: tuple[Entry, ...], errors: dict[str, float]) -> Contestant:
-    judged = [entry.picture_error for entry in history if entry.picture_error is not None]
-    return Contestant(name, history, judged[-1] if judged else float("nan"), errors)
 
 
 @dataclass(frozen=True)
@@ -180,12 +173,14 @@ class Outcome:
     views: tuple[ViewPictures, ...]
     recovered: tuple[Recovered, ...]
     poses: tuple[RecoveredPose, ...]
-    history: tuple[Entry, ...]
+    run: Run
     values: dict[str, Array]
     """Variables as people see them, and what poses make of the scene, by key."""
-    variant: str
     notes: tuple[str, ...]
-    rival: Rival | None = None
+
+    @property
+    def history(self) -> list[Entry]:
+        return self.run.history
 
     def command(self) -> str:
         """The command line that makes this run again, or goes on with it where it was stopped."""
@@ -193,9 +188,6 @@ class Outcome:
             return resume_command(self.folder)
         job = self.folder / "config.json" if self.source is None else self.source
         return f"pathreplay optimize {shlex.quote(str(job))}"
-
-    def seconds(self) -> float:
-        return sum(entry.seconds for entry in self.history)
 
     def dropped(self) -> int:
         return sum(entry.dropped for entry in self.history)
@@ -215,7 +207,7 @@ class Outcome:
         """What stands below a picture, texture or volume of that kind."""
         ours, theirs = self.names()
         captions = {
-            "result": "recovered" if self.rival is None else f"recovered by {ours}",
+            "result": "recovered" if self.run.rival is None else f"recovered by {ours}",
             "rival": f"recovered by {theirs}",
             "difference": f"difference ×{DIFFERENCE_GAIN:g}",
             "rival-difference": f"its difference ×{DIFFERENCE_GAIN:g}",
@@ -224,10 +216,8 @@ class Outcome:
 
     def comparison(self) -> list[Contestant]:
         """The job and its rival in numbers; empty where there was none."""
-        if self.rival is None:
+        if self.run.rival is None:
             return []
+        runs = zip(self.names(), (self.run, self.run.rival), ("result", "rival"), strict=True)
         known = [item for item in self.recovered if item.truth is not None]
-        ours = {item.key: item.error() or 0.0 for item in known}
-        theirs = {item.key: item.rival_error() or 0.0 for item in known}
-        name, rival = self.names()
-        return [_contestant(name, self.history, ours), _contestant(rival, self.rival.history, theirs)]
+        return [Contestant(name, run, {i.key: i.error(kind) or 0.0 for i in known}) for name, run, kind in runs]

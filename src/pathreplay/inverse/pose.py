@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.parameters import get_array, is_transform
@@ -70,8 +71,7 @@ class Pose:
                 A[row, 3] = entry
             # Rounding of the product may not touch the last row: cameras divide by what it makes.
             return type(self.base)(type(self.base.matrix)(A @ mi.Matrix4f(self.base.matrix)))
-        moved = R @ (dr.unravel(mi.Vector3f, self.base) - c) + shift
-        return dr.ravel(moved)
+        return dr.ravel(R @ (dr.unravel(mi.Vector3f, self.base) - c) + shift)
 
     def error(self, value: NDArray[np.float32]) -> PoseError | None:
         """How far ``value`` (of :func:`get_array`) is from the truth; None where that is not known."""
@@ -85,7 +85,9 @@ class Pose:
             shift = a.mean(axis=0) - b.mean(axis=0)
             turn = (a - a.mean(axis=0)).T @ (b - b.mean(axis=0))
         position = float(np.linalg.norm(shift))
-        return PoseError(position, None if self.distance is None else position / self.distance, _angle(turn))
+        nearest, _ = Rotation.align_vectors(turn.T, np.eye(3))
+        angle = float(np.degrees(nearest.magnitude()))
+        return PoseError(position, None if self.distance is None else position / self.distance, angle)
 
 
 @dataclass(frozen=True)
@@ -101,17 +103,10 @@ class PoseError:
         return f"{self.position:.3g}{share} and {self.degrees:.3g}° off"
 
 
-def make_pose(
-    key: str,
-    value: Any,
-    kind: PoseKind,
-    pivot: list[float] | None,
-    distance: float | None,
-) -> Pose:
+def make_pose(key: str, value: Any, kind: PoseKind, pivot: list[float] | None, distance: float | None) -> Pose:
     """A pose for the parameter ``key``; the default pivot is the origin of the object's own frame (a mesh: its centre).
 
-    Raises:
-        PathreplayError: the parameter is neither a transform nor a mesh's vertices.
+    Raises PathreplayError where the parameter is neither a transform nor a mesh's vertices.
     """
     array = get_array(value)
     if is_transform(value):
@@ -139,12 +134,3 @@ def rotation_matrix(r: Any) -> Any:
     zero = mi.Float(0)
     K = mi.Matrix3f([[zero, -r.z, r.y], [r.z, zero, -r.x], [-r.y, r.x, zero]])
     return mi.Matrix3f(1) + a * K + b * (K @ K)
-
-
-def _angle(turn: NDArray[np.float64]) -> float:
-    """Angle, in degrees, of the rotation nearest to a matrix (by its singular value decomposition)."""
-    U, _, V = np.linalg.svd(turn)
-    R = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ V))]) @ V
-    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
-    # The sine decides near 0, where the cosine is flat and rounds to 1.
-    return float(np.degrees(np.arctan2(sine, (np.trace(R) - 1) / 2)))

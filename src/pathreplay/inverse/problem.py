@@ -107,23 +107,16 @@ def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, An
     return plain | {pose.key: pose.value(variables) for pose in problem.poses}
 
 
-def put(problem: Problem, variables: Mapping[str, Any]) -> None:
-    """Give the scene what follows from the variables."""
-    problem.params.update(scene_values(problem, variables))
-
-
 def put_values(problem: Problem, values: Arrays) -> None:
     """Give the scene these values of the variables, without derivatives."""
-    put(problem, variables_of(problem, values))
+    problem.params.update(scene_values(problem, variables_of(problem, values)))
 
 
 def build_problem(config: Config, base: Path, targets: dict[str, Image] | None = None) -> Problem:
     """Load and check everything that the job names; relative paths start at ``base``.
 
     ``targets`` (by view name) are the pictures of an earlier part of the same run; otherwise they are read or rendered.
-
-    Raises:
-        PathreplayError: whatever in the job cannot work, as one line.
+    Raises PathreplayError for whatever in the job cannot work.
     """
     loss = find_loss(config.loss)
     wanted = [entry.key for entry in config.parameters]
@@ -222,7 +215,7 @@ def _variables(
                 like = type(like)(start)
             variables.append(Variable(key, like, entry.lower, entry.upper, rate, start, None, levels, form))
             continue
-        _require_near(scene, key, params[key], entry)
+        limits.require_near(scene, key, parameters.get_array(params[key]), entry)
         pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
         poses.append(pose)
         for part, name in pose.parts().items():
@@ -236,15 +229,6 @@ def _variables(
             limits.require_learning_rate(name, rate, start)
             variables.append(Variable(name, mi.Vector3f(0), None, None, rate, start, None))
     return variables, poses
-
-
-def _require_near(scene: mi.Scene, key: str, value: Any, entry: Parameter) -> None:
-    array = parameters.get_array(value)
-    extent = limits.extent_of(scene, array[:3, 3] if array.shape == (4, 4) else array)
-    shift, turn = (None, None) if entry.start is None else (entry.start.translation, entry.start.rotation)
-    limits.require_near(key, extent, {"pivot": entry.pivot, "start.translation": shift})
-    if turn is not None and max(map(abs, turn)) > 360:
-        raise PathreplayError(f"Parameter '{key}' starts turned by {turn} degrees; give angles between -360 and 360")
 
 
 def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:

@@ -12,7 +12,7 @@ import rich.progress
 from rich.console import Console
 
 from pathreplay.errors import plain_line
-from pathreplay.inverse.observers import Event, Refined, Started, Stepped
+from pathreplay.inverse.loop import Event, Refined, Started, Stepped
 
 # Between two lines, where there is no bar: a log of a long run stays readable.
 _SECONDS = 10.0

@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.inverse.losses import Loss
+from pathreplay.render.path_integrator import Tables
 from pathreplay.scenes.parameters import keep_only
-from pathreplay.transport.traits import Tables
 
 # Integrators of Mitsuba's that look at nothing on the host while they render; they do not say so. Ours does.
 _OF_MITSUBA = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import safetensors.numpy
 
-from pathreplay.inverse.checkpoint import Entry
+from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.file_names import file_names
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes
-from pathreplay.inverse.loop import Run
 from pathreplay.inverse.outcome import Outcome, Recovered, RecoveredPose, ViewPictures, resume_command
 from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.problem import Problem, scene_values, variables_of
 from pathreplay.inverse.report import report_files
-from pathreplay.inverse.rival import Rival
 from pathreplay.inverse.values import Array
 from pathreplay.media.volume_files import vol_bytes
 from pathreplay.scenes.parameters import get_array, to_value
@@ -76,20 +74,16 @@ def outcome_of(
     run: Run,
     before: dict[str, Image],
     after: dict[str, Image],
-    rival: Rival | None,
-    variant: str,
+    rivals: dict[str, Image],
 ) -> Outcome:
-    """All that is told of a run; ``before`` and ``after`` are the pictures by view."""
-    theirs = rival.values if rival else {}
+    """All that is told of a run; ``before``, ``after`` and the ``rivals`` are pictures by view."""
+    theirs = run.rival.values if run.rival else {}
     stored = scene_values(problem, variables_of(problem, run.values))
     values = {key: get_array(value) for key, value in stored.items()} | run.values
     views = tuple(
-        ViewPictures(
-            v.name, v.target, before[v.name], after[v.name], exposure_for(v.target),
-            rival.pictures[v.name] if rival else None,
-        )
+        ViewPictures(v.name, v.target, before[v.name], after[v.name], exposure_for(v.target), rivals.get(v.name))
         for v in problem.views
-    )  # fmt: skip
+    )
     poses = tuple(_recovered_pose(problem, pose, values) for pose in problem.poses)
     parts = {name for pose in problem.poses for name in pose.parts().values()}
     files_of = file_names(v.key for v in problem.variables)
@@ -98,19 +92,17 @@ def outcome_of(
         for v in problem.variables
         if v.key not in parts
     )
-    history = tuple(run.history)
-    return Outcome(config, source, folder, views, recovered, poses, history, values, variant, problem.notes, rival)
+    return Outcome(config, source, folder, views, recovered, poses, run, values, problem.notes)
 
 
 def result_files(outcome: Outcome) -> dict[str, bytes]:
     """All files of the end of a run, the report among them, by name in the run folder."""
-    values = {key: np.ascontiguousarray(value) for key, value in outcome.values.items()}
-    files = {
-        "parameters.safetensors": safetensors.numpy.save(values),
-        "parameters.json": _parameters_json(outcome.recovered, outcome.poses).encode(),
-        "history.jsonl": "".join(json.dumps(asdict(entry)) + "\n" for entry in outcome.history).encode(),
-        **(outcome.rival.files() if outcome.rival else {}),
-    }
+    table = {item.key: item.as_dict() for item in outcome.recovered}
+    table |= {item.pose.key: item.as_dict() for item in outcome.poses}
+    files = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}
+    files |= _run_files("", outcome.history, outcome.values)
+    if rival := outcome.run.rival:
+        files |= _run_files("rival/", rival.history, rival.values)
     for view in outcome.views:
         files[f"images/result-{view.name}.exr"] = exr_bytes(view.result)
         for kind, image in view.pictures().items():
@@ -134,10 +126,10 @@ def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
         iterations=len(outcome.history),
         stopped=stopped,
         stopped_by=stopped_by if stopped else None,
-        history=outcome.history,
+        history=tuple(outcome.history),
         parameters=outcome.values,
         errors={item.key: error for item in outcome.recovered if (error := item.error()) is not None},
-        poses={item.pose.key: item.error for item in outcome.poses if item.error is not None},
+        poses={item.pose.key: errors["error"] for item in outcome.poses if (errors := item.errors())},
     )
 
 
@@ -145,31 +137,22 @@ def _recovered_pose(problem: Problem, pose: Pose, values: dict[str, Array]) -> R
     variables = {variable.key: variable for variable in problem.variables}
     names = pose.parts()
     at_start = {name: to_value(variables[name].like, variables[name].start) for name in names.values()}
+
+    def seen(part: str, value: Array) -> Array:
+        return np.degrees(value) if part == "rotation" else value
+
     return RecoveredPose(
         pose=pose,
-        start={part: variables[name].start for part, name in names.items()},
-        result={part: values[name] for part, name in names.items()},
+        start={part: seen(part, variables[name].start) for part, name in names.items()},
+        result={part: seen(part, values[name]) for part, name in names.items()},
         value=values[pose.key],
-        error=pose.error(values[pose.key]),
-        error_at_start=pose.error(get_array(pose.value(at_start))),
+        value_at_start=get_array(pose.value(at_start)),
     )
 
 
-def _parameters_json(recovered: tuple[Recovered, ...], poses: tuple[RecoveredPose, ...]) -> str:
-    """Small values in full, large ones by shape, mean and range (their numbers are in parameters.safetensors)."""
-    table: dict[str, Any] = {}
-    for item in recovered:
-        value = item.result
-        entry: dict[str, Any] = {"shape": list(value.shape)}
-        if value.size <= 16:
-            entry |= {"value": value.tolist(), "start": item.start.tolist()}
-            if item.truth is not None:
-                entry["truth"] = item.truth.tolist()
-        else:
-            entry |= {"mean": float(value.mean()), "min": float(value.min()), "max": float(value.max())}
-        if item.truth is not None:
-            entry |= {"rmse": item.error(), "rmse_at_start": item.error_at_start()}
-        table[item.key] = entry
-    for pose in poses:
-        table[pose.pose.key] = pose.as_dict()
-    return json.dumps(table, indent=2) + "\n"
+def _run_files(folder: str, history: Sequence[Entry], values: Mapping[str, Array]) -> dict[str, bytes]:
+    arrays = {key: np.ascontiguousarray(value) for key, value in values.items()}
+    return {
+        f"{folder}parameters.safetensors": safetensors.numpy.save(arrays),
+        f"{folder}history.jsonl": "".join(json.dumps(asdict(entry)) + "\n" for entry in history).encode(),
+    }

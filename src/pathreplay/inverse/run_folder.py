@@ -70,11 +70,12 @@ class RunFolder:
             with undisturbed():  # all or none: a second Ctrl-C waits
                 for part, final in parts:
                     os.replace(part, final)
-        except OSError as error:
-            _remove(parts, made)
-            raise PathreplayError(self._failure(error)) from error
-        except BaseException:  # a second Ctrl-C
-            _remove(parts, made)
+        except BaseException as error:  # a second Ctrl-C, too
+            for remove in (*(part.unlink for part, _ in parts), *(folder.rmdir for folder in made)):
+                with contextlib.suppress(OSError):
+                    remove()
+            if isinstance(error, OSError):
+                raise PathreplayError(self._failure(error)) from error
             raise
 
     def _make_parent(self, folder: Path, made: list[Path]) -> None:
@@ -121,8 +122,8 @@ def create_run_folder(
     return run
 
 
+# Bytes of a run.json, far above what two paths take.
 _LONGEST_ORIGIN = 2**20
-"""Bytes of a run.json, far above what two paths take."""
 
 
 class _Origin(BaseModel):
@@ -137,8 +138,7 @@ class _Origin(BaseModel):
 def open_run_folder(path: Path) -> tuple[RunFolder, Config, str | None]:
     """An existing run folder, locked; its job, and the config path that it was started with.
 
-    Raises:
-        PathreplayError: it is no run folder, holds no checkpoint to go on from, is damaged, or is in use.
+    Raises PathreplayError if it is no run folder, holds no checkpoint to go on from, is damaged, or is in use.
     """
     require_writable_name(path, "--resume")
     copy = next((path / name for name in ("config.toml", "config.json") if (path / name).is_file()), None)
@@ -193,14 +193,13 @@ def require_writable_name(path: Path, option: str) -> None:
 def _make_new(output: Path) -> Path:
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        number = 1
+        number, folder = 1, output
         while True:
-            folder = output if number == 1 else output.with_name(f"{output.name}-{number}")
-            try:
+            with contextlib.suppress(FileExistsError):
                 folder.mkdir()  # fails where it exists: two runs at once cannot get the same one
                 return folder
-            except FileExistsError:
-                number += 1
+            number += 1
+            folder = output.with_name(f"{output.name}-{number}")
     except OSError as error:
         raise PathreplayError(
             f"Run folder {output} cannot be made ({error.strerror}); give another with --output"
@@ -214,15 +213,6 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return about.st_dev, about.st_ino
-
-
-def _remove(parts: list[tuple[Path, Path]], made: list[Path]) -> None:
-    for part, _ in parts:
-        with contextlib.suppress(OSError):
-            part.unlink()
-    for folder in made:
-        with contextlib.suppress(OSError):
-            folder.rmdir()
 
 
 def _write_through(path: Path, data: bytes) -> None:

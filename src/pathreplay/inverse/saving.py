@@ -1,27 +1,26 @@
-"""The run folder as an observer: a checkpoint now and then, and one at the end."""
+"""A run in its folder: what is written of it at the start and now and then, and how it goes on from that."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+
+from pathreplay.errors import PathreplayError
 from pathreplay.inverse import checkpoint
-from pathreplay.inverse.loop import Run
-from pathreplay.inverse.observers import Event, Started, Stepped, Stopped
+from pathreplay.inverse.checkpoint import Run
+from pathreplay.inverse.images import Image, exr_bytes, read_image
+from pathreplay.inverse.loop import Event, Started, Stepped, Stopped
+from pathreplay.inverse.problem import Problem
 from pathreplay.inverse.run_folder import CHECKPOINT, RIVAL_CHECKPOINT, RunFolder
-
-
-def checkpoints(run: Run, rival: Run | None) -> dict[str, bytes]:
-    """The files from which the runs go on."""
-    runs = {CHECKPOINT: run} if rival is None else {CHECKPOINT: run, RIVAL_CHECKPOINT: rival}
-    return {
-        name: checkpoint.save(each.values, each.optimiser.state(), each.history, each.learned)
-        for name, each in runs.items()
-    }
+from pathreplay.inverse.values import require_finite_array
+from pathreplay.render.film import picture_shape
 
 
 class Saving:
-    """Writes the checkpoints of the runs into the folder, after every so many iterations (``every``)."""
+    """Writes the checkpoints of a run into the folder, after every so many iterations (``every``) and at the end."""
 
-    def __init__(self, folder: RunFolder, run: Run, rival: Run | None, every: int) -> None:
-        self.folder, self.runs, self.every = folder, (run, rival), every
+    def __init__(self, folder: RunFolder, run: Run, every: int) -> None:
+        self.folder, self.run, self.every = folder, run, every
         self.saved = 0
 
     def observe(self, event: Event) -> None:
@@ -37,5 +36,59 @@ class Saving:
             self._write(event.done)
 
     def _write(self, done: int) -> None:
-        self.folder.write(checkpoints(*self.runs))
+        self.folder.write(_checkpoints(self.run))
         self.saved = done
+
+
+def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict[str, bytes]:
+    """What a run goes on from, by name: targets, pictures of its start (by view), checkpoints."""
+    pictures = {_picture("target", view.name): view.target for view in problem.views}
+    pictures |= {_picture("start", name): image for name, image in before.items()}
+    return {name: exr_bytes(image) for name, image in pictures.items()} | _checkpoints(run)
+
+
+def saved_targets(folder: Path) -> dict[str, Image]:
+    """The targets in a run folder, by view."""
+    return {path.stem.removeprefix("target-"): _read(path) for path in sorted(folder.glob(_picture("target", "*")))}
+
+
+def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
+    """Bring a run to where the folder's checkpoint was; returns the pictures of its start.
+
+    Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
+    """
+    _require_pictures(folder, "target", problem, {view.name: view.target for view in problem.views})
+    before = {view.name: _read(folder / _picture("start", view.name)) for view in problem.views}
+    _require_pictures(folder, "start", problem, before)
+    for name, each in _runs(run).items():
+        checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables})
+    return before
+
+
+def _runs(run: Run) -> dict[str, Run]:
+    return {CHECKPOINT: run} if run.rival is None else {CHECKPOINT: run, RIVAL_CHECKPOINT: run.rival}
+
+
+def _checkpoints(run: Run) -> dict[str, bytes]:
+    return {name: checkpoint.save(each) for name, each in _runs(run).items()}
+
+
+def _picture(kind: str, view: str) -> str:
+    return f"images/{kind}-{view}.exr"
+
+
+def _read(path: Path) -> Image:
+    return read_image(path, way_out="start the job from its config")
+
+
+def _require_pictures(folder: Path, kind: str, problem: Problem, pictures: Mapping[str, Image]) -> None:
+    """Raise PathreplayError unless the pictures of that ``kind`` fit the films of the views and are finite."""
+    for view in problem.views:
+        path, found = folder / _picture(kind, view.name), pictures[view.name]
+        wanted = picture_shape(problem.scene.sensors()[view.sensor])
+        if found.shape != wanted:
+            raise PathreplayError(
+                f"{path} has shape {found.shape} (height, width, channels), sensor '{view.name}' renders {wanted}; "
+                "start the job from its config"
+            )
+        require_finite_array(str(path), found)

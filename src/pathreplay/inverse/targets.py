@@ -13,9 +13,9 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse import limits
 from pathreplay.inverse.config import Config, Value
 from pathreplay.inverse.grids import comparable
-from pathreplay.inverse.images import Image, find_image, over_black, read_image, transparent_share, with_channels
+from pathreplay.inverse.images import Image, find_image, over_black, read_image, transparent_share
 from pathreplay.inverse.seeds import TARGET, seeds
-from pathreplay.inverse.values import Array, make_value, require_finite_array, seen
+from pathreplay.inverse.values import Array, adapted_image, make_value, require_finite_array, seen
 from pathreplay.render.film import picture_shape
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator
@@ -92,17 +92,11 @@ def read_targets(
                 f"Target image '{file}' is {image.shape[1]} x {image.shape[0]}, "
                 f"sensor '{name}' renders {width} x {height}; resize the image or the film"
             )
-        adapted = with_channels(image, channels)
-        if adapted is None:
-            raise PathreplayError(
-                f"Target image '{file}' has {image.shape[2]} channels, sensor '{name}' renders {channels}; convert it"
-            )
-        require_finite_array(f"Target image '{file}'", adapted)
+        targets[name] = adapted_image(f"Target image '{file}'", image, f"sensor '{name}' renders", channels)
         share = transparent_share(image)
         if share and channels in (1, 3):
             notes.append(
                 f"target image '{file}' is transparent in {share:.1%} of its pixels: black is fitted there; if "
                 "the background of your scene is not black, put it behind the picture first"
             )
-        targets[name] = adapted
     return targets, tuple(notes)

@@ -12,7 +12,7 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import Picture, Value
 from pathreplay.inverse.grids import Array, resampled
-from pathreplay.inverse.images import find_image, read_image, resized, with_channels
+from pathreplay.inverse.images import Image, find_image, read_image, resized, with_channels
 from pathreplay.media.volume_files import load_volume
 from pathreplay.scenes.parameters import get_array, is_transform
 from pathreplay.scenes.stored import form_of
@@ -28,8 +28,7 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
     resampled to the texture's size, and its channels are adapted; a volume is resampled to the grid's. Relative paths
     start at ``base``.
 
-    Raises:
-        PathreplayError: the value does not fit the parameter, or the file is missing, unreadable or not finite.
+    Raises PathreplayError where the value does not fit the parameter, or the file is missing, unreadable or not finite.
     """
     if is_transform(like):
         raise PathreplayError(
@@ -55,18 +54,22 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
             f"(shape {current.shape}); give numbers"
         )
     image = read_image(find_image(picture.image, base), raw=picture.raw)
-    adapted = with_channels(image, current.shape[2])
-    if adapted is None:
-        raise PathreplayError(
-            f"Image '{picture.image}' has {image.shape[2]} channels, '{key}' has {current.shape[2]}; convert the image"
-        )
-    require_finite_array(f"Image '{picture.image}'", adapted)
+    adapted = adapted_image(f"Image '{picture.image}'", image, f"'{key}' has", current.shape[2])
     return resized(adapted, current.shape[0], current.shape[1], crop=picture.fit == "crop")
 
 
 def seen(params: mi.SceneParameters, key: str) -> Any:
     """What people see of a parameter of the scene: the kind of value that jobs take, optimise and save."""
     return form_of(params, key).see(params[key])
+
+
+def adapted_image(name: str, image: Image, other: str, channels: int) -> Image:
+    """The image with as many channels as an ``other`` has; raises PathreplayError if it cannot, or is not finite."""
+    adapted = with_channels(image, channels)
+    if adapted is None:
+        raise PathreplayError(f"{name} has {image.shape[2]} channels, {other} {channels}; convert it")
+    require_finite_array(name, adapted)
+    return adapted
 
 
 def _volume(key: str, path: Path, shape: tuple[int, ...]) -> Array:

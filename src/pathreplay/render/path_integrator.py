@@ -15,9 +15,9 @@ import mitsuba as mi
 from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
 from ..gradient.primal import primal
-from ..transport.facts import SceneFacts
+from ..transport.facts import SceneFacts as SceneFacts
 from ..transport.start import CameraStart
-from ..transport.traits import Tables
+from ..transport.traits import Tables as Tables
 from ..transport.vertex import Walk
 from .camera_pass import Pass, Seed, Which, mitsuba_integrator
 from .interior import Interior, image
