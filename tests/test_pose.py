@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize, problem, targets
+from pathreplay.inverse.config import load_config
 from pathreplay.inverse.pose import Pose, make_pose, rotation_matrix
 from pathreplay.scenes.parameters import get_array
 
@@ -277,7 +278,9 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 @pytest.mark.slow
 def test_the_glass_pane_ends_at_its_index() -> None:
-    result = optimize(EXAMPLES / "glass-pane/config.toml", progress=False)
+    # By one thread: the order in which threads add alone moves where the index ends between 0.0003 and 0.002.
+    config = load_config(EXAMPLES / "glass-pane/config.toml").model_copy(update={"deterministic": True})
+    result = optimize(config, progress=False)
     assert result.errors["glass.eta"] < 0.002
     assert result.errors["front_face.bsdf.normalmap.data"] < 0.02
 

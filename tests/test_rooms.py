@@ -38,8 +38,6 @@ ALLOWED: dict[str, set[str]] = {
     "bsdfs": {FILES},
     FILES: set(),
 }
-#: Arrows of today that ALLOWED has not. Every one has to go; nothing is to be added.
-EXCEPTIONS = {("inverse", "transport")}
 #: Closures that make a plugin's class, on the base class of a variant: their methods are looked at one by one.
 CLASS_MAKERS = {"_plugin_class", "_make_class", "_make_classes", "path_integrator"}
 #: Each driver, and the file of its own.
@@ -103,13 +101,8 @@ def test_every_room_has_its_place() -> None:
 
 
 def test_no_arrow_points_back_up() -> None:
-    found = [where for one, other, where in arrows() if other not in ALLOWED[one] and (one, other) not in EXCEPTIONS]
+    found = [where for one, other, where in arrows() if other not in ALLOWED[one]]
     assert not found, "\n".join(found)
-
-
-def test_exceptions_are_needed() -> None:
-    """One that has gone is to be struck out, so that it does not come back."""
-    assert {(one, other) for one, other, _ in arrows() if other not in ALLOWED[one]} == EXCEPTIONS
 
 
 def test_what_is_allowed_has_no_circle() -> None:
