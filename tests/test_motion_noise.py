@@ -13,8 +13,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from pathreplay.render.facts import SceneFacts
 from pathreplay.transport import velocity
-from pathreplay.transport.facts import SceneFacts
 from truth import (
     RES,
     Bench,

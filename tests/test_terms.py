@@ -17,8 +17,8 @@ from media_scenes import cloud, heterogeneous, smooth
 from pathreplay import PathreplayError
 from pathreplay.gradient.baseline import Baseline, Seen
 from pathreplay.render.camera_pass import Pass
+from pathreplay.render.facts import SceneFacts
 from pathreplay.render.term import Found, Term
-from pathreplay.transport.facts import SceneFacts
 from truth import lit_room, rgb
 
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}

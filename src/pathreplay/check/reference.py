@@ -14,8 +14,8 @@ from typing import Any, TypeAlias
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
+from pathreplay.render.facts import SceneFacts
 from pathreplay.scenes.descriptions import load_integrator
-from pathreplay.transport.facts import SceneFacts
 
 Spec: TypeAlias = "mi.Integrator | Mapping[str, Any] | str | None"
 """An integrator: finished, described, by name, or left to us."""

@@ -16,7 +16,8 @@ from pathreplay.inverse.losses import QUADRATIC
 from pathreplay.inverse.problem import Problem, scene_values, variables_of
 from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.values import Array, Arrays
-from pathreplay.render.path_integrator import SceneFacts, plain_errors
+from pathreplay.render.facts import SceneFacts
+from pathreplay.render.path_integrator import plain_errors
 from pathreplay.scenes.parameters import get_array
 
 

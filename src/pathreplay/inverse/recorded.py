@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.inverse.losses import Loss
-from pathreplay.render.path_integrator import Tables
+from pathreplay.render.facts import Tables
 from pathreplay.scenes.parameters import keep_only
 
 # Integrators of Mitsuba's that look at nothing on the host while they render; they do not say so. Ours does.

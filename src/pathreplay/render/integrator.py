@@ -12,10 +12,10 @@ from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
-from ..transport.facts import SceneFacts
 from ..transport.vertex import Walk
 from .camera_pass import Pass, Seed, Which
 from .diagnostics import Diagnostics, doubts, lost_note, missing_edges, used_before_note
+from .facts import SceneFacts
 from .interior import PathReplay
 from .path_integrator import UNBOUNDED, path_integrator
 from .pixels import pixel_loss, sweepable

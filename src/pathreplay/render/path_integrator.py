@@ -15,11 +15,11 @@ import mitsuba as mi
 from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
 from ..gradient.primal import primal
-from ..transport.facts import SceneFacts as SceneFacts
 from ..transport.start import CameraStart
-from ..transport.traits import Tables as Tables
+from ..transport.traits import Tables
 from ..transport.vertex import Walk
 from .camera_pass import Pass, Seed, Which, mitsuba_integrator
+from .facts import SceneFacts
 from .interior import Interior, image
 from .properties import flag, whole_number
 from .term import Found, Term

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import mitsuba as mi
 
-from .media import Media, scene_media
-from .traits import INSTANCE, MASK, Tables, Traits, fixed_traits, is_null, nodes_of, with_gradients
-from .velocity import blend_lengths
+from ..transport.media import Media, scene_media
+from ..transport.traits import INSTANCE, MASK, Traits, fixed_traits, is_null, nodes_of, with_gradients
+from ..transport.traits import Tables as Tables
+from ..transport.velocity import blend_lengths
 
 
 class SceneFacts:
