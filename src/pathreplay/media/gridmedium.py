@@ -13,12 +13,14 @@ free-flight distances and the estimate of transmittance (all detached), the boun
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
+from ..plugins import on_base
 from . import cellwalk
 from .supergrid import Bounds, all_bounds, cheapest, constant_bounds, find_lattice, mean_chord, voxel_bounds
 
@@ -29,124 +31,123 @@ FAR = 1e6
 
 def register() -> None:
     """Registers `gridmedium` for the variant that is active now, whose base class is like no other variant's."""
-    mi.register_medium("gridmedium", _plugin_class())
+    mi.register_medium("gridmedium", on_base(GridMedium, mi.Medium))
 
 
-def _plugin_class() -> type:
-    class GridMedium(mi.Medium):
-        def __init__(self, props: Any) -> None:
-            super().__init__(props)
-            phase = self.phase_function()
-            if mi.has_flag(phase.flags(), mi.PhaseFunctionFlags.Microflake):
-                raise PathreplayError(
-                    f"gridmedium: with the phase function {phase.class_name()} the density depends on the "
-                    "direction, and majorants do not follow that; use Mitsuba's heterogeneous"
-                )
-            self.sigma_t = _volume(props, "sigma_t", 1.0)
-            self.albedo = _volume(props, "albedo", 0.75)
-            self.emission = _volume(props, "emission", None)
-            self.scale = mi.Float(_number(props, "scale", 1.0))
-            self.supergrid = _choice(props)
-            self.m_is_homogeneous = False
-            self.parameters_changed([])
-            lowest = dr.min(self.levels[-1].lowest)[0]
-            if lowest < 0:
-                raise PathreplayError(f"gridmedium: sigma_t is {lowest:g} somewhere; give densities of at least 0")
+class GridMedium:
+    phase_function: Callable[[], mi.PhaseFunction]  # Mitsuba's
 
-        # ------------------------------------------------ parameters ------------------------------------------------
+    def __init__(self, props: Any) -> None:
+        mi.Medium.__init__(self, props)
+        phase = self.phase_function()
+        if mi.has_flag(phase.flags(), mi.PhaseFunctionFlags.Microflake):
+            raise PathreplayError(
+                f"gridmedium: with the phase function {phase.class_name()} the density depends on the "
+                "direction, and majorants do not follow that; use Mitsuba's heterogeneous"
+            )
+        self.sigma_t = _volume(props, "sigma_t", 1.0)
+        self.albedo = _volume(props, "albedo", 0.75)
+        self.emission = _volume(props, "emission", None)
+        self.scale = mi.Float(_number(props, "scale", 1.0))
+        self.supergrid = _choice(props)
+        self.m_is_homogeneous = False
+        self.parameters_changed([])
+        lowest = dr.min(self.levels[-1].lowest)[0]
+        if lowest < 0:
+            raise PathreplayError(f"gridmedium: sigma_t is {lowest:g} somewhere; give densities of at least 0")
 
-        def traverse(self, cb: Any) -> None:
-            for name in ("scale", "albedo", "sigma_t", "emission"):
-                if getattr(self, name) is not None:
-                    cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
-            cb.put("phase_function", self.phase_function(), mi.ParamFlags.Differentiable)
+    # ------------------------------------------------ parameters ------------------------------------------------
 
-        def parameters_changed(self, keys: list[str]) -> None:
-            if keys and "sigma_t" not in keys and "scale" not in keys:
-                return
-            dr.make_opaque(self.scale)  # a literal would be compiled into the kernel, anew after every update
-            with dr.suspend_grad():
-                if not keys or "sigma_t" in keys:
-                    self.box = self.sigma_t.bbox()
-                    self.is_chromatic, self.levels = _look(self.sigma_t, self.supergrid is True)
-                    self.m_has_spectral_extinction = self.is_chromatic
-                self._choose_cells()
+    def traverse(self, cb: Any) -> None:
+        for name in ("scale", "albedo", "sigma_t", "emission"):
+            if getattr(self, name) is not None:
+                cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+        cb.put("phase_function", self.phase_function(), mi.ParamFlags.Differentiable)
 
-        def _choose_cells(self) -> None:
-            """Tables of majorants and of control densities for the present scale, each with the cells that pay."""
-            scale = dr.detach(self.scale)
-            # Where something glows or is differentiated, empty cells want (null) collisions, too: one a crossing.
-            with dr.resume_grad():
-                params = mi.traverse(self.sigma_t)
-                moves = dr.grad_enabled(self.scale) or any(dr.grad_enabled(params[key]) for key in params.keys())
-            chord = mean_chord(self.box)
-            least = 1 / chord if chord > 0 and (moves or self.emission is not None) else 0.0
-            majorants = [(dr.maximum(cellwalk.majorants(level, scale), least),) for level in self.levels]
-            self.flight_cells = self._cheapest_cells(majorants)
-            self.shadow_cells = self._cheapest_cells([cellwalk.control(level, scale) for level in self.levels])
-            self.majorant = mi.Float(majorants[-1][0])
-            dr.make_opaque(self.majorant)
+    def parameters_changed(self, keys: list[str]) -> None:
+        if keys and "sigma_t" not in keys and "scale" not in keys:
+            return
+        dr.make_opaque(self.scale)  # a literal would be compiled into the kernel, anew after every update
+        with dr.suspend_grad():
+            if not keys or "sigma_t" in keys:
+                self.box = self.sigma_t.bbox()
+                self.is_chromatic, self.levels = _look(self.sigma_t, self.supergrid is True)
+                self.m_has_spectral_extinction = self.is_chromatic
+            self._choose_cells()
 
-        def _cheapest_cells(self, values: list[tuple[Any, ...]]) -> cellwalk.Cells:
-            """Of the numbers by cell, one tuple per level and the rate of collisions last, those that pay."""
-            rates = [dr.mean(numbers[-1]) for numbers in values]
-            dr.eval(values, rates)
-            last = len(values) - 1
-            first = last if self.supergrid is False else 0
-            last = max(last - 1, 0) if self.supergrid is True else last
-            allowed = slice(first, last + 1)
-            collisions = [float(rate[0]) for rate in rates[allowed]]
-            chosen = first + cheapest(self.levels[allowed], collisions, mean_chord(self.box))
-            return cellwalk.make_cells(self.levels[chosen], values[chosen])
+    def _choose_cells(self) -> None:
+        """Tables of majorants and of control densities for the present scale, each with the cells that pay."""
+        scale = dr.detach(self.scale)
+        # Where something glows or is differentiated, empty cells want (null) collisions, too: one a crossing.
+        with dr.resume_grad():
+            params = mi.traverse(self.sigma_t)
+            moves = dr.grad_enabled(self.scale) or any(dr.grad_enabled(params[key]) for key in params.keys())
+        chord = mean_chord(self.box)
+        least = 1 / chord if chord > 0 and (moves or self.emission is not None) else 0.0
+        majorants = [(dr.maximum(cellwalk.majorants(level, scale), least),) for level in self.levels]
+        self.flight_cells = self._cheapest_cells(majorants)
+        self.shadow_cells = self._cheapest_cells([cellwalk.control(level, scale) for level in self.levels])
+        self.majorant = mi.Float(majorants[-1][0])
+        dr.make_opaque(self.majorant)
 
-        def to_string(self) -> str:
-            lines = [f"sigma_t = {self.sigma_t}", f"albedo = {self.albedo}", f"emission = {self.emission}"]
-            cells = " x ".join(str(n - 2) for n in self.flight_cells.shape)
-            lines += [f"scale = {self.scale}", f"cells = {cells}"]
-            return "GridMedium[\n  " + ",\n".join(lines).replace("\n", "\n  ") + "\n]"
+    def _cheapest_cells(self, values: list[tuple[Any, ...]]) -> cellwalk.Cells:
+        """Of the numbers by cell, one tuple per level and the rate of collisions last, those that pay."""
+        rates = [dr.mean(numbers[-1]) for numbers in values]
+        dr.eval(values, rates)
+        last = len(values) - 1
+        first = last if self.supergrid is False else 0
+        last = max(last - 1, 0) if self.supergrid is True else last
+        allowed = slice(first, last + 1)
+        collisions = [float(rate[0]) for rate in rates[allowed]]
+        chosen = first + cheapest(self.levels[allowed], collisions, mean_chord(self.box))
+        return cellwalk.make_cells(self.levels[chosen], values[chosen])
 
-        # -------------------------------------- what Mitsuba's integrators call --------------------------------------
+    def to_string(self) -> str:
+        lines = [f"sigma_t = {self.sigma_t}", f"albedo = {self.albedo}", f"emission = {self.emission}"]
+        cells = " x ".join(str(n - 2) for n in self.flight_cells.shape)
+        lines += [f"scale = {self.scale}", f"cells = {cells}"]
+        return "GridMedium[\n  " + ",\n".join(lines).replace("\n", "\n  ") + "\n]"
 
-        def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
-            return mi.UnpolarizedSpectrum(self.majorant)
+    # -------------------------------------- what Mitsuba's integrators call --------------------------------------
 
-        def get_scattering_coefficients(self, mei: Any, active: Any = True) -> tuple[Any, Any, Any]:
-            σ_t = self.scale * self.sigma_t.eval(mei, active)
-            return σ_t * self.albedo.eval(mei, active), self.majorant - σ_t, σ_t
+    def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+        return mi.UnpolarizedSpectrum(self.majorant)
 
-        def intersect_aabb(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
-            near, far = cellwalk.through(self.box, ray)
-            return near <= far, near, far
+    def get_scattering_coefficients(self, mei: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        σ_t = self.scale * self.sigma_t.eval(mei, active)
+        return σ_t * self.albedo.eval(mei, active), self.majorant - σ_t, σ_t
 
-        # -------------------------------------------- what our own calls ---------------------------------------------
+    def intersect_aabb(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+        near, far = cellwalk.through(self.box, ray)
+        return near <= far, near, far
 
-        def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool = True) -> tuple[mi.Float, mi.Float]:
-            """Distance to the next tentative collision and the local majorant there. Detached.
+    # -------------------------------------------- what our own calls ---------------------------------------------
 
-            The distance t solves ∫_0^t m ds = -log(1 - u) with m the local majorant, at least σ_t in all channels and
-            0 outside of the medium's bounding box. It is infinite, and the majorant 0, if there is no such t below
-            ray.maxt. ``u`` lies in [0, 1).
-            """
-            with dr.suspend_grad():
-                return cellwalk.free_flight(self.flight_cells, self.box, dr.detach(ray), dr.detach(u), active)
+    def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool = True) -> tuple[mi.Float, mi.Float]:
+        """Distance to the next tentative collision and the local majorant there. Detached.
 
-        def transmittance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
-            """Unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) by channel. Detached."""
-            with dr.suspend_grad():
-                ray, scale = dr.detach(ray), dr.detach(self.scale)
+        The distance t solves ∫_0^t m ds = -log(1 - u) with m the local majorant, at least σ_t in all channels and
+        0 outside of the medium's bounding box. It is infinite, and the majorant 0, if there is no such t below
+        ray.maxt. ``u`` lies in [0, 1).
+        """
+        with dr.suspend_grad():
+            return cellwalk.free_flight(self.flight_cells, self.box, dr.detach(ray), dr.detach(u), active)
 
-                def density(t: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-                    at = dr.zeros(mi.Interaction3f)
-                    at.p, at.time, at.wavelengths = ray(t), ray.time, ray.wavelengths
-                    return scale * dr.detach(self.sigma_t.eval(at, active))
+    def transmittance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+        """Unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) by channel. Detached."""
+        with dr.suspend_grad():
+            ray, scale = dr.detach(ray), dr.detach(self.scale)
 
-                return cellwalk.transmittance(self.shadow_cells, self.box, ray, density, sampler, active)
+            def density(t: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+                at = dr.zeros(mi.Interaction3f)
+                at.p, at.time, at.wavelengths = ray(t), ray.time, ray.wavelengths
+                return scale * dr.detach(self.sigma_t.eval(at, active))
 
-        def emission_at(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
-            """Radiance emitted per unit length at an interaction; 0 without emission."""
-            return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, active)
+            return cellwalk.transmittance(self.shadow_cells, self.box, ray, density, sampler, active)
 
-    return GridMedium
+    def emission_at(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+        """Radiance emitted per unit length at an interaction; 0 without emission."""
+        return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, active)
 
 
 # ---------------------------------------------- reading the properties ----------------------------------------------

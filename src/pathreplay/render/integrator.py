@@ -12,12 +12,13 @@ from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
+from ..plugins import on_base
 from ..transport.vertex import Walk
-from .camera_pass import Pass, Seed, Which
+from .camera_pass import Pass, Seed, Which, mitsuba_integrator
 from .diagnostics import Diagnostics, doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts
 from .interior import PathReplay
-from .path_integrator import UNBOUNDED, path_integrator
+from .path_integrator import UNBOUNDED, PathIntegrator
 from .pixels import pixel_loss, sweepable
 from .properties import choice, deviation
 from .term import Found
@@ -51,142 +52,140 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
     return PathReplay(driver, auto, branch, recovery)
 
 
-def _make_class() -> type:
-    class PathReplayIntegrator(path_integrator()):  # type: ignore[misc]
-        """Differentiable path tracer for surfaces and media.
+class PathReplayIntegrator(PathIntegrator):
+    """Differentiable path tracer for surfaces and media.
 
-        Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
-        (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``, ``none``), ``noise``
-        (0.01; of ray adjoints with the replay driver: see `Recovery`) and ``branch`` (``auto``, True, False). ``auto``
-        drivers sweep unless ``max_depth`` is more than the sweep can hold. Forward mode is the same whatever the
-        driver.
+    Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
+    (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``, ``none``), ``noise``
+    (0.01; of ray adjoints with the replay driver: see `Recovery`) and ``branch`` (``auto``, True, False). ``auto``
+    drivers sweep unless ``max_depth`` is more than the sweep can hold. Forward mode is the same whatever the
+    driver.
 
-        Media are differentiated where paths went, less a baseline that is learned from earlier gradient passes of this
-        integrator (with other seeds). ``branch`` walks one more path from where a medium might have scattered and did
-        not, without which a gradient by extinction is wrong where it is zero; ``auto`` does so where extinction with
-        gradients varies in space or is zero, which mostly takes less time for the same noise, too.
+    Media are differentiated where paths went, less a baseline that is learned from earlier gradient passes of this
+    integrator (with other seeds). ``branch`` walks one more path from where a medium might have scattered and did
+    not, without which a gradient by extinction is wrong where it is zero; ``auto`` does so where extinction with
+    gradients varies in space or is zero, which mostly takes less time for the same noise, too.
 
-        Not differentiated: visibility; with ``attach='none'`` all motion of shapes, cameras and directions; by
-        extinction where it is zero if ``branch`` is off; with the replay driver, by weights that are exactly zero.
-        Raises PathreplayError for unknown or unusable properties and in polarised variants.
+    Not differentiated: visibility; with ``attach='none'`` all motion of shapes, cameras and directions; by
+    extinction where it is zero if ``branch`` is off; with the replay driver, by weights that are exactly zero.
+    Raises PathreplayError for unknown or unusable properties and in polarised variants.
+    """
+
+    name = "pathreplay"
+    interior: PathReplay
+    recordable = True  # where there are no media: it looks at nothing on the host while it renders
+
+    def __init__(self, props: mi.Properties) -> None:
+        PathIntegrator.__init__(self, props)
+        self.attach = choice(props, self.name, "attach", "delta", ATTACH)
+        self.interior = _interior(self.name, props, self.max_depth)
+        self.driver, self.branch = self.interior.driver, self.interior.branch
+        self.told: set[str] = set()  # what has been said in the log
+        self.untold = Diagnostics()  # of passes whose lost paths have not been told
+        self.baseline: tuple[SceneFacts, Baseline] | None = None  # and the scene that it belongs to
+
+    def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0) -> bool:
+        """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
+        view = Pass.of(scene, sensor, 0, spp)
+        if self.driver != "sweep" or not sweepable(view.sensor, self.max_depth, view.spp):
+            return False
+        return not self._facts(scene).has_media
+
+    def render_and_backward(
+        self,
+        scene: mi.Scene,
+        offset: mi.TensorXf,
+        slope: mi.TensorXf,
+        sensor: Which = 0,
+        seed: Seed = 0,
+        spp: int = 0,
+    ) -> mi.TensorXf:
+        """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
+
+        ``offset`` and ``slope`` are tensors like the image (height x width x 3); the loss adds up over its values.
+        Each path is judged by the others of its pixel: see `pixel_sweep`. What is not differentiated: see `sweep`.
+        Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
+        number of samples does not, or a tensor has another shape.
         """
+        with self._passing(scene, sensor, seed, spp) as view, dr.isolate_grad():
+            loss = pixel_loss(view, self.max_depth, offset, slope)
+            walk = self._walk(scene, view.sensor)
+            self._learned(view, walk)
+            found = self.interior.pixels(view, walk, loss)
+        self._told(view, walk, found)
+        return found.image
 
-        name = "pathreplay"
-        recordable = True  # where there are no media: it looks at nothing on the host while it renders
+    def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
+        """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
+        for doubt in doubts(walk):
+            self._tell_once(doubt)
+        if walk.media is None:
+            return None
+        baseline = self._baseline(walk.scene)
+        if view.key in baseline.passes:
+            self._tell_once(used_before_note(view.key[0]))
+            return None
+        return baseline
 
-        def __init__(self, props: mi.Properties) -> None:
-            super().__init__(props)
-            self.attach = choice(props, self.name, "attach", "delta", ATTACH)
-            self.interior = _interior(self.name, props, self.max_depth)
-            self.driver, self.branch = self.interior.driver, self.interior.branch
-            self.told: set[str] = set()  # what has been said in the log
-            self.untold = Diagnostics()  # of passes whose lost paths have not been told
-            self.baseline: tuple[SceneFacts, Baseline] | None = None  # and the scene that it belongs to
+    def _baseline(self, scene: mi.Scene) -> Baseline:
+        facts = self._facts(scene)
+        if self.baseline is None or self.baseline[0] is not facts:
+            self.baseline = facts, Baseline.fresh(scene.bbox())
+        return self.baseline[1]
 
-        def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0) -> bool:
-            """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
-            view = Pass.of(scene, sensor, 0, spp)
-            if self.driver != "sweep" or not sweepable(view.sensor, self.max_depth, view.spp):
-                return False
-            return not self._facts(scene).has_media
+    def learned(self) -> dict[str, np.ndarray]:
+        """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
+        return {} if self.baseline is None else self.baseline[1].learned()
 
-        def render_and_backward(
-            self,
-            scene: mi.Scene,
-            offset: mi.TensorXf,
-            slope: mi.TensorXf,
-            sensor: Which = 0,
-            seed: Seed = 0,
-            spp: int = 0,
-        ) -> mi.TensorXf:
-            """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
+    def restore_learned(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
+        """Go on with what `learned` told of the same scene; where that is nothing, anew. Raises PathreplayError."""
+        box = scene.bbox()
+        self.baseline = self._facts(scene), Baseline.restored(box, learned) if learned else Baseline.fresh(box)
 
-            ``offset`` and ``slope`` are tensors like the image (height x width x 3); the loss adds up over its values.
-            Each path is judged by the others of its pixel: see `pixel_sweep`. What is not differentiated: see `sweep`.
-            Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
-            number of samples does not, or a tensor has another shape.
-            """
-            with self._passing(scene, sensor, seed, spp) as view, dr.isolate_grad():
-                loss = pixel_loss(view, self.max_depth, offset, slope)
-                walk = self._walk(scene, view.sensor)
-                self._learned(view, walk)
-                found = self.interior.pixels(view, walk, loss)
-            self._told(view, walk, found)
-            return found.image
+    def _told(self, view: Pass, walk: Walk, found: Found) -> None:
+        """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see `take_lost`,
+        which tells of the passes before, too."""
+        if found.diagnostics.moves:
+            self._tell_edges(walk, view.sensor)
+        frozen = dr.flag(dr.JitFlag.FreezingScope)
+        self.untold = self.untold + found.diagnostics if frozen else found.diagnostics
+        if self.untold.counters and not frozen:
+            paths = self.untold.paths
+            self.tell_lost(self.take_lost(), paths)
+        if found.seen is not None and self.baseline is not None:
+            self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
 
-        def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
-            """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
-            for doubt in doubts(walk):
-                self._tell_once(doubt)
-            if walk.media is None:
-                return None
-            baseline = self._baseline(walk.scene)
-            if view.key in baseline.passes:
-                self._tell_once(used_before_note(view.key[0]))
-                return None
-            return baseline
+    def _tell_edges(self, walk: Walk, sensor: mi.Sensor) -> None:
+        if EDGES in self.told:
+            return
+        note, named = missing_edges(walk, sensor)
+        if named:
+            self.told.add(EDGES)
+        if note:
+            self._tell_once(note)
 
-        def _baseline(self, scene: mi.Scene) -> Baseline:
-            facts = self._facts(scene)
-            if self.baseline is None or self.baseline[0] is not facts:
-                self.baseline = facts, Baseline.fresh(scene.bbox())
-            return self.baseline[1]
+    def _tell_once(self, message: str) -> None:
+        if message not in self.told:
+            self.told.add(message)
+            mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
 
-        def learned(self) -> dict[str, np.ndarray]:
-            """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
-            return {} if self.baseline is None else self.baseline[1].learned()
+    def take_lost(self) -> mi.UInt32 | None:
+        """How many paths lost a part of their gradient, or None: a frozen function cannot look itself."""
+        lost, self.untold = self.untold.lost(), Diagnostics()
+        return lost
 
-        def restore_learned(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
-            """Go on with what `learned` told of the same scene; where that is nothing, anew. Raises PathreplayError."""
-            box = scene.bbox()
-            self.baseline = self._facts(scene), Baseline.restored(box, learned) if learned else Baseline.fresh(box)
+    def tell_lost(self, count: mi.UInt32, paths: int) -> None:
+        """Warn if paths lost a part of their gradient; ``count`` of so many ``paths``."""
+        if count[0] > 0:
+            mi.Log(mi.LogLevel.Warn, f"pathreplay: {lost_note(count[0], paths)}")
 
-        def _told(self, view: Pass, walk: Walk, found: Found) -> None:
-            """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see `take_lost`,
-            which tells of the passes before, too."""
-            if found.diagnostics.moves:
-                self._tell_edges(walk, view.sensor)
-            frozen = dr.flag(dr.JitFlag.FreezingScope)
-            self.untold = self.untold + found.diagnostics if frozen else found.diagnostics
-            if self.untold.counters and not frozen:
-                paths = self.untold.paths
-                self.tell_lost(self.take_lost(), paths)
-            if found.seen is not None and self.baseline is not None:
-                self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
-
-        def _tell_edges(self, walk: Walk, sensor: mi.Sensor) -> None:
-            if EDGES in self.told:
-                return
-            note, named = missing_edges(walk, sensor)
-            if named:
-                self.told.add(EDGES)
-            if note:
-                self._tell_once(note)
-
-        def _tell_once(self, message: str) -> None:
-            if message not in self.told:
-                self.told.add(message)
-                mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
-
-        def take_lost(self) -> mi.UInt32 | None:
-            """How many paths lost a part of their gradient, or None: a frozen function cannot look itself."""
-            lost, self.untold = self.untold.lost(), Diagnostics()
-            return lost
-
-        def tell_lost(self, count: mi.UInt32, paths: int) -> None:
-            """Warn if paths lost a part of their gradient; ``count`` of so many ``paths``."""
-            if count[0] > 0:
-                mi.Log(mi.LogLevel.Warn, f"pathreplay: {lost_note(count[0], paths)}")
-
-        def to_string(self) -> str:
-            return self._described(
-                hide_emitters=self.hide_emitters, driver=self.driver, attach=self.attach, branch=self.branch
-            )
-
-    return PathReplayIntegrator
+    def to_string(self) -> str:
+        return self._described(
+            hide_emitters=self.hide_emitters, driver=self.driver, attach=self.attach, branch=self.branch
+        )
 
 
 def register() -> None:
     """Register the plugin for the active variant, which must be an AD variant."""
-    plugin = _make_class()
+    plugin = on_base(PathReplayIntegrator, mitsuba_integrator())
     mi.register_integrator("pathreplay", lambda props: plugin(props))

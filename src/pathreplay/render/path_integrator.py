@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import reduce
 from operator import add
@@ -77,143 +77,142 @@ def require_usable(name: str, props: mi.Properties) -> None:
     flag(props, name, "hide_emitters", False)
 
 
-def path_integrator() -> type:
-    """The base class of our integrators, for the active variant, which must be an AD variant."""
+class PathIntegrator:
+    """A template of an integrator (see `on_base`), for those of ours.
 
-    class PathIntegrator(mitsuba_integrator()):  # type: ignore[misc]
-        """Properties ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5) and ``hide_emitters`` (False).
+    Properties ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5) and ``hide_emitters`` (False).
+    Classes below have a ``name`` (the plugin's), ``attach`` (as `Walk` has it) and the term ``interior``. Raises
+    PathreplayError for unusable properties and in polarised variants.
+    """
 
-        Classes below have a ``name`` (the plugin's), ``attach`` (as `Walk` has it) and the term ``interior``. Raises
-        PathreplayError for unusable properties and in polarised variants.
+    name = ""
+    attach = "none"
+    interior: Interior
+    max_depth: int  # these are Mitsuba's
+    rr_depth: int
+    skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
+
+    def __init__(self, props: mi.Properties) -> None:
+        require_usable(self.name, props)
+        mitsuba_integrator().__init__(self, props)
+        self.hide_emitters = flag(props, self.name, "hide_emitters", False)
+        self.tables: Tables | None = None  # of the scene, in a frozen function, which cannot make them
+        self.facts: SceneFacts | None = None  # about the scene that was rendered last
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """What the gradient is a sum of."""
+        return (self.interior,)
+
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: Which = 0,
+        seed: Seed = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
+        """Render an image: see Mitsuba's ADIntegrator. Nothing is differentiated: use `mi.render` for that."""
+        if not develop:
+            raise PathreplayError(f"{self.name}: develop = False is not supported: leave it out")
+        with self._passing(scene, sensor, seed, spp) as view:
+            return image(view, self._walk(scene, view.sensor))
+
+    def render_forward(
+        self, scene: mi.Scene, params: object, sensor: Which = 0, seed: Seed = 0, spp: int = 0
+    ) -> mi.TensorXf:
+        """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
+
+        The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
+        from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
         """
+        with self._passing(scene, sensor, seed, spp) as view:
+            walk = self._walk(scene, view.sensor)
+            learned = self._learned(view, walk)
+            found = reduce(add, [term.forward(view, walk, learned) for term in self.terms])
+        self._told(view, walk, found)
+        return found.image
 
-        name = ""
-        attach = "none"
-        interior: Interior
+    def render_backward(
+        self, scene: mi.Scene, params: object, grad_in: mi.TensorXf, sensor: Which = 0, seed: Seed = 0, spp: int = 0
+    ) -> None:
+        """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
 
-        def __init__(self, props: mi.Properties) -> None:
-            require_usable(self.name, props)
-            super().__init__(props)
-            self.hide_emitters = flag(props, self.name, "hide_emitters", False)
-            self.tables: Tables | None = None  # of the scene, in a frozen function, which cannot make them
-            self.facts: SceneFacts | None = None  # about the scene that was rendered last
+        Warns of what terms tell: a part of the gradient was not finite and had to be left out, edges move.
+        """
+        # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
+        with self._passing(scene, sensor, seed, spp) as view, dr.isolate_grad():
+            walk = self._walk(scene, view.sensor)
+            learned = self._learned(view, walk)
+            found = reduce(add, [term.backward(view, walk, grad_in, learned) for term in self.terms])
+        self._told(view, walk, found)
 
-        @property
-        def terms(self) -> tuple[Term, ...]:
-            """What the gradient is a sum of."""
-            return (self.interior,)
+    def sample(
+        self,
+        mode: dr.ADMode,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.Ray3f,
+        δL: mi.Spectrum | None = None,
+        active: bool | mi.Bool = True,
+        **_: Any,
+    ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], Any]:
+        """Radiance along rays, its tangent, or nothing (after back-propagating ``δL``): see Mitsuba's ADIntegrator.
 
-        def render(
-            self,
-            scene: mi.Scene,
-            sensor: Which = 0,
-            seed: Seed = 0,
-            spp: int = 0,
-            develop: bool = True,
-            evaluate: bool = True,
-        ) -> mi.TensorXf:
-            """Render an image: see Mitsuba's ADIntegrator. Nothing is differentiated: use `mi.render` for that."""
-            if not develop:
-                raise PathreplayError(f"{self.name}: develop = False is not supported: leave it out")
-            with self._passing(scene, sensor, seed, spp) as view:
-                return image(view, self._walk(scene, view.sensor))
+        For those who have rays and no sensor, such as Mitsuba's `aov`: the rays start in no medium. As it is no
+        pass, nothing is learned from it and nothing is told.
+        """
+        walk, start = self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))
+        if mode == dr.ADMode.Primal:
+            return *primal(walk, start), [], None
+        if mode == dr.ADMode.Forward:
+            return *self.interior.tangent(walk, start)[:2], [], None
+        self.interior.propagate(walk, start, δL)
+        return mi.Spectrum(0), mi.Bool(True), [], None
 
-        def render_forward(
-            self, scene: mi.Scene, params: object, sensor: Which = 0, seed: Seed = 0, spp: int = 0
-        ) -> mi.TensorXf:
-            """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
+    def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
+        """What earlier passes found out that this one may use."""
+        return None
 
-            The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
-            from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
-            """
-            with self._passing(scene, sensor, seed, spp) as view:
-                walk = self._walk(scene, view.sensor)
-                learned = self._learned(view, walk)
-                found = reduce(add, [term.forward(view, walk, learned) for term in self.terms])
-            self._told(view, walk, found)
-            return found.image
+    def _told(self, view: Pass, walk: Walk, found: Found) -> None:
+        """What is done with what terms have found."""
 
-        def render_backward(
-            self, scene: mi.Scene, params: object, grad_in: mi.TensorXf, sensor: Which = 0, seed: Seed = 0, spp: int = 0
-        ) -> None:
-            """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
-
-            Warns of what terms tell: a part of the gradient was not finite and had to be left out, edges move.
-            """
-            # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
-            with self._passing(scene, sensor, seed, spp) as view, dr.isolate_grad():
-                walk = self._walk(scene, view.sensor)
-                learned = self._learned(view, walk)
-                found = reduce(add, [term.backward(view, walk, grad_in, learned) for term in self.terms])
-            self._told(view, walk, found)
-
-        def sample(
-            self,
-            mode: dr.ADMode,
-            scene: mi.Scene,
-            sampler: mi.Sampler,
-            ray: mi.Ray3f,
-            δL: mi.Spectrum | None = None,
-            active: bool | mi.Bool = True,
-            **_: Any,
-        ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], Any]:
-            """Radiance along rays, its tangent, or nothing (after back-propagating ``δL``): see Mitsuba's ADIntegrator.
-
-            For those who have rays and no sensor, such as Mitsuba's `aov`: the rays start in no medium. As it is no
-            pass, nothing is learned from it and nothing is told.
-            """
-            walk, start = self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))
-            if mode == dr.ADMode.Primal:
-                return *primal(walk, start), [], None
-            if mode == dr.ADMode.Forward:
-                return *self.interior.tangent(walk, start)[:2], [], None
-            self.interior.propagate(walk, start, δL)
-            return mi.Spectrum(0), mi.Bool(True), [], None
-
-        def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
-            """What earlier passes found out that this one may use."""
-            return None
-
-        def _told(self, view: Pass, walk: Walk, found: Found) -> None:
-            """What is done with what terms have found."""
-
-        @contextmanager
-        def _passing(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Iterator[Pass]:
-            """The pass under way, in which nothing is differentiated but what asks for it: see `careful`, too."""
-            if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
-                raise PathreplayError(
-                    f"{self.name}: scene or integrator belongs to another variant than the active one, "
-                    f"{mi.variant()!r}: load it anew, or set its variant"
-                )
-            with careful(), dr.suspend_grad():
-                yield Pass.of(scene, sensor, seed, spp)
-
-        def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> Walk:
-            """How the scene is walked through; the sensor may be in a medium."""
-            facts = self._facts(scene)
-            return Walk(
-                scene=scene,
-                traits=facts.traits(self.tables),
-                media=facts.media(sensor),  # type: ignore[arg-type]
-                attach=self.attach,
-                hide_emitters=self.hide_emitters,
-                max_depth=self.max_depth,
-                rr_depth=self.rr_depth,
-                skip_area_emitters=self.skip_area_emitters,
+    @contextmanager
+    def _passing(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Iterator[Pass]:
+        """The pass under way, in which nothing is differentiated but what asks for it: see `careful`, too."""
+        if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
+            raise PathreplayError(
+                f"{self.name}: scene or integrator belongs to another variant than the active one, "
+                f"{mi.variant()!r}: load it anew, or set its variant"
             )
+        with careful(), dr.suspend_grad():
+            yield Pass.of(scene, sensor, seed, spp)
 
-        def _facts(self, scene: mi.Scene) -> SceneFacts:
-            """The facts about a scene, those of its last pass if it has not become another."""
-            if self.facts is None or not self.facts.are_about(scene):
-                self.facts = SceneFacts(scene)
-            return self.facts
+    def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> Walk:
+        """How the scene is walked through; the sensor may be in a medium."""
+        facts = self._facts(scene)
+        return Walk(
+            scene=scene,
+            traits=facts.traits(self.tables),
+            media=facts.media(sensor),  # type: ignore[arg-type]
+            attach=self.attach,
+            hide_emitters=self.hide_emitters,
+            max_depth=self.max_depth,
+            rr_depth=self.rr_depth,
+            skip_area_emitters=self.skip_area_emitters,
+        )
 
-        def _described(self, **more: Any) -> str:
-            depth = -1 if self.max_depth == UNBOUNDED else self.max_depth
-            values = {"max_depth": depth, "rr_depth": self.rr_depth, **more}
-            return f"{type(self).__name__}[{', '.join(f'{key} = {value}' for key, value in values.items())}]"
+    def _facts(self, scene: mi.Scene) -> SceneFacts:
+        """The facts about a scene, those of its last pass if it has not become another."""
+        if self.facts is None or not self.facts.are_about(scene):
+            self.facts = SceneFacts(scene)
+        return self.facts
 
-        def to_string(self) -> str:
-            return self._described()
+    def _described(self, **more: Any) -> str:
+        depth = -1 if self.max_depth == UNBOUNDED else self.max_depth
+        values = {"max_depth": depth, "rr_depth": self.rr_depth, **more}
+        return f"{type(self).__name__}[{', '.join(f'{key} = {value}' for key, value in values.items())}]"
 
-    return PathIntegrator
+    def to_string(self) -> str:
+        return self._described()

@@ -16,9 +16,11 @@ from ..gradient.adjoint import LostPaths
 from ..gradient.baseline import Seen
 from ..gradient.driver import Driver, ForwardDriver
 from ..gradient.forward import forward
+from ..plugins import on_base
+from ..render.camera_pass import mitsuba_integrator
 from ..render.diagnostics import Diagnostics
 from ..render.interior import Interior
-from ..render.path_integrator import path_integrator
+from ..render.path_integrator import PathIntegrator
 from ..render.properties import choice, flag
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
@@ -51,52 +53,50 @@ class OtherInterior(Interior):
         return Diagnostics()
 
 
-def _make_classes() -> tuple[type, ...]:
-    base = path_integrator()
+class TapeIntegrator(PathIntegrator):
+    """Plain AD of a wavefront path tracer: for comparison only, since memory grows with the depth (see `tape`).
 
-    class TapeIntegrator(base):  # type: ignore[misc, valid-type]
-        """Plain AD of a wavefront path tracer: for comparison only, since memory grows with the depth (see `tape`).
+    Properties: those of `PathIntegrator` and ``attach`` (``delta``, ``none``), which means what it does for
+    `pathreplay`.
+    """
 
-        Properties: those of `PathIntegrator` and ``attach`` (``delta``, ``none``), which means what it does for
-        `pathreplay`.
-        """
+    name = "pathreplay_tape"
+    interior = OtherInterior(name, tape_backward, tape_forward)
 
-        name = "pathreplay_tape"
-        interior = OtherInterior(name, tape_backward, tape_forward)
+    def __init__(self, props: mi.Properties) -> None:
+        PathIntegrator.__init__(self, props)
+        self.attach = choice(props, self.name, "attach", "delta", ATTACH)
 
-        def __init__(self, props: mi.Properties) -> None:
-            super().__init__(props)
-            self.attach = choice(props, self.name, "attach", "delta", ATTACH)
 
-    class RadiativeIntegrator(base):  # type: ignore[misc, valid-type]
-        """Radiative backpropagation: for comparison only, since time grows with the square of the depth.
+class RadiativeIntegrator(PathIntegrator):
+    """Radiative backpropagation: for comparison only, since time grows with the square of the depth.
 
-        Properties: those of `PathIntegrator` and ``linear`` (False: unbiased; True: the biased variant in linear
-        time), see `radiative`. Nothing that moves is differentiated, and there is no forward mode.
-        """
+    Properties: those of `PathIntegrator` and ``linear`` (False: unbiased; True: the biased variant in linear
+    time), see `radiative`. Nothing that moves is differentiated, and there is no forward mode.
+    """
 
-        name = "pathreplay_rb"
+    name = "pathreplay_rb"
 
-        def __init__(self, props: mi.Properties) -> None:
-            super().__init__(props)
-            linear = flag(props, self.name, "linear", False)
-            self.interior = OtherInterior(self.name, partial(radiative, linear=linear))
+    def __init__(self, props: mi.Properties) -> None:
+        PathIntegrator.__init__(self, props)
+        linear = flag(props, self.name, "linear", False)
+        self.interior = OtherInterior(self.name, partial(radiative, linear=linear))
 
-    class ListingIntegrator(base):  # type: ignore[misc, valid-type]
-        """Delta tracking as first published: for comparison only, since it misses derivatives (see `listing`).
 
-        Properties: those of `PathIntegrator`. For scenes with media; what moves raises in reverse mode. Tangents are
-        those of `pathreplay`.
-        """
+class ListingIntegrator(PathIntegrator):
+    """Delta tracking as first published: for comparison only, since it misses derivatives (see `listing`).
 
-        name = "pathreplay_listing"
-        attach = "delta"  # so that it is noticed
-        interior = OtherInterior(name, listing, forward)
+    Properties: those of `PathIntegrator`. For scenes with media; what moves raises in reverse mode. Tangents are
+    those of `pathreplay`.
+    """
 
-    return TapeIntegrator, RadiativeIntegrator, ListingIntegrator
+    name = "pathreplay_listing"
+    attach = "delta"  # so that it is noticed
+    interior = OtherInterior(name, listing, forward)
 
 
 def register() -> None:
     """Register the plugins for the active variant, which must be an AD variant."""
-    for plugin in _make_classes():
-        mi.register_integrator(plugin.name, lambda props, plugin=plugin: plugin(props))  # type: ignore[attr-defined]
+    for template in (TapeIntegrator, RadiativeIntegrator, ListingIntegrator):
+        plugin = on_base(template, mitsuba_integrator())
+        mi.register_integrator(template.name, lambda props, plugin=plugin: plugin(props))
