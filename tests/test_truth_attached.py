@@ -12,7 +12,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.bsdfs.smoothdielectric import _plugin_class
+from pathreplay.bsdfs.smoothdielectric import SmoothDielectric
+from pathreplay.plugins import on_base
 from truth import (
     Bench,
     Case,
@@ -37,7 +38,7 @@ from truth import (
 def register_one_lobe() -> None:
     """`one_lobe`: a smoothdielectric that only ever samples one of its lobes (property ``lobe``)."""
 
-    class OneLobe(_plugin_class()):
+    class OneLobe(on_base(SmoothDielectric, mi.BSDF)):
         def __init__(self, props):
             super().__init__(props)
             self.lobe = props.get("lobe", 1)

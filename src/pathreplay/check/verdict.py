@@ -66,9 +66,9 @@ def judge(
     with np.errstate(invalid="ignore"):  # infinite samples are looked for below
         reference = (4 * half_step - full_step) / 3
         # D(h/2) is off by a third of what halving changed; that it bounds the better combination keeps us safe.
-        change, change_se = mean_and_error((half_step - full_step) / 3)
-        g, g_se = mean_and_error(gradient)
-        r, r_se = mean_and_error(reference)
+        change, change_se = map(float, mean_and_error((half_step - full_step) / 3))
+        g, g_se = map(float, mean_and_error(gradient))
+        r, r_se = map(float, mean_and_error(reference))
     truncation = math.sqrt(max(0.0, change**2 - change_se**2))
     scale = max(abs(g), abs(r))
     known = Judgement(g, g_se, r, r_se, math.hypot(truncation, rounding), math.nan, math.inf, "inconclusive", "")
@@ -79,7 +79,7 @@ def judge(
         return replace(known, reason="the reference is NaN or infinite: look at the image, or choose a smaller step")
 
     σ = math.sqrt(g_se**2 + r_se**2 + known.step_error**2 + (SUMMATION * scale) ** 2)
-    z = welch(g - r, σ, (g_se, gradient.size), (r_se, reference.size))
+    z = float(welch(g - r, σ, (g_se, gradient.size), (r_se, reference.size)))
     resolution = σ / scale if scale > 0 else math.inf
     verdict: Verdict
     if abs(z) >= Z_LIMIT:

@@ -128,9 +128,9 @@ class PathReplayIntegrator(PathIntegrator):
         return baseline
 
     def _baseline(self, scene: mi.Scene) -> Baseline:
-        facts = self._facts(scene)
-        if self.baseline is None or self.baseline[0] is not facts:
-            self.baseline = facts, Baseline.fresh(scene.bbox())
+        # Not by the facts of the last pass: other scenes may have been rendered between.
+        if self.baseline is None or not self.baseline[0].are_about(scene):
+            self.baseline = self._facts(scene), Baseline.fresh(scene.bbox())
         return self.baseline[1]
 
     def learned(self) -> dict[str, np.ndarray]:

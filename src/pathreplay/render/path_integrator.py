@@ -154,22 +154,16 @@ class PathIntegrator:
         scene: mi.Scene,
         sampler: mi.Sampler,
         ray: mi.Ray3f,
-        δL: mi.Spectrum | None = None,
         active: bool | mi.Bool = True,
         **_: Any,
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], Any]:
-        """Radiance along rays, its tangent, or nothing (after back-propagating ``δL``): see Mitsuba's ADIntegrator.
+        """Radiance along rays, for those who have rays and no sensor, such as Mitsuba's `aov`: they start in no medium.
 
-        For those who have rays and no sensor, such as Mitsuba's `aov`: the rays start in no medium. As it is no
-        pass, nothing is learned from it and nothing is told.
+        Derivatives are those of passes: see `render_forward` and `render_backward`. Raises PathreplayError for them.
         """
-        walk, start = self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))
-        if mode == dr.ADMode.Primal:
-            return *primal(walk, start), [], None
-        if mode == dr.ADMode.Forward:
-            return *self.interior.tangent(walk, start)[:2], [], None
-        self.interior.propagate(walk, start, δL)
-        return mi.Spectrum(0), mi.Bool(True), [], None
+        if mode != dr.ADMode.Primal:
+            raise PathreplayError(f"{self.name}: sample() is not differentiated: use mi.render, or render_backward")
+        return *primal(self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
 
     def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
         """What earlier passes found out that this one may use."""

@@ -87,7 +87,7 @@ class ListingIntegrator(PathIntegrator):
     """Delta tracking as first published: for comparison only, since it misses derivatives (see `listing`).
 
     Properties: those of `PathIntegrator`. For scenes with media; what moves raises in reverse mode. Tangents are
-    those of `pathreplay`.
+    those of the forward driver, without baseline and branch.
     """
 
     name = "pathreplay_listing"

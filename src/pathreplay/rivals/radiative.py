@@ -34,13 +34,13 @@ def radiative(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths,
 
     while dr.hint(path.active, exclude=[walk], label="pathreplay: radiative backpropagation"):
         u, step = path.choose(walk, sampler)
+        at = next_arrival(walk, path.at, step, step.active)
         if dr.hint(linear, mode="scalar"):
             L = mi.Spectrum(dr.select(step.active, 1, 0))
         else:
-            at = next_arrival(walk, path.at, step, step.active)
             depth, η = path.passed(walk, step), path.η * step.eta
             L, _ = walk_on(walk, sampler, PathState(at, mi.Spectrum(1), None, η, depth, step.active))
-        onward, v = path.advance(walk, u, step)
+        onward, v = path.advance(walk, u, step, at)
         with dr.resume_grad():
             again = repeat_step(walk, replace(v, go_on=step.active), False, path.active)
             backward(dr.sum(δL * path.β * (again.e + again.w * L)))

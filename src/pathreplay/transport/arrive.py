@@ -14,6 +14,7 @@ import mitsuba as mi
 from .emitters import emission
 from .flight import fly, fly_again
 from .media import interaction
+from .traits import is_null
 from .vertex import Arrival, Flight, Replayed, Walk
 
 
@@ -104,7 +105,7 @@ def _in_medium(
     event = active & flight.event
     bsdf, phase = si.bsdf(at.ray), at.medium.phase_function()
     surface = active & ~event & si.is_valid()
-    through = surface & _is_null(bsdf)
+    through = surface & is_null(bsdf)
     seen = active & ~event
     if walk.hide_emitters:
         seen &= ~at.camera | si.is_valid()
@@ -114,10 +115,3 @@ def _in_medium(
     origin.n = dr.select(event, 0, si.n)
     inside = InMedium(event, through, mei, phase, flight, w, e)
     return Vertex(si, bsdf, surface & ~through, origin, emission(walk.scene, at, si, attached, seen), inside)
-
-
-def _is_null(bsdf: mi.BSDFPtr) -> mi.Bool:
-    """True where light can only pass straight through."""
-    flags = bsdf.flags()
-    reflects = mi.has_flag(flags, mi.BSDFFlags.Smooth) | mi.has_flag(flags, mi.BSDFFlags.DeltaReflection)
-    return mi.has_flag(flags, mi.BSDFFlags.Null) & ~reflects & ~mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)

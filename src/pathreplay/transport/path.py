@@ -44,15 +44,18 @@ class PathState:
         """Vertices before the next: one more, but with media not so at null boundaries."""
         return self.depth + (1 if walk.media is None else dr.select(step.null, mi.UInt32(0), 1))
 
-    def advance(self, walk: Walk, u: Numbers, step: Chosen) -> tuple[PathState, Replayed]:
-        """The path at its next vertex, and what later passes are to know of the one that it has left."""
+    def advance(self, walk: Walk, u: Numbers, step: Chosen, at: Arrival | None = None) -> tuple[PathState, Replayed]:
+        """The path at its next vertex, and what later passes are to know of the one that it has left.
+
+        ``at`` is the next arrival, if somebody has followed the step already.
+        """
         β = self.β * dr.detach(step.w)
         β_alive = None if self.β_alive is None else sustain(self.β_alive, self.β, step)
         lasting = β if β_alive is None else β_alive
         η = self.η * step.eta
         rr_weight, survives = survival(lasting, η, self.depth, u.roulette, walk, step)
         active = step.active & survives & (dr.max(lasting) != 0)
-        at = next_arrival(walk, self.at, step, active)
+        at = next_arrival(walk, self.at, step, active) if at is None else at
         β_alive = None if β_alive is None else β_alive * rr_weight
         onward = PathState(at, β * rr_weight, β_alive, η, self.passed(walk, step), active)
         return onward, Replayed(self.at, u, step.kept, active, at.hit, rr_weight, self.β)

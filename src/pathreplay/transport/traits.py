@@ -82,9 +82,10 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     )
 
 
-def is_null(bsdf: mi.BSDF) -> bool:
-    """Whether a BSDF does nothing but let light straight through."""
-    return bool(bsdf.component_count() == 1 and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null))
+def is_null(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:
+    """Whether (or where) a BSDF does nothing but let light straight through."""
+    others = mi.BSDFFlags.Smooth | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
+    return bsdf.flags() & (others | mi.BSDFFlags.Null) == +mi.BSDFFlags.Null
 
 
 def _attachables(nodes: set[mi.Object], shapes: list[mi.Shape]) -> list[mi.BSDF]:
