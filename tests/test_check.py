@@ -62,6 +62,7 @@ def test_verdict(case: dict[str, float], expected: str) -> None:
     result = verdict_on(**case)
     assert result.verdict == expected, result
     assert result.reason
+    assert {type(result.gradient), type(result.reference_se), type(result.z), type(result.resolution)} == {float}
 
 
 def test_an_inconclusive_verdict_names_the_samples_that_are_missing() -> None:

@@ -42,7 +42,8 @@ def welch(difference: Any, σ: Any, *parts: tuple[Any, int]) -> Any:
 
     What else σ holds is known, and adds no uncertainty to it (Welch-Satterthwaite).
     """
-    noise = sum(error**4 / (n - 1) for error, n in parts)
+    difference, σ = np.asarray(difference, np.float64), np.asarray(σ, np.float64)
+    noise = sum(np.asarray(error, np.float64) ** 4 / (n - 1) for error, n in parts)
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(difference == 0, 0.0, np.abs(difference) / σ)
         z = np.where(noise > 0, normal(t, σ**4 / noise), t)

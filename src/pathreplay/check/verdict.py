@@ -66,12 +66,14 @@ def judge(
     with np.errstate(invalid="ignore"):  # infinite samples are looked for below
         reference = (4 * half_step - full_step) / 3
         # D(h/2) is off by a third of what halving changed; that it bounds the better combination keeps us safe.
-        change, change_se = map(float, mean_and_error((half_step - full_step) / 3))
-        g, g_se = map(float, mean_and_error(gradient))
-        r, r_se = map(float, mean_and_error(reference))
+        change, change_se = mean_and_error((half_step - full_step) / 3)
+        g, g_se = mean_and_error(gradient)
+        r, r_se = mean_and_error(reference)
     truncation = math.sqrt(max(0.0, change**2 - change_se**2))
     scale = max(abs(g), abs(r))
-    known = Judgement(g, g_se, r, r_se, math.hypot(truncation, rounding), math.nan, math.inf, "inconclusive", "")
+    g, g_se, r, r_se = float(g), float(g_se), float(r), float(r_se)
+    step_error = math.hypot(truncation, rounding)
+    known = Judgement(g, g_se, r, r_se, step_error, math.nan, math.inf, "inconclusive", "")
     if not np.isfinite(gradient).all():
         bad = int(np.count_nonzero(~np.isfinite(gradient)))
         return replace(known, verdict="fail", reason=f"{bad} of {gradient.size} gradient samples are NaN or infinite")
@@ -91,7 +93,7 @@ def judge(
         verdict, reason = "zero", f"both are zero to within {Z_LIMIT * σ:.1g}, which is nothing against the image"
     else:
         verdict, reason = "inconclusive", _unresolved(resolution, known.step_error, σ)
-    return replace(known, z=z, resolution=resolution, verdict=verdict, reason=reason)
+    return replace(known, z=z, resolution=float(resolution), verdict=verdict, reason=reason)
 
 
 def _unresolved(resolution: float, step_error: float, σ: float) -> str:
