@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .emitters import emission
-from .flight import fly, fly_again
+from .flight import Flown, fly, fly_again
 from .media import interaction
 from .traits import is_null
 from .vertex import Arrival, Flight, Replayed, Walk
@@ -58,7 +58,7 @@ def choose(
     mei = interaction(at.medium, dr.detach(at.ray), flight.t)
     w = dr.select(event, flight.σ_s * dr.rcp(flight.density), 1) * flight.W
     e = mi.Spectrum(0 if flight.E is None else flight.E)
-    return _in_medium(walk, at, si, mei, flight, w, e, False, active)
+    return _in_medium(walk, at, si, flight, Flown(mei, w, e), False, active)
 
 
 def repeat(walk: Walk, again: Replayed, attached: bool, active: mi.Bool) -> Vertex:
@@ -74,16 +74,11 @@ def repeat(walk: Walk, again: Replayed, attached: bool, active: mi.Bool) -> Vert
         return _on_surface(walk, at, si, attached, active, known)
     reach = dr.select(si.is_valid(), si.t, dr.inf)
     flown = fly_again(walk, at, kept.media.flight, reach, attached, active)
-    return _in_medium(walk, at, si, flown.mei, kept.media.flight, flown.w, flown.e, attached, active)
+    return _in_medium(walk, at, si, kept.media.flight, flown, attached, active)
 
 
 def _on_surface(
-    walk: Walk,
-    at: Arrival,
-    si: mi.SurfaceInteraction3f,
-    attached: bool,
-    active: mi.Bool,
-    glow: mi.Spectrum | None = None,
+    walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool, glow: mi.Spectrum = None
 ) -> Vertex:
     if glow is None:
         seen = active & (~at.camera | si.is_valid()) if walk.hide_emitters else active
@@ -92,15 +87,7 @@ def _on_surface(
 
 
 def _in_medium(
-    walk: Walk,
-    at: Arrival,
-    si: mi.SurfaceInteraction3f,
-    mei: mi.MediumInteraction3f,
-    flight: Flight,
-    w: mi.Spectrum,
-    e: mi.Spectrum,
-    attached: bool,
-    active: mi.Bool,
+    walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, flight: Flight, flown: Flown, attached: bool, active: mi.Bool
 ) -> Vertex:
     event = active & flight.event
     bsdf, phase = si.bsdf(at.ray), at.medium.phase_function()
@@ -111,7 +98,7 @@ def _in_medium(
         seen &= ~at.camera | si.is_valid()
     origin = dr.zeros(mi.Interaction3f)
     origin.t, origin.time, origin.wavelengths = mi.Float(0), at.ray.time, at.ray.wavelengths
-    origin.p = dr.select(event, mei.p, si.p)
+    origin.p = dr.select(event, flown.mei.p, si.p)
     origin.n = dr.select(event, 0, si.n)
-    inside = InMedium(event, through, mei, phase, flight, w, e)
+    inside = InMedium(event, through, flown.mei, phase, flight, flown.w, flown.e)
     return Vertex(si, bsdf, surface & ~through, origin, emission(walk.scene, at, si, attached, seen), inside)

@@ -33,13 +33,9 @@ class Sampled:
 
     f: mi.Spectrum  # value for the direction of the emitter sample
     pdf_light: mi.Float  # density of sampling that direction
-    d: mi.Vector3f  # direction of the continuation, world space
-    w: mi.Spectrum  # its weight
-    pdf: mi.Float
-    delta: mi.Bool
-    null: mi.Bool  # it passes straight through
-    black: mi.Bool  # a surface's weight was zero in all channels
-    lobe: mi.UInt32
+    w: mi.Spectrum  # weight of the continuation
+    kept: Kept
+    null: mi.Bool  # the continuation passes straight through
     eta: mi.Float
     active: mi.Bool  # there is a continuation
 
@@ -62,19 +58,9 @@ def choose(
     if v.inside is not None and walk.media.passes:
         at_surface |= v.surface & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.Null)
     f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(ctx, v.si, v.si.to_local(light_d), u.lobe, u.direction, at_surface)
-    sampled = Sampled(
-        f=f,
-        pdf_light=pdf_light,
-        d=v.si.to_world(sample.wo),
-        w=w,
-        pdf=sample.pdf,
-        delta=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta),
-        null=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null),
-        black=dr.all(w == 0),
-        lobe=sample.sampled_component,
-        eta=sample.eta,
-        active=at_surface,
-    )
+    delta, null = (mi.has_flag(sample.sampled_type, kind) for kind in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
+    kept = Kept(v.si.to_world(sample.wo), sample.pdf, delta, dr.all(w == 0), sample.sampled_component, lit)
+    sampled = Sampled(f, pdf_light, w, kept, null, sample.eta, at_surface)
     return sampled if v.inside is None else _in_medium(v, at, u, light_d, lit, go_on, sampled)
 
 
@@ -87,16 +73,19 @@ def _in_medium(
     wo, w, pdf = phase.sample(ctx, v.inside.mei, u.lobe, u.direction, go_on & event)
     null = through | (v.surface & surface.null)
     bounce = go_on & (v.surface | event) & (~event | (pdf > 0))
-    return replace(
-        surface,
+    kept = replace(
+        surface.kept,
+        d=dr.select(event, wo, dr.select(through, at.ray.d, surface.kept.d)),
+        pdf=dr.select(event, pdf, dr.select(through, 1, surface.kept.pdf)),
+        delta=dr.select(event, ~at.medium.use_emitter_sampling(), surface.kept.delta),
+        lobe=dr.select(v.surface, surface.kept.lobe, 0),
+    )
+    return Sampled(
         f=dr.select(event, f, surface.f),
         pdf_light=dr.select(event, pdf_light, surface.pdf_light),
-        d=dr.select(event, wo, dr.select(through, at.ray.d, surface.d)),
         w=dr.select(event, dr.select(pdf > 0, w, 0), dr.select(through, 1, surface.w)),
-        pdf=dr.select(event, pdf, dr.select(through, 1, surface.pdf)),
-        delta=dr.select(event, ~at.medium.use_emitter_sampling(), surface.delta),
+        kept=kept,
         null=null,
-        lobe=dr.select(v.surface, surface.lobe, 0),
         eta=dr.select(v.surface, surface.eta, 1),
         active=bounce | null,
     )

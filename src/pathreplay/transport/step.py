@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import arrive, connect, scatter
-from .vertex import Arrival, Chosen, Flight, Kept, KeptInMedia, KnownLight, Numbers, Replayed, Signature, Step, Walk
+from .vertex import Arrival, Chosen, Flight, KeptInMedia, KnownLight, Numbers, Replayed, Signature, Step, Walk
 
 
 def choose_step(
@@ -37,27 +37,17 @@ def choose_step(
     to = scatter.choose(walk, v, at, u, ctx, link.light.d, link.lit, go_on)
     reached = link.reaches(to.pdf_light, False)
     lighting = dr.select(link.lit, to.f * reached, 0)
-    kept = Kept(to.d, to.pdf, to.delta, to.black, to.lobe, link.lit, light=link.light)
-    signature = _signature(v, at, to.lobe, go_on)
-    ray_next = v.origin.spawn_ray(to.d)
-    if v.inside is None:
-        if not walk.traits.lights_vary:
-            kept.known = KnownLight(v.glow, link.light.d, reached)
-        return Chosen(v.glow + lighting, to.w, ray_next, to.pdf, signature, kept, to.eta, to.null, to.active)
-    kept.media = KeptInMedia(to.null, v.inside.flight, link.shadow)
-    crossed = (v.surface | v.inside.through) & v.si.is_medium_transition()
-    return Chosen(
-        e=v.inside.e + v.inside.w * (v.glow + lighting),
-        w=v.inside.w * to.w,
-        ray_next=ray_next,
-        pdf=to.pdf,
-        signature=signature,
-        kept=kept,
-        eta=to.eta,
-        null=to.null,
-        active=to.active,
-        medium=dr.select(crossed, v.si.target_medium(to.d), at.medium),
-    )
+    kept, e, w, medium = to.kept, v.glow + lighting, to.w, at.medium
+    kept.light = link.light
+    if v.inside is not None:
+        kept.media = KeptInMedia(to.null, v.inside.flight, link.shadow)
+        e, w = v.inside.e + v.inside.w * e, v.inside.w * w
+        crossed = (v.surface | v.inside.through) & v.si.is_medium_transition()
+        medium = dr.select(crossed, v.si.target_medium(kept.d), medium)
+    elif not walk.traits.lights_vary:
+        kept.known = KnownLight(v.glow, link.light.d, reached)
+    signature, ray_next = _signature(v, at, kept.lobe, go_on), v.origin.spawn_ray(kept.d)
+    return Chosen(e, w, ray_next, kept.pdf, signature, kept, to.eta, to.null, to.active, medium)
 
 
 def repeat_step(
