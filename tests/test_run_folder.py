@@ -241,6 +241,7 @@ DAMAGE: dict[str, Callable[[Path], Any]] = {
     "moment is infinite": tensor(SECOND, lambda a: a + np.float32(np.inf)),
     "moment is negative": tensor(SECOND, lambda a: -a - 1),
     "other shape": tensor(VALUE, lambda a: a.reshape(-1)),
+    "moment of other shape": tensor(SECOND, lambda a: a.reshape(-1, 1, 1)),
     "other type": tensor(VALUE, lambda a: a.astype(np.float64)),
     "tensor missing": lambda run: tensors(run, lambda arrays, about: arrays.pop(VALUE)),
     "empty checkpoint": lambda run: (run / CHECKPOINT).write_bytes(b""),

@@ -68,7 +68,8 @@ class Adam:
         """See `Optimiser`."""
         for key, value in values.items():
             moments = [state.arrays[f"first:{key}"], state.arrays[f"second:{key}"]]
-            if any(moment.size != value.size or moment.dtype != value.dtype for moment in moments):
+            shapes = value.shape, (value.size,)  # Dr.Jit keeps them flat
+            if any(moment.shape not in shapes or moment.dtype != value.dtype for moment in moments):
                 raise ValueError(f"the means of '{key}' are not like its value, {value.dtype} of shape {value.shape}")
             if (moments[1] < 0).any():
                 raise ValueError(f"'second:{key}', a mean of squares, is negative")
