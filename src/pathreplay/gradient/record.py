@@ -42,13 +42,21 @@ class Layout:
     moves: bool  # the path moves with the parameters
     resamples: bool  # BSDFs are sampled once more
     fixed: bool  # what emitters bring to surfaces is known
-    varies: bool  # it is not
     media: bool
     chromatic: bool
     emissive: bool
     passes: bool
     branch: bool
-    always: bool = True
+
+    @property
+    def varies(self) -> bool:
+        """What emitters bring is to be found out again."""
+        return not self.fixed
+
+    @property
+    def always(self) -> bool:
+        """Of what every record has."""
+        return True
 
     @staticmethod
     def of(walk: Walk, moves: bool) -> Layout:
@@ -56,9 +64,7 @@ class Layout:
         media = walk.media is not None
         fixed = not media and not moves and not walk.traits.lights_vary
         kinds = {name: media and getattr(walk.media, name) for name in ("chromatic", "emissive", "passes")}
-        return Layout(
-            mi.variant(), moves, walk.resamples or media, fixed, not fixed, media=media, branch=walk.branch, **kinds
-        )
+        return Layout(mi.variant(), moves, walk.resamples or media, fixed, media=media, branch=walk.branch, **kinds)
 
 
 # Where it stands in a Replayed, its type in Mitsuba, and what of the layout has it remembered.

@@ -37,8 +37,7 @@ def listing(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -
     if dr.hint(walk.media is None, mode="scalar"):
         raise PathreplayError("pathreplay_listing differentiates media, and the scene has none: use 'pathreplay'")
     # Nobody else's tracking is used, so that every collision is one that can be differentiated.
-    media = replace(walk.media, grids=(), plain=True)
-    walk = replace(walk, baseline=None, branching=None, media=media)
+    walk = replace(walk, media=replace(walk.media, grids=(), plain=True))
     sampler, path = start.sampler, PathState.begin(walk, start)
     if dr.hint(path_moves(walk, start, path.at), mode="scalar"):
         raise PathreplayError("pathreplay_listing cannot follow what moves: use 'pathreplay'")
