@@ -52,7 +52,14 @@ def _attached_arrival(at: Arrival) -> Arrival:
 
 
 def backward_step(
-    walk: Walk, v: Replayed, attached: bool, δL: mi.Spectrum, L: mi.Spectrum, q: RayDerivative, active: mi.Bool
+    walk: Walk,
+    v: Replayed,
+    attached: bool,
+    δL: mi.Spectrum,
+    L: mi.Spectrum,
+    q: RayDerivative,
+    active: mi.Bool,
+    rays_only: bool = False,
 ) -> tuple[mi.Spectrum, RayDerivative, mi.Bool]:
     """Back-propagate  δL β_i·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters; gives L_i, q_i, and its loss.
 
@@ -62,6 +69,7 @@ def backward_step(
     lost = mi.Bool(False)
     with dr.resume_grad():
         at = _attached_arrival(v.at) if attached else v.at
+    with dr.resume_grad(*((at.ray.o, at.ray.d, at.pdf) if rays_only else ())):
         step = repeat_step(walk, replace(v, at=at), attached, active)
         Li = step.e + step.w * (v.rr_weight * L)
         target = dr.sum(δL * v.β * Li)

@@ -58,6 +58,7 @@ def walk_back(
     q: RayDerivative,
     lost: LostPaths,
     seen: Seen | None = None,
+    rays_only: bool = False,
 ) -> tuple[mi.Spectrum, RayDerivative]:
     """Back-propagate from the last of ``count`` records to the first; gives radiance and ray adjoint there.
 
@@ -66,10 +67,10 @@ def walk_back(
     """
     broken = mi.Bool(False)  # a part of the adjoint was not finite
 
-    while dr.hint(count > 0, exclude=[walk, layout, ray0, lost, seen], label="pathreplay: sweep"):
+    while dr.hint(count > 0, exclude=[walk, layout, ray0, lost, seen, rays_only], label="pathreplay: sweep"):
         count -= 1
         v = read_back(layout, records, first + count, last, ray0)
-        L, q, breaks = backward_step(walk, v, layout.moves, δL, L, q, mi.Bool(True))
+        L, q, breaks = backward_step(walk, v, layout.moves, δL, L, q, mi.Bool(True), rays_only)
         if dr.hint(seen is not None, mode="scalar"):
             seen.learn(v, L)  # type: ignore[union-attr]
         if dr.hint(layout.moves, mode="scalar"):

@@ -14,18 +14,20 @@ from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
 from ..plugins import on_base
 from ..transport.vertex import Walk
+from .boundary import Boundary
 from .camera_pass import Pass, Seed, Which, mitsuba_integrator
 from .diagnostics import Diagnostics, doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts
 from .interior import PathReplay
 from .path_integrator import UNBOUNDED, PathIntegrator
 from .pixels import pixel_loss, sweepable
-from .properties import choice, deviation
-from .term import Found
+from .properties import choice, deviation, whole_number
+from .term import Found, Term
 
 DRIVERS = ("auto", "sweep", "replay")
 ATTACH = ("delta", "all", "none")
 BRANCH = ("auto", True, False)
+EDGE_TERMS = ("none", "film", "all")
 EDGES = "edges"
 """In `told`: that edges move has been said."""
 
@@ -80,9 +82,18 @@ class PathReplayIntegrator(PathIntegrator):
         self.attach = choice(props, self.name, "attach", "delta", ATTACH)
         self.interior = _interior(self.name, props, self.max_depth)
         self.driver, self.branch = self.interior.driver, self.interior.branch
+        self.edges = choice(props, self.name, "edges", "none", EDGE_TERMS)
+        self.edge_spp = whole_number(props, self.name, "edge_spp", 0, lowest=0)
         self.told: set[str] = set()  # what has been said in the log
         self.untold = Diagnostics()  # of passes whose lost paths have not been told
         self.baseline: tuple[SceneFacts, Baseline] | None = None  # and the scene that it belongs to
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The interior, and edges where they are asked for."""
+        if self.edges == "none":
+            return (self.interior,)
+        return self.interior, Boundary(self.edges == "all", self.edge_spp)
 
     def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0) -> bool:
         """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
@@ -181,7 +192,11 @@ class PathReplayIntegrator(PathIntegrator):
 
     def to_string(self) -> str:
         return self._described(
-            hide_emitters=self.hide_emitters, driver=self.driver, attach=self.attach, branch=self.branch
+            hide_emitters=self.hide_emitters,
+            driver=self.driver,
+            attach=self.attach,
+            branch=self.branch,
+            edges=self.edges,
         )
 
 

@@ -27,6 +27,7 @@ class Tables:
 
     attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: nowhere)
     blend_lengths: mi.Float  # those of `velocity`, by shape
+    faceted: mi.Bool  # this shape is a mesh without vertex normals
 
 
 @dataclass(frozen=True)
@@ -78,8 +79,17 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         outlines=not _seamless(shapes, nodes),
-        tables=Tables(_mask_by_index(attachables) if attachables else None, blend_lengths(shapes)),
+        tables=Tables(_mask_by_index(attachables) if attachables else None, blend_lengths(shapes), _faceted(shapes)),
     )
+
+
+def _faceted(shapes: list[mi.Shape]) -> mi.Bool:
+    """Of each shape, by registry index: a mesh without vertex normals."""
+    flat = {0: False}
+    for shape in shapes:
+        index = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]
+        flat[index] = shape.is_mesh() and (shape.has_face_normals() or not shape.has_vertex_normals())
+    return mi.Bool([flat.get(i, False) for i in range(max(flat) + 1)])
 
 
 def is_null(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:

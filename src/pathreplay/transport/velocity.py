@@ -66,6 +66,19 @@ def moved_direction(
     return dr.select(ok, dr.replace_grad(d, φ * d_H), d), dr.replace_grad(mi.Float(1), log_J)
 
 
+def held_direction(
+    origin: mi.Interaction3f, d: mi.Vector3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> mi.Vector3f:
+    """The direction from ``origin`` to the point that a ray along ``d`` hit, glued to its surface; its value is ``d``.
+
+    Differentiable in ``origin`` and in the shape that was hit.
+    """
+    y = held_point(hit, dr.detach(origin.spawn_ray(d)), active)
+    towards = y.p - origin.spawn_ray(dr.detach(d)).o
+    ok = active & (dr.squared_norm(towards) > 0)
+    return dr.select(ok, dr.replace_grad(d, dr.normalize(towards)), d)
+
+
 def _share(h0: mi.Float, y: HeldPoint, towards: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Vector3f]:
     """φ, and the slope that makes ∇φ·V_H = slope·d_H'; nothing here is attached."""
     r = dr.norm(towards)

@@ -1,0 +1,28 @@
+"""Random numbers that are counted: those of a key are the same each time, for paths side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+
+
+@dataclass
+class Counted:
+    """Random numbers that are counted: those of a key are the same each time. Takes a sampler's place."""
+
+    key: mi.UInt32
+    index: mi.UInt32
+
+    @staticmethod
+    def of(key: mi.UInt32) -> Counted:
+        return Counted(mi.UInt32(key), mi.UInt32(0))
+
+    def next_1d(self, active: bool | mi.Bool = True) -> mi.Float:
+        x = mi.sample_tea_float32(self.key, self.index)
+        self.index += 1
+        return x
+
+    def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
+        x = self.next_1d()
+        return mi.Point2f(x, self.next_1d())

@@ -1,0 +1,111 @@
+"""Crofton's segments: edges are found by what differs between the ends of short lines, so that nobody has to list them.
+
+Lines of length l are thrown at random on a surface, such as the film or the sphere of directions. With p(c) the density
+of their centres and directions that are uniform, the expected sum of g / p(c) over all crossings with edges is
+2 l / π times the integral of g along the edges. Signatures tell that there is a crossing; bisection finds where.
+
+Two crossings of one line go unseen, as at a corner. So lines whose ends agree are looked at in the middle, too; what
+only the middle finds counts twice in each half, which takes out the error of first order in l.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+BISECTIONS = 14
+"""How often a line is halved: what is left of it is 2^-14 as long."""
+OFF_PLANE = 0.1
+"""Share of their distance by which two points leave each other's tangent planes, where a surface hides itself."""
+ROUNDING = 1e-5
+"""Share of their coordinates by which points may be wrong."""
+
+
+@dataclass
+class Sight:
+    """What is seen at a place of a line: two of them tell whether there is an edge between."""
+
+    signature: mi.UInt32
+    p: mi.Point3f  # where the view ends; zero where it does not
+    n: mi.Normal3f
+
+    @staticmethod
+    def nothing() -> Sight:
+        return Sight(mi.UInt32(0), mi.Point3f(0), mi.Normal3f(0))
+
+    def differs(self, other: Sight) -> mi.Bool:
+        """Whether it is another shape, or another sheet of the same: see `hides_itself`."""
+        return (self.signature != other.signature) | hides_itself(self.p, self.n, other.p, other.n)
+
+
+def hides_itself(p: mi.Point3f, n: mi.Normal3f, p_other: mi.Point3f, n_other: mi.Normal3f) -> mi.Bool:
+    """Whether two points of one shape are on different sheets: no tangent plane comes close to the other point."""
+    across = p_other - p
+    off = dr.maximum(dr.abs(dr.dot(n, across)), dr.abs(dr.dot(n_other, across)))
+    rounding = ROUNDING * dr.max(dr.maximum(dr.abs(p), dr.abs(p_other)))
+    return off > OFF_PLANE * dr.norm(across) + rounding
+
+
+@dataclass
+class Crossed:
+    """A piece of a line, from ``a`` to ``b``, with an edge on it."""
+
+    line: Any
+    a: mi.Float
+    b: mi.Float
+    weight: mi.Float  # number of crossings that it stands for; 0: none
+
+
+Look = Callable[..., Sight]
+"""(line, place on it, active) -> what is seen there."""
+
+
+@dr.syntax
+def search(draw: Callable[[mi.UInt32], tuple[Any, mi.Bool]], look: Look, lines: int, pick: mi.PCG32) -> Crossed:
+    """Look at ``lines`` lines in each lane; gives a piece of one with an edge, in proportion to what it counts.
+
+    ``draw`` (number of the line) gives a line, whose places are from ``line.begin`` to ``line.end``, and whether there
+    is one. ``pick`` are random numbers of the search.
+    """
+    line, _ = draw(mi.UInt32(0))
+    kept = Crossed(line, mi.Float(0), mi.Float(0), mi.Float(0))
+    mass = mi.Float(0)
+    j = mi.UInt32(0)
+    while dr.hint(j < lines, exclude=[draw, look], label="pathreplay: search"):
+        line, active = draw(j)
+        a, b = mi.Float(line.begin), mi.Float(line.end)
+        c = 0.5 * (a + b)
+        at_a, at_b, at_c = look(line, a, active), look(line, b, active), look(line, c, active)
+        odd = active & at_a.differs(at_b)
+        even = active & ~odd & at_c.differs(at_a)
+        first = pick.next_float32() < 0.5
+        a, b = dr.select(even & ~first, c, a), dr.select(even & first, c, b)
+        weight = dr.select(odd, 1, dr.select(even, 4.0, 0))  # one half of two, each of which counts twice
+        mass += weight
+        take = pick.next_float32() * mass < weight
+        kept = dr.select(take, Crossed(line, a, b, weight), kept)
+        j += 1
+    kept.weight = mass
+    return kept
+
+
+@dr.syntax
+def bisect(look: Look, found: Crossed, pick: mi.PCG32) -> Crossed:
+    """The same, 2^-14 as long. Of several crossings one is chosen; none, where a surface was merely bent, weighs 0."""
+    a, b, weight, line = mi.Float(found.a), mi.Float(found.b), mi.Float(found.weight), found.line
+    at_a, at_b = look(line, a, weight > 0), look(line, b, weight > 0)
+    n = mi.UInt32(0)
+    while dr.hint((weight > 0) & (n < BISECTIONS), exclude=[look], label="pathreplay: bisection"):
+        c = 0.5 * (a + b)
+        at_c = look(line, c, mi.Bool(True))
+        left, right = at_c.differs(at_a), at_c.differs(at_b)
+        weight = dr.select(left & right, 2 * weight, dr.select(left | right, weight, 0))
+        left &= ~right | (pick.next_float32() < 0.5)
+        a, at_a = dr.select(left, a, c), dr.select(left, at_a, at_c)
+        b, at_b = dr.select(left, c, b), dr.select(left, at_c, at_b)
+        n += 1
+    return Crossed(line, a, b, weight)

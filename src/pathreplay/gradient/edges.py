@@ -1,0 +1,107 @@
+"""Edges: what their motion adds to a gradient, carried from where they were found back to parameters and camera.
+
+Two searches find edges along camera paths: `film_edges` those that a path slides over, `inner_edges` those that a
+scattering vertex sees. Both tell how the edge moves at their vertex, as a function of the ray that arrives there. The
+rest is the same for both: reverse mode takes the adjoint of that ray back along the records of the path, forward mode
+brings its tangent from the camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.vertex import Walk
+from .adjoint import LostPaths, RayDerivative, backward, forward_step, tangents
+from .record import Layout, read_back
+from .two_walks import walk_back
+
+
+class Places(Protocol):
+    """Where on a film paths may begin: places (Point2f, in pixels) from its corner to ``size``."""
+
+    size: mi.ScalarVector2f
+
+    def ray(self, s: mi.Point2f, key: mi.UInt32) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """The camera ray through a place and its weight; attached to the camera and ``s``, if those have gradients.
+
+        What else is random about it (time, wavelengths, aperture) comes from the ``key``.
+        """
+
+
+@dataclass
+class Edges:
+    """An edge for each lane, at the end of a path of ``k`` vertices and the ray from the last."""
+
+    s: mi.Point2f  # where the path begins
+    key: mi.UInt32
+    k: mi.UInt32  # zero where nothing was found
+    ray: mi.Ray3f
+    layout: Layout
+    records: Any  # of the path, and one more: of the vertex that sees the edge
+    motion: Callable[[mi.Ray3f], mi.Spectrum]  # zero where nothing was found
+
+
+def edges_backward(walk: Walk, places: Places, found: Edges, W: mi.Spectrum, lost: LostPaths) -> None:
+    """Back-propagate W·motion into the parameters; ``W`` is the adjoint of radiance that arrives at the places."""
+    at = attached_ray(found.ray)
+    with dr.resume_grad():
+        backward(dr.sum(W * found.motion(at)))
+    q = ray_to_camera(walk, places, found, ray_adjoint(at), lost)
+    with dr.resume_grad():
+        ray, _ = places.ray(found.s, found.key)
+        if dr.grad_enabled(ray.o, ray.d):
+            dr.eval(q)  # every parameter of the camera sums over it apart, which would run the loops as often
+            backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
+
+
+@dr.syntax
+def edges_forward(walk: Walk, places: Places, found: Edges) -> mi.Spectrum:
+    """The tangent of the motion, which is that of the radiance at the places. Parameters carry their tangents."""
+    with dr.resume_grad():
+        ray = places.ray(found.s, found.key)[0]
+        δo, δd = tangents(ray.o, ray.d)
+    δ = RayDerivative(mi.Point3f(δo), mi.Vector3f(δd), mi.Float(0))
+    layout, records, k, ray0 = found.layout, found.records, found.k, dr.detach(ray)
+    i = mi.UInt32(0)
+    while dr.hint(i < k, exclude=[walk, layout, ray0], label="pathreplay: towards an edge"):
+        v = read_back(layout, records, i, k, ray0)
+        δ = forward_step(walk, v, True, δ, mi.Bool(True))[3].finite_part()[0]
+        i += 1
+    at = attached_ray(found.ray)
+    with dr.resume_grad():
+        dr.set_grad(at.o, δ.o)
+        dr.set_grad(at.d, δ.d)
+        (δ_motion,) = tangents(found.motion(at))
+    return δ_motion
+
+
+def ray_to_camera(
+    walk: Walk, places: Places, found: Edges, q: RayDerivative, lost: LostPaths, rays_only: bool = False
+) -> RayDerivative:
+    """The adjoint of the camera ray, from that of the ray that sees the edge; ``rays_only``: reaching no parameter."""
+    none, k = mi.Spectrum(0), found.k
+    ray0 = dr.detach(places.ray(found.s, found.key)[0])
+    first, count, last = mi.UInt32(0), mi.UInt32(k), mi.UInt32(k)
+    return walk_back(
+        walk, found.layout, found.records, first, count, last, ray0, none, none, q, lost, rays_only=rays_only
+    )[1]
+
+
+def attached_ray(ray: mi.Ray3f) -> mi.Ray3f:
+    """A copy of a ray, origin and direction of which are variables of their own."""
+    ray = mi.Ray3f(ray)
+    ray.o, ray.d = mi.Point3f(dr.detach(ray.o)), mi.Vector3f(dr.detach(ray.d))
+    with dr.resume_grad():
+        dr.enable_grad(ray.o, ray.d)
+    return ray
+
+
+def ray_adjoint(ray: mi.Ray3f) -> RayDerivative:
+    """What was back-propagated into a ray, where that is finite."""
+    with dr.resume_grad():
+        return RayDerivative(dr.grad(ray.o), dr.grad(ray.d), mi.Float(0)).finite_part()[0]

@@ -1,0 +1,246 @@
+"""Edges on the film: what silhouettes, creases and borders do to an image, seen directly, in mirrors and through glass.
+
+A camera ray and the delta lobes after it slide over what they meet: the place s on the film is fixed, the point that
+is seen is not. At an edge the radiance f(s) jumps, and if the edge moves, an integral over the film changes by the
+jump times the area that is swept. Edges are found by short lines on the film (see `crofton`), and with N of them
+
+    dI/dπ = - Σ K dB/dπ,    K = π/2 · (f_a - f_b) / (l p(c) N) · sgn(w·∂B/∂s) / |∂B/∂s|,
+
+with B(s, π) = 0 on the edge, f_a and f_b the radiances at its two sides, and w the direction from a to b. At an outline
+B = n·(o + t d - z): z is the point of the near surface, glued to it, o + t d the same point on the path, and n normal
+to both edge and ray. Where two surfaces meet, B is the difference of their distances.
+
+Both sides of an edge share their random numbers, and so the lobes before it. Where lobes differ, because they are
+chosen with another probability, there is no edge: that is a choice of the walk.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.path import PathState
+from ..transport.signature import edge_normal, mixed, place_met
+from ..transport.start import CameraStart
+from ..transport.surface import held_point
+from ..transport.vertex import Arrival, Walk
+from .adjoint import LostPaths
+from .counted import Counted
+from .crofton import Crossed, Sight, bisect, search
+from .edges import Edges, Places, attached_ray, ray_adjoint, ray_to_camera
+from .primal import walk_on
+from .record import Layout, record, record_type
+
+MAX_CHAIN = 16
+"""Vertices of a chain of delta lobes, at most."""
+MEETS = 1e-3
+"""Relative difference of two distances, and angle, from which on surfaces meet at an edge."""
+
+
+@dataclass
+class FilmLine:
+    """A line on the film."""
+
+    c: mi.Point2f
+    w: mi.Vector2f  # its direction
+    key: mi.UInt32  # of the random numbers that its paths share
+    begin: mi.Float
+    end: mi.Float
+
+    def at(self, t: mi.Float) -> mi.Point2f:
+        return self.c + t * self.w
+
+
+@dataclass
+class Fork:
+    """Where two chains part that begin close to each other."""
+
+    k: mi.UInt32  # vertices that they share
+    a: Arrival
+    b: Arrival
+    β: mi.Spectrum  # throughput before
+    found: mi.Bool
+
+
+@dataclass
+class FilmCrossing:
+    """An edge on the film, and what the jump there weighs."""
+
+    line: FilmLine
+    s: mi.Point2f  # on its near side
+    k: mi.UInt32  # vertices before
+    near: Arrival
+    far: mi.PreliminaryIntersection3f
+    meets: mi.Bool  # two surfaces meet there
+    n: mi.Vector3f
+    jump: mi.Spectrum  # (f_a - f_b) · π/2 / (l p(c) N)
+    active: mi.Bool
+
+
+def film_edges(
+    walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lines: int, l: float, lost: LostPaths
+) -> Edges:
+    """Find an edge on the film in each lane, by ``lines`` lines of length ``l`` (pixels). Detached."""
+    walk = without_roulette(walk)
+    pick = mi.PCG32(dr.width(lane), initstate=seed, initseq=lane)
+    size = places.size + 2 * l
+
+    def draw(j: mi.UInt32) -> tuple[FilmLine, mi.Bool]:
+        i = lane * lines + j
+        key = mixed(mixed(i, seed), mi.UInt32(0x51ED270B))
+        turn = dr.two_pi * mi.sample_tea_float32(key, mi.UInt32(0x30000))
+        w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
+        return FilmLine(quasi_random(i, seed) * size - l, w, key, mi.Float(-0.5 * l), mi.Float(0.5 * l)), mi.Bool(True)
+
+    def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:
+        return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)
+
+    found = bisect(look, search(draw, look, lines, pick), pick)
+    c = _weighed(walk, places, found, 0.5 * dr.pi * size.x * size.y / (l * dr.width(lane) * lines))
+    layout = Layout.of(walk, True)
+    records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)
+    records, reached = _record_chain(walk, places.ray(c.s, c.line.key)[0], c, layout, records)
+    c = replace(c, active=reached, k=dr.select(reached, c.k, 0))
+
+    edges = Edges(c.s, c.line.key, c.k, c.near.ray, layout, records, lambda ray: mi.Spectrum(_gap(c, ray)))
+    slope = _slope(walk, places, edges, lost)
+    n = dr.norm(slope)
+    K = c.jump * (dr.sign(dr.dot(c.line.w, slope)) / n)
+    K = dr.select(c.active & (n > 0) & dr.all(dr.isfinite(K)), K, 0)
+    return replace(edges, motion=lambda ray: -K * _gap(c, ray))
+
+
+def without_roulette(walk: Walk) -> Walk:
+    """The walk as chains take it: roulette would end paths beside an edge in different places."""
+    return replace(walk, rr_depth=0xFFFFFFFF, max_depth=min(walk.max_depth, MAX_CHAIN))
+
+
+def quasi_random(i: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
+    """The i-th point of the R2 sequence in the unit square (Roberts, 2018), shifted by the seed."""
+    x = i * mi.UInt32(3242174889) + mi.sample_tea_32(seed, mi.UInt32(1))[0]
+    y = i * mi.UInt32(2447445413) + mi.sample_tea_32(seed, mi.UInt32(2))[0]
+    return mi.Point2f(mi.Float(x >> 8), mi.Float(y >> 8)) * 2**-24
+
+
+@dr.syntax
+def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> Sight:
+    """What a path meets from the camera to the first vertex where it is scattered."""
+    numbers = Counted.of(key)
+    path = PathState.begin(walk, CameraStart(ray, numbers, active))
+    sight = Sight.nothing()
+    while dr.hint(path.active, exclude=[walk], label="pathreplay: chain"):
+        here = _sight(walk, path.at, path.active)
+        path.active &= _slides(path.at.hit)
+        u, step = path.choose(walk, numbers)
+        step.active &= step.kept.delta
+        lobe = dr.select(step.active, step.kept.lobe + 1, 0)
+        sight = replace(here, signature=mixed(mixed(sight.signature, here.signature), lobe))
+        path = path.advance(walk, u, step)[0]
+    return sight
+
+
+def _sight(walk: Walk, at: Arrival, active: mi.Bool) -> Sight:
+    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.Minimal, active)
+    return Sight(place_met(walk, at.hit, active), si.p, si.n)
+
+
+def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+    """Whether paths may be reflected or refracted there without being scattered."""
+    return hit.is_valid() & mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Delta)
+
+
+@dr.syntax
+def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: mi.Bool) -> Fork:
+    """Where two chains with the same random numbers part: at the first vertex where they meet different things."""
+    numbers_a, numbers_b = Counted.of(key), Counted.of(key)
+    a = PathState.begin(walk, CameraStart(rays[0], numbers_a, active))
+    b = PathState.begin(walk, CameraStart(rays[1], numbers_b, active))
+    found = active & _sight(walk, a.at, active).differs(_sight(walk, b.at, active))
+    go_on = active & ~found
+    while dr.hint(go_on, exclude=[walk], label="pathreplay: fork"):
+        a.active &= _slides(a.at.hit)
+        b.active &= _slides(b.at.hit)
+        u_a, step_a = a.choose(walk, numbers_a)
+        u_b, step_b = b.choose(walk, numbers_b)
+        both = step_a.active & step_b.active & step_a.kept.delta & step_b.kept.delta
+        both &= step_a.kept.lobe == step_b.kept.lobe
+        step_a.active &= both
+        step_b.active &= both
+        a, b = a.advance(walk, u_a, step_a)[0], b.advance(walk, u_b, step_b)[0]
+        go_on &= a.active & b.active
+        found |= go_on & _sight(walk, a.at, go_on).differs(_sight(walk, b.at, go_on))
+        go_on &= ~found
+    return Fork(a.depth, a.at, b.at, a.β, found)
+
+
+def _weighed(walk: Walk, places: Places, found: Crossed, per_line: float) -> FilmCrossing:
+    """What the jump of radiance is, with the same random numbers on both sides."""
+    line, active = found.line, found.weight > 0
+    ends = line.at(found.a), line.at(found.b)
+    (ray_a, weight), (ray_b, _) = (places.ray(s, line.key) for s in ends)
+    fork = _fork(walk, (ray_a, ray_b), line.key, active)
+    active &= fork.found
+    f = []
+    for side in (fork.a, fork.b):
+        path = PathState(side, mi.Spectrum(1), None, mi.Float(1), mi.UInt32(fork.k), mi.Bool(active))
+        f.append(walk_on(walk, Counted(line.key, mi.UInt32(0x20000)), path)[0])
+    jump = weight * fork.β * (f[0] - f[1]) * (per_line * found.weight)
+
+    t_a, t_b = (dr.select(side.hit.is_valid(), side.hit.t, dr.inf) for side in (fork.a, fork.b))
+    near_a = t_a <= t_b
+    near, far = dr.select(near_a, fork.a, fork.b), dr.select(near_a, fork.b.hit, fork.a.hit)
+    active &= near.hit.is_valid()
+    n = edge_normal(near.hit, near.ray, active)
+    return FilmCrossing(line, dr.select(near_a, *ends), fork.k, near, far, _meet(fork), n, jump, active)
+
+
+def _meet(fork: Fork) -> mi.Bool:
+    """Whether two surfaces meet where paths part, at an angle."""
+    a, b = fork.a, fork.b
+    both = a.hit.is_valid() & b.hit.is_valid()
+    n_a, n_b = (x.hit.compute_surface_interaction(x.ray, mi.RayFlags.Minimal, both).n for x in (a, b))
+    angle = dr.squared_norm(dr.cross(n_a, n_b)) > dr.square(MEETS)
+    return both & angle & (dr.abs(a.hit.t - b.hit.t) < MEETS * dr.minimum(a.hit.t, b.hit.t))
+
+
+def _gap(c: FilmCrossing, ray: mi.Ray3f) -> mi.Float:
+    """B: zero on the edge; differentiable in the ray that arrives, and in the shapes."""
+    z = held_point(c.near.hit, dr.detach(ray), c.active).p
+    t0 = dr.select(c.active, c.near.hit.t, 0)
+    outline = dr.select(c.active, dr.dot(c.n, ray.o + t0 * ray.d - z), 0)
+    both = c.active & c.meets
+    t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, both).t for hit in (c.near.hit, c.far)]
+    return dr.select(both, t[0] - t[1], outline)
+
+
+@dr.syntax
+def _record_chain(walk: Walk, ray: mi.Ray3f, c: FilmCrossing, layout: Layout, records: Any) -> tuple[Any, mi.Bool]:
+    """Record the vertices that the two sides share, and the arrival at the edge after them; whether it was reached."""
+    numbers = Counted.of(c.line.key)
+    path = PathState.begin(walk, CameraStart(ray, numbers, c.active))
+    count = mi.UInt32(0)
+    while dr.hint(path.active & (count <= c.k), exclude=[walk, layout], label="pathreplay: record chain"):
+        u, step = path.choose(walk, numbers)
+        onward, v = path.advance(walk, u, step)
+        records[count] = record(layout, v)
+        path = onward
+        count += 1
+    return records, c.active & (count == c.k + 1)
+
+
+def _slope(walk: Walk, places: Places, edges: Edges, lost: LostPaths) -> mi.Vector2f:
+    """∂B/∂s: how fast the edge is passed on the film. Reaches no parameter."""
+    at = attached_ray(edges.ray)
+    with dr.resume_grad(at.o, at.d):
+        dr.backward(edges.motion(at)[0])
+    q = ray_to_camera(walk, places, edges, ray_adjoint(at), lost, rays_only=True)
+    s = mi.Point2f(dr.detach(edges.s))
+    with dr.resume_grad():
+        dr.enable_grad(s)
+    with dr.resume_grad(s):
+        ray, _ = places.ray(s, edges.key)
+        dr.backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
+        return mi.Vector2f(dr.grad(s))

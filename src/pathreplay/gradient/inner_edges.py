@@ -1,0 +1,291 @@
+"""Edges that points of surfaces see: shadows, and what moves in and out of indirect light.
+
+At a vertex x that scatters, light arrives from a direction ω, which the interior lets move with a velocity V when
+parameters move: it follows the number u that drew it (emitter samples), or the point that it hit (other samples, with
+the share φ, see `velocity`). At an edge the integrand jumps from f_near to f_far, and what V does not follow is
+
+    dJ/dπ = ∫ [f_near (V_edge - V_near) - f_far (V_edge - V_far)]·n dl,        n normal to the edge, from near to far.
+
+One vertex of each camera path is chosen. Edges are found by short lines (see `crofton`) in the unit square of emitter
+samples, where the visibility changes, and by short arcs around samples of the BSDF, where it is another surface that is
+seen. Multiple importance sampling belongs to both integrands, which thus add up. What moves x goes back along the path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.path import PathState
+from ..transport.signature import edge_normal, mixed, place_met
+from ..transport.start import CameraStart
+from ..transport.surface import held_point
+from ..transport.velocity import held_direction, moved_direction
+from ..transport.vertex import Arrival, Walk, is_smooth, mis_weight
+from .counted import Counted
+from .crofton import Sight, bisect, search
+from .edges import Edges, Places
+from .film_edges import quasi_random
+from .primal import walk_on
+from .record import Layout, record, record_type, room_for
+
+BORDER = 1e-4
+"""Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
+
+
+Importance = Callable[..., "mi.Spectrum"]
+
+
+@dataclass
+class Chosen:
+    """The vertex of a camera path that looks for edges."""
+
+    at: Arrival
+    k: mi.UInt32  # vertices before
+    β: mi.Spectrum  # throughput before, over the probability of the choice
+    mass: mi.Float  # by which it was chosen
+    active: mi.Bool
+
+
+@dataclass
+class SquareLine:
+    """A line in the unit square of samples of one emitter."""
+
+    c: mi.Point2f
+    w: mi.Vector2f
+    emitter: mi.EmitterPtr
+    share: mi.Float  # 1 / probability of the emitter
+    begin: mi.Float
+    end: mi.Float
+
+    def at(self, t: mi.Float) -> mi.Point2f:
+        return self.c + t * self.w
+
+
+@dataclass
+class Arc:
+    """A piece of a great circle of directions."""
+
+    c: mi.Vector3f
+    w: mi.Vector3f  # the direction in which it leaves its centre
+    pdf: mi.Float  # density of the centre
+    begin: mi.Float
+    end: mi.Float
+
+    def at(self, t: mi.Float) -> mi.Vector3f:
+        return self.c * dr.cos(t) + self.w * dr.sin(t)
+
+
+@dr.syntax
+def choose_vertex(
+    walk: Walk, numbers: Counted, ray: mi.Ray3f, W: mi.Spectrum, layout: Layout, records: Any
+) -> tuple[Any, Chosen]:
+    """Record a camera path, and choose one of the vertices that scatter smoothly, by what they count."""
+    path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))
+    chosen = Chosen(path.at, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), mi.Bool(False))
+    mass = mi.Float(0)
+    count = mi.UInt32(0)
+    while dr.hint(path.active, exclude=[walk, layout, W], label="pathreplay: choose a vertex"):
+        here = path.at.hit.is_valid() & is_smooth(path.at.hit.shape.bsdf()) & (path.depth + 1 < walk.max_depth)
+        m = dr.select(path.active & here, dr.mean(dr.abs(path.β * W)), 0)
+        mass += m
+        take = (m > 0) & (numbers.next_1d() * mass < m)
+        chosen = dr.select(take, Chosen(path.at, count, path.β, m, mi.Bool(True)), chosen)
+        u, step = path.choose(walk, numbers)
+        onward, v = path.advance(walk, u, step)
+        records[count] = record(layout, v)
+        path = onward
+        count += 1
+    chosen.β *= mass / dr.maximum(chosen.mass, dr.smallest(mi.Float))
+    return records, chosen
+
+
+@dataclass
+class Shaded:
+    """A crossing in the square of an emitter: where the lit side ends."""
+
+    line: SquareLine
+    u: mi.Point2f  # at the side in the shadow
+    hit: mi.PreliminaryIntersection3f  # of what casts it
+    ray: mi.Ray3f
+    n: mi.Vector3f
+    K: mi.Spectrum
+    active: mi.Bool
+
+
+def emitter_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick: mi.PCG32) -> Shaded:
+    """Find the edge of a shadow among the samples of an emitter, and weigh it. Detached."""
+    scene = walk.scene
+    si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
+
+    def draw(j: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
+        numbers = Counted(key, 8 * j)
+        index, share, _ = scene.sample_emitter(numbers.next_1d())
+        turn = dr.two_pi * numbers.next_1d()
+        c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(dr.cos(turn), dr.sin(turn))
+        begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)
+        for axis in range(2):  # the part that is inside
+            cuts = (BORDER - c[axis]) / w[axis], (1 - BORDER - c[axis]) / w[axis]
+            begin, end = dr.maximum(begin, dr.minimum(*cuts)), dr.minimum(end, dr.maximum(*cuts))
+        inside = x.active & (begin < end)
+        emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, x.active)
+        begin, end = dr.select(inside, begin, 0), dr.select(inside, end, 0)
+        return SquareLine(c, w, emitter, share, begin, end), inside
+
+    def shadowed(line: SquareLine, t: mi.Float, active: mi.Bool) -> tuple[Any, ...]:
+        light, Le = line.emitter.sample_direction(si, line.at(t), active)
+        ray = si.spawn_ray_to(light.p)
+        lit = active & (light.pdf != 0)
+        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=lit)
+        # A lamp's own limb hides it by rounding only.
+        hidden = lit & hit.is_valid() & (hit.shape.emitter() != light.emitter)
+        return light, Le, ray, hit, hidden
+
+    def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
+        return Sight(mi.UInt32(shadowed(line, t, active)[-1]), mi.Point3f(0), mi.Normal3f(0))
+
+    found = bisect(look, search(draw, look, lines, pick), pick)
+    line, active = found.line, found.weight > 0
+    a_hidden = shadowed(line, found.a, active)[-1]
+    light, Le, *_ = shadowed(line, dr.select(a_hidden, found.b, found.a), active)
+    t = dr.select(a_hidden, found.a, found.b)
+    _, _, ray, hit, hidden = shadowed(line, t, active)
+    active &= hidden
+    f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
+    density = light.pdf / line.share
+    F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density, pdf))
+    K = 0.5 * dr.pi * dr.square(1 + l) / (l * lines) * found.weight * F * dr.select(a_hidden, -1, 1)
+    return Shaded(line, line.at(t), hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
+
+
+def shadow_gap(x: Chosen, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
+    """B: distance of the line to the emitter sample from the edge; differentiable in all that moves."""
+    si = x.at.hit.compute_surface_interaction(at, mi.RayFlags.All, c.active)
+    light, _ = c.line.emitter.sample_direction(si, u, c.active)
+    z = held_point(c.hit, dr.detach(c.ray), c.active).p
+    return dr.select(c.active, dr.dot(c.n, si.p + dr.select(c.active, c.hit.t, 0) * light.d - z), 0)
+
+
+def shadow_weight(x: Chosen, c: Shaded) -> mi.Spectrum:
+    """K in full: with the derivative of B along the line."""
+    with dr.resume_grad():
+        u = mi.Point2f(dr.detach(c.u))
+        dr.enable_grad(u)
+    with dr.resume_grad(u):
+        dr.backward(shadow_gap(x, c, x.at.ray, u))
+        slope = mi.Vector2f(dr.grad(u))
+    n = dr.norm(slope)
+    K = c.K * (dr.sign(dr.dot(c.line.w, slope)) / n)
+    return dr.select(c.active & dr.all(dr.isfinite(K)) & (n > 0), K, 0)
+
+
+@dataclass
+class Hiding:
+    """A crossing on an arc: one surface hides another."""
+
+    near: mi.PreliminaryIntersection3f
+    far: mi.PreliminaryIntersection3f  # may be none
+    d_near: mi.Vector3f
+    d_far: mi.Vector3f
+    n: mi.Vector3f  # from near to far
+    K_near: mi.Spectrum
+    K_far: mi.Spectrum
+    active: mi.Bool
+
+
+def arc_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick: mi.PCG32) -> Hiding:
+    """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides. Detached."""
+    scene, ctx = walk.scene, mi.BSDFContext()
+    si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
+
+    def draw(j: mi.UInt32) -> tuple[Arc, mi.Bool]:
+        numbers = Counted(key, 0x100 + 8 * j)
+        sample, _ = si.bsdf().sample(ctx, si, numbers.next_1d(), numbers.next_2d(), x.active)
+        ok = x.active & (sample.pdf > 0) & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        c = dr.select(ok, si.to_world(sample.wo), mi.Vector3f(0, 0, 1))
+        turn = dr.two_pi * numbers.next_1d()
+        w = mi.Frame3f(c).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
+        return Arc(c, w, dr.select(ok, sample.pdf, 1), mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
+
+    def hit(d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
+        ray = si.spawn_ray(d)
+        return ray, scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+
+    def look(line: Arc, t: mi.Float, active: mi.Bool) -> Sight:
+        ray, seen = hit(line.at(t), active)
+        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        return Sight(place_met(walk, seen, active, facets=False), at.p, at.n)
+
+    found = bisect(look, search(draw, look, lines, pick), pick)
+    line, active = found.line, found.weight > 0
+    ray_a, a = hit(line.at(found.a), active)
+    ray_b, b = hit(line.at(found.b), active)
+    t_a, t_b = (dr.select(h.is_valid(), h.t, dr.inf) for h in (a, b))
+    near_a = t_a <= t_b
+    near, far = dr.select(near_a, a, b), dr.select(near_a, b, a)
+    ray_near, ray_far = dr.select(near_a, ray_a, ray_b), dr.select(near_a, ray_b, ray_a)
+    active &= near.is_valid()
+
+    n = edge_normal(near, ray_near, active)
+    n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
+    f, pdf = si.bsdf().eval_pdf(ctx, si, si.to_local(ray_far.d), active)
+    common = x.β * f * (0.5 * dr.pi / (l * lines) * found.weight / line.pdf)
+    active &= dr.any(common != 0)
+    K = []
+    for ray, seen in ((ray_near, near), (ray_far, far)):
+        arrival = Arrival(ray, seen, pdf, mi.Bool(False), mi.Bool(False))
+        path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), x.k + 1, active & (x.k + 1 < walk.max_depth))
+        L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
+        K.append(dr.select(active, common * L, 0))
+    return Hiding(near, far, ray_near.d, ray_far.d, n, K[0], K[1], active)
+
+
+def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
+    """What the edge sweeps that the directions at its sides do not follow; differentiable in all that moves."""
+    si = x.at.hit.compute_surface_interaction(at, mi.RayFlags.All, c.active)
+    lengths = walk.traits.tables.blend_lengths
+    edge = held_direction(si, c.d_near, c.near, c.active)
+    d_near, _ = moved_direction(lengths, si, c.d_near, c.near, c.active)
+    d_far, _ = moved_direction(lengths, si, c.d_far, c.far, c.active)
+    swept = c.K_near * dr.dot(c.n, edge - d_near) - c.K_far * dr.dot(c.n, edge - d_far)
+    return dr.select(c.active, swept, 0)
+
+
+def inner_edges(
+    walk: Walk,
+    places: Places,
+    lane: mi.UInt32,
+    seed: mi.UInt32,
+    lines: int,
+    lengths: tuple[float, float],
+    W: Importance,
+) -> Edges:
+    """Find an edge that a vertex sees in each lane, by ``lines`` lines of each kind. Detached.
+
+    ``lengths`` are those in the square and on the sphere (radians). ``W`` (place, ray) -> Spectrum is what light counts
+    that arrives at a place of the film: it decides which paths are worth looking at.
+    """
+    key = mixed(mixed(lane, seed), mi.UInt32(0x2545F491))
+    pick = mi.PCG32(dr.width(lane), initstate=seed + 1, initseq=lane)
+    s = quasi_random(lane, seed) * places.size
+    ray0, weight = dr.detach(places.ray(s, key))
+    layout = Layout.of(walk, True)
+    records = dr.alloc_local(record_type(layout), room_for(walk))
+    β = weight * (places.size.x * places.size.y / dr.width(lane))
+    records, x = choose_vertex(walk, Counted.of(key), ray0, W(s, ray0), layout, records)
+    x.β *= β
+
+    square, arc = lengths
+    shaded = emitter_edges(walk, x, lines, square, key ^ 0x1B873593, pick)
+    K = shadow_weight(x, shaded)
+    hiding = arc_edges(walk, x, lines, arc, key ^ 0x38B34AE5, pick)
+
+    def motion(ray: mi.Ray3f) -> mi.Spectrum:
+        return hiding_motion(walk, x, hiding, ray) - K * shadow_gap(x, shaded, ray, shaded.u)
+
+    k = dr.select(x.active, x.k, 0)
+    return Edges(s, key, k, x.at.ray, layout, records, motion)

@@ -1,0 +1,107 @@
+"""Places on the film of a pass: their camera rays, what an adjoint image wants of them, and how they make an image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import integrate
+
+from ..gradient.counted import Counted
+from .camera_pass import Pass
+
+QUADRATURE = 4097
+"""Points of the integral over a filter."""
+
+
+@dataclass(frozen=True)
+class FilmPlaces:
+    """The part of a film that paths begin in: its crop window, and its border where it samples one. See `Places`."""
+
+    view: Pass
+    corner: mi.ScalarPoint2f  # in the film's pixels
+    size: mi.ScalarVector2f
+
+    @staticmethod
+    def of(view: Pass) -> FilmPlaces:
+        film = view.sensor.film()
+        border = film.rfilter().border_size() if film.sample_border() else 0
+        corner = mi.ScalarPoint2f(film.crop_offset()) - border
+        return FilmPlaces(view, corner, mi.ScalarVector2f(film.crop_size()) + 2 * border)
+
+    def ray(self, s: mi.Point2f, key: mi.UInt32) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """The camera ray through a place, and its weight: see `Places`."""
+        sensor, film, numbers = self.view.sensor, self.view.sensor.film(), Counted(key, mi.UInt32(0x40000))
+        place = (self.corner + s - mi.ScalarPoint2f(film.crop_offset())) / mi.ScalarVector2f(film.crop_size())
+        time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
+        wavelength, aperture = numbers.next_1d(), numbers.next_2d()
+        ray, weight = sensor.sample_ray(time, wavelength, place, aperture)
+        return mi.Ray3f(ray), dr.detach(weight)
+
+    def importance(self, grad_in: mi.TensorXf, s: mi.Point2f, wavelengths: mi.Spectrum) -> mi.Spectrum:
+        """What ``grad_in``, the adjoint of the image, wants of radiance at places, per pixel of film; outside nothing.
+
+        W(s) = Σ_j g_j h_j(s) / ∫ h_j, with the filter h_j of pixel j.
+        """
+        inside = dr.all((s >= 0) & (s < self.size))
+        with dr.resume_grad():
+            raw = self._block()
+            pixels = mi.TensorXf(raw.tensor())
+            dr.enable_grad(pixels)
+            image = self._developed(pixels)
+            dr.set_grad(image, grad_in)
+            dr.enqueue(dr.ADMode.Backward, image)
+            dr.traverse(dr.ADMode.Backward)
+            wanted = dr.grad(pixels)
+            L = dr.full(mi.Spectrum, 1.0, dr.width(s))
+            dr.enable_grad(L)
+            block = self._block()
+            self._put(block, s, L, wavelengths)
+            made = block.tensor()
+            dr.set_grad(made, wanted)
+            dr.enqueue(dr.ADMode.Backward, made)
+            dr.traverse(dr.ADMode.Backward)
+            return dr.select(inside, dr.grad(L), 0)
+
+    def image(self, s: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
+        """The image that radiances make which arrive at places, each for a pixel's area of film."""
+        block = self._block()
+        self._put(block, s, dr.select(dr.all((s >= 0) & (s < self.size)), L, 0), wavelengths)
+        return self._developed(block.tensor())
+
+    def _block(self) -> mi.ImageBlock:
+        film = self.view.sensor.film()
+        film.prepare([])
+        return film.create_block()
+
+    def _put(self, block: mi.ImageBlock, s: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> None:
+        if mi.is_spectral:
+            rgb = mi.spectrum_to_srgb(L, wavelengths)
+        else:
+            rgb = mi.Color3f(L.x if mi.is_monochromatic else L)
+        alpha = [mi.Float(0)] * (block.channel_count() - 4)
+        block.put(self.corner + s, [rgb.x, rgb.y, rgb.z, *alpha, mi.Float(0)])
+
+    def _developed(self, pixels: mi.TensorXf) -> mi.TensorXf:
+        """The image of a block without weights: those of its pixels are ∫ h_j."""
+        film, block = self.view.sensor.film(), self._block()
+        whole = mi.TensorXf(self._weights(block).ravel(), pixels.shape) + pixels
+        film.put_block(mi.ImageBlock(whole, block.offset(), film.rfilter(), block.has_border()))
+        return film.develop()
+
+    def _weights(self, block: mi.ImageBlock) -> np.ndarray:
+        """∫ h_j over the places, in the last of a block's channels; zero in the others."""
+        rfilter, border = self.view.sensor.film().rfilter(), block.border_size()
+        x = np.linspace(-rfilter.radius(), rfilter.radius(), QUADRATURE)
+        h = np.ones(QUADRATURE) if rfilter.is_box_filter() else rfilter.eval(mi.Float(x)).numpy()
+        until = integrate.cumulative_trapezoid(h, x, initial=0)
+        sides = []
+        for axis in range(2):
+            pixel = np.arange(block.size()[axis] + 2 * border) + block.offset()[axis] - border + 0.5
+            begin, end = self.corner[axis], self.corner[axis] + self.size[axis]
+            sides.append(np.interp(end - pixel, x, until) - np.interp(begin - pixel, x, until))
+        weights = np.zeros((len(sides[1]), len(sides[0]), block.channel_count()), np.float32)
+        weights[..., -1] = np.outer(sides[1], sides[0])
+        return weights

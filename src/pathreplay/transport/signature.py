@@ -1,0 +1,68 @@
+"""Signature: what tells paths apart that have an edge between them, and which way that edge lies."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .vertex import Walk
+
+# Cosine between ray and normal of a cylinder below which an edge is its limb rather than its rim.
+GRAZING = 0.05
+
+
+def place_met(walk: Walk, hit: mi.PreliminaryIntersection3f, active: mi.Bool, facets: bool = True) -> mi.UInt32:
+    """What a ray met, as a number: 0 for nothing, else one for each shape, copy of a shape, and facet of a flat mesh.
+
+    A mesh with vertex normals shades as if it were smooth: it has no facets.
+    """
+    met = active & hit.is_valid()
+    shape = dr.reinterpret_array(mi.UInt32, hit.shape)
+    place = mixed(shape, dr.reinterpret_array(mi.UInt32, hit.instance))
+    if facets:
+        faceted = dr.gather(mi.Bool, walk.traits.tables.faceted, shape, met)
+        place = mixed(place, dr.select(faceted, hit.prim_index + 1, 0))
+    return dr.select(met, place | 1, 0)
+
+
+def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:
+    """A number for a pair of numbers (Knuth's multiplicative hashing)."""
+    h = (h ^ x) * mi.UInt32(0x9E3779B1)
+    return h ^ (h >> 15)
+
+
+def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
+    """A unit vector normal to the ray and to the border of the shape that it just met, on which the hit all but lies.
+
+    On meshes the nearest side of the triangle, on rectangles and disks the rim, elsewhere the limb (on cylinders
+    the nearer of the two). Detached.
+    """
+    with dr.suspend_grad():
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        kind = hit.shape.shape_type()
+        on_mesh = active & hit.shape.is_mesh()
+        square, disk = kind == int(mi.ShapeType.Rectangle), kind == int(mi.ShapeType.Disk)
+        limb = dr.abs(dr.dot(si.n, ray.d)) < GRAZING
+        rim = disk | ((kind == int(mi.ShapeType.Cylinder)) & ~limb)
+        # Distance to the sides u = 0, 1 and v = 0, 1.
+        to_u = dr.minimum(si.uv.x, 1 - si.uv.x) * dr.norm(si.dp_du)
+        to_v = dr.minimum(si.uv.y, 1 - si.uv.y) * dr.norm(si.dp_dv)
+        side = dr.select(to_u < to_v, si.dp_dv, si.dp_du)
+        side = dr.select(on_mesh, _nearest_side(hit, ray, on_mesh), dr.select(square, side, si.dp_dv))
+        straight = on_mesh | square | rim
+        return dr.normalize(dr.select(straight, dr.cross(side, ray.d), si.n - dr.dot(si.n, ray.d) * ray.d))
+
+
+def _nearest_side(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
+    corners = []
+    for uv in ((0, 0), (1, 0), (0, 1)):
+        corner = mi.PreliminaryIntersection3f(hit)
+        corner.prim_uv = mi.Point2f(*uv)
+        flags = mi.RayFlags.FollowShape | mi.RayFlags.Minimal
+        corners.append(corner.compute_surface_interaction(ray, flags, active).p)
+    a, b, c = corners
+    sides = (c - b, c - a, b - a)  # facing a, b, c
+    weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
+    heights = [dr.abs(w) * dr.rcp(dr.norm(side)) for w, side in zip(weights, sides, strict=True)]  # x 2 areas
+    nearest = dr.select(heights[1] < heights[2], sides[1], sides[2])
+    return dr.select(heights[0] < dr.minimum(heights[1], heights[2]), sides[0], nearest)
