@@ -274,7 +274,7 @@ def report() -> doctor.DoctorReport:
 
 def test_the_doctor_finds_that_this_machine_works(report: doctor.DoctorReport) -> None:
     assert report.works
-    assert report.mitsuba == mi.__version__ and report.pathreplay == pathreplay.__version__
+    assert report.mitsuba == mi.__version__
     verdicts = {variant.name: variant for variant in report.variants}
     assert verdicts["llvm_ad_rgb"].works, verdicts["llvm_ad_rgb"].message
     assert not any("polarized" in name or "scalar" in name for name in verdicts)
@@ -297,4 +297,5 @@ def test_the_doctor_without_any_libllvm_says_how_to_get_one(monkeypatch: pytest.
 def test_the_report_never_wraps_a_path(report: doctor.DoctorReport, capsys: pytest.CaptureFixture[str]) -> None:
     path = "/a/[long]/" + "x" * 300 + "/libLLVM.so.23.1"
     replace(report, libraries=(LlvmLibrary(path, "pip", "23.1.4", True, ""),)).print()
-    assert any(path in line for line in capsys.readouterr().out.splitlines())
+    lines = capsys.readouterr().out.splitlines()
+    assert any(path in line for line in lines) and f"  pathreplay {pathreplay.__version__}," in lines[1]

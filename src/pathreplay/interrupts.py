@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-Handler = Callable[[int, FrameType | None], Any]
-
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 # Two signals that are closer than this are one wish to end: the second may not disturb what the first one set going.
@@ -32,8 +30,8 @@ def raise_once(error: BaseException) -> None:
 class Interrupted(KeyboardInterrupt):
     """A signal ended the command. ``number`` is the signal's."""
 
-    def __init__(self, number: int, message: str = "") -> None:
-        super().__init__(message or f"ended by {name_of(number)}")
+    def __init__(self, number: int) -> None:
+        super().__init__(f"ended by {name_of(number)}")
         self.number = number
 
 
@@ -43,7 +41,7 @@ def name_of(number: int) -> str:
 
 
 @contextmanager
-def handled(handle: Handler, keep: Callable[[], bool] = lambda: False) -> Iterator[None]:
+def handled(handle: Callable[[int, FrameType | None], Any], keep: Callable[[], bool] = lambda: False) -> Iterator[None]:
     """Within this block ``handle`` gets the signals of `ENDING`; in threads other than the main one nothing happens.
 
     SIGTERM and SIGHUP stay ignored where the parent process ignores them (nohup). Handlers come back at the end,
@@ -95,9 +93,3 @@ def undisturbed() -> Iterator[None]:
     finally:
         for number in late:
             signal.raise_signal(number)
-
-
-def ignored() -> None:
-    """From now on the signals do nothing: the process is at its end."""
-    for number in ENDING:
-        signal.signal(number, signal.SIG_IGN)
