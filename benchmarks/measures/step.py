@@ -12,8 +12,7 @@ import numpy as np
 
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import make_config
-from pathreplay.inverse.evaluate import Evaluator
-from pathreplay.inverse.executor import Local
+from pathreplay.inverse.evaluate import Evaluator, Local
 from pathreplay.inverse.loop import take_step
 from pathreplay.inverse.losses import l2
 from pathreplay.inverse.optimiser import Adam

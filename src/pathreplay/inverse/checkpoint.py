@@ -14,7 +14,7 @@ import safetensors.numpy
 from pydantic import ConfigDict, Field, NonNegativeInt, TypeAdapter, ValidationError
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.executor import Executor
+from pathreplay.inverse.evaluate import Executor
 from pathreplay.inverse.grids import Levels
 from pathreplay.inverse.optimiser import Optimiser, State
 from pathreplay.inverse.values import Array, Arrays

@@ -1,11 +1,11 @@
-"""The loss of a problem and its gradient as a function of values and shard; the scene is a device that computes it."""
+"""The loss of a problem and its gradient as a function of values and shard, and who computes them, and where."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -59,6 +59,28 @@ def total(evaluations: Sequence[Evaluation]) -> Evaluation:
         sum(each.dropped for each in evaluations),
         evaluations[-1].learned,
     )
+
+
+class Executor(Protocol):
+    """Evaluates the shards of an iteration. Results come in the order of the shards, whoever was ready first."""
+
+    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
+        """One evaluation for each shard, in their order; the last one has learned from all of them."""
+
+
+class Local:
+    """In this process, one after the other; each knows what those before it have learned."""
+
+    def __init__(self, evaluate: Evaluate) -> None:
+        self.evaluate = evaluate
+
+    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
+        """See `Executor`."""
+        found: list[Evaluation] = []
+        for shard in shards:
+            found.append(self.evaluate(values, shard, learned))
+            learned = found[-1].learned
+        return found
 
 
 class Evaluator:

@@ -14,8 +14,7 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config
-from pathreplay.inverse.evaluate import Evaluator, Shard, total
-from pathreplay.inverse.executor import Local
+from pathreplay.inverse.evaluate import Evaluator, Local, Shard, total
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.optimiser import Adam
