@@ -11,7 +11,7 @@ import pytest
 
 from pathreplay.inverse import make_config
 from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard, total
-from pathreplay.inverse.loop import Event, Refined, Started, Stepped, Stopped, iterate, new_run, take_step
+from pathreplay.inverse.loop import Refined, Started, Stepped, Stopped, iterate, new_run, take_step
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.stopping import Stop
 from pathreplay.threads import one_thread
@@ -121,12 +121,7 @@ def test_observers_hear_of_everything_in_order() -> None:
     grid = [{"key": TEXTURE, "initial": 0.5, "resolutions": [2, 4], "refine_at": [2]}]
     config = make_config({**JOB, "iterations": 3, "parameters": grid})
     problem = build_problem(config, Path.cwd())
-    run, heard = new_run(problem, problem.integrator), []
-
-    class Listener:
-        def observe(self, event: Event) -> None:
-            heard.append(event)
-
-    iterate(problem, config, run, Stop(), [Listener()])
+    run = new_run(problem, problem.integrator)
+    heard = list(iterate(problem, config, run, Stop()))
     first, second, third = (Stepped(entry) for entry in run.history)
     assert heard == [Started(0, 3), first, second, Refined(TEXTURE, (4, 4, 3)), third, Stopped(3)]

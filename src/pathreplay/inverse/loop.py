@@ -1,11 +1,10 @@
-"""The optimisation loop: evaluate, step, project; interruptible and resumable, and what observers hear of it."""
+"""The optimisation loop: evaluate, step, project; interruptible and resumable, and what it tells of itself."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -61,34 +60,21 @@ class Stopped:
 Event = Started | Refined | Stepped | Stopped
 
 
-class Observer(Protocol):
-    """Hears of everything in the order in which it happens; what it raises ends the run."""
-
-    def observe(self, event: Event) -> None:
-        """Called between iterations."""
-
-
 def new_run(problem: Problem, integrator: mi.Integrator, record: bool = True) -> Run:
     """A run at the problem's start values, in this process."""
     values = {v.key: get_array(to_value(v.like, v.start)) for v in problem.variables}
     return Run(Local(Evaluator(problem, integrator, record)), Adam(values), values)
 
 
-def iterate(problem: Problem, config: Config, run: Run, stop: Stop, observers: Sequence[Observer]) -> None:
-    """Take steps from ``len(run.history)`` to ``config.iterations``, and tell of them.
+def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
+    """Take steps from ``len(run.history)`` to ``config.iterations``; yields what happens, for observers.
 
     After each step the run's rival takes as many as bring it to the same number of seconds. Taking turns, both have the
     same share of a machine whose load changes. Its learning rate and resolutions are those of the job's iteration.
     """
-
-    def tell(event: Event) -> None:
-        for observer in observers:
-            observer.observe(event)
-
-    tell(Started(len(run.history), config.iterations))
+    yield Started(len(run.history), config.iterations)
     for i in range(len(run.history), config.iterations):
-        for refined in take_step(problem, config, run, i):
-            tell(refined)
+        yield from take_step(problem, config, run, i)
         if rival := run.rival:
             while rival.seconds() < run.seconds():
                 take_step(problem, config, rival, i)
@@ -96,10 +82,10 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop, observers: S
                 for each in (run, rival):
                     error = judged(problem, config, each.values, i)
                     each.history[-1] = replace(each.history[-1], picture_error=error)
-        tell(Stepped(run.history[-1]))
+        yield Stepped(run.history[-1])
         if stop.wanted():
             break
-    tell(Stopped(len(run.history)))
+    yield Stopped(len(run.history))
 
 
 def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Refined]:

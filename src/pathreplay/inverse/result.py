@@ -11,13 +11,13 @@ import numpy as np
 import safetensors.numpy
 
 from pathreplay.inverse.checkpoint import Entry, Run
-from pathreplay.inverse.config import Config
 from pathreplay.inverse.file_names import file_names
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes
 from pathreplay.inverse.outcome import Outcome, Recovered, RecoveredPose, ViewPictures, resume_command
 from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.problem import Problem, scene_values, variables_of
 from pathreplay.inverse.report import report_files
+from pathreplay.inverse.run_folder import Job
 from pathreplay.inverse.values import Array
 from pathreplay.media.volume_files import vol_bytes
 from pathreplay.scenes.parameters import get_array, to_value
@@ -67,8 +67,7 @@ class RunResult:
 
 
 def outcome_of(
-    config: Config,
-    source: Path | None,
+    job: Job,
     folder: Path,
     problem: Problem,
     run: Run,
@@ -92,7 +91,7 @@ def outcome_of(
         for v in problem.variables
         if v.key not in parts
     )
-    return Outcome(config, source, folder, views, recovered, poses, run, values, problem.notes)
+    return Outcome(job.config, job.source, folder, views, recovered, poses, run, values, problem.notes)
 
 
 def result_files(outcome: Outcome) -> dict[str, bytes]:

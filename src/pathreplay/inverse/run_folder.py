@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -23,11 +24,20 @@ CHECKPOINT = "checkpoint.safetensors"
 RIVAL_CHECKPOINT = "rival/checkpoint.safetensors"
 
 
-class RunFolder:
-    """A folder that belongs to one run, and is locked until `close`. ``origin`` is where paths of its config start."""
+@dataclass(frozen=True)
+class Job:
+    """What a run does, the file that says so (None where Python does), and the folder where its paths start."""
 
-    def __init__(self, path: Path, origin: Path) -> None:
-        self.path, self.origin = path, origin
+    config: Config
+    source: Path | None
+    base: Path
+
+
+class RunFolder:
+    """A folder that belongs to one run, and is locked until `close`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
         self.lock = FolderLock(path)
         self.identity = _identity(path)
 
@@ -99,23 +109,21 @@ class RunFolder:
         return f"Run folder {self.path} cannot be written ({error.strerror}): mend that, {rescue}"
 
 
-def create_run_folder(
-    output: Path, config: Config, source: Path | None, base: Path, files: Mapping[str, bytes]
-) -> RunFolder:
+def create_run_folder(output: Path, job: Job, files: Mapping[str, bytes]) -> RunFolder:
     """Make ``output``, or ``output-2``, ``-3``, … where that exists, and put the job and its first files into it.
 
     The config is copied as it was written (``config.toml``), or as JSON where it came from Python. What fails leaves no
     folder behind. Raises PathreplayError where the folder cannot be made or written.
     """
-    if source is not None and source.suffix != ".json":
-        copy = {"config.toml": source.read_bytes()}
+    if job.source is not None and job.source.suffix != ".json":
+        copy = {"config.toml": job.source.read_bytes()}
     else:
-        copy = {"config.json": config.model_dump_json(indent=2, exclude_unset=True).encode()}
-    origin = {"base": str(base.resolve()), "config": None if source is None else str(source)}
+        copy = {"config.json": job.config.model_dump_json(indent=2, exclude_unset=True).encode()}
+    origin = {"base": str(job.base.resolve()), "config": None if job.source is None else str(job.source)}
     with undisturbed(), contextlib.ExitStack() as undo:
         path = _make_new(output)
         undo.callback(shutil.rmtree, path, ignore_errors=True)
-        run = RunFolder(path, base.resolve())
+        run = RunFolder(path)
         undo.callback(run.close)
         run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
         undo.pop_all()
@@ -135,8 +143,8 @@ class _Origin(BaseModel):
     config: str | None
 
 
-def open_run_folder(path: Path) -> tuple[RunFolder, Config, str | None]:
-    """An existing run folder, locked; its job, and the config path that it was started with.
+def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
+    """The job of an existing run folder, and that folder, locked.
 
     Raises PathreplayError if it is no run folder, holds no checkpoint to go on from, is damaged, or is in use.
     """
@@ -155,8 +163,8 @@ def open_run_folder(path: Path) -> tuple[RunFolder, Config, str | None]:
     except (OSError, ValueError) as error:
         what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
         raise PathreplayError(f"{path / 'run.json'} cannot be used ({what}); start the job from its config") from None
-    config = load_config(copy)
-    return RunFolder(path, Path(origin.base)), config, origin.config
+    job = Job(load_config(copy), None if origin.config is None else Path(origin.config), Path(origin.base))
+    return job, RunFolder(path)
 
 
 def default_output(source: Path | None) -> Path:
