@@ -9,11 +9,11 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from pathreplay.interrupts import Stop
 from pathreplay.inverse import make_config
 from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard, total
 from pathreplay.inverse.loop import Refined, Started, Stepped, Stopped, iterate, new_run, take_step
 from pathreplay.inverse.problem import Problem, build_problem
-from pathreplay.inverse.stopping import Stop
 from pathreplay.threads import one_thread
 from test_deterministic import CLOUD
 from test_inverse_run import JOB, TEXTURE, room  # noqa: F401 (room: its folder, for every test)

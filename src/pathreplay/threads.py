@@ -6,9 +6,6 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 import drjit as dr
-import mitsuba as mi
-
-from pathreplay.errors import PathreplayError
 
 
 def spare_thread() -> AbstractContextManager[None]:
@@ -28,15 +25,6 @@ def one_thread(wanted: bool) -> AbstractContextManager[None]:
     Mitsuba's may be read or written in the block: see `spare_thread`.
     """
     return _threads(1 if wanted else dr.thread_count())
-
-
-def require_one_thread_possible() -> None:
-    """Raise PathreplayError where the active variant runs on a GPU, whose threads cannot be told to be one."""
-    if not mi.variant().startswith("llvm"):
-        raise PathreplayError(
-            f"deterministic = true needs an LLVM variant, this is '{mi.variant()}': on a GPU the order of additions "
-            "is random; set variant = 'llvm_ad_rgb', or leave 'deterministic' out"
-        )
 
 
 @contextmanager

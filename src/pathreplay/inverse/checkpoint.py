@@ -127,17 +127,14 @@ def _read(
     for name, array in tensors.items():
         if not np.isfinite(array).all():
             raise ValueError(f"'{name}' holds NaN or infinite values")
-    for key, value in values.items():
-        # Optimisers begin anew on a grid that was refined.
-        if steps[key] > len(history) or (steps[key] < len(history) and levels[key] is None):
-            raise ValueError(f"{steps[key]} steps of '{key}' in {len(history)} iterations")
-        _require_like(tensors[_VALUE + key], key, value, levels[key])
     found = {key: tensors.pop(_VALUE + key) for key in values}
+    for key, value in values.items():
+        grid, array = levels[key], found[key]
+        # Optimisers begin anew on a grid that was refined.
+        if steps[key] > len(history) or (steps[key] < len(history) and grid is None):
+            raise ValueError(f"{steps[key]} steps of '{key}' in {len(history)} iterations")
+        shapes = [value.shape] if grid is None else list(grid.shapes)
+        if array.dtype != value.dtype or array.shape not in shapes:
+            raise ValueError(f"'{key}' is {array.dtype} of shape {array.shape}, in the job {value.dtype} of {shapes}")
     learned = {name.removeprefix(_LEARNED): tensors.pop(name) for name in list(tensors) if name.startswith(_LEARNED)}
     return found, State(steps, tensors), history, learned
-
-
-def _require_like(found: Array, key: str, value: Array, levels: Levels | None) -> None:
-    shapes = [value.shape] if levels is None else list(levels.shapes)
-    if found.dtype != value.dtype or found.shape not in shapes:
-        raise ValueError(f"'{key}' is {found.dtype} of shape {found.shape}, in the job {value.dtype} of {shapes}")

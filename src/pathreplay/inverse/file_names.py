@@ -17,16 +17,11 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
     Letters, digits, ``_``, ``.`` and ``-`` stay, other characters become ``_``. A name that is too long is cut. Where
     two names would meet, or one was cut, a short hash of the name follows.
     """
-    given = list(dict.fromkeys(names))
-    safe = {name: re.sub(r"[^\w.-]", "_", name) for name in given}
+    safe = {name: re.sub(r"[^\w.-]", "_", name) for name in names}
     # Some file systems ignore capitals: casefold.
     met = Counter(text.casefold() for text in safe.values())
-    return {name: _marked(name, text) if met[text.casefold()] > 1 else _cut(name, text) for name, text in safe.items()}
-
-
-def _cut(name: str, text: str) -> str:
-    return text if len(text.encode()) <= LONGEST else _marked(name, text)
-
-
-def _marked(name: str, text: str) -> str:
-    return f"{text.encode()[:LONGEST].decode(errors='ignore')}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    for name, text in safe.items():
+        cut = text.encode()[:LONGEST].decode(errors="ignore")
+        if met[text.casefold()] > 1 or cut != text:
+            safe[name] = f"{cut}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return safe

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
-from pathreplay.interrupts import undisturbed
+from pathreplay.interrupts import Stop, stopping, undisturbed
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.images import Image
@@ -28,9 +28,8 @@ from pathreplay.inverse.run_folder import (
     require_output,
 )
 from pathreplay.inverse.saving import Saving, first_files, go_on, saved_targets
-from pathreplay.inverse.stopping import Stop, stopping
 from pathreplay.scenes.loading import told
-from pathreplay.threads import one_thread, require_one_thread_possible
+from pathreplay.threads import one_thread
 
 
 def optimize(
@@ -70,9 +69,12 @@ def _run(job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> R
         if resumed is not None:
             stack.callback(resumed.close)
         with undisturbed():
-            backend.set_variant(config.variant)
-        if config.deterministic:
-            require_one_thread_possible()
+            variant = backend.set_variant(config.variant)
+        if config.deterministic and not variant.startswith("llvm"):
+            raise PathreplayError(
+                f"deterministic = true needs an LLVM variant, this is '{variant}': on a GPU the order of additions "
+                "is random; set variant = 'llvm_ad_rgb', or leave 'deterministic' out"
+            )
         bar = stack.enter_context(Progress(progress))
         bar.say("preparing")
         problem = build_problem(config, job.base, None if resumed is None else saved_targets(resumed.path))
@@ -101,7 +103,7 @@ def _run(job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> R
             theirs = render_views(problem, config, run.rival.values) if run.rival else {}
         outcome = outcome_of(job, folder.path, problem, run, before, after, theirs)
         folder.write(result_files(outcome))
-        return result_of(outcome, stop.by())
+        return result_of(outcome, stop.by)
 
 
 @contextmanager

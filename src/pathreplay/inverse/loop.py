@@ -11,15 +11,14 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.interrupts import Stop
 from pathreplay.inverse.checkpoint import Entry, Run
-from pathreplay.inverse.config import Config
+from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
 from pathreplay.inverse.evaluate import Evaluator, Local, Shard, total
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.optimiser import Adam
 from pathreplay.inverse.problem import Problem, put_values
-from pathreplay.inverse.seeds import ITERATION, JUDGEMENT, PICTURE, seeds
-from pathreplay.inverse.stopping import Stop
 from pathreplay.inverse.values import Arrays
 from pathreplay.scenes.parameters import get_array, to_value
 
@@ -78,12 +77,13 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
         if rival := run.rival:
             while rival.seconds() < run.seconds():
                 take_step(problem, config, rival, i)
-            if _due(i, config.iterations):
+            # Due after the first iteration, and after those with which a tenth of them is done.
+            if i == 0 or JUDGEMENTS * i // config.iterations < JUDGEMENTS * (i + 1) // config.iterations:
                 for each in (run, rival):
                     error = judged(problem, config, each.values, i)
                     each.history[-1] = replace(each.history[-1], picture_error=error)
         yield Stepped(run.history[-1])
-        if stop.wanted():
+        if stop.by is not None:
             break
     yield Stopped(len(run.history))
 
@@ -99,10 +99,14 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     Raises PathreplayError where the loss is no longer finite.
     """
     begin, i = time.perf_counter(), len(run.history)
-    refined = _refine(problem, run, position)
+    refined = []
+    for v in problem.variables:
+        if v.levels and run.values[v.key].shape != (shape := v.levels.shape_at(position)):
+            run.values[v.key] = resampled(run.values[v.key], shape)
+            refined.append(Refined(v.key, shape))
     # The last view first: what is learned of media depends on the order, and earlier versions had this one.
     shards = [
-        Shard((n,), config.spp, seeds(config.seed, ITERATION, i, view.sensor)[:1])
+        Shard((n,), config.spp, config.seeds(ITERATION, view.sensor, i)[:1])
         for n, view in reversed(list(enumerate(problem.views)))
     ]
     found = total(run.executor.run(run.values, shards, run.learned))
@@ -126,11 +130,11 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
 def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:
     """Pictures of all views with these values in the scene, by the job's integrator; same noise at every call."""
     put_values(problem, values)
-    pictures: dict[str, Image] = {}
-    for view in problem.views:
-        seed, _ = seeds(config.seed, PICTURE, 0, view.sensor)
-        pictures[view.name] = _picture(problem, view.sensor, problem.integrator, config.picture_spp, seed)
-    return pictures
+    spp = config.picture_spp
+    return {
+        v.name: _picture(problem, v.sensor, problem.integrator, spp, config.seeds(PICTURE, v.sensor)[0])
+        for v in problem.views
+    }
 
 
 def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> float:
@@ -145,7 +149,7 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
     for view in problem.views:
         a, b = (
             _picture(problem, view.sensor, problem.judge, config.spp, seed).astype(np.float64) - view.target
-            for seed in seeds(config.seed, JUDGEMENT, iteration, view.sensor)
+            for seed in config.seeds(JUDGEMENT, view.sensor, iteration)
         )
         total += float(np.mean(a * b)) / len(problem.views)
     return float(np.sqrt(max(total, 0.0)))
@@ -155,18 +159,3 @@ def _picture(problem: Problem, sensor: int, integrator: mi.Integrator, spp: int,
     with dr.suspend_grad():
         image = mi.render(problem.scene, sensor=sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
     return np.array(image, dtype=np.float32)
-
-
-def _due(i: int, iterations: int) -> bool:
-    """Whether a judgement is due: after the first iteration, and after those with which a tenth of them is done."""
-    return i == 0 or JUDGEMENTS * i // iterations < JUDGEMENTS * (i + 1) // iterations
-
-
-def _refine(problem: Problem, run: Run, position: int) -> list[Refined]:
-    refined = []
-    for variable in problem.variables:
-        key, shape = variable.key, variable.levels and variable.levels.shape_at(position)
-        if shape and run.values[key].shape != shape:
-            run.values[key] = resampled(run.values[key], shape)
-            refined.append(Refined(key, shape))
-    return refined

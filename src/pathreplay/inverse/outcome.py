@@ -189,14 +189,6 @@ class Outcome:
         job = self.folder / "config.json" if self.source is None else self.source
         return f"pathreplay optimize {shlex.quote(str(job))}"
 
-    def dropped(self) -> int:
-        return sum(entry.dropped for entry in self.history)
-
-    def judge(self) -> str:
-        """Type of the integrator that renders the pictures by which two runs are compared."""
-        target = self.config.target
-        return self.config.integrator.type if target.images is not None else target.integrator.type
-
     def names(self) -> tuple[str, str]:
         """What the job and its rival are called: their integrators; a run against itself has one name twice."""
         ours = self.config.integrator.type

@@ -31,8 +31,6 @@ PARTS: dict[str, tuple[str, ...]] = {
     "rigid": ("translation", "rotation"),
 }
 
-Vector = tuple[float, float, float]
-
 # θ² below which series stand in for a and b: their next terms, θ⁴ / 120 and θ⁴ / 720, are below float32 rounding there.
 _SMALL = 1e-3
 
@@ -45,7 +43,7 @@ class Pose:
     kind: PoseKind
     base: Any
     """M₀ or the vertices, as the scene file has them; detached."""
-    pivot: Vector
+    pivot: tuple[float, float, float]
     distance: float | None
     """Length that translation errors are compared with."""
     truth: NDArray[np.float32] | None

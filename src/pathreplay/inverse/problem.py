@@ -130,7 +130,7 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     if rival is not None:
         _keys(params, config.parameters, rival)
         _edges(params, keys, rival)  # for its log: one note is enough
-    judge = integrator if config.target.images is not None else load_integrator(config.target.integrator.as_dict())
+    judge = integrator if config.target.images is not None else load_integrator(config.target.integrator.model_dump())
     # Before any target is rendered: the cheap mistakes first.
     sensors = _sensors(scene, config.sensors)
     limits.require_visible(scene, params, keys)
@@ -165,7 +165,7 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
 
 
 def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
-    integrator = load_integrator(plugin.as_dict())
+    integrator = load_integrator(plugin.model_dump())
     if not isinstance(integrator, mi.CppADIntegrator):
         raise PathreplayError(
             f"Integrator '{plugin.type}' computes no gradients; use 'pathreplay' or another AD integrator"

@@ -45,7 +45,7 @@ def report_files(outcome: Outcome) -> dict[str, bytes]:
     environment.filters["swatch"] = swatch
     html = environment.get_template("report.html.j2").render(
         outcome=outcome,
-        data_uri=_data_uri,
+        data_uri=lambda image, exposure=1.0: _uri("image/png", png_bytes(image, exposure)),
         curves={name: _uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves},
         contestants=contestants,
         versions=versions(),
@@ -130,13 +130,9 @@ def summary(outcome: Outcome) -> bytes:
         for column, (kind, image) in enumerate(pictures.items()):
             line[column].imshow(_shown(image, exposure), interpolation="nearest", vmin=0, vmax=1, cmap="gray")
             label = outcome.caption(kind)
-            line[column].set_title(label if column else f"{_short(name)}: {label}", fontsize=8)
+            short = name if len(name) <= 24 else f"…{name[-23:]}"  # what fits over a picture
+            line[column].set_title(label if column else f"{short}: {label}", fontsize=8)
     return _with_palette(drawn(figure, "png"))
-
-
-def _short(name: str) -> str:
-    """What of a name fits over a picture: of a long key the end."""
-    return name if len(name) <= 24 else f"…{name[-23:]}"
 
 
 def versions() -> dict[str, str]:
@@ -174,10 +170,6 @@ def _with_palette(png: bytes) -> bytes:
     buffer = io.BytesIO()
     picture.quantize(palette=palette).save(buffer, "png", optimize=True)  # with a palette given, Pillow dithers
     return buffer.getvalue()
-
-
-def _data_uri(image: Image, exposure: float = 1.0) -> str:
-    return _uri("image/png", png_bytes(image, exposure))
 
 
 def _uri(kind: str, data: bytes) -> str:

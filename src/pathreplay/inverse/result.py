@@ -18,9 +18,9 @@ from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.problem import Problem, scene_values, variables_of
 from pathreplay.inverse.report import report_files
 from pathreplay.inverse.run_folder import Job
-from pathreplay.inverse.values import Array
+from pathreplay.inverse.values import Array, Arrays
 from pathreplay.media.volume_files import vol_bytes
-from pathreplay.scenes.parameters import get_array, to_value
+from pathreplay.scenes.parameters import get_array
 
 
 @dataclass(frozen=True, repr=False)
@@ -77,13 +77,16 @@ def outcome_of(
 ) -> Outcome:
     """All that is told of a run; ``before``, ``after`` and the ``rivals`` are pictures by view."""
     theirs = run.rival.values if run.rival else {}
-    stored = scene_values(problem, variables_of(problem, run.values))
-    values = {key: get_array(value) for key, value in stored.items()} | run.values
+    starts = _with_scene(problem, {v.key: v.start for v in problem.variables})
+    values = _with_scene(problem, run.values)
     views = tuple(
         ViewPictures(v.name, v.target, before[v.name], after[v.name], exposure_for(v.target), rivals.get(v.name))
         for v in problem.views
     )
-    poses = tuple(_recovered_pose(problem, pose, values) for pose in problem.poses)
+    poses = tuple(
+        RecoveredPose(pose, _parts(pose, starts), _parts(pose, values), values[pose.key], starts[pose.key])
+        for pose in problem.poses
+    )
     parts = {name for pose in problem.poses for name in pose.parts().values()}
     files_of = file_names(v.key for v in problem.variables)
     recovered = tuple(
@@ -132,21 +135,16 @@ def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
     )
 
 
-def _recovered_pose(problem: Problem, pose: Pose, values: dict[str, Array]) -> RecoveredPose:
-    variables = {variable.key: variable for variable in problem.variables}
-    names = pose.parts()
-    at_start = {name: to_value(variables[name].like, variables[name].start) for name in names.values()}
+def _with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
+    """The values of the variables, and what they make of the scene's parameters."""
+    stored = scene_values(problem, variables_of(problem, values))
+    return {key: get_array(value) for key, value in stored.items()} | dict(values)
 
-    def seen(part: str, value: Array) -> Array:
-        return np.degrees(value) if part == "rotation" else value
 
-    return RecoveredPose(
-        pose=pose,
-        start={part: seen(part, variables[name].start) for part, name in names.items()},
-        result={part: seen(part, values[name]) for part, name in names.items()},
-        value=values[pose.key],
-        value_at_start=get_array(pose.value(at_start)),
-    )
+def _parts(pose: Pose, values: Arrays) -> dict[str, Array]:
+    """Translation and rotation vector (degrees) of a pose."""
+    parts = {part: values[name] for part, name in pose.parts().items()}
+    return {part: np.degrees(value) if part == "rotation" else value for part, value in parts.items()}
 
 
 def _run_files(folder: str, history: Sequence[Entry], values: Mapping[str, Array]) -> dict[str, bytes]:

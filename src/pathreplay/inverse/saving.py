@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pathreplay.errors import PathreplayError
+from pathreplay.files import file_problem
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.images import Image, exr_bytes, read_image
@@ -78,7 +79,9 @@ def _picture(kind: str, view: str) -> str:
 
 
 def _read(path: Path) -> Image:
-    return read_image(path, way_out="start the job from its config")
+    if problem := file_problem(path):
+        raise PathreplayError(f"Image {path} {problem}; start the job from its config")
+    return read_image(path)
 
 
 def _require_pictures(folder: Path, kind: str, problem: Problem, pictures: Mapping[str, Image]) -> None:
