@@ -60,7 +60,7 @@ class Step:
         self.upper = 1.0 if texture else None  # a density has no upper bound
         self.target = mi.TensorXf(target)
         like, array = type(truth)(truth), get_array(self.start)
-        variable = Variable(self.key, like, 0.0, self.upper, RATE, array, None)
+        variable = Variable(self.key, like, (0.0, np.inf if self.upper is None else self.upper), RATE, array, None)
         view = View("camera", 0, np.array(target))
         self.problem = Problem(
             self.scene, self.params, judge, None, judge, (variable,), (), (view,), l2, ()

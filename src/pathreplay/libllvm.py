@@ -74,8 +74,7 @@ _SYSTEM_PATTERNS = {
         "/usr/lib/*-linux-gnu/libLLVM*.so*",  # Debian, Ubuntu
         "/usr/lib/llvm-*/lib/libLLVM*.so*",  # apt.llvm.org
         "/usr/lib64/libLLVM*.so*",  # Fedora, SUSE
-        "/usr/lib64/llvm*/lib/libLLVM*.so*",
-        "/usr/lib64/llvm*/lib64/libLLVM*.so*",
+        "/usr/lib64/llvm*/lib*/libLLVM*.so*",
         "/usr/lib/libLLVM*.so*",  # Arch
         "/usr/lib/llvm/*/lib64/libLLVM*.so*",  # Gentoo
         "/usr/local/lib/libLLVM*.so*",

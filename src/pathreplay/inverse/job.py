@@ -19,14 +19,7 @@ from pathreplay.inverse.outcome import resume_command
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
 from pathreplay.inverse.result import RunResult, outcome_of, result_files, result_of
-from pathreplay.inverse.run_folder import (
-    Job,
-    RunFolder,
-    create_run_folder,
-    default_output,
-    open_run_folder,
-    require_output,
-)
+from pathreplay.inverse.run_folder import Job, RunFolder, create_run_folder, new_output, open_run_folder
 from pathreplay.inverse.saving import Saving, first_files, go_on, saved_targets
 from pathreplay.scenes.loading import told
 from pathreplay.threads import one_thread
@@ -161,5 +154,4 @@ def _started(
         job = Job(config, None, Path.cwd())
     else:
         job = Job(load_config(Path(config)), Path(config), Path(config).parent)
-    wanted = job.config.output if output is None else output
-    return job, default_output(job.source) if wanted is None else require_output(wanted), None
+    return job, new_output(job.config.output if output is None else output, job.source), None

@@ -118,7 +118,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     decay = config.learning_rate_decay ** (position / config.iterations)
     rates = {v.key: v.learning_rate * decay for v in problem.variables}
     stepped = run.optimiser.step(run.values, found.gradients, rates)
-    run.values = {v.key: np.clip(stepped[v.key], *v.bounds()) for v in problem.variables}
+    run.values = {v.key: np.clip(stepped[v.key], *v.bounds) for v in problem.variables}
     run.learned = found.learned
     seconds = time.perf_counter() - begin
     norms = {key: float(np.linalg.norm(gradient)) for key, gradient in found.gradients.items()}

@@ -42,8 +42,8 @@ class Variable:
     key: str
     like: Any
     """A Dr.Jit value of its type and shape."""
-    lower: float | None
-    upper: float | None
+    bounds: tuple[float, float]
+    """Lowest and highest value that a step may end at."""
     learning_rate: float
     start: Array
     truth: Array | None
@@ -52,10 +52,6 @@ class Variable:
     """Of a grid that is refined on the way."""
     form: Form = AS_STORED
     """How Mitsuba stores it; everything here is what people see."""
-
-    def bounds(self) -> tuple[float, float]:
-        """Lowest and highest value that a step may end at."""
-        return -np.inf if self.lower is None else self.lower, np.inf if self.upper is None else self.upper
 
 
 @dataclass(frozen=True)
@@ -102,8 +98,7 @@ def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
 
 def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, Any]:
     """The scene's parameters, by key and as Mitsuba stores them; derivatives flow to the variables."""
-    parts = {name for pose in problem.poses for name in pose.parts().values()}
-    plain = {v.key: v.form.store(variables[v.key]) for v in problem.variables if v.key not in parts}
+    plain = {v.key: v.form.store(variables[v.key]) for v in problem.variables if v.key in problem.params}
     return plain | {pose.key: pose.value(variables) for pose in problem.poses}
 
 
@@ -213,7 +208,8 @@ def _variables(
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
                 like = type(like)(start)
-            variables.append(Variable(key, like, entry.lower, entry.upper, rate, start, None, levels, form))
+            bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
+            variables.append(Variable(key, like, bounds, rate, start, None, levels, form))
             continue
         limits.require_near(scene, key, parameters.get_array(params[key]), entry)
         pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
@@ -227,7 +223,7 @@ def _variables(
                 degrees = entry.rotation_learning_rate
                 rate = rate if degrees is None else float(np.radians(degrees))
             limits.require_learning_rate(name, rate, start)
-            variables.append(Variable(name, mi.Vector3f(0), None, None, rate, start, None))
+            variables.append(Variable(name, mi.Vector3f(0), (-np.inf, np.inf), rate, start, None))
     return variables, poses
 
 

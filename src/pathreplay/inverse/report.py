@@ -14,7 +14,6 @@ import jinja2
 import mitsuba as mi
 import numpy as np
 import PIL.Image
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from pathreplay.inverse.checkpoint import Entry
@@ -60,9 +59,8 @@ def loss_figure(history: Sequence[Entry]) -> Figure:
     axes.plot([entry.iteration for entry in history], [entry.loss for entry in history], color=OURS, linewidth=1.5)
     if any(entry.loss > 0 for entry in history):
         axes.set_yscale("log")
-    axes.set_xlabel("iteration")
     axes.set_ylabel("loss")
-    _plain(axes)
+    _plain(axes, "iteration")
     return figure
 
 
@@ -82,16 +80,14 @@ def comparison_figure(contestants: Sequence[Contestant]) -> Figure:
             points = zip(*found, strict=True)
             axes.plot(*points, color=colour, linewidth=1.5, marker=marker, markersize=3, label=contestant.name)
         axes.set_ylim(bottom=0)
-        axes.set_xlabel("seconds")
         axes.set_title("error of the pictures" if key is None else f"error of {key}", fontsize=9, color=GREY)
-        _plain(axes)
+        _plain(axes, "seconds")
     axes.legend(frameon=False, labelcolor=GREY)
     return figure
 
 
 def drawn(figure: Figure, kind: str) -> bytes:
     """The figure as the bytes of an image file ('svg', with a transparent ground, or 'png')."""
-    FigureCanvasAgg(figure)
     buffer = io.BytesIO()
     # No date in the file: the same run gives the same bytes.
     metadata = {"Date": None} if kind == "svg" else None
@@ -99,7 +95,8 @@ def drawn(figure: Figure, kind: str) -> bytes:
     return buffer.getvalue()
 
 
-def _plain(axes: Any) -> None:
+def _plain(axes: Any, along: str) -> None:
+    axes.set_xlabel(along)
     axes.grid(True, color=GREY, alpha=0.25, linewidth=0.5)
     axes.tick_params(which="both", colors=GREY)
     for part in (axes.xaxis.label, axes.yaxis.label):

@@ -87,12 +87,11 @@ def outcome_of(
         RecoveredPose(pose, _parts(pose, starts), _parts(pose, values), values[pose.key], starts[pose.key])
         for pose in problem.poses
     )
-    parts = {name for pose in problem.poses for name in pose.parts().values()}
     files_of = file_names(v.key for v in problem.variables)
     recovered = tuple(
         Recovered(v.key, files_of[v.key], v.start, values[v.key], v.truth, theirs.get(v.key))
         for v in problem.variables
-        if v.key not in parts
+        if v.key in problem.params
     )
     return Outcome(job.config, job.source, folder, views, recovered, poses, run, values, problem.notes)
 

@@ -167,15 +167,13 @@ def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
     return job, RunFolder(path)
 
 
-def default_output(source: Path | None) -> Path:
-    """``runs/<name>``, named after the config file, or after its folder where it is just called config."""
-    if source is None:
-        return Path("runs/optimize")
-    return Path("runs") / (source.resolve().parent.name if source.stem == "config" else source.stem)
-
-
-def require_output(output: str | Path) -> Path:
-    """``output`` as a path that a new folder can have; raises PathreplayError if it cannot, and says why."""
+def new_output(output: str | Path | None, source: Path | None) -> Path:
+    """Where a new folder shall be: ``output``; else in ``runs``, by the name of the config file, or of its folder where
+    it is just called config. Raises PathreplayError if no folder can be there, and says why.
+    """
+    if output is None:
+        named = "optimize" if source is None else source.stem
+        return Path("runs") / (source.resolve().parent.name if source and named == "config" else named)
     path = Path(output)
     require_writable_name(path, "--output")
     if not str(output) or path.name in ("", ".."):
