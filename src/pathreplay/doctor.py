@@ -47,9 +47,9 @@ class DoctorReport:
         """Whether at least one variant that pathreplay can use runs here."""
         return any(variant.works for variant in self.variants)
 
-    def print(self, console: Console | None = None) -> None:
+    def print(self) -> None:
         """Write the report for people. Lines are never wrapped, so that paths can be copied."""
-        console = console or Console(highlight=False)
+        console = Console(highlight=False)
 
         def line(*parts: str | tuple[str, str]) -> None:
             console.print(Text.assemble(*parts), soft_wrap=True)

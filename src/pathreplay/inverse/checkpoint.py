@@ -11,15 +11,13 @@ from typing import Annotated, ClassVar
 import numpy as np
 import safetensors
 import safetensors.numpy
-from pydantic import ConfigDict, Field, NonNegativeInt, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, FiniteFloat, NonNegativeInt, TypeAdapter, ValidationError
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.evaluate import Executor
 from pathreplay.inverse.grids import Levels
 from pathreplay.inverse.optimiser import Optimiser, State
 from pathreplay.inverse.values import Array, Arrays
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -35,8 +33,8 @@ class Entry:
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     iteration: NonNegativeInt
-    loss: Finite
-    seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    loss: FiniteFloat
+    seconds: Annotated[FiniteFloat, Field(ge=0)]
     gradient_norms: dict[str, float]
     dropped: NonNegativeInt = 0
     errors: dict[str, float] = field(default_factory=dict)
@@ -79,10 +77,7 @@ def save(run: Run) -> bytes:
         **{_VALUE + key: value for key, value in run.values.items()},
         **state.arrays,
     }
-    metadata = {
-        "steps": json.dumps(state.steps),
-        "history": json.dumps([asdict(entry) for entry in run.history]),
-    }
+    metadata = {"steps": json.dumps(state.steps), "history": json.dumps([asdict(entry) for entry in run.history])}
     return safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata)
 
 

@@ -230,7 +230,7 @@ def load_config(path: Path) -> Config:
 
     Raises PathreplayError for an unreadable file, an unknown key (names the nearest), a value out of its range.
     """
-    problem = file_problem(path, _LONGEST_FILE)
+    problem = file_problem(path, 64 * 2**20)  # no job is as long: what is larger is some other file
     if problem == MISSING:
         near = [str(p) for p in path.parent.glob("*.toml")] if path.parent.is_dir() else []
         close = difflib.get_close_matches(str(path), near, n=1, cutoff=0.3)
@@ -245,10 +245,6 @@ def load_config(path: Path) -> Config:
     if path.suffix == ".json":
         return _checked(str(path), Config.model_validate_json, text)
     return _checked(str(path), Config.model_validate, _toml(path, text))
-
-
-# No job is as long: what is larger is some other file.
-_LONGEST_FILE = 64 * 2**20
 
 
 def _toml(path: Path, text: str) -> dict[str, Any]:

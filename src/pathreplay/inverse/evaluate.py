@@ -144,7 +144,9 @@ class Evaluator:
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
         records = self.freezes and view in self._sweeps
         if view not in self._sweeps:
-            self._sweeps[view] = self._can_sweep(sensor, spp)
+            may = problem.loss in QUADRATIC and hasattr(self.integrator, "sweeps_pixels")
+            scene = problem.scene
+            self._sweeps[view] = may and bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         share = 1 / len(problem.views)
@@ -156,9 +158,3 @@ class Evaluator:
         if lost is not None:
             self.integrator.tell_lost(lost, target.shape[0] * target.shape[1] * spp)
         return float(value[0]) if dr.width(value) else float("nan")
-
-    def _can_sweep(self, sensor: int, spp: int) -> bool:
-        if self.problem.loss not in QUADRATIC or not hasattr(self.integrator, "sweeps_pixels"):
-            return False
-        scene = self.problem.scene
-        return bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
-from pathreplay.interrupts import Stop, stopping, undisturbed
+from pathreplay.interrupts import stopping, undisturbed
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.images import Image
@@ -60,7 +60,7 @@ def _run(job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> R
     config = job.config
     with ExitStack() as stack:
         if resumed is not None:
-            stack.callback(resumed.close)
+            stack.callback(resumed.lock.close)
         with undisturbed():
             variant = backend.set_variant(config.variant)
         if config.deterministic and not variant.startswith("llvm"):
@@ -78,13 +78,17 @@ def _run(job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> R
             run.rival = new_run(problem, problem.rival, not config.deterministic)
         if resumed is None:
             folder, before = _begun(output, job, problem, run)
-            stack.callback(folder.close)
+            stack.callback(folder.lock.close)
         else:
             folder, before = resumed, _went_on(resumed, config, problem, run)
         way_out = f"aborted; go on from the last checkpoint with: {resume_command(folder.path)}"
         stop = stack.enter_context(stopping(bar.say, way_out))
+        saving = Saving(folder, run, config.checkpoint_every)
         try:
-            _iterate(folder, config, problem, run, stop, bar)
+            with _computing(config):
+                for event in iterate(problem, config, run, stop):
+                    bar.observe(event)
+                    saving.observe(event)
         except PathreplayError:
             # A new folder goes again where not even the first iteration can be done; one that is resumed never does.
             if resumed is None and not run.history and not stop.aborted:
@@ -124,15 +128,6 @@ def _went_on(folder: RunFolder, config: Config, problem: Problem, run: Run) -> d
             f"Run {folder.path} has all its {len(run.history)} iterations; raise 'iterations' in its config"
         )
     return before
-
-
-def _iterate(folder: RunFolder, config: Config, problem: Problem, run: Run, stop: Stop, bar: Progress) -> None:
-    """Do the iterations that are left, with a checkpoint now and then and one at the end."""
-    saving = Saving(folder, run, config.checkpoint_every)
-    with _computing(config):
-        for event in iterate(problem, config, run, stop):
-            bar.observe(event)
-            saving.observe(event)
 
 
 def _started(

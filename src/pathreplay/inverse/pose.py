@@ -25,11 +25,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.scenes.parameters import get_array, is_transform
 
 PoseKind = Literal["translation", "rotation", "rigid"]
-PARTS: dict[str, tuple[str, ...]] = {
-    "translation": ("translation",),
-    "rotation": ("rotation",),
-    "rigid": ("translation", "rotation"),
-}
+PARTS = {"translation": ("translation",), "rotation": ("rotation",), "rigid": ("translation", "rotation")}
 
 # θ² below which series stand in for a and b: their next terms, θ⁴ / 120 and θ⁴ / 720, are below float32 rounding there.
 _SMALL = 1e-3

@@ -17,6 +17,7 @@ import PIL.Image
 from matplotlib.figure import Figure
 
 from pathreplay.inverse.checkpoint import Entry
+from pathreplay.inverse.grids import rmse
 from pathreplay.inverse.images import Image, png_bytes
 from pathreplay.inverse.outcome import Contestant, Outcome
 
@@ -29,7 +30,7 @@ PANELS = 2
 
 def report_files(outcome: Outcome) -> dict[str, bytes]:
     """report.html, the curves (SVG, PNG) and summary.png, as file name -> content."""
-    curves = {"loss": loss_figure(outcome.history)}
+    curves = {"loss": loss_figure(outcome.run.history)}
     contestants = outcome.comparison()
     if contestants:
         curves["comparison"] = comparison_figure(contestants)
@@ -47,6 +48,7 @@ def report_files(outcome: Outcome) -> dict[str, bytes]:
         data_uri=lambda image, exposure=1.0: _uri("image/png", png_bytes(image, exposure)),
         curves={name: _uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves},
         contestants=contestants,
+        rmse=rmse,
         versions=versions(),
     )
     return {"report.html": html.encode(), **drawings, "summary.png": summary(outcome)}
@@ -72,10 +74,8 @@ def comparison_figure(contestants: Sequence[Contestant]) -> Figure:
         for contestant, colour in zip(contestants, (OURS, RIVAL), strict=True):
             history = contestant.run.history
             seconds = np.cumsum([entry.seconds for entry in history])
-            if key is None:
-                found = [(s, e.picture_error) for s, e in zip(seconds, history, strict=True) if e.picture_error]
-            else:
-                found = [(s, e.errors[key]) for s, e in zip(seconds, history, strict=True)]
+            errors = [entry.picture_error if key is None else entry.errors[key] for entry in history]
+            found = [(s, error) for s, error in zip(seconds, errors, strict=True) if key or error]
             marker = "o" if key is None else None
             points = zip(*found, strict=True)
             axes.plot(*points, color=colour, linewidth=1.5, marker=marker, markersize=3, label=contestant.name)

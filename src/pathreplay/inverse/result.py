@@ -101,7 +101,7 @@ def result_files(outcome: Outcome) -> dict[str, bytes]:
     table = {item.key: item.as_dict() for item in outcome.recovered}
     table |= {item.pose.key: item.as_dict() for item in outcome.poses}
     files = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}
-    files |= _run_files("", outcome.history, outcome.values)
+    files |= _run_files("", outcome.run.history, outcome.values)
     if rival := outcome.run.rival:
         files |= _run_files("rival/", rival.history, rival.values)
     for view in outcome.views:
@@ -120,14 +120,14 @@ def result_files(outcome: Outcome) -> dict[str, bytes]:
 
 def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
     """What Python gets; ``stopped_by`` is the name of a signal, which may have come too late to stop anything."""
-    stopped = len(outcome.history) < outcome.config.iterations
+    stopped = len(outcome.run.history) < outcome.config.iterations
     return RunResult(
         folder=outcome.folder,
         report=outcome.folder / "report.html",
-        iterations=len(outcome.history),
+        iterations=len(outcome.run.history),
         stopped=stopped,
         stopped_by=stopped_by if stopped else None,
-        history=tuple(outcome.history),
+        history=tuple(outcome.run.history),
         parameters=outcome.values,
         errors={item.key: error for item in outcome.recovered if (error := item.error()) is not None},
         poses={item.pose.key: errors["error"] for item in outcome.poses if (errors := item.errors())},

@@ -34,16 +34,12 @@ class Job:
 
 
 class RunFolder:
-    """A folder that belongs to one run, and is locked until `close`."""
+    """A folder that belongs to one run, until its ``lock`` is closed."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.lock = FolderLock(path)
         self.identity = _identity(path)
-
-    def close(self) -> None:
-        """Unlock it."""
-        self.lock.close()
 
     def remove(self) -> None:
         """Remove it with all that is in it, where it still is the folder that was made."""
@@ -124,14 +120,10 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, bytes]) -> Run
         path = _make_new(output)
         undo.callback(shutil.rmtree, path, ignore_errors=True)
         run = RunFolder(path)
-        undo.callback(run.close)
+        undo.callback(run.lock.close)
         run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
         undo.pop_all()
     return run
-
-
-# Bytes of a run.json, far above what two paths take.
-_LONGEST_ORIGIN = 2**20
 
 
 class _Origin(BaseModel):
@@ -155,7 +147,7 @@ def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
     if not (path / CHECKPOINT).is_file():
         raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start the job from its config")
     try:
-        if problem := file_problem(path / "run.json", _LONGEST_ORIGIN):
+        if problem := file_problem(path / "run.json", 2**20):  # far above what two paths take
             raise ValueError(f"it {problem}")
         origin = _Origin.model_validate_json((path / "run.json").read_bytes())
         if "\0" in origin.base + (origin.config or ""):

@@ -58,9 +58,17 @@ def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
 
     Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
     """
-    _require_pictures(folder, "target", problem, {view.name: view.target for view in problem.views})
     before = {view.name: _read(folder / _picture("start", view.name)) for view in problem.views}
-    _require_pictures(folder, "start", problem, before)
+    for view in problem.views:
+        wanted = picture_shape(problem.scene.sensors()[view.sensor])
+        for kind, found in (("target", view.target), ("start", before[view.name])):
+            path = folder / _picture(kind, view.name)
+            if found.shape != wanted:
+                raise PathreplayError(
+                    f"{path} has shape {found.shape} (height, width, channels), sensor '{view.name}' renders {wanted}; "
+                    "start the job from its config"
+                )
+            require_finite_array(str(path), found)
     for name, each in _runs(run).items():
         checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables})
     return before
@@ -82,16 +90,3 @@ def _read(path: Path) -> Image:
     if problem := file_problem(path):
         raise PathreplayError(f"Image {path} {problem}; start the job from its config")
     return read_image(path)
-
-
-def _require_pictures(folder: Path, kind: str, problem: Problem, pictures: Mapping[str, Image]) -> None:
-    """Raise PathreplayError unless the pictures of that ``kind`` fit the films of the views and are finite."""
-    for view in problem.views:
-        path, found = folder / _picture(kind, view.name), pictures[view.name]
-        wanted = picture_shape(problem.scene.sensors()[view.sensor])
-        if found.shape != wanted:
-            raise PathreplayError(
-                f"{path} has shape {found.shape} (height, width, channels), sensor '{view.name}' renders {wanted}; "
-                "start the job from its config"
-            )
-        require_finite_array(str(path), found)

@@ -43,8 +43,7 @@ def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> d
     """Values of the wanted parameters in the target scene, where it has them in the same shape or as such a grid."""
     params = mi.traverse(scene)
     found = {key: parameters.get_array(seen(params, key)) for key in keys if key in params}
-    shapes = {key: parameters.get_array(seen(own, key)).shape for key in found}
-    return {key: value for key, value in found.items() if comparable(value.shape, shapes[key])}
+    return {k: value for k, value in found.items() if comparable(value.shape, parameters.get_array(seen(own, k)).shape)}
 
 
 def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -> dict[str, Image]:
