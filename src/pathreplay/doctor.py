@@ -102,17 +102,6 @@ if not 0.0 < gradient < 100.0:
 """
 
 
-def _versions() -> tuple[str, str, list[str], list[str]]:
-    """Of Mitsuba and Dr.Jit, the variants that Mitsuba has, and the ways out if they are missing."""
-    try:
-        import drjit as dr
-        import mitsuba as mi
-    except Exception as error:
-        way_out = "install Mitsuba: pip install 'mitsuba>=3.9.1,<3.10'"
-        return f"cannot be imported ({plain_line(str(error))})", "unknown", [], [way_out]
-    return str(mi.__version__), str(dr.__version__), list(mi.variants()), []
-
-
 def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[VariantVerdict]:
     """Try each variant; once one of a back end fails to start, its others are not tried."""
     environment = os.environ | ({ENVIRONMENT_VARIABLE: library.path} if library else {})
@@ -132,7 +121,15 @@ def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[Variant
 
 def examine() -> DoctorReport:
     """Try every libLLVM and every variant on this machine (a few seconds). Raises nothing."""
-    mitsuba_version, drjit_version, known, ways_out = _versions()
+    ways_out: list[str] = []
+    try:
+        import drjit as dr
+        import mitsuba as mi
+
+        versions, known = (str(mi.__version__), str(dr.__version__)), list(mi.variants())
+    except Exception as error:
+        versions, known = (f"cannot be imported ({plain_line(str(error))})", "unknown"), []
+        ways_out.append("install Mitsuba: pip install 'mitsuba>=3.9.1,<3.10'")
     libraries = tuple(libllvm.probe(path, origin) for path, origin in libllvm.candidates()) if known else ()
     library = next((library for library in libraries if library.works), None)
     names = sorted(filter(is_usable_variant, known), key=lambda name: (name.split("_")[0] != "llvm", known.index(name)))
@@ -150,4 +147,4 @@ def examine() -> DoctorReport:
         )
     if "metal" in broken:
         ways_out.append("Metal: needs a Mac with Apple silicon; without one, LLVM does the work on the CPU")
-    return DoctorReport(mitsuba_version, drjit_version, libraries, tuple(variants), tuple(ways_out))
+    return DoctorReport(*versions, libraries, tuple(variants), tuple(ways_out))

@@ -89,14 +89,13 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None]) -> None:
     try:
         values, state, history, learned = _read(path, run.values, levels)
         run.optimiser.restore(state, values)
+        run.values, run.history, run.learned = values, history, learned
+        return
     except ValidationError as error:
         first = error.errors()[0]
         why = f"{'.'.join(map(str, first['loc']))}: {first['msg'].lower()}"
     except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         why = str(error)
-    else:
-        run.values, run.history, run.learned = values, history, learned
-        return
     raise PathreplayError(f"Checkpoint {path} cannot be read ({why}); start the job from its config")
 
 

@@ -14,9 +14,9 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.files import file_names
 from pathreplay.inverse import limits
 from pathreplay.inverse.config import Config, Parameter, Plugin
-from pathreplay.inverse.file_names import file_names
 from pathreplay.inverse.grids import Levels, make_levels, resampled
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.losses import Loss, find_loss
@@ -215,8 +215,7 @@ def _variables(
         pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
         poses.append(pose)
         for part, name in pose.parts().items():
-            given = getattr(entry.start, part, None) or [0.0, 0.0, 0.0]
-            start = np.array(given, np.float32)
+            start = np.array(getattr(entry.start, part, None) or [0.0, 0.0, 0.0], np.float32)
             if part == "rotation":
                 # Users write degrees. A learning rate without unit is taken in radians, fit for a scene of size 1.
                 start = np.radians(start)

@@ -129,7 +129,11 @@ def summary(outcome: Outcome) -> bytes:
             label = outcome.caption(kind)
             short = name if len(name) <= 24 else f"…{name[-23:]}"  # what fits over a picture
             line[column].set_title(label if column else f"{short}: {label}", fontsize=8)
-    return _with_palette(drawn(figure, "png"))
+    # 256 colours: fewer bytes for noisy pictures, fit for a README or a mail. With a palette given, Pillow dithers.
+    picture = PIL.Image.open(io.BytesIO(drawn(figure, "png"))).convert("RGB")
+    buffer = io.BytesIO()
+    picture.quantize(palette=picture.quantize(256)).save(buffer, "png", optimize=True)
+    return buffer.getvalue()
 
 
 def versions() -> dict[str, str]:
@@ -158,15 +162,6 @@ def _shown(image: Image, exposure: float) -> Image:
 def _encoded(linear: np.ndarray) -> np.ndarray:
     """sRGB of linear radiance, both from 0 to 1."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
-
-
-def _with_palette(png: bytes) -> bytes:
-    """The PNG in 256 colours: fewer bytes for noisy pictures, fit for a README or a mail."""
-    picture = PIL.Image.open(io.BytesIO(png)).convert("RGB")
-    palette = picture.quantize(256)
-    buffer = io.BytesIO()
-    picture.quantize(palette=palette).save(buffer, "png", optimize=True)  # with a palette given, Pillow dithers
-    return buffer.getvalue()
 
 
 def _uri(kind: str, data: bytes) -> str:

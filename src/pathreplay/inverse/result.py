@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import safetensors.numpy
 
+from pathreplay.files import file_names
 from pathreplay.inverse.checkpoint import Entry, Run
-from pathreplay.inverse.file_names import file_names
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes
 from pathreplay.inverse.outcome import Outcome, Recovered, RecoveredPose, ViewPictures, resume_command
 from pathreplay.inverse.pose import Pose, PoseError
