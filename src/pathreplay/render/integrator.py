@@ -15,7 +15,7 @@ from ..gradient.record import MAX_DEPTH
 from ..plugins import on_base
 from ..transport.vertex import Walk
 from .camera_pass import Pass, Seed, Which, mitsuba_integrator
-from .diagnostics import Diagnostics, doubts, lost_note, missing_edges, used_before_note
+from .diagnostics import doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts
 from .interior import PathReplay
 from .path_integrator import UNBOUNDED, PathIntegrator
@@ -81,7 +81,7 @@ class PathReplayIntegrator(PathIntegrator):
         self.interior = _interior(self.name, props, self.max_depth)
         self.driver, self.branch = self.interior.driver, self.interior.branch
         self.told: set[str] = set()  # what has been said in the log
-        self.untold = Diagnostics()  # of passes whose lost paths have not been told
+        self.untold = Found()  # of passes whose lost paths have not been told
         self.baseline: tuple[SceneFacts, Baseline] | None = None  # and the scene that it belongs to
 
     def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0) -> bool:
@@ -145,13 +145,12 @@ class PathReplayIntegrator(PathIntegrator):
     def _told(self, view: Pass, walk: Walk, found: Found) -> None:
         """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see `take_lost`,
         which tells of the passes before, too."""
-        if found.diagnostics.moves:
+        if found.moves:
             self._tell_edges(walk, view.sensor)
         frozen = dr.flag(dr.JitFlag.FreezingScope)
-        self.untold = self.untold + found.diagnostics if frozen else found.diagnostics
-        if self.untold.counters and not frozen:
-            paths = self.untold.paths
-            self.tell_lost(self.take_lost(), paths)
+        self.untold = self.untold + Found(lost=found.lost) if frozen else Found()
+        if found.lost is not None and not frozen:
+            self.tell_lost(found.lost, found.paths)
         if found.seen is not None and self.baseline is not None:
             self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
 
@@ -171,7 +170,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     def take_lost(self) -> mi.UInt32 | None:
         """How many paths lost a part of their gradient, or None: a frozen function cannot look itself."""
-        lost, self.untold = self.untold.lost(), Diagnostics()
+        lost, self.untold = self.untold.lost, Found()
         return lost
 
     def tell_lost(self, count: mi.UInt32, paths: int) -> None:

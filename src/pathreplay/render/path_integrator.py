@@ -20,7 +20,7 @@ from ..transport.traits import Tables
 from ..transport.vertex import Walk
 from .camera_pass import Pass, Seed, Which, mitsuba_integrator
 from .facts import SceneFacts
-from .interior import Interior, image
+from .interior import image
 from .properties import flag, whole_number
 from .term import Found, Term
 
@@ -29,22 +29,16 @@ UNBOUNDED = 0xFFFFFFFF
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Within this block a PathreplayError that Dr.Jit wrapped in others comes out as itself."""
+    """Within this block a PathreplayError that Dr.Jit wrapped in others, on the way out of a loop, is itself again."""
     try:
         yield
     except RuntimeError as error:
-        mended = _mendable(error)
-        if mended is error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, PathreplayError):
+            cause = cause.__cause__
+        if cause is None:
             raise
-        raise mended from None
-
-
-def _mendable(error: BaseException) -> BaseException:
-    """The PathreplayError that Dr.Jit wrapped in errors of its own on the way out of a loop; else the error itself."""
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, PathreplayError):
-        cause = cause.__cause__
-    return cause or error
+        raise cause from None
 
 
 @contextmanager
@@ -87,7 +81,7 @@ class PathIntegrator:
 
     name = ""
     attach = "none"
-    interior: Interior
+    interior: Term
     max_depth: int  # these are Mitsuba's
     rr_depth: int
     skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
