@@ -9,7 +9,8 @@ import mitsuba as mi
 
 from .. import memory
 from ..errors import PathreplayError
-from .camera_pass import Pass, Rays, mitsuba_integrator
+from ..plugins import mitsuba_integrator
+from .camera_pass import Pass, Rays
 
 # Dr.Jit counts the samples of one kernel in 32 bits.
 MOST_SAMPLES = 2**32 - 1

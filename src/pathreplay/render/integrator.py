@@ -12,9 +12,8 @@ from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
-from ..plugins import on_base
 from ..transport.vertex import Walk
-from .camera_pass import Pass, Seed, Which, mitsuba_integrator
+from .camera_pass import Pass, Seed, Which
 from .diagnostics import doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts
 from .interior import PathReplay
@@ -121,17 +120,14 @@ class PathReplayIntegrator(PathIntegrator):
             self._tell_once(doubt)
         if walk.media is None:
             return None
-        baseline = self._baseline(walk.scene)
+        # Not by the facts of the last pass: other scenes may have been rendered between.
+        if self.baseline is None or not self.baseline[0].are_about(walk.scene):
+            self.baseline = self._facts(walk.scene), Baseline.fresh(walk.scene.bbox())
+        baseline = self.baseline[1]
         if view.key in baseline.passes:
             self._tell_once(used_before_note(view.key[0]))
             return None
         return baseline
-
-    def _baseline(self, scene: mi.Scene) -> Baseline:
-        # Not by the facts of the last pass: other scenes may have been rendered between.
-        if self.baseline is None or not self.baseline[0].are_about(scene):
-            self.baseline = self._facts(scene), Baseline.fresh(scene.bbox())
-        return self.baseline[1]
 
     def learned(self) -> dict[str, np.ndarray]:
         """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
@@ -182,9 +178,3 @@ class PathReplayIntegrator(PathIntegrator):
         return self._described(
             hide_emitters=self.hide_emitters, driver=self.driver, attach=self.attach, branch=self.branch
         )
-
-
-def register() -> None:
-    """Register the plugin for the active variant, which must be an AD variant."""
-    plugin = on_base(PathReplayIntegrator, mitsuba_integrator())
-    mi.register_integrator("pathreplay", lambda props: plugin(props))

@@ -15,10 +15,11 @@ import mitsuba as mi
 from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
 from ..gradient.primal import primal
+from ..plugins import mitsuba_integrator
 from ..transport.start import CameraStart
 from ..transport.traits import Tables
 from ..transport.vertex import Walk
-from .camera_pass import Pass, Seed, Which, mitsuba_integrator
+from .camera_pass import Pass, Seed, Which
 from .facts import SceneFacts
 from .interior import image
 from .properties import flag, whole_number

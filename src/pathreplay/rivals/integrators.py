@@ -14,8 +14,7 @@ import mitsuba as mi
 from ..gradient.baseline import Baseline
 from ..gradient.driver import Driver, ForwardDriver
 from ..gradient.forward import forward
-from ..plugins import on_base
-from ..render.camera_pass import Pass, mitsuba_integrator
+from ..render.camera_pass import Pass
 from ..render.interior import back_propagate, tangent
 from ..render.path_integrator import PathIntegrator
 from ..render.properties import choice, flag
@@ -87,10 +86,3 @@ class ListingIntegrator(PathIntegrator):
     name = "pathreplay_listing"
     attach = "delta"  # so that it is noticed
     interior = OtherInterior(listing, forward)
-
-
-def register() -> None:
-    """Register the plugins for the active variant, which must be an AD variant."""
-    for template in (TapeIntegrator, RadiativeIntegrator, ListingIntegrator):
-        plugin = on_base(template, mitsuba_integrator())
-        mi.register_integrator(template.name, lambda props, plugin=plugin: plugin(props))
