@@ -91,13 +91,7 @@ class PathReplayIntegrator(PathIntegrator):
         return not self._facts(scene).has_media
 
     def render_and_backward(
-        self,
-        scene: mi.Scene,
-        offset: mi.TensorXf,
-        slope: mi.TensorXf,
-        sensor: Which = 0,
-        seed: Seed = 0,
-        spp: int = 0,
+        self, scene: mi.Scene, offset: mi.TensorXf, slope: mi.TensorXf, sensor: Which = 0, seed: Seed = 0, spp: int = 0
     ) -> mi.TensorXf:
         """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
 

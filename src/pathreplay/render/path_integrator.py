@@ -144,13 +144,7 @@ class PathIntegrator:
         self._told(view, walk, found)
 
     def sample(
-        self,
-        mode: dr.ADMode,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        ray: mi.Ray3f,
-        active: bool | mi.Bool = True,
-        **_: Any,
+        self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool = True, **_: Any
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], Any]:
         """Radiance along rays, for those who have rays and no sensor, such as Mitsuba's `aov`: they start in no medium.
 
