@@ -64,15 +64,8 @@ def branch_term(walk: Walk, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f) 
     onward = replace(walk, branching=None)
     active = branch.mass > 0
     with dr.suspend_grad():
-        at = Arrival(
-            ray=mi.Ray3f(branch.p, branch.d, ray.time, ray.wavelengths),
-            hit=dr.zeros(mi.PreliminaryIntersection3f),
-            pdf=mi.Float(1),
-            delta=mi.Bool(True),
-            camera=mi.Bool(False),
-            medium=branch.medium,
-            behind=mi.Float(0),
-        )
+        ray, hit = mi.Ray3f(branch.p, branch.d, ray.time, ray.wavelengths), dr.zeros(mi.PreliminaryIntersection3f)
+        at = Arrival(ray, hit, mi.Float(1), mi.Bool(True), mi.Bool(False), branch.medium, mi.Float(0))
         one = mi.Spectrum(1)
         flight = Flight(event=active, t=mi.Float(0), density=mi.Float(1), W=one, along=mi.Float(0), σ_s=one)
         u = Numbers.draw(sampler)

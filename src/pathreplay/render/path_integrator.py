@@ -59,19 +59,6 @@ def careful() -> Iterator[None]:
             gc.enable()
 
 
-def require_usable(name: str, props: mi.Properties) -> None:
-    """Return quietly if the plugin can be made. Raises PathreplayError for bad properties and polarised variants."""
-    if mi.is_polarized:
-        raise PathreplayError(
-            f"{name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
-            f"use {mi.variant().replace('_polarized', '')!r}"
-        )
-    # All three are Mitsuba's, too, which takes what it is given or says less.
-    whole_number(props, name, "max_depth", 6, lowest=0, unbounded=True)
-    whole_number(props, name, "rr_depth", 5, lowest=1)
-    flag(props, name, "hide_emitters", False)
-
-
 class PathIntegrator:
     """A template of an integrator (see `on_base`), for those of ours.
 
@@ -88,9 +75,17 @@ class PathIntegrator:
     skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
 
     def __init__(self, props: mi.Properties) -> None:
-        require_usable(self.name, props)
+        if mi.is_polarized:
+            raise PathreplayError(
+                f"{self.name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
+                f"use {mi.variant().replace('_polarized', '')!r}"
+            )
+        # All three are Mitsuba's, too, which takes what it is given or says less.
+        whole_number(props, self.name, "max_depth", 6, lowest=0, unbounded=True)
+        whole_number(props, self.name, "rr_depth", 5, lowest=1)
+        hide_emitters = flag(props, self.name, "hide_emitters", False)
         mitsuba_integrator().__init__(self, props)
-        self.hide_emitters = flag(props, self.name, "hide_emitters", False)
+        self.hide_emitters = hide_emitters
         self.tables: Tables | None = None  # of the scene, in a frozen function, which cannot make them
         self.facts: SceneFacts | None = None  # about the scene that was rendered last
 

@@ -41,14 +41,7 @@ class Sampled:
 
 
 def choose(
-    walk: Walk,
-    v: Vertex,
-    at: Arrival,
-    u: Numbers,
-    ctx: mi.BSDFContext,
-    d: mi.Vector3f,
-    lit: mi.Bool,
-    go_on: mi.Bool,
+    walk: Walk, v: Vertex, at: Arrival, u: Numbers, ctx: mi.BSDFContext, d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool
 ) -> Sampled:
     """Sample the continuation, and evaluate the vertex for the direction ``d`` of the emitter sample. Detached.
 
@@ -80,15 +73,9 @@ def _in_medium(
         delta=dr.select(event, ~at.medium.use_emitter_sampling(), surface.kept.delta),
         lobe=dr.select(v.surface, surface.kept.lobe, 0),
     )
-    return Sampled(
-        f=dr.select(event, f, surface.f),
-        pdf_light=dr.select(event, pdf_light, surface.pdf_light),
-        w=dr.select(event, dr.select(pdf > 0, w, 0), dr.select(through, 1, surface.w)),
-        kept=kept,
-        null=null,
-        eta=dr.select(v.surface, surface.eta, 1),
-        active=bounce | null,
-    )
+    f, pdf_light = dr.select(event, f, surface.f), dr.select(event, pdf_light, surface.pdf_light)
+    w = dr.select(event, dr.select(pdf > 0, w, 0), dr.select(through, 1, surface.w))
+    return Sampled(f, pdf_light, w, kept, null, dr.select(v.surface, surface.eta, 1), bounce | null)
 
 
 def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
