@@ -8,7 +8,7 @@ the variant to use. Polarised variants get the plugins themselves, which say tha
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from pathreplay.errors import PathreplayError
@@ -67,14 +67,11 @@ def _register_stand_ins(variant: str) -> None:
     colours = variant.removesuffix("_polarized").rsplit("_", 1)[-1]
     alike = [name for name in usable if name.endswith(colours)] or usable
 
-    def stand_in(plugin: str) -> Callable[[Any], Any]:
-        def refuse(props: Any) -> Any:
-            raise PathreplayError(f"{plugin}: variant {variant!r} has no derivatives: use {' or '.join(alike)}")
-
-        return refuse
+    def refuse(plugin: str, props: Any) -> Any:
+        raise PathreplayError(f"{plugin}: variant {variant!r} has no derivatives: use {' or '.join(alike)}")
 
     for plugin, (kind, *_) in PLUGINS.items():
-        getattr(mi, f"register_{kind}")(plugin, stand_in(plugin))
+        getattr(mi, f"register_{kind}")(plugin, partial(refuse, plugin))
 
 
 def install() -> None:
