@@ -18,8 +18,7 @@ from pathreplay.check.objective import Loss, Mode, Objective, alone, integrator_
 from pathreplay.check.reference import Spec, integrator_under_test, reference_integrator
 from pathreplay.check.verdict import Judgement
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.render.film import film_size
-from pathreplay.render.film_limits import require_memory, require_samples
+from pathreplay.render.film import require_film
 from pathreplay.scenes.parameters import get_array, require_differentiable, require_finite
 from pathreplay.scenes.spectra import coefficient_channels
 
@@ -233,12 +232,11 @@ def _require_arguments(
         raise PathreplayError(f"seeds is {shown(seeds)}; give up to {_MOST_SEEDS}, and take more samples instead")
     if seeds < 2:
         raise PathreplayError(f"seeds is {seeds}; a standard error needs at least 2, and 8 or more make sense")
-    film = film_size(scene.sensors()[sensor])
-    for name, count in (("spp", spp), ("fd_spp", spp if fd_spp is None else fd_spp)):
+    counts = {"spp": spp, "fd_spp": spp if fd_spp is None else fd_spp}
+    for name, count in counts.items():
         if count < 1:
             raise PathreplayError(f"{name} is {count}; give at least 1 sample per pixel")
-        require_samples(name, count, film, f"sensor {sensor}")
-    require_memory(film, f"sensor {sensor}")
+    require_film(scene.sensors()[sensor], f"sensor {sensor}", counts)
     if seed < 0:
         raise PathreplayError(f"seed is {seed}; give a whole number from 0 on")
     if mode not in ("backward", "forward"):

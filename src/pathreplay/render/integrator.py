@@ -12,10 +12,9 @@ from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
-from ..plugins import on_base
 from ..transport.vertex import Walk
-from .camera_pass import Pass, Seed, Which, mitsuba_integrator
-from .diagnostics import Diagnostics, doubts, lost_note, missing_edges, used_before_note
+from .camera_pass import Pass, Seed, Which
+from .diagnostics import doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts
 from .interior import PathReplay
 from .path_integrator import UNBOUNDED, PathIntegrator
@@ -81,7 +80,7 @@ class PathReplayIntegrator(PathIntegrator):
         self.interior = _interior(self.name, props, self.max_depth)
         self.driver, self.branch = self.interior.driver, self.interior.branch
         self.told: set[str] = set()  # what has been said in the log
-        self.untold = Diagnostics()  # of passes whose lost paths have not been told
+        self.untold = Found()  # of passes whose lost paths have not been told
         self.baseline: tuple[SceneFacts, Baseline] | None = None  # and the scene that it belongs to
 
     def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0) -> bool:
@@ -92,13 +91,7 @@ class PathReplayIntegrator(PathIntegrator):
         return not self._facts(scene).has_media
 
     def render_and_backward(
-        self,
-        scene: mi.Scene,
-        offset: mi.TensorXf,
-        slope: mi.TensorXf,
-        sensor: Which = 0,
-        seed: Seed = 0,
-        spp: int = 0,
+        self, scene: mi.Scene, offset: mi.TensorXf, slope: mi.TensorXf, sensor: Which = 0, seed: Seed = 0, spp: int = 0
     ) -> mi.TensorXf:
         """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
 
@@ -121,17 +114,14 @@ class PathReplayIntegrator(PathIntegrator):
             self._tell_once(doubt)
         if walk.media is None:
             return None
-        baseline = self._baseline(walk.scene)
+        # Not by the facts of the last pass: other scenes may have been rendered between.
+        if self.baseline is None or not self.baseline[0].are_about(walk.scene):
+            self.baseline = self._facts(walk.scene), Baseline.fresh(walk.scene.bbox())
+        baseline = self.baseline[1]
         if view.key in baseline.passes:
             self._tell_once(used_before_note(view.key[0]))
             return None
         return baseline
-
-    def _baseline(self, scene: mi.Scene) -> Baseline:
-        # Not by the facts of the last pass: other scenes may have been rendered between.
-        if self.baseline is None or not self.baseline[0].are_about(scene):
-            self.baseline = self._facts(scene), Baseline.fresh(scene.bbox())
-        return self.baseline[1]
 
     def learned(self) -> dict[str, np.ndarray]:
         """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
@@ -145,13 +135,12 @@ class PathReplayIntegrator(PathIntegrator):
     def _told(self, view: Pass, walk: Walk, found: Found) -> None:
         """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see `take_lost`,
         which tells of the passes before, too."""
-        if found.diagnostics.moves:
+        if found.moves:
             self._tell_edges(walk, view.sensor)
         frozen = dr.flag(dr.JitFlag.FreezingScope)
-        self.untold = self.untold + found.diagnostics if frozen else found.diagnostics
-        if self.untold.counters and not frozen:
-            paths = self.untold.paths
-            self.tell_lost(self.take_lost(), paths)
+        self.untold = self.untold + Found(lost=found.lost) if frozen else Found()
+        if found.lost is not None and not frozen:
+            self.tell_lost(found.lost, found.paths)
         if found.seen is not None and self.baseline is not None:
             self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
 
@@ -171,7 +160,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     def take_lost(self) -> mi.UInt32 | None:
         """How many paths lost a part of their gradient, or None: a frozen function cannot look itself."""
-        lost, self.untold = self.untold.lost(), Diagnostics()
+        lost, self.untold = self.untold.lost, Found()
         return lost
 
     def tell_lost(self, count: mi.UInt32, paths: int) -> None:
@@ -183,9 +172,3 @@ class PathReplayIntegrator(PathIntegrator):
         return self._described(
             hide_emitters=self.hide_emitters, driver=self.driver, attach=self.attach, branch=self.branch
         )
-
-
-def register() -> None:
-    """Register the plugin for the active variant, which must be an AD variant."""
-    plugin = on_base(PathReplayIntegrator, mitsuba_integrator())
-    mi.register_integrator("pathreplay", lambda props: plugin(props))
