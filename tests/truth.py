@@ -190,7 +190,7 @@ def measure(case: Case) -> list[Row]:
 TRANSPOSE_MAX = 1e-5
 
 
-def hold(case: Case, transpose: float = TRANSPOSE_MAX) -> None:
+def hold(case: Case) -> None:
     """Measure a case and assert all three levels for every driver."""
     for row in measure(case):
         assert abs(row.z) < Z_LIMIT, row
@@ -199,7 +199,7 @@ def hold(case: Case, transpose: float = TRANSPOSE_MAX) -> None:
         if case.lanes is not None:
             assert row.lanes < case.lanes, row
         if row.driver != "forward":
-            assert row.transpose < transpose, row
+            assert row.transpose < TRANSPOSE_MAX, row
 
 
 # ------------------------------ Scene parts ------------------------------
