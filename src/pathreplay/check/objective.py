@@ -19,7 +19,7 @@ from pathreplay.check.statistics import relative_l1
 from pathreplay.check.stencil import CENTRAL, Stencil
 from pathreplay.check.verdict import NEGLIGIBLE, Judgement, judge
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes.loading import told
+from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.parameters import get_array
 
 Mode = Literal["backward", "forward"]

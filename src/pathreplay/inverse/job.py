@@ -22,7 +22,7 @@ from pathreplay.inverse.result import RunResult, outcome_of, result_files, resul
 from pathreplay.inverse.run_folder import RunFolder, create_run_folder, default_output, open_run_folder, require_output
 from pathreplay.inverse.saving import Saving, first_files, go_on, saved_targets
 from pathreplay.inverse.stopping import Stop, stopping
-from pathreplay.scenes.loading import told
+from pathreplay.scenes.descriptions import told
 from pathreplay.threads import one_thread, require_one_thread_possible
 
 
