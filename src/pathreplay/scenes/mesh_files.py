@@ -52,16 +52,17 @@ def require_sound_ply(path: Path) -> None:
         if file.read(3) != b"ply":
             raise PathreplayError(f"Mesh {path} is no PLY file: it does not begin with 'ply'; get it anew")
         form, elements = _ply_header(file)
-        begin = file.tell()
-    if form is None or [element.name for element in elements[:2]] != ["vertex", "face"] or "list" in elements[0].kinds:
-        return
-    vertices, faces = elements[0].count, elements[1].count
-    if not vertices or not faces:
-        raise PathreplayError(f"Mesh {path} has {vertices} vertices and {faces} faces; give it some, or leave it out")
-    try:
-        indices = _triangles(path, begin, elements, form)
-    except (KeyError, ValueError, IndexError):
-        return  # not what we know: Mitsuba may
+        names = [element.name for element in elements[:2]]
+        if form is None or names != ["vertex", "face"] or "list" in elements[0].kinds:
+            return
+        vertices, faces = elements[0].count, elements[1].count
+        if not vertices or not faces:
+            has = f"has {vertices} vertices and {faces} faces"
+            raise PathreplayError(f"Mesh {path} {has}; give it some, or leave it out")
+        try:
+            indices = _triangles(file, elements, form)
+        except (KeyError, ValueError, IndexError):
+            return  # not what we know: Mitsuba may
     if indices is not None:
         _require_vertices(path, indices, vertices)
 
@@ -81,23 +82,19 @@ def _ply_header(file: Any) -> tuple[str | None, list[_Element]]:
     return None, []
 
 
-def _triangles(path: Path, begin: int, elements: list[_Element], form: str) -> NDArray[Any] | None:
+def _triangles(file: Any, elements: list[_Element], form: str) -> NDArray[Any] | None:
     """Vertices of the faces, (n, 3); None where some are missing, or are no triangles: Mitsuba refuses these."""
     vertex, face = (element.layout(form) for element in elements[:2])
-    data = _numbers(path, begin) if form == "ascii" else np.memmap(path, np.uint8, "r", begin)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # where numbers end and text begins
+        text = form == "ascii"
+        data = np.fromfile(file, np.float64, sep=" ") if text else np.memmap(file, np.uint8, "r", file.tell())
     skipped, faces = vertex.itemsize * elements[0].count, elements[1].count
     if data.nbytes < skipped + face.itemsize * faces:
         return None
     entries = np.frombuffer(data, face, faces, skipped)
     at = elements[1].kinds.index("list")
     return entries[f"{at}"] if (entries[f"count {at}"] == 3).all() else None
-
-
-def _numbers(path: Path, begin: int) -> NDArray[np.float64]:
-    with path.open("rb") as file, warnings.catch_warnings():
-        file.seek(begin)
-        warnings.simplefilter("ignore")  # where numbers end and text begins
-        return np.fromstring(file.read().decode("latin-1"), np.float64, sep=" ")
 
 
 _MAGIC = 0x041C
