@@ -69,10 +69,8 @@ def integrator_under_test(spec: Spec, scene: mi.Scene, max_depth: int | None = N
     if isinstance(spec, Mapping):
         description = dict(spec)
     else:
-        description = {"type": spec or "pathreplay"}
-        limits = read_limits(own) if own is not None else None
-        if limits is not None:
-            description.update(vars(limits))
+        limits = None if own is None else read_limits(own)
+        description = {"type": spec or "pathreplay", **({} if limits is None else vars(limits))}
     if max_depth is not None:
         description["max_depth"] = max_depth
     return load_integrator(description)

@@ -56,10 +56,6 @@ def load_scene_with(
     return scene, exchanged
 
 
-SMOOTH_GLASS = {"dielectric": "smoothdielectric"}
-"""Mitsuba's plugin with an index that carries no derivative -> ours with one that does."""
-
-
 def load_scene_for(
     spec: str | Path, wanted: Iterable[str], base: Path | None = None, /, **parameters: Any
 ) -> tuple[mi.Scene, tuple[str, ...]]:
@@ -80,7 +76,7 @@ def load_scene_for(
     # Dr.Jit traces calls through every instance alive, so the first scene has to go before the second one comes.
     del scene, params
     gc.collect()
-    scene, exchanged = load_scene_with(spec, SMOOTH_GLASS, base, **parameters)
+    scene, exchanged = load_scene_with(spec, {"dielectric": "smoothdielectric"}, base, **parameters)
     count = "one" if len(exchanged) == 1 else f"all {len(exchanged)}"
     return scene, (f"replaced 'dielectric' by 'smoothdielectric' ({count} of them): its eta carries a derivative",)
 

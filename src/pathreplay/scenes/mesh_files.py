@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,7 +96,8 @@ def _triangles(file: Any, elements: list[_Element], form: str) -> NDArray[Any] |
     return entries[f"{at}"] if (entries[f"count {at}"] == 3).all() else None
 
 
-_MAGIC = 0x041C
+# How a file of version 3 or 4 begins -> bytes of an entry in the table at its end.
+_ENTRIES = {b"\x1c\x04\x03\0": 4, b"\x1c\x04\x04\0": 8}
 
 
 def require_sound_serialized(path: Path, index: Any) -> None:
@@ -106,18 +106,14 @@ def require_sound_serialized(path: Path, index: Any) -> None:
     Damage of other kinds is left to Mitsuba, which sees it.
     """
     with path.open("rb") as file:
-        head = file.read(4)
-        if len(head) < 4 or struct.unpack("<HH", head) not in ((_MAGIC, 3), (_MAGIC, 4)):
-            return
-        version, size = struct.unpack("<HH", head)[1], path.stat().st_size
+        entry, size = _ENTRIES.get(file.read(4)), path.stat().st_size
         file.seek(max(size - 4, 4))
-        if len(last := file.read(4)) < 4:
-            return
-    (count,) = struct.unpack("<I", last)
-    if count < 1 or size - 4 - (8 if version == 4 else 4) * count < 4:
-        raise PathreplayError(f"Mesh {path} of {size} bytes should hold {count} shapes; it is damaged, write it anew")
-    if not isinstance(index, int) or not 0 <= index < count:
+        last = file.read(4)
+    if entry is None or len(last) < 4:
         return
+    count = int.from_bytes(last, "little")
+    if count < 1 or size - 4 - entry * count < 4:
+        raise PathreplayError(f"Mesh {path} of {size} bytes should hold {count} shapes; it is damaged, write it anew")
     try:
         # With normals of faces Mitsuba makes none of vertices, by indices that it has not looked at.
         description = {"type": "serialized", "filename": str(path), "shape_index": index, "face_normals": True}

@@ -39,13 +39,12 @@ def require_shallow(path: Path) -> None:
 
 def _included(path: Path) -> list[str]:
     names: list[str] = []
-    depth = 0
+    inside: list[str] = []
     parser = expat.ParserCreate()
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal depth
-        depth += 1
-        if depth > DEEPEST:
+        inside.append(tag)
+        if len(inside) > DEEPEST:
             raise PathreplayError(
                 f"Scene {path} has more than {DEEPEST} elements inside each other (line {parser.CurrentLineNumber}); "
                 "flatten it with <ref id=…/>"
@@ -53,11 +52,7 @@ def _included(path: Path) -> list[str]:
         if tag == "include" and "filename" in attributes:
             names.append(attributes["filename"])
 
-    def end(tag: str) -> None:
-        nonlocal depth
-        depth -= 1
-
-    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    parser.StartElementHandler, parser.EndElementHandler = begin, lambda tag: inside.pop()
     try:
         with path.open("rb") as file:
             parser.ParseFile(file)
