@@ -151,6 +151,16 @@ class Bench(Objective):
         case = self.case
         return np.array([self.backward(integrator, k, case.spp) for k in range(1, (count or case.seeds) + 1)])
 
+    def lane_error(self, integrator: mi.Integrator, h: float, seed: int, spp: int) -> float:
+        """Relative L1 error, lane by lane, of the forward pass against differences with its own random numbers."""
+        found, expected = self.forward(integrator, seed, spp), self.difference(integrator, CENTRAL, h, seed, spp)
+        return float(np.abs(found - expected).sum() / np.abs(expected).sum())
+
+    def transpose_error(self, ahead: mi.Integrator, back: mi.Integrator, seed: int, spp: int) -> float:
+        """|<W, J v> - <J^T W, v>| / Σ |W J v|: a forward pass against a reverse pass with the same random numbers."""
+        tangent = self.forward(ahead, seed, spp)
+        return abs(self.dot(tangent) - self.backward(back, seed, spp)) / self.dot(np.abs(tangent))
+
     def release(self) -> None:
         """Detach the parameter: Dr.Jit traces virtual calls through all scenes alive, and trips over attached ones."""
         self.params[self.key] = self.value

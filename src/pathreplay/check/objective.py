@@ -15,8 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.check.direction import Line
-from pathreplay.check.statistics import relative_l1
-from pathreplay.check.stencil import CENTRAL, Stencil
+from pathreplay.check.stencil import Stencil
 from pathreplay.check.verdict import NEGLIGIBLE, Judgement, judge
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.descriptions import told
@@ -134,16 +133,6 @@ class Objective:
         dr.enqueue(dr.ADMode.Backward, self.params[self.key])
         dr.traverse(dr.ADMode.Backward)
         return float(dr.grad(t)[0])
-
-    def lane_error(self, integrator: mi.Integrator, h: float, seed: int, spp: int) -> float:
-        """Relative L1 error, lane by lane, of the forward pass against differences with its own random numbers."""
-        found = self.forward(integrator, seed, spp)
-        return relative_l1(found, self.difference(integrator, CENTRAL, h, seed, spp))
-
-    def transpose_error(self, ahead: mi.Integrator, back: mi.Integrator, seed: int, spp: int) -> float:
-        """|<w, J v> - <Jᵀ w, v>| / Σ |w J v|: a forward pass against a reverse pass with the same random numbers."""
-        tangent = self.forward(ahead, seed, spp)
-        return abs(self.dot(tangent) - self.backward(back, seed, spp)) / self.dot(np.abs(tangent))
 
     def judge(self, line: Line, gradients: np.ndarray, full: np.ndarray, half: np.ndarray) -> Judgement:
         """The verdict on gradients, from differences along the line with its stencil and with this halved."""
