@@ -118,13 +118,14 @@ def check_gradient(
         PathreplayError: a bad argument, a parameter without derivative, NaN in the scene, an integrator that cannot
             differentiate this parameter.
     """
+    fd_spp = spp if fd_spp is None else fd_spp
     _require_types(key, loss, sensor=sensor, seeds=seeds, spp=spp, fd_spp=fd_spp, seed=seed)
     _require_arguments(scene, sensor, seeds, spp, fd_spp, seed, mode)
     params = mi.traverse(scene)
     tested = integrator_under_test(integrator, scene, max_depth)
     line = _line(params, key, tested, step, direction, seed)
     plain = reference_integrator(reference, scene, tested)
-    plan = _Plan(mode, seeds, spp, fd_spp or spp, seed, progress)
+    plan = _Plan(mode, seeds, spp, fd_spp, seed, progress)
     with alone(params, key):
         return plan.carry_out(Objective(scene, params, key, line.move, sensor), line, tested, plain, loss)
 
@@ -144,7 +145,7 @@ class _Plan:
     def carry_out(
         self, objective: Objective, line: Line, tested: mi.Integrator, plain: mi.Integrator, loss: Loss | None
     ) -> GradientCheck:
-        n, stencil, points = self.seeds, line.stencil, line.stencil.points()
+        n, stencil = self.seeds, line.stencil
         # Distinct 32-bit words: seeds of the gradient's primal image, of its derivative, of the reference, of the
         # weights.
         words = [int(word) for word in np.random.SeedSequence(self.seed).generate_state(3 * n + 1)]
@@ -153,7 +154,7 @@ class _Plan:
         pairs, others = zip(words[:n], words[n : 2 * n], strict=True), words[2 * n : -1]
         gradients = [self._tick(objective.derivative(tested, self.mode, *pair, self.spp)) for pair in pairs]
         values = {}
-        for o in points:
+        for o in stencil.points():
             images = (objective.image(plain, seed, self.fd_spp, o * line.step) for seed in others)
             values[o] = np.array([self._tick(objective.dot(image)) for image in images])
         full, half = (each(values.__getitem__) / line.step for each in (stencil, stencil.halved()))
@@ -206,14 +207,11 @@ def _require_types(key: object, loss: object, **numbers: object) -> None:
     if loss is not None and not callable(loss):
         raise PathreplayError(f"loss is {shown(loss)}; give a function from the image to a number, or leave it out")
     for name, number in numbers.items():
-        absent = name == "fd_spp" and number is None
-        if not absent and (isinstance(number, bool) or not isinstance(number, (int, np.integer))):
+        if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
             raise PathreplayError(f"{name} is {shown(number)}; give a whole number")
 
 
-def _require_arguments(
-    scene: object, sensor: int, seeds: int, spp: int, fd_spp: int | None, seed: int, mode: str
-) -> None:
+def _require_arguments(scene: object, sensor: int, seeds: int, spp: int, fd_spp: int, seed: int, mode: str) -> None:
     if mi.variant() is None or not dr.is_diff_v(mi.Float):
         raise PathreplayError(
             f"Variant '{mi.variant()}' has no derivatives; call mi.set_variant('llvm_ad_rgb') before loading the scene"
@@ -232,7 +230,7 @@ def _require_arguments(
         raise PathreplayError(f"seeds is {shown(seeds)}; give up to {_MOST_SEEDS}, and take more samples instead")
     if seeds < 2:
         raise PathreplayError(f"seeds is {seeds}; a standard error needs at least 2, and 8 or more make sense")
-    counts = {"spp": spp, "fd_spp": spp if fd_spp is None else fd_spp}
+    counts = {"spp": spp, "fd_spp": fd_spp}
     for name, count in counts.items():
         if count < 1:
             raise PathreplayError(f"{name} is {count}; give at least 1 sample per pixel")

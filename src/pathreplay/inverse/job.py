@@ -21,7 +21,7 @@ from pathreplay.inverse.progress import Progress
 from pathreplay.inverse.result import RunResult, outcome_of, result_files, result_of
 from pathreplay.inverse.run_folder import Job, RunFolder, create_run_folder, new_output, open_run_folder
 from pathreplay.inverse.saving import Saving, first_files, go_on, saved_targets
-from pathreplay.scenes.loading import told
+from pathreplay.scenes.descriptions import told
 from pathreplay.threads import one_thread
 
 

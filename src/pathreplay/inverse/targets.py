@@ -16,8 +16,8 @@ from pathreplay.inverse.images import Image, find_image, over_black, read_image,
 from pathreplay.inverse.values import Array, adapted_image, make_value, require_finite_array, seen
 from pathreplay.render.film import picture_shape
 from pathreplay.scenes import parameters
-from pathreplay.scenes.descriptions import load_integrator
-from pathreplay.scenes.loading import load_scene, told
+from pathreplay.scenes.descriptions import load_integrator, told
+from pathreplay.scenes.loading import load_scene
 from pathreplay.scenes.stored import form_of
 
 

@@ -77,6 +77,7 @@ class PathReplayIntegrator(PathIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
         self.attach = choice(props, self.name, "attach", "delta", ATTACH)
+        self.moves_rays = self.attach != "none"  # gradients reach cameras, and lights that move
         self.interior = _interior(self.name, props, self.max_depth)
         self.driver, self.branch = self.interior.driver, self.interior.branch
         self.told: set[str] = set()  # what has been said in the log
