@@ -21,8 +21,7 @@ from pathreplay.gradient.driver import Driver, ForwardDriver
 from pathreplay.gradient.forward import forward
 from pathreplay.gradient.sweep import sweep
 from pathreplay.inverse import losses, make_config, optimize
-from pathreplay.inverse.evaluate import Evaluator, Shard
-from pathreplay.inverse.executor import Executor, Local
+from pathreplay.inverse.evaluate import Evaluator, Executor, Local, Shard
 from pathreplay.inverse.loop import new_run
 from pathreplay.inverse.problem import build_problem
 from pathreplay.render.camera_pass import Pass

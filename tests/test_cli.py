@@ -172,7 +172,7 @@ def test_the_doctor_ends_with_what_it_found(run, monkeypatch: pytest.MonkeyPatch
     from pathreplay.doctor import DoctorReport, VariantVerdict
 
     variant = VariantVerdict("llvm_ad_rgb", works, "" if works else "no libLLVM works")
-    report = DoctorReport("0", "3", "here", "3.9.1", "1.5.0", (), (variant,), ("libLLVM: install one",))
+    report = DoctorReport("3.9.1", "1.5.0", (), (variant,), ("libLLVM: install one",))
     monkeypatch.setattr("pathreplay.doctor.examine", lambda: report)
     status, out, _ = run("doctor")
     assert status == expected

@@ -9,11 +9,11 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from pathreplay.interrupts import Stop
 from pathreplay.inverse import make_config
 from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard, total
-from pathreplay.inverse.loop import Event, Refined, Started, Stepped, Stopped, iterate, new_run, take_step
+from pathreplay.inverse.loop import Refined, Started, Stepped, Stopped, iterate, new_run, take_step
 from pathreplay.inverse.problem import Problem, build_problem
-from pathreplay.inverse.stopping import Stop
 from pathreplay.threads import one_thread
 from test_deterministic import CLOUD
 from test_inverse_run import JOB, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
@@ -121,12 +121,7 @@ def test_observers_hear_of_everything_in_order() -> None:
     grid = [{"key": TEXTURE, "initial": 0.5, "resolutions": [2, 4], "refine_at": [2]}]
     config = make_config({**JOB, "iterations": 3, "parameters": grid})
     problem = build_problem(config, Path.cwd())
-    run, heard = new_run(problem, problem.integrator), []
-
-    class Listener:
-        def observe(self, event: Event) -> None:
-            heard.append(event)
-
-    iterate(problem, config, run, Stop(), [Listener()])
+    run = new_run(problem, problem.integrator)
+    heard = list(iterate(problem, config, run, Stop()))
     first, second, third = (Stepped(entry) for entry in run.history)
     assert heard == [Started(0, 3), first, second, Refined(TEXTURE, (4, 4, 3)), third, Stopped(3)]

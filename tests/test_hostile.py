@@ -42,7 +42,7 @@ HANDFUL = (
     ".vol in a scene: 5 channels",
     "a film of zero (check)",
     "a shapegroup of nothing",
-    "serialized: a face of vertex 1000",
+    "serialized: a face of vertex 1000, a wrong checksum",
     "serialized: 1e6 shapes",
 )
 

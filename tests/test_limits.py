@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from pathreplay import memory
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.limits import require_grid, require_learning_rate
-from pathreplay.render.film_limits import MOST_SAMPLES, require_samples
+from pathreplay.render.film import MOST_SAMPLES, require_film
 
 
 def test_a_container_s_limit_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -45,10 +46,11 @@ def test_the_named_resolution_is_the_largest_that_fits(shape: tuple[int, ...], m
 
 
 def test_the_named_count_of_samples_is_the_largest_that_dr_jit_takes() -> None:
-    most = MOST_SAMPLES // 24
-    require_samples("spp", most, (6, 4), "sensor 'eye'")
+    film = {"type": "hdrfilm", "width": 6, "height": 4, "rfilter": {"type": "box"}}
+    sensor, most = mi.load_dict({"type": "perspective", "film": film}), MOST_SAMPLES // 24
+    require_film(sensor, "sensor 'eye'", {"spp": most})
     with pytest.raises(PathreplayError, match=f"'spp' up to {most}$"):
-        require_samples("spp", most + 1, (6, 4), "sensor 'eye'")
+        require_film(sensor, "sensor 'eye'", {"spp": most + 1})
 
 
 def test_learning_rates_are_held_against_values_and_bounds() -> None:

@@ -13,8 +13,8 @@ import safetensors.numpy
 
 from pathreplay.check import check_gradient
 from pathreplay.errors import PathreplayError
+from pathreplay.files import LONGEST, file_names
 from pathreplay.inverse import RunResult, make_config, optimize
-from pathreplay.inverse.file_names import LONGEST, file_names
 from pathreplay.scenes import parameters
 from pathreplay.scenes.loading import load_scene
 

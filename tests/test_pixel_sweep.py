@@ -13,13 +13,12 @@ from pathreplay.check.statistics import gap
 from pathreplay.check.stencil import CENTRAL
 from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config import make_config
+from pathreplay.inverse.config import ITERATION, make_config
 from pathreplay.inverse.evaluate import Evaluator, Shard
 from pathreplay.inverse.loop import new_run, take_step
 from pathreplay.inverse.losses import QUADRATIC, RELATIVE_FLOOR, l2
 from pathreplay.inverse.problem import build_problem
 from pathreplay.inverse.recorded import linear_derivative
-from pathreplay.inverse.seeds import ITERATION, seeds
 from truth import (
     Bench,
     Case,
@@ -213,7 +212,7 @@ def gradient(config, folder) -> np.ndarray:
     """Of a single step, by the first variable."""
     problem = build_problem(config, folder)
     run = new_run(problem, problem.integrator)
-    numbers = [seeds(config.seed, ITERATION, 0, view.sensor)[0] for view in problem.views]
+    numbers = [config.seeds(ITERATION, view.sensor)[0] for view in problem.views]
     shard = Shard(tuple(range(len(problem.views))), config.spp, tuple(numbers))
     return Evaluator(problem, problem.integrator)(run.values, shard, {}).gradients[problem.variables[0].key]
 

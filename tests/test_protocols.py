@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pathreplay import backend
-from pathreplay.inverse.evaluate import Evaluate, Evaluation, Shard
-from pathreplay.inverse.executor import Executor, Local
+from pathreplay.inverse.evaluate import Evaluate, Evaluation, Executor, Local, Shard
 from pathreplay.inverse.optimiser import Adam, Optimiser
 
 OPTIMISERS = [Adam]

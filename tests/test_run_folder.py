@@ -109,7 +109,7 @@ def test_a_folder_that_cannot_be_written_is_gone_and_let_go_of(room: Path, monke
     closed: list[FolderLock] = []
     monkeypatch.setattr(FolderLock, "close", lambda lock: closed.append(lock))
     with pytest.raises(PathreplayError, match="No space left"):
-        run_folder.create_run_folder(room / "full", load_config(room / job), room / job, room, {})
+        run_folder.create_run_folder(room / "full", run_folder.Job(load_config(room / job), room / job, room), {})
     assert len(closed) == 1 and not (room / "full").exists()
 
 

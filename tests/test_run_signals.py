@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from pathreplay import interrupts
+from pathreplay.interrupts import stopping
 from pathreplay.inverse import optimize
-from pathreplay.inverse.stopping import stopping
 from small_job import TIMEOUT_S, ended, hear_signals, kill_at_checkpoint, start, wait_for, write_job
 
 ENDLESS = {"iterations": 100_000, "checkpoint_every": 1}
@@ -100,10 +100,10 @@ def test_handlers_come_back_and_scheduler_signals_may_come_twice() -> None:
     before = {number: signal.getsignal(number) for number in interrupts.ENDING}
     said: list[str] = []
     with stopping(said.append, "out") as stop:
-        assert not stop.wanted()
+        assert stop.by is None
         for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGHUP):
             signal.raise_signal(number)
-        assert stop.by() == "SIGTERM" and len(said) == 1
+        assert stop.by == "SIGTERM" and len(said) == 1
         with pytest.raises(KeyboardInterrupt, match="out"):
             signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)  # at once after the other: one wish
@@ -115,7 +115,7 @@ def test_what_is_ignored_stays_ignored() -> None:
     try:
         with stopping(lambda text: None, "") as stop:
             signal.raise_signal(signal.SIGHUP)
-        assert not stop.wanted()
+        assert stop.by is None
     finally:
         signal.signal(signal.SIGHUP, before)
 

@@ -171,7 +171,7 @@ def test_a_given_radiance_comes_back() -> None:
     params = mi.traverse(world)
     dr.enable_grad(params["square.bsdf.specular_reflectance.value"])
     params.update()
-    L = back(world, 2.0, RayDerivative.zero(), 1.0)
+    L = back(world, 2.0, dr.zeros(RayDerivative), 1.0)
     assert np.allclose(L, 1.6, rtol=1e-5)
     found = dr.grad(params["square.bsdf.specular_reflectance.value"])
     assert np.allclose(found, 3 * 2.0 * LANES, rtol=1e-5)

@@ -12,8 +12,7 @@ import numpy as np
 
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import make_config
-from pathreplay.inverse.evaluate import Evaluator
-from pathreplay.inverse.executor import Local
+from pathreplay.inverse.evaluate import Evaluator, Local
 from pathreplay.inverse.loop import take_step
 from pathreplay.inverse.losses import l2
 from pathreplay.inverse.optimiser import Adam
@@ -61,7 +60,7 @@ class Step:
         self.upper = 1.0 if texture else None  # a density has no upper bound
         self.target = mi.TensorXf(target)
         like, array = type(truth)(truth), get_array(self.start)
-        variable = Variable(self.key, like, 0.0, self.upper, RATE, array, None)
+        variable = Variable(self.key, like, (0.0, np.inf if self.upper is None else self.upper), RATE, array, None)
         view = View("camera", 0, np.array(target))
         self.problem = Problem(
             self.scene, self.params, judge, None, judge, (variable,), (), (view,), l2, ()

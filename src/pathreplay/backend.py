@@ -25,8 +25,7 @@ def point_drjit() -> None:
     """Make Dr.Jit load a libLLVM that works, without a trial. Raises nothing.
 
     Before drjit is imported: sets DRJIT_LIBLLVM_PATH, unless it names a file that can be loaded, to pip's library,
-    otherwise to the system's newest that is not known to fail. Afterwards: if Dr.Jit found none or one that is
-    known to fail, tells it to load another one (`reload_llvm`).
+    otherwise to the system's newest that is not known to fail. Afterwards: reloads one that is known to fail.
     """
     if "drjit" in sys.modules:
         path = None if loaded_is_plausible() else _untried_choice()
@@ -96,25 +95,22 @@ def reload_llvm(path: str) -> bool:
     in_use = active and "No variables registered" not in (dr.whos(as_string=True) or "")
     if in_use or (active and dr.has_backend(dr.JitBackend.CUDA)):
         return False
-    before = os.environ.get(ENVIRONMENT_VARIABLE)
-    os.environ[ENVIRONMENT_VARIABLE] = path
-    _preload(libllvm.unlinked_siblings(path))
     try:
         core = ctypes.CDLL(os.path.join(os.path.dirname(dr.__file__), "libdrjit-core.so"))
         shutdown, init = core._Z12jit_shutdowni, core._Z8jit_initj
     except (OSError, AttributeError):  # another platform, or another Dr.Jit
-        pass
-    else:
-        if active:
-            shutdown(ctypes.c_int(0))
-        init(ctypes.c_uint(1 << int(dr.JitBackend.LLVM.value)))
-        if loaded_is_plausible():
-            return True
-    if before is None:
+        return False
+    before = os.environ.get(ENVIRONMENT_VARIABLE)
+    os.environ[ENVIRONMENT_VARIABLE] = path
+    _preload(libllvm.unlinked_siblings(path))
+    if active:
+        shutdown(ctypes.c_int(0))
+    init(ctypes.c_uint(1 << int(dr.JitBackend.LLVM.value)))
+    if not (works := loaded_is_plausible()):
         del os.environ[ENVIRONMENT_VARIABLE]
-    else:
-        os.environ[ENVIRONMENT_VARIABLE] = before
-    return False
+        if before is not None:
+            os.environ[ENVIRONMENT_VARIABLE] = before
+    return works
 
 
 def warn_of_bad_llvm() -> None:

@@ -43,7 +43,8 @@ class _Commands(typer.core.TyperGroup):
 
 
 def _end(interrupt: BaseException) -> NoReturn:
-    interrupts.ignored()  # a second signal finds the process on its way out
+    for number in interrupts.ENDING:
+        signal.signal(number, signal.SIG_IGN)  # a second one finds the process on its way out
     with contextlib.suppress(OSError):  # the terminal may be gone
         print(f"pathreplay: {str(interrupt) or 'ended by Ctrl-C'}", file=sys.stderr, flush=True)
     raise SystemExit(128 + getattr(interrupt, "number", signal.SIGINT))

@@ -15,6 +15,7 @@ from rich.text import Text
 
 from pathreplay import __version__, libllvm
 from pathreplay.backend import is_usable_variant
+from pathreplay.errors import plain_line
 from pathreplay.libllvm import ENVIRONMENT_VARIABLE, LlvmLibrary
 
 
@@ -35,9 +36,6 @@ class DoctorReport:
     each failure that can be mended.
     """
 
-    pathreplay: str
-    python: str
-    platform: str
     mitsuba: str
     drjit: str
     libraries: tuple[LlvmLibrary, ...]
@@ -49,9 +47,9 @@ class DoctorReport:
         """Whether at least one variant that pathreplay can use runs here."""
         return any(variant.works for variant in self.variants)
 
-    def print(self, console: Console | None = None) -> None:
+    def print(self) -> None:
         """Write the report for people. Lines are never wrapped, so that paths can be copied."""
-        console = console or Console(highlight=False)
+        console = Console(highlight=False)
 
         def line(*parts: str | tuple[str, str]) -> None:
             console.print(Text.assemble(*parts), soft_wrap=True)
@@ -59,8 +57,8 @@ class DoctorReport:
         def verdict(works: bool) -> tuple[str, str]:
             return ("  ok    ", "green") if works else ("  fails ", "red")
 
-        line(("Versions", "bold"), f"\n  pathreplay {self.pathreplay}, Mitsuba {self.mitsuba}, Dr.Jit {self.drjit}")
-        line(f"  Python {self.python}, {self.platform}")
+        line(("Versions", "bold"), f"\n  pathreplay {__version__}, Mitsuba {self.mitsuba}, Dr.Jit {self.drjit}")
+        line(f"  Python {platform.python_version()} ({sys.executable}), {platform.platform()}")
         line(("libLLVM", "bold"), " (in the order in which they are looked for)")
         for library in self.libraries:
             reason = f": {library.message}" if library.message else ""
@@ -104,18 +102,6 @@ if not 0.0 < gradient < 100.0:
 """
 
 
-def _versions() -> tuple[str, str, list[str], list[str]]:
-    """Versions of Mitsuba and Dr.Jit, the variants that Mitsuba has, and the ways out if they are missing."""
-    try:
-        import drjit as dr
-        import mitsuba as mi
-    except Exception as error:
-        reason = " ".join(str(error).split())
-        way_out = "install Mitsuba: pip install 'mitsuba>=3.9.1,<3.10'"
-        return f"cannot be imported ({reason})", "unknown", [], [way_out]
-    return str(mi.__version__), str(dr.__version__), list(mi.variants()), []
-
-
 def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[VariantVerdict]:
     """Try each variant; once one of a back end fails to start, its others are not tried."""
     environment = os.environ | ({ENVIRONMENT_VARIABLE: library.path} if library else {})
@@ -135,7 +121,15 @@ def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[Variant
 
 def examine() -> DoctorReport:
     """Try every libLLVM and every variant on this machine (a few seconds). Raises nothing."""
-    mitsuba_version, drjit_version, known, ways_out = _versions()
+    ways_out: list[str] = []
+    try:
+        import drjit as dr
+        import mitsuba as mi
+
+        versions, known = (str(mi.__version__), str(dr.__version__)), list(mi.variants())
+    except Exception as error:
+        versions, known = (f"cannot be imported ({plain_line(str(error))})", "unknown"), []
+        ways_out.append("install Mitsuba: pip install 'mitsuba>=3.9.1,<3.10'")
     libraries = tuple(libllvm.probe(path, origin) for path, origin in libllvm.candidates()) if known else ()
     library = next((library for library in libraries if library.works), None)
     names = sorted(filter(is_usable_variant, known), key=lambda name: (name.split("_")[0] != "llvm", known.index(name)))
@@ -144,8 +138,7 @@ def examine() -> DoctorReport:
     broken = {variant.name.split("_")[0] for variant in variants if not variant.works}
     if "llvm" in broken and library is None:
         ways_out.append(f"libLLVM: {libllvm.WAY_OUT}")
-    asked_for = libllvm.ASKED_FOR
-    if asked_for and library is not None and any(each.path == asked_for and not each.works for each in libraries):
+    if library is not None and any(each.path == libllvm.ASKED_FOR and not each.works for each in libraries):
         ways_out.append(f"{ENVIRONMENT_VARIABLE} names a libLLVM that fails: unset it, or let it name {library.path}")
     if "cuda" in broken:
         ways_out.append(
@@ -154,13 +147,4 @@ def examine() -> DoctorReport:
         )
     if "metal" in broken:
         ways_out.append("Metal: needs a Mac with Apple silicon; without one, LLVM does the work on the CPU")
-    return DoctorReport(
-        pathreplay=__version__,
-        python=f"{platform.python_version()} ({sys.executable})",
-        platform=platform.platform(),
-        mitsuba=mitsuba_version,
-        drjit=drjit_version,
-        libraries=libraries,
-        variants=tuple(variants),
-        ways_out=tuple(ways_out),
-    )
+    return DoctorReport(*versions, libraries, tuple(variants), tuple(ways_out))

@@ -1,4 +1,4 @@
-"""Signals that ask a command to end: Ctrl-C, a scheduler's SIGTERM, the SIGHUP of a terminal that closes."""
+"""Signals that ask a command, or the run that it does, to end: Ctrl-C, a scheduler's SIGTERM, a terminal's SIGHUP."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
-Handler = Callable[[int, FrameType | None], Any]
+from pathreplay.errors import PathreplayError
 
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
@@ -32,8 +33,8 @@ def raise_once(error: BaseException) -> None:
 class Interrupted(KeyboardInterrupt):
     """A signal ended the command. ``number`` is the signal's."""
 
-    def __init__(self, number: int, message: str = "") -> None:
-        super().__init__(message or f"ended by {name_of(number)}")
+    def __init__(self, number: int) -> None:
+        super().__init__(f"ended by {name_of(number)}")
         self.number = number
 
 
@@ -43,7 +44,7 @@ def name_of(number: int) -> str:
 
 
 @contextmanager
-def handled(handle: Handler, keep: Callable[[], bool] = lambda: False) -> Iterator[None]:
+def handled(handle: Callable[[int, FrameType | None], Any], keep: Callable[[], bool] = lambda: False) -> Iterator[None]:
     """Within this block ``handle`` gets the signals of `ENDING`; in threads other than the main one nothing happens.
 
     SIGTERM and SIGHUP stay ignored where the parent process ignores them (nohup). Handlers come back at the end,
@@ -97,7 +98,36 @@ def undisturbed() -> Iterator[None]:
             signal.raise_signal(number)
 
 
-def ignored() -> None:
-    """From now on the signals do nothing: the process is at its end."""
-    for number in ENDING:
-        signal.signal(number, signal.SIG_IGN)
+@dataclass
+class Stop:
+    """Tells a run to end when it has done what is under way."""
+
+    by: str | None = None
+    """Who asked for it: 'Ctrl-C', 'SIGTERM' or 'SIGHUP'; None if nobody did."""
+    aborted: bool = False
+
+
+@contextmanager
+def stopping(say: Callable[[str], None], way_out: str) -> Iterator[Stop]:
+    """Within this block a first signal asks for a stop, and a second one that is a Ctrl-C raises KeyboardInterrupt.
+
+    SIGTERM and SIGHUP only ask, however often they come: schedulers and terminals send them more than once. ``say`` is
+    told what is going on; ``way_out`` is the message of the KeyboardInterrupt.
+    """
+    stop = Stop()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if stop.by is None:
+            stop.by = name_of(number)
+            say(f"{stop.by}: stopping after this iteration (Ctrl-C aborts)")
+        elif number == signal.SIGINT:
+            stop.aborted = True
+            raise_once(KeyboardInterrupt(way_out))
+
+    with handled(handle):
+        try:
+            yield stop
+        except (RuntimeError, PathreplayError):
+            if stop.aborted:  # Dr.Jit turns what is raised while it traces into errors of its own
+                raise KeyboardInterrupt(way_out) from None
+            raise

@@ -1,9 +1,9 @@
 """Finds a libLLVM with which Dr.Jit works.
 
-LLVM 14 and older are refused by Dr.Jit; 15 and 16 it accepts, and then they abort the process at the first minimum or
-maximum ("Cannot select: fminimum"). A trial in this process is too dangerous, so candidates are tried in a process of
-their own (0.2-0.3 s each). Their order: DRJIT_LIBLLVM_PATH, the one that `pip install pathreplay` brought
-(karellen-llvm-core), the system's from new to old.
+LLVM 14 and older are refused by Dr.Jit 1.5; 15 and 16 it accepts, and then they abort the process at the first
+minimum or maximum, which they cannot select for x86. A trial in this process is too dangerous, so candidates are tried
+in a process of their own (0.2-0.3 s each). Their order: DRJIT_LIBLLVM_PATH, the one that `pip install pathreplay`
+brought (karellen-llvm-core), the system's from new to old.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
 #: What the user set, before `import pathreplay` fills the variable in or replaces a value that cannot work.
 ASKED_FOR = os.environ.get(ENVIRONMENT_VARIABLE, "")
 PIP_DISTRIBUTION = "karellen-llvm-core"
-#: Dr.Jit 1.5 emits llvm.minimum/llvm.maximum, which LLVM 15 and 16 cannot select for x86; older ones it refuses itself.
 OLDEST_USABLE_MAJOR = 17
 #: A trial takes 0.3 s; a machine under load may need more, a hanging library must not hold us for ever.
 PROBE_TIMEOUT_S = 60.0
@@ -75,8 +74,7 @@ _SYSTEM_PATTERNS = {
         "/usr/lib/*-linux-gnu/libLLVM*.so*",  # Debian, Ubuntu
         "/usr/lib/llvm-*/lib/libLLVM*.so*",  # apt.llvm.org
         "/usr/lib64/libLLVM*.so*",  # Fedora, SUSE
-        "/usr/lib64/llvm*/lib/libLLVM*.so*",
-        "/usr/lib64/llvm*/lib64/libLLVM*.so*",
+        "/usr/lib64/llvm*/lib*/libLLVM*.so*",
         "/usr/lib/libLLVM*.so*",  # Arch
         "/usr/lib/llvm/*/lib64/libLLVM*.so*",  # Gentoo
         "/usr/local/lib/libLLVM*.so*",
@@ -114,7 +112,7 @@ def _known_to_linker() -> list[str]:
     """What ldconfig lists, so that folders which only this system knows are found as well."""
     for program in ("ldconfig", "/sbin/ldconfig", "/usr/sbin/ldconfig") if sys.platform == "linux" else ():
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            listing = subprocess.run([program, "-p"], capture_output=True, text=True, timeout=10, check=False).stdout
+            listing = subprocess.run([program, "-p"], capture_output=True, text=True, timeout=10).stdout
             return re.findall(r"^\s*libLLVM\S* .*=> (\S+)$", listing, re.MULTILINE)
     return []
 
@@ -155,8 +153,7 @@ for path in task["preload"]:
 _PROBE = """
 import drjit as dr
 if not dr.has_backend(dr.JitBackend.LLVM):
-    print("refused by Dr.Jit", file=sys.stderr)
-    raise SystemExit(3)
+    raise SystemExit("refused by Dr.Jit")
 print(".".join(str(number) for number in dr.detail.llvm_version()), flush=True)
 from drjit.llvm.ad import Float
 x = Float([1.0, 2.0, 3.0] * 7)  # more lanes than any vector register has, so that both full and partial packets run
@@ -166,8 +163,7 @@ dr.backward(dr.sum(y))
 gradient = dr.grad(x)
 dr.eval(y, gradient)
 if [y[i] for i in range(3)] != [1.5, 4.0, 6.0] or [gradient[i] for i in range(3)] != [1.5, 4.0, 2.0]:
-    print(f"wrong result: {y}, gradient {gradient}", file=sys.stderr)
-    raise SystemExit(4)
+    raise SystemExit(f"wrong result: {y}, gradient {gradient}")
 """
 
 
@@ -188,17 +184,14 @@ def _reason(returncode: int, stderr: str) -> str:
     """One line that says why a trial failed, from what the process left behind."""
     # We switch the kernel cache off ourselves (see `probe`), and Dr.Jit says so.
     told = [line.strip() for line in stderr.splitlines() if line.strip() and "kernel cache" not in line]
-    lines = [re.sub(r"^\w+\(\): ", "", line) for line in told]
+    lines = [re.sub(r"^\w+\(\): ", "", line) for line in told] or [""]
     crash = returncode < 0 and returncode != -signal.SIGTERM
-    wanted = next((line for line in lines if line.startswith("LLVM ERROR")), None) if crash else None
-    detail = wanted or (lines[-1] if lines and "Traceback" in stderr else lines[0] if lines else "")
+    usual = lines[-1] if "Traceback" in stderr else lines[0]
+    detail = next((line for line in lines if crash and line.startswith("LLVM ERROR")), usual)
     detail = re.sub(r"0x[0-9a-f]+(: |, )?", "", detail).strip(" ,")
     detail = detail if len(detail) <= 200 else detail[:200] + " ..."
     if crash:
-        try:
-            name = signal.Signals(-returncode).name
-        except ValueError:
-            name = f"signal {-returncode}"
+        name = {known.value: known.name for known in signal.Signals}.get(-returncode, f"signal {-returncode}")
         return f"kills the process with {name}" + (f" ({detail})" if detail else "")
     return detail or f"the trial ended with exit status {returncode}"
 
@@ -219,7 +212,6 @@ def run_trial(code: str, task: Mapping[str, object], environment: Mapping[str, s
             text=True,
             errors="replace",
             timeout=PROBE_TIMEOUT_S,
-            check=False,
         )
     except subprocess.TimeoutExpired:
         return "", f"gave no answer within {PROBE_TIMEOUT_S:g} s"

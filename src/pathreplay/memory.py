@@ -24,16 +24,12 @@ def available() -> int:
     left = int(psutil.virtual_memory().available)
     for limit, used, statistics in _CONTAINERS:
         try:
-            left = min(left, int(limit.read_text()) - int(used.read_text()) + _cached(statistics.read_text()))
+            # Files that a container counts as used, and gives up when memory is wanted.
+            cached = dict(re.findall(r"^(?:total_)?((?:in)?active_file) (\d+)$", statistics.read_text(), re.MULTILINE))
+            left = min(left, int(limit.read_text()) - int(used.read_text()) + sum(map(int, cached.values())))
         except (OSError, ValueError):  # no such group, or 'max': no limit
             continue
     return max(left, 0)
-
-
-def _cached(statistics: str) -> int:
-    """Bytes of files that a container counts as used, and gives up when memory is wanted."""
-    sizes = dict(re.findall(r"^(?:total_)?((?:in)?active_file) (\d+)$", statistics, re.MULTILINE))
-    return sum(map(int, sizes.values()))
 
 
 def require(needed: int, thing: str, way_out: str) -> None:

@@ -8,32 +8,26 @@ the variant to use. Polarised variants get the plugins themselves, which say tha
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from pathreplay.errors import PathreplayError
 
-#: Each has `register() -> None`, which registers its plugins for the active variant; doing so again is harmless.
-PLUGIN_MODULES = (
-    "pathreplay.render.integrator",
-    "pathreplay.rivals.integrators",
-    "pathreplay.bsdfs.smoothdielectric",
-    "pathreplay.media.gridmedium",
-)
-
-#: All that they register: name -> the function of Mitsuba's that does it.
+#: Each by name: what it is to Mitsuba, and the template of its class (see `on_base`).
 PLUGINS = {
-    "pathreplay": "register_integrator",
-    "pathreplay_tape": "register_integrator",
-    "pathreplay_rb": "register_integrator",
-    "pathreplay_listing": "register_integrator",
-    "smoothdielectric": "register_bsdf",
-    "gridmedium": "register_medium",
+    "pathreplay": ("integrator", "pathreplay.render.integrator", "PathReplayIntegrator"),
+    "pathreplay_tape": ("integrator", "pathreplay.rivals.integrators", "TapeIntegrator"),
+    "pathreplay_rb": ("integrator", "pathreplay.rivals.integrators", "RadiativeIntegrator"),
+    "pathreplay_listing": ("integrator", "pathreplay.rivals.integrators", "ListingIntegrator"),
+    "smoothdielectric": ("bsdf", "pathreplay.bsdfs.smoothdielectric", "SmoothDielectric"),
+    "gridmedium": ("medium", "pathreplay.media.gridmedium", "GridMedium"),
 }
 
 
 def register(variant: str) -> None:
     """Register all plugins for the active variant, whose name is `variant`; stand-ins where it has no derivatives."""
+    import mitsuba as mi
+
     if "_ad_" not in variant:
         _register_stand_ins(variant)
         return
@@ -41,8 +35,19 @@ def register(variant: str) -> None:
         from pathreplay.backend import warn_of_bad_llvm
 
         warn_of_bad_llvm()
-    for module in PLUGIN_MODULES:
-        importlib.import_module(module).register()
+    bases = {"integrator": mitsuba_integrator(), "bsdf": mi.BSDF, "medium": mi.Medium}
+    for name, (kind, module, template) in PLUGINS.items():
+        plugin = on_base(getattr(importlib.import_module(module), template), bases[kind])
+        getattr(mi, f"register_{kind}")(name, plugin)
+
+
+def mitsuba_integrator() -> Any:
+    """Mitsuba's ADIntegrator of the active variant: what it does to prepare a pass is what its users' seeds mean."""
+    # The name under which Mitsuba runs its Python modules anew for every variant. Of `mitsuba.ad`, the public name, an
+    # import statement makes a copy, which stays what it was in the first variant.
+    from mitsuba.python.ad.integrators.common import ADIntegrator
+
+    return ADIntegrator
 
 
 def on_base(template: type, base: type) -> type:
@@ -62,14 +67,11 @@ def _register_stand_ins(variant: str) -> None:
     colours = variant.removesuffix("_polarized").rsplit("_", 1)[-1]
     alike = [name for name in usable if name.endswith(colours)] or usable
 
-    def stand_in(plugin: str) -> Callable[[Any], Any]:
-        def refuse(props: Any) -> Any:
-            raise PathreplayError(f"{plugin}: variant {variant!r} has no derivatives: use {' or '.join(alike)}")
+    def refuse(plugin: str, props: Any) -> Any:
+        raise PathreplayError(f"{plugin}: variant {variant!r} has no derivatives: use {' or '.join(alike)}")
 
-        return refuse
-
-    for plugin, how in PLUGINS.items():
-        getattr(mi, how)(plugin, stand_in(plugin))
+    for plugin, (kind, *_) in PLUGINS.items():
+        getattr(mi, f"register_{kind}")(plugin, partial(refuse, plugin))
 
 
 def install() -> None:

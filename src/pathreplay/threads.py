@@ -3,44 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 import drjit as dr
-import mitsuba as mi
-
-from pathreplay.errors import PathreplayError
 
 
-@contextmanager
-def spare_thread() -> Iterator[None]:
+def spare_thread() -> AbstractContextManager[None]:
     """Within this block, in which Mitsuba reads files, the pool has at least two threads.
 
     Mitsuba 3.9 hands the blocks of an EXR to the pool and waits without helping. In a pool of one, which a process gets
     that may use a single core (`taskset -c 0`, small containers), nobody else is there to do them. Writing has the same
     fault; we write without Mitsuba (see `exr_bytes`).
     """
-    with _threads(max(2, dr.thread_count())):
-        yield
+    return _threads(max(2, dr.thread_count()))
 
 
-@contextmanager
-def one_thread(wanted: bool) -> Iterator[None]:
+def one_thread(wanted: bool) -> AbstractContextManager[None]:
     """Within this block, if it is ``wanted``, Dr.Jit computes in a single thread, with the same bits each time.
 
     Threads add to pixels and gradients by atomic additions, in the order in which they happen to arrive. No file of
     Mitsuba's may be read or written in the block: see `spare_thread`.
     """
-    with _threads(1 if wanted else dr.thread_count()):
-        yield
-
-
-def require_one_thread_possible() -> None:
-    """Raise PathreplayError where the active variant runs on a GPU, whose threads cannot be told to be one."""
-    if not mi.variant().startswith("llvm"):
-        raise PathreplayError(
-            f"deterministic = true needs an LLVM variant, this is '{mi.variant()}': on a GPU the order of additions "
-            "is random; set variant = 'llvm_ad_rgb', or leave 'deterministic' out"
-        )
+    return _threads(1 if wanted else dr.thread_count())
 
 
 @contextmanager

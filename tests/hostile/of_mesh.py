@@ -97,9 +97,9 @@ def _serialized(name: str, data: bytes, *, options: str = "", refused: bool = Tr
     add(KIND, f"serialized: {name}", spoil, refused=refused)
 
 
-def _body(vertices: int, faces: int, indices: tuple[int, ...], flags: int = 0x1000) -> bytes:
+def _body(vertices: int, faces: int, indices: tuple[int, ...], flags: int = 0x1000, behind: bytes = b"") -> bytes:
     body = struct.pack("<I", flags) + b"m\0" + struct.pack("<QQ", vertices, faces)
-    body += np.array(VERTICES, "<f4").tobytes() + np.array(indices, "<u4").tobytes()
+    body += np.array(VERTICES, "<f4").tobytes() + np.array(indices, "<u4").tobytes() + behind
     return struct.pack("<HH", 0x041C, 4) + zlib.compress(body) + struct.pack("<QI", 0, 1)
 
 
@@ -111,6 +111,9 @@ _serialized("shape 7", serialized(), options='<integer name="shape_index" value=
 _serialized("shape -1", serialized(), options='<integer name="shape_index" value="-1"/>')
 _serialized("4e9 vertices", _body(4_000_000_000, 1, (0, 1, 2)))
 _serialized("a face of vertex 1000", _body(4, 1, (0, 1, 1000)))
+# Mitsuba reads no further than the faces, so that it does not see the checksum (the 4 bytes before the table).
+_damaged = _body(4, 1, (0, 1, 1000), behind=b"more")
+_serialized("a face of vertex 1000, a wrong checksum", _damaged[:-16] + bytes(4) + _damaged[-12:])
 _serialized("1e6 shapes", serialized()[:-4] + struct.pack("<I", 10**6))
 _serialized("unknown flags", _body(4, 1, (0, 1, 2), 0xFFFFFFFF), refused=False)
 

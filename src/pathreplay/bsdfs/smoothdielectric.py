@@ -25,19 +25,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..plugins import on_base
 
 #: Highest probability of reflection from the denser side, unless it is total.
 MAX_REFLECTION = 0.75
 TINTS = ("specular_reflectance", "specular_transmittance")
-
-
-def register() -> None:
-    """Registers `smoothdielectric` for the variant that is active now, whose base class is like no other variant's.
-
-    In a polarised variant the plugin is registered as well, and refuses when a scene asks for it.
-    """
-    mi.register_bsdf("smoothdielectric", on_base(SmoothDielectric, mi.BSDF))
 
 
 def _index(props: Any, name: str, default: str) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 import mitsuba as mi
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from pathreplay.check.gradient import GradientCheck, check_gradient
@@ -40,14 +40,14 @@ def check_all(
     # Standard error, and gone when done: what is printed or piped is the result alone.
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=None)
+
+        def progress(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
         for i, key in enumerate(keys):
-            task = bar.add_task(escape(f"{key} ({i + 1}/{len(keys)})"), total=None)
-
-            def progress(done: int, total: int, task: TaskID = task) -> None:
-                bar.update(task, completed=done, total=total)
-
+            bar.reset(task, description=escape(f"{key} ({i + 1}/{len(keys)})"))
             results.append(check_gradient(scene, key, integrator=tested, progress=progress, **options))
-            bar.remove_task(task)
     return results
 
 
@@ -85,8 +85,9 @@ def _with_error(value: float, error: float) -> str:
 def write_checks(results: Sequence[GradientCheck], path: Path) -> None:
     """Write all fields of the checks as a JSON list, the samples too; NaN and infinity become null."""
     records = [{**asdict(result), "passed": result.passed, "variant": mi.variant()} for result in results]
+    finite = json.loads(json.dumps(records), parse_constant=lambda name: None)
     try:
-        path.write_text(json.dumps(_finite(records), indent=2) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(finite, indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise PathreplayError(f"{path} cannot be written ({error.strerror}); give --json another file") from None
 
@@ -100,11 +101,3 @@ def require_writable(path: Path) -> None:
         raise PathreplayError(f"Folder {path.parent} for {path.name} does not exist; make it first")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
         raise PathreplayError(f"{path} may not be written (its permissions); give --json another file")
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _finite(entry) for name, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

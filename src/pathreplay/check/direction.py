@@ -68,9 +68,8 @@ def choose_line(
         raise PathreplayError(f"Parameter '{key}' is empty; there is nothing to check")
     transform = key.rsplit(".", 1)[-1] == "to_world"
     if direction is not None:
-        v = np.asarray(direction, np.float64)
-        description = "given"
-        if v.shape != value.shape and v.size == value.size == 1:
+        v, description = np.asarray(direction, np.float64), "given"
+        if v.size == value.size == 1:
             v = v.reshape(value.shape)
         if v.shape != value.shape:
             raise PathreplayError(f"Direction of shape {v.shape} given for '{key}', whose shape is {value.shape}")

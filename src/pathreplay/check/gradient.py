@@ -18,8 +18,7 @@ from pathreplay.check.objective import Loss, Mode, Objective, alone, integrator_
 from pathreplay.check.reference import Spec, integrator_under_test, reference_integrator
 from pathreplay.check.verdict import Judgement
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.render.film import film_size
-from pathreplay.render.film_limits import require_memory, require_samples
+from pathreplay.render.film import require_film
 from pathreplay.scenes.parameters import get_array, require_differentiable, require_finite
 from pathreplay.scenes.spectra import coefficient_channels
 
@@ -119,13 +118,14 @@ def check_gradient(
         PathreplayError: a bad argument, a parameter without derivative, NaN in the scene, an integrator that cannot
             differentiate this parameter.
     """
+    fd_spp = spp if fd_spp is None else fd_spp
     _require_types(key, loss, sensor=sensor, seeds=seeds, spp=spp, fd_spp=fd_spp, seed=seed)
     _require_arguments(scene, sensor, seeds, spp, fd_spp, seed, mode)
     params = mi.traverse(scene)
     tested = integrator_under_test(integrator, scene, max_depth)
     line = _line(params, key, tested, step, direction, seed)
     plain = reference_integrator(reference, scene, tested)
-    plan = _Plan(mode, seeds, spp, fd_spp or spp, seed, progress)
+    plan = _Plan(mode, seeds, spp, fd_spp, seed, progress)
     with alone(params, key):
         return plan.carry_out(Objective(scene, params, key, line.move, sensor), line, tested, plain, loss)
 
@@ -145,7 +145,7 @@ class _Plan:
     def carry_out(
         self, objective: Objective, line: Line, tested: mi.Integrator, plain: mi.Integrator, loss: Loss | None
     ) -> GradientCheck:
-        n, stencil, points = self.seeds, line.stencil, line.stencil.points()
+        n, stencil = self.seeds, line.stencil
         # Distinct 32-bit words: seeds of the gradient's primal image, of its derivative, of the reference, of the
         # weights.
         words = [int(word) for word in np.random.SeedSequence(self.seed).generate_state(3 * n + 1)]
@@ -154,7 +154,7 @@ class _Plan:
         pairs, others = zip(words[:n], words[n : 2 * n], strict=True), words[2 * n : -1]
         gradients = [self._tick(objective.derivative(tested, self.mode, *pair, self.spp)) for pair in pairs]
         values = {}
-        for o in points:
+        for o in stencil.points():
             images = (objective.image(plain, seed, self.fd_spp, o * line.step) for seed in others)
             values[o] = np.array([self._tick(objective.dot(image)) for image in images])
         full, half = (each(values.__getitem__) / line.step for each in (stencil, stencil.halved()))
@@ -207,14 +207,11 @@ def _require_types(key: object, loss: object, **numbers: object) -> None:
     if loss is not None and not callable(loss):
         raise PathreplayError(f"loss is {shown(loss)}; give a function from the image to a number, or leave it out")
     for name, number in numbers.items():
-        absent = name == "fd_spp" and number is None
-        if not absent and (isinstance(number, bool) or not isinstance(number, (int, np.integer))):
+        if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
             raise PathreplayError(f"{name} is {shown(number)}; give a whole number")
 
 
-def _require_arguments(
-    scene: object, sensor: int, seeds: int, spp: int, fd_spp: int | None, seed: int, mode: str
-) -> None:
+def _require_arguments(scene: object, sensor: int, seeds: int, spp: int, fd_spp: int, seed: int, mode: str) -> None:
     if mi.variant() is None or not dr.is_diff_v(mi.Float):
         raise PathreplayError(
             f"Variant '{mi.variant()}' has no derivatives; call mi.set_variant('llvm_ad_rgb') before loading the scene"
@@ -233,12 +230,11 @@ def _require_arguments(
         raise PathreplayError(f"seeds is {shown(seeds)}; give up to {_MOST_SEEDS}, and take more samples instead")
     if seeds < 2:
         raise PathreplayError(f"seeds is {seeds}; a standard error needs at least 2, and 8 or more make sense")
-    film = film_size(scene.sensors()[sensor])
-    for name, count in (("spp", spp), ("fd_spp", spp if fd_spp is None else fd_spp)):
+    counts = {"spp": spp, "fd_spp": fd_spp}
+    for name, count in counts.items():
         if count < 1:
             raise PathreplayError(f"{name} is {count}; give at least 1 sample per pixel")
-        require_samples(name, count, film, f"sensor {sensor}")
-    require_memory(film, f"sensor {sensor}")
+    require_film(scene.sensors()[sensor], f"sensor {sensor}", counts)
     if seed < 0:
         raise PathreplayError(f"seed is {seed}; give a whole number from 0 on")
     if mode not in ("backward", "forward"):

@@ -15,11 +15,10 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.check.direction import Line
-from pathreplay.check.statistics import relative_l1
-from pathreplay.check.stencil import CENTRAL, Stencil
+from pathreplay.check.stencil import Stencil
 from pathreplay.check.verdict import NEGLIGIBLE, Judgement, judge
 from pathreplay.errors import PathreplayError
-from pathreplay.scenes.loading import told
+from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.parameters import get_array
 
 Mode = Literal["backward", "forward"]
@@ -104,9 +103,9 @@ class Objective:
 
     def derivative(self, integrator: mi.Integrator, mode: Mode, primal: int, seed: int, spp: int) -> float:
         """dF/dt at 0, through ``mi.render`` and with seeds for picture and derivative, as users have it."""
-        t, name = self._attached(), integrator_name(integrator)
+        name = integrator_name(integrator)
         with told(f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode", (RuntimeError, TypeError)):
-            self.put(t)
+            t = self._attached()
             image = mi.render(
                 self.scene, self.params, sensor=self.sensor, integrator=integrator,
                 seed=mi.UInt32(primal), seed_grad=seed, spp=spp,
@@ -119,17 +118,13 @@ class Objective:
 
     def forward(self, integrator: mi.Integrator, seed: int, spp: int) -> np.ndarray:
         """The derivative of the picture, by the integrator's forward pass alone."""
-        t = self._attached()
-        dr.set_grad(t, 1)
-        self.put(t)
-        dr.forward(t, dr.ADFlag.ClearEdges)
+        dr.forward(self._attached(), dr.ADFlag.ClearEdges)
         image = integrator.render_forward(self.scene, self.params, self.sensor, seed=seed, spp=spp)
         return np.array(image, np.float64)
 
     def backward(self, integrator: mi.Integrator, seed: int, spp: int) -> float:
         """dF/dt, by the integrator's reverse pass alone."""
         t = self._attached()
-        self.put(t)
         integrator.render_backward(self.scene, self.params, self.adjoint, self.sensor, seed=seed, spp=spp)
         return self.collect(t)
 
@@ -139,16 +134,6 @@ class Objective:
         dr.traverse(dr.ADMode.Backward)
         return float(dr.grad(t)[0])
 
-    def lane_error(self, integrator: mi.Integrator, h: float, seed: int, spp: int) -> float:
-        """Relative L1 error, lane by lane, of the forward pass against differences with its own random numbers."""
-        found = self.forward(integrator, seed, spp)
-        return relative_l1(found, self.difference(integrator, CENTRAL, h, seed, spp))
-
-    def transpose_error(self, ahead: mi.Integrator, back: mi.Integrator, seed: int, spp: int) -> float:
-        """|<w, J v> - <Jᵀ w, v>| / Σ |w J v|: a forward pass against a reverse pass with the same random numbers."""
-        tangent = self.forward(ahead, seed, spp)
-        return abs(self.dot(tangent) - self.backward(back, seed, spp)) / self.dot(np.abs(tangent))
-
     def judge(self, line: Line, gradients: np.ndarray, full: np.ndarray, half: np.ndarray) -> Judgement:
         """The verdict on gradients, from differences along the line with its stencil and with this halved."""
         # A rounding error of one half unit in the last place of every image, all of one sign, at worst.
@@ -157,8 +142,10 @@ class Objective:
         return judge(gradients, full, half, rounding=rounding, negligible=NEGLIGIBLE * self.scale / line.size)
 
     def _attached(self) -> mi.Float:
+        """t = 0 with gradients, which the parameter's value at t now passes on."""
         t = dr.opaque(mi.Float, 0)
         dr.enable_grad(t)
+        self.put(t)
         return t
 
     def _render(self, integrator: mi.Integrator, seed: int, spp: int) -> mi.TensorXf:
@@ -177,10 +164,8 @@ def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
     and out of phase between channels, of which no mirror symmetry of a scene makes a constant.
     """
     height, width, channels = shape
-    y, x, c = np.meshgrid(
-        (np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, np.arange(channels), indexing="ij"
-    )
-    w = 1 + 0.5 * np.cos(2 * np.pi * (0.7 * x + 0.4 * y + c / 3))
+    y, x, c = np.ogrid[:height, :width, :channels]
+    w = 1 + 0.5 * np.cos(2 * np.pi * (0.7 * ((x + 0.5) / width) + 0.4 * ((y + 0.5) / height) + c / 3))
     if alpha:
         w[..., -1] = 0
     return w / w.size
@@ -189,6 +174,5 @@ def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
 def integrator_name(integrator: mi.Integrator) -> str:
     """The integrator as its user writes it, from the name of its class: 'PRBIntegrator' is 'prb'."""
     # For Python plugins Mitsuba's class_name() is that of the C++ base.
-    python = isinstance(integrator, mi.CppADIntegrator)
-    name = type(integrator).__name__ if python else str(integrator.class_name())
+    name = type(integrator).__name__ if isinstance(integrator, mi.CppADIntegrator) else str(integrator.class_name())
     return name.removesuffix("Integrator").replace("VolumetricPath", "Volpath").lower()

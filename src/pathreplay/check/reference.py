@@ -15,13 +15,11 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 from pathreplay.render.facts import SceneFacts
+from pathreplay.render.path_integrator import UNBOUNDED
 from pathreplay.scenes.descriptions import load_integrator
 
 Spec: TypeAlias = "mi.Integrator | Mapping[str, Any] | str | None"
 """An integrator: finished, described, by name, or left to us."""
-
-UNBOUNDED = 0xFFFFFFFF
-"""What Mitsuba's Python integrators keep for ``max_depth = -1``."""
 
 NO_ROULETTE = 2**30
 """A ``rr_depth`` that no path reaches."""
@@ -47,7 +45,7 @@ def read_limits(integrator: mi.Integrator) -> Limits | None:
     rr_depth: Any = getattr(integrator, "rr_depth", printed.get("rr_depth", 5))
     if max_depth is None:
         return None
-    depth = int(max_depth)
+    depth = int(max_depth)  # Mitsuba's Python integrators keep -1 as UNBOUNDED
     return Limits(-1 if depth >= UNBOUNDED else depth, int(rr_depth), bool(getattr(integrator, "hide_emitters", False)))
 
 
@@ -71,10 +69,8 @@ def integrator_under_test(spec: Spec, scene: mi.Scene, max_depth: int | None = N
     if isinstance(spec, Mapping):
         description = dict(spec)
     else:
-        description = {"type": spec or "pathreplay"}
-        limits = read_limits(own) if own is not None else None
-        if limits is not None:
-            description.update(vars(limits))
+        limits = None if own is None else read_limits(own)
+        description = {"type": spec or "pathreplay", **({} if limits is None else vars(limits))}
     if max_depth is not None:
         description["max_depth"] = max_depth
     return load_integrator(description)

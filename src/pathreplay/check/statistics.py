@@ -53,8 +53,3 @@ def welch(difference: Any, σ: Any, *parts: tuple[Any, int]) -> Any:
 def normal(t: Any, freedom: Any) -> Any:
     """The normal deviate that is as improbable as a ratio t under Student's distribution, for t >= 0."""
     return stats.norm.isf(np.maximum(stats.t.sf(t, freedom), 1e-300))
-
-
-def relative_l1(found: np.ndarray, expected: np.ndarray) -> float:
-    """Σ |found - expected| / Σ |expected|: the error lane by lane, where nothing averages out."""
-    return float(np.abs(found - expected).sum() / np.abs(expected).sum())

@@ -67,12 +67,9 @@ def judge(
         reference = (4 * half_step - full_step) / 3
         # D(h/2) is off by a third of what halving changed; that it bounds the better combination keeps us safe.
         change, change_se = mean_and_error((half_step - full_step) / 3)
-        g, g_se = mean_and_error(gradient)
-        r, r_se = mean_and_error(reference)
+        g, g_se, r, r_se = map(float, (*mean_and_error(gradient), *mean_and_error(reference)))
     truncation = math.sqrt(max(0.0, change**2 - change_se**2))
-    scale = max(abs(g), abs(r))
-    g, g_se, r, r_se = float(g), float(g_se), float(r), float(r_se)
-    step_error = math.hypot(truncation, rounding)
+    scale, step_error = max(abs(g), abs(r)), math.hypot(truncation, rounding)
     known = Judgement(g, g_se, r, r_se, step_error, math.nan, math.inf, "inconclusive", "")
     if not np.isfinite(gradient).all():
         bad = int(np.count_nonzero(~np.isfinite(gradient)))
@@ -80,7 +77,7 @@ def judge(
     if not (np.isfinite(full_step).all() and np.isfinite(half_step).all()):
         return replace(known, reason="the reference is NaN or infinite: look at the image, or choose a smaller step")
 
-    σ = math.sqrt(g_se**2 + r_se**2 + known.step_error**2 + (SUMMATION * scale) ** 2)
+    σ = math.sqrt(g_se**2 + r_se**2 + step_error**2 + (SUMMATION * scale) ** 2)
     z = float(welch(g - r, σ, (g_se, gradient.size), (r_se, reference.size)))
     resolution = σ / scale if scale > 0 else math.inf
     verdict: Verdict
@@ -92,8 +89,8 @@ def judge(
     elif scale <= Z_LIMIT * σ <= negligible or scale == σ == 0:
         verdict, reason = "zero", f"both are zero to within {Z_LIMIT * σ:.1g}, which is nothing against the image"
     else:
-        verdict, reason = "inconclusive", _unresolved(resolution, known.step_error, σ)
-    return replace(known, z=z, resolution=float(resolution), verdict=verdict, reason=reason)
+        verdict, reason = "inconclusive", _unresolved(resolution, step_error, σ)
+    return replace(known, z=z, resolution=resolution, verdict=verdict, reason=reason)
 
 
 def _unresolved(resolution: float, step_error: float, σ: float) -> str:

@@ -21,14 +21,10 @@ class RayDerivative:
     d: mi.Vector3f
     pdf: mi.Float
 
-    @staticmethod
-    def zero() -> RayDerivative:
-        return RayDerivative(mi.Point3f(0), mi.Vector3f(0), mi.Float(0))
-
     def finite_part(self) -> tuple[RayDerivative, mi.Bool]:
         """The derivative where it is finite and zero elsewhere, and where that is."""
         ok = dr.all(dr.isfinite(self.o)) & dr.all(dr.isfinite(self.d)) & dr.isfinite(self.pdf)
-        return RayDerivative(dr.select(ok, self.o, 0), dr.select(ok, self.d, 0), dr.select(ok, self.pdf, 0)), ok
+        return dr.select(ok, self, dr.zeros(RayDerivative)), ok
 
 
 class LostPaths:

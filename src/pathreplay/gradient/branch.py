@@ -22,7 +22,7 @@ from .primal import walk_on
 
 @dataclass
 class Branch:
-    """The null collision that was kept so far (loop state)."""
+    """The null collision that was kept so far (loop state); zero before there is any."""
 
     p: mi.Point3f  # where
     d: mi.Vector3f  # direction of the path that came there
@@ -34,37 +34,17 @@ class Branch:
     depth: mi.UInt32  # vertices before
     η: mi.Float  # relative index of refraction since the camera
 
-    @staticmethod
-    def none() -> Branch:
-        return Branch(
-            mi.Point3f(0),
-            mi.Vector3f(0),
-            dr.zeros(mi.MediumPtr),
-            mi.Spectrum(0),
-            mi.Spectrum(0),
-            mi.Float(0),
-            mi.Float(0),
-            mi.UInt32(0),
-            mi.Float(1),
-        )
-
     def offer(self, path: PathState, step: Chosen) -> Branch:
         """This one, or the null collision of one more flight, by their masses."""
-        at, null = path.at, step.kept.media.flight.null
+        ray, null = path.at.ray, step.kept.media.flight.null
         active = path.active & dr.any(path.β != 0)
         mass = self.mass + dr.select(active, null.mass, 0)
         taken = active & (null.pick * mass < null.mass)
-        return Branch(
-            p=dr.select(taken, at.ray.o + null.t * at.ray.d, self.p),
-            d=dr.select(taken, at.ray.d, self.d),
-            medium=dr.select(taken, at.medium, self.medium),
-            weight=mi.Spectrum(dr.select(taken, path.β * null.ω, self.weight)),
-            bare=mi.Spectrum(dr.select(taken, path.β * null.bare, self.bare)),
-            mass=mass,
-            number=self.number + dr.select(active, null.number, 0),
-            depth=dr.select(taken, path.depth, self.depth),
-            η=dr.select(taken, path.η, self.η),
-        )
+        weight, bare = mi.Spectrum(path.β * null.ω), mi.Spectrum(path.β * null.bare)
+        number = self.number + dr.select(active, null.number, 0)
+        p, medium = mi.Point3f(ray.o + null.t * ray.d), path.at.medium
+        offered = Branch(p, ray.d, medium, weight, bare, mass, number, path.depth, path.η)
+        return replace(dr.select(taken, offered, self), mass=mass, number=number)
 
 
 def branch_backward(walk: Walk, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum) -> None:
@@ -84,15 +64,8 @@ def branch_term(walk: Walk, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f) 
     onward = replace(walk, branching=None)
     active = branch.mass > 0
     with dr.suspend_grad():
-        at = Arrival(
-            ray=mi.Ray3f(branch.p, branch.d, ray.time, ray.wavelengths),
-            hit=dr.zeros(mi.PreliminaryIntersection3f),
-            pdf=mi.Float(1),
-            delta=mi.Bool(True),
-            camera=mi.Bool(False),
-            medium=branch.medium,
-            behind=mi.Float(0),
-        )
+        ray, hit = mi.Ray3f(branch.p, branch.d, ray.time, ray.wavelengths), dr.zeros(mi.PreliminaryIntersection3f)
+        at = Arrival(ray, hit, mi.Float(1), mi.Bool(True), mi.Bool(False), branch.medium, mi.Float(0))
         one = mi.Spectrum(1)
         flight = Flight(event=active, t=mi.Float(0), density=mi.Float(1), W=one, along=mi.Float(0), σ_s=one)
         u = Numbers.draw(sampler)

@@ -24,7 +24,8 @@ from .two_walks import walk_back
 class Places(Protocol):
     """Where on a film paths may begin: places (Point2f, in pixels) from its corner to ``size``."""
 
-    size: mi.ScalarVector2f
+    @property
+    def size(self) -> mi.ScalarVector2f: ...
 
     def ray(self, s: mi.Point2f, key: mi.UInt32) -> tuple[mi.Ray3f, mi.Spectrum]:
         """The camera ray through a place and its weight; attached to the camera and ``s``, if those have gradients.

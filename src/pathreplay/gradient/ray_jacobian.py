@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.emitters import emission
+from ..transport.path import PathState
 from ..transport.step import repeat_step
 from ..transport.vertex import Arrival, Numbers, Replayed, Walk, reciprocal
 from .adjoint import tangents
@@ -76,10 +77,6 @@ class Slope:
     pdf: mi.Float  # by the density of the ray
     slide: mi.Float  # by the length that the origin slides forward along the ray
 
-    @staticmethod
-    def zero() -> Slope:
-        return Slope(mi.Float(0), mi.Float(0))
-
 
 @dataclass
 class Linearised:
@@ -88,6 +85,8 @@ class Linearised:
     A: mi.Matrix4f  # coordinates of the next ray by those of this ray
     e: mi.Vector4f  # derivative of δL·β_i e_i + (slope of e_{i+1})·(pdf, slide)
     log_w: list[mi.Spectrum]  # four: derivative of log w_i, by each coordinate; 0 where w_i is 0
+    slope: Slope  # of the next vertex
+    frame_next: RayFrame  # of the next ray
 
 
 def has_smooth_lobes(walk: Walk) -> bool:
@@ -105,15 +104,13 @@ def length_scale(scene: mi.Scene) -> float:
 def emission_slope(walk: Walk, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
     """How weight·e (detached weight) changes with the density of an arrival and the distance it came."""
     if not has_smooth_lobes(walk):
-        return Slope.zero()
+        return dr.zeros(Slope)
     slopes = []
     for k in range(2):
-        pdf, slide = at.pdf, mi.Float(0)
-        if k == 0:
-            pdf = _unit_tangent(pdf)
-        else:
-            slide = _unit_tangent(slide)
-        with dr.resume_grad(slide if k else pdf):
+        x = [at.pdf, mi.Float(0)]
+        x[k] = _unit_tangent(x[k])
+        with dr.resume_grad(x[k]):
+            pdf, slide = x
             ray = mi.Ray3f(at.ray)
             si = at.hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
             ray.o = ray.o + ray.d * slide
@@ -139,13 +136,14 @@ def local_terms(
     return e, w, frame_next.coordinates(o, d)
 
 
-def linearise(
-    walk: Walk, v: Replayed, weight: mi.Spectrum, slope: Slope, frame: RayFrame, frame_next: RayFrame, active: mi.Bool
-) -> Linearised:
+def linearise(walk: Walk, v: Replayed, onward: PathState, δL: mi.Spectrum, scale: float, active: mi.Bool) -> Linearised:
     """Differentiate `local_terms` by the four coordinates of the ray, and by nothing else.
 
-    Both passes call this very function, so that they see the same numbers to the last bit.
+    ``onward`` is the path at the next vertex, ``scale`` the unit of length. Both passes call this very function, so
+    that they see the same numbers to the last bit.
     """
+    slope = emission_slope(walk, onward.at, δL * onward.β, v.go_on)
+    frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
     columns = []
     for k in range(4):
         # One graph per column: traversing one twice ends the process (Dr.Jit 1.5, virtual calls in a loop).
@@ -155,10 +153,11 @@ def linearise(
             ray = mi.Ray3f(v.at.ray)
             ray.o, ray.d = frame.point(ray.o, x), frame.direction(ray.d, x)
             at = Arrival(ray=ray, hit=v.at.hit, pdf=v.at.pdf, delta=v.at.delta, camera=v.at.camera)
-            e, w, x_next = local_terms(walk, v, at, weight, slope, frame_next, active)
+            e, w, x_next = local_terms(walk, v, at, δL * v.β, slope, frame_next, active)
             columns.append(tangents(e, w, *x_next))
     A = [columns[k][2 + j] for j in range(4) for k in range(4)]
-    return Linearised(A=mi.Matrix4f(*A), e=mi.Vector4f(*[c[0] for c in columns]), log_w=[c[1] for c in columns])
+    e, log_w = mi.Vector4f(*[c[0] for c in columns]), [c[1] for c in columns]
+    return Linearised(mi.Matrix4f(*A), e, log_w, slope, frame_next)
 
 
 def _unit_tangent(value: mi.Float) -> mi.Float:

@@ -47,16 +47,12 @@ class Layout:
     emissive: bool
     passes: bool
     branch: bool
+    always: bool = True  # of what every record has
 
     @property
     def varies(self) -> bool:
         """What emitters bring is to be found out again."""
         return not self.fixed
-
-    @property
-    def always(self) -> bool:
-        """Of what every record has."""
-        return True
 
     @staticmethod
     def of(walk: Walk, moves: bool) -> Layout:

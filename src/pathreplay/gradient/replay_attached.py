@@ -18,7 +18,7 @@ from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 from .adjoint import LostPaths, backward
-from .ray_jacobian import RayFrame, Recovery, emission_slope, length_scale, linearise, local_terms, random_sign
+from .ray_jacobian import RayFrame, Recovery, length_scale, linearise, local_terms, random_sign
 
 
 def replay_attached(
@@ -59,9 +59,7 @@ def _tangents(
     while dr.hint(path.active, exclude=[walk, recovery, scale], label="pathreplay: tangents"):
         u, step = path.choose(walk, sampler)
         onward, v = path.advance(walk, u, step)
-        slope = emission_slope(walk, onward.at, δL * onward.β, v.go_on)
-        frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
-        local = linearise(walk, v, δL * v.β, slope, frame, frame_next, path.active)
+        local = linearise(walk, v, onward, δL, scale, path.active)
 
         L += Spectrum(v.β * step.e)
         lit = Spectrum(δL) * Spectrum(v.β * step.e)
@@ -93,10 +91,8 @@ def _peel(
     while dr.hint(path.active, exclude=[walk, recovery, scale, lost], label="pathreplay: replay"):
         u, step = path.choose(walk, sampler)
         onward, v = path.advance(walk, u, step)
-        slope = emission_slope(walk, onward.at, δL * onward.β, v.go_on)
-        frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
         L = dr.select(v.go_on, L - Spectrum(v.β * step.e), 0)
-        local = linearise(walk, v, δL * v.β, slope, frame, frame_next, path.active)
+        local = linearise(walk, v, onward, δL, scale, path.active)
 
         p = Vector(local.e) + Vector(*[dr.sum(Spectrum(δL) * L * Spectrum(k)) for k in local.log_w])
         A = recovery.regularised(Matrix(local.A), random_sign(u), ~v.kept.delta)
@@ -107,7 +103,7 @@ def _peel(
         broken |= breaks
 
         with dr.resume_grad():
-            e, w, x_next = local_terms(walk, v, v.at, δL * v.β, slope, frame_next, path.active)
+            e, w, x_next = local_terms(walk, v, v.at, δL * v.β, local.slope, local.frame_next, path.active)
             q_next = mi.Vector4f(q)
             target = e + dr.sum(δL * mi.Spectrum(L) * w) + sum(q_next[k] * x_next[k] for k in range(4))
             if dr.hint(dr.grad_enabled(target), mode="scalar"):  # not so where the camera alone moves

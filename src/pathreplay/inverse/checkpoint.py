@@ -11,15 +11,13 @@ from typing import Annotated, ClassVar
 import numpy as np
 import safetensors
 import safetensors.numpy
-from pydantic import ConfigDict, Field, NonNegativeInt, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, FiniteFloat, NonNegativeInt, TypeAdapter, ValidationError
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.executor import Executor
+from pathreplay.inverse.evaluate import Executor
 from pathreplay.inverse.grids import Levels
 from pathreplay.inverse.optimiser import Optimiser, State
 from pathreplay.inverse.values import Array, Arrays
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -35,8 +33,8 @@ class Entry:
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     iteration: NonNegativeInt
-    loss: Finite
-    seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    loss: FiniteFloat
+    seconds: Annotated[FiniteFloat, Field(ge=0)]
     gradient_norms: dict[str, float]
     dropped: NonNegativeInt = 0
     errors: dict[str, float] = field(default_factory=dict)
@@ -79,10 +77,7 @@ def save(run: Run) -> bytes:
         **{_VALUE + key: value for key, value in run.values.items()},
         **state.arrays,
     }
-    metadata = {
-        "steps": json.dumps(state.steps),
-        "history": json.dumps([asdict(entry) for entry in run.history]),
-    }
+    metadata = {"steps": json.dumps(state.steps), "history": json.dumps([asdict(entry) for entry in run.history])}
     return safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata)
 
 
@@ -94,14 +89,13 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None]) -> None:
     try:
         values, state, history, learned = _read(path, run.values, levels)
         run.optimiser.restore(state, values)
+        run.values, run.history, run.learned = values, history, learned
+        return
     except ValidationError as error:
         first = error.errors()[0]
         why = f"{'.'.join(map(str, first['loc']))}: {first['msg'].lower()}"
     except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         why = str(error)
-    else:
-        run.values, run.history, run.learned = values, history, learned
-        return
     raise PathreplayError(f"Checkpoint {path} cannot be read ({why}); start the job from its config")
 
 
@@ -127,17 +121,14 @@ def _read(
     for name, array in tensors.items():
         if not np.isfinite(array).all():
             raise ValueError(f"'{name}' holds NaN or infinite values")
-    for key, value in values.items():
-        # Optimisers begin anew on a grid that was refined.
-        if steps[key] > len(history) or (steps[key] < len(history) and levels[key] is None):
-            raise ValueError(f"{steps[key]} steps of '{key}' in {len(history)} iterations")
-        _require_like(tensors[_VALUE + key], key, value, levels[key])
     found = {key: tensors.pop(_VALUE + key) for key in values}
+    for key, value in values.items():
+        grid, array = levels[key], found[key]
+        # Optimisers begin anew on a grid that was refined.
+        if steps[key] > len(history) or (steps[key] < len(history) and grid is None):
+            raise ValueError(f"{steps[key]} steps of '{key}' in {len(history)} iterations")
+        shapes = [value.shape] if grid is None else list(grid.shapes)
+        if array.dtype != value.dtype or array.shape not in shapes:
+            raise ValueError(f"'{key}' is {array.dtype} of shape {array.shape}, in the job {value.dtype} of {shapes}")
     learned = {name.removeprefix(_LEARNED): tensors.pop(name) for name in list(tensors) if name.startswith(_LEARNED)}
     return found, State(steps, tensors), history, learned
-
-
-def _require_like(found: Array, key: str, value: Array, levels: Levels | None) -> None:
-    shapes = [value.shape] if levels is None else list(levels.shapes)
-    if found.dtype != value.dtype or found.shape not in shapes:
-        raise ValueError(f"'{key}' is {found.dtype} of shape {found.shape}, in the job {value.dtype} of {shapes}")

@@ -146,9 +146,6 @@ class Plugin(BaseModel):
                 raise ValueError(f"'{name}' of '{self.type}' is {shown(value)}; give a whole number below {2**31}")
         return self
 
-    def as_dict(self) -> dict[str, Any]:
-        return self.model_dump()
-
 
 class Target(_Table):
     """What the pictures should look like: image files, one per sensor, or a scene to render."""
@@ -175,6 +172,10 @@ class Target(_Table):
                 "target: integrator 'pathreplay' would grade itself; render targets with another, such as 'path'"
             )
         return self
+
+
+# Streams of random numbers: pictures never share a seed with iterations, nor targets with renderings.
+ITERATION, TARGET, PICTURE, JUDGEMENT = 0, 1, 2, 3
 
 
 class Config(_Table):
@@ -209,6 +210,11 @@ class Config(_Table):
                 )
         return self
 
+    def seeds(self, stream: int, sensor: int, iteration: int = 0) -> tuple[int, int]:
+        """Two independent 32-bit seeds; none is used for another stream, sensor or iteration."""
+        first, second = np.random.SeedSequence([self.seed, stream, iteration, sensor]).generate_state(2)
+        return int(first), int(second)
+
 
 # Models of nested tables, by the name under which they appear in the file or in what pydantic tries.
 _TABLES: dict[str, type[BaseModel]] = {
@@ -224,9 +230,12 @@ def load_config(path: Path) -> Config:
 
     Raises PathreplayError for an unreadable file, an unknown key (names the nearest), a value out of its range.
     """
-    problem = file_problem(path, _LONGEST_FILE)
+    problem = file_problem(path, 64 * 2**20)  # no job is as long: what is larger is some other file
     if problem == MISSING:
-        raise PathreplayError(_no_file(path))
+        near = [str(p) for p in path.parent.glob("*.toml")] if path.parent.is_dir() else []
+        close = difflib.get_close_matches(str(path), near, n=1, cutoff=0.3)
+        hint = f"did you mean {close[0]}?" if close else "give the path of a TOML file"
+        raise PathreplayError(f"No config file {path}; {hint}")
     if problem:
         raise PathreplayError(f"Config {path} {problem}; give the path of a TOML file")
     try:
@@ -236,10 +245,6 @@ def load_config(path: Path) -> Config:
     if path.suffix == ".json":
         return _checked(str(path), Config.model_validate_json, text)
     return _checked(str(path), Config.model_validate, _toml(path, text))
-
-
-# No job is as long: what is larger is some other file.
-_LONGEST_FILE = 64 * 2**20
 
 
 def _toml(path: Path, text: str) -> dict[str, Any]:
@@ -263,9 +268,3 @@ def _checked(name: str, validate: Callable[[Any], Config], job: Any) -> Config:
         return validate(job)
     except ValidationError as error:
         raise PathreplayError(f"{name}: {first_error(error, Config, _TABLES)}") from None
-
-
-def _no_file(path: Path) -> str:
-    near = [str(p) for p in path.parent.glob("*.toml")] if path.parent.is_dir() else []
-    close = difflib.get_close_matches(str(path), near, n=1, cutoff=0.3)
-    return f"No config file {path}" + (f"; did you mean {close[0]}?" if close else "; give the path of a TOML file")

@@ -1,11 +1,11 @@
-"""The loss of a problem and its gradient as a function of values and shard; the scene is a device that computes it."""
+"""The loss of a problem and its gradient as a function of values and shard, and who computes them, and where."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -59,6 +59,28 @@ def total(evaluations: Sequence[Evaluation]) -> Evaluation:
         sum(each.dropped for each in evaluations),
         evaluations[-1].learned,
     )
+
+
+class Executor(Protocol):
+    """Evaluates the shards of an iteration. Results come in the order of the shards, whoever was ready first."""
+
+    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
+        """One evaluation for each shard, in their order; the last one has learned from all of them."""
+
+
+class Local:
+    """In this process, one after the other; each knows what those before it have learned."""
+
+    def __init__(self, evaluate: Evaluate) -> None:
+        self.evaluate = evaluate
+
+    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
+        """See `Executor`."""
+        found: list[Evaluation] = []
+        for shard in shards:
+            found.append(self.evaluate(values, shard, learned))
+            learned = found[-1].learned
+        return found
 
 
 class Evaluator:
@@ -122,7 +144,9 @@ class Evaluator:
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
         records = self.freezes and view in self._sweeps
         if view not in self._sweeps:
-            self._sweeps[view] = self._can_sweep(sensor, spp)
+            may = problem.loss in QUADRATIC and hasattr(self.integrator, "sweeps_pixels")
+            scene = problem.scene
+            self._sweeps[view] = may and bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         share = 1 / len(problem.views)
@@ -134,9 +158,3 @@ class Evaluator:
         if lost is not None:
             self.integrator.tell_lost(lost, target.shape[0] * target.shape[1] * spp)
         return float(value[0]) if dr.width(value) else float("nan")
-
-    def _can_sweep(self, sensor: int, spp: int) -> bool:
-        if self.problem.loss not in QUADRATIC or not hasattr(self.integrator, "sweeps_pixels"):
-            return False
-        scene = self.problem.scene
-        return bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))

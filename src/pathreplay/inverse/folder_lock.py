@@ -52,8 +52,10 @@ class FolderLock:
         try:
             fcntl.flock(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
+            match = re.fullmatch(r"(\d+) ([\w.-]+)\s*", os.pread(self.file, 200, 0).decode("ascii", "replace"))
+            holder = f"process {match[1]} on {match[2]}" if match else "another process"
             raise PathreplayError(
-                f"Run folder {folder} is in use by {self._holder()}; wait for its end, or stop it with Ctrl-C or "
+                f"Run folder {folder} is in use by {holder}; wait for its end, or stop it with Ctrl-C or "
                 "SIGTERM, then resume"
             ) from None
         except OSError:
@@ -61,11 +63,6 @@ class FolderLock:
         with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
             os.ftruncate(self.file, 0)
             os.pwrite(self.file, f"{os.getpid()} {socket.gethostname()}\n".encode(), 0)
-
-    def _holder(self) -> str:
-        text = os.pread(self.file, 200, 0).decode("ascii", "replace")
-        match = re.fullmatch(r"(\d+) ([\w.-]+)\s*", text)
-        return f"process {match[1]} on {match[2]}" if match else "another process"
 
     def close(self) -> None:
         """Let go; a second call does nothing."""

@@ -25,8 +25,6 @@ Image = NDArray[np.float32]
 SAMPLE = "matplotlib:"
 """Prefix of a picture that matplotlib ships, e.g. ``matplotlib:grace_hopper.jpg``."""
 
-_WAY_OUT = "correct the path or create the file"
-
 
 def find_image(name: str, base: Path) -> Path:
     """Path of an image file: relative to ``base``, or one of matplotlib's sample pictures."""
@@ -37,17 +35,15 @@ def find_image(name: str, base: Path) -> Path:
     else:
         path = base / name
     if problem := file_problem(path):
-        raise PathreplayError(f"No image file '{name}': {path} {problem}; {_WAY_OUT}")
+        raise PathreplayError(f"No image file '{name}': {path} {problem}; correct the path or create the file")
     return path
 
 
-def read_image(path: Path, *, raw: bool = False, way_out: str = _WAY_OUT) -> Image:
+def read_image(path: Path, *, raw: bool = False) -> Image:
     """Read an image as linear float32 (height, width, channels); ``raw`` keeps stored values (normal maps, masks).
 
-    Raises PathreplayError where there is no file (what to do then is the ``way_out``), or no image in it.
+    Raises PathreplayError where there is no image in the file.
     """
-    if problem := file_problem(path):
-        raise PathreplayError(f"Image {path} {problem}; {way_out}")
     try:
         with spare_thread():
             bitmap = mi.Bitmap(str(path))

@@ -16,8 +16,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import Displacement, Parameter
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.values import Array
-from pathreplay.render.film import film_size
-from pathreplay.render.film_limits import MOST_SAMPLES, require_memory, require_samples
+from pathreplay.render.film import MOST_SAMPLES, film_size, require_film
 
 if TYPE_CHECKING:
     from pathreplay.inverse.losses import Loss
@@ -33,13 +32,10 @@ _FARTHEST = 1e4
 
 def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str, int]) -> None:
     """Raise PathreplayError unless memory and a kernel hold every sensor (name -> index) at each ``spp`` (by key)."""
-    total = 0
+    pixels = 0
     for name, index in sensors.items():
-        size = film_size(scene.sensors()[index])
-        for key, count in spp.items():
-            require_samples(key, count, size, f"sensor '{name}'")
-        total += size[0] * size[1]
-        require_memory(size, f"sensor '{name}'", total * _A_VIEW)
+        pixels += prod(film_size(scene.sensors()[index]))
+        require_film(scene.sensors()[index], f"sensor '{name}'", spp, pixels * _A_VIEW)
 
 
 def require_visible(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:

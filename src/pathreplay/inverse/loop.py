@@ -1,27 +1,24 @@
-"""The optimisation loop: evaluate, step, project; interruptible and resumable, and what observers hear of it."""
+"""The optimisation loop: evaluate, step, project; interruptible and resumable, and what it tells of itself."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.interrupts import Stop
 from pathreplay.inverse.checkpoint import Entry, Run
-from pathreplay.inverse.config import Config
-from pathreplay.inverse.evaluate import Evaluator, Shard, total
-from pathreplay.inverse.executor import Local
+from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
+from pathreplay.inverse.evaluate import Evaluator, Local, Shard, total
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.optimiser import Adam
 from pathreplay.inverse.problem import Problem, put_values
-from pathreplay.inverse.seeds import ITERATION, JUDGEMENT, PICTURE, seeds
-from pathreplay.inverse.stopping import Stop
 from pathreplay.inverse.values import Arrays
 from pathreplay.scenes.parameters import get_array, to_value
 
@@ -62,45 +59,33 @@ class Stopped:
 Event = Started | Refined | Stepped | Stopped
 
 
-class Observer(Protocol):
-    """Hears of everything in the order in which it happens; what it raises ends the run."""
-
-    def observe(self, event: Event) -> None:
-        """Called between iterations."""
-
-
 def new_run(problem: Problem, integrator: mi.Integrator, record: bool = True) -> Run:
     """A run at the problem's start values, in this process."""
     values = {v.key: get_array(to_value(v.like, v.start)) for v in problem.variables}
     return Run(Local(Evaluator(problem, integrator, record)), Adam(values), values)
 
 
-def iterate(problem: Problem, config: Config, run: Run, stop: Stop, observers: Sequence[Observer]) -> None:
-    """Take steps from ``len(run.history)`` to ``config.iterations``, and tell of them.
+def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
+    """Take steps from ``len(run.history)`` to ``config.iterations``; yields what happens, for observers.
 
     After each step the run's rival takes as many as bring it to the same number of seconds. Taking turns, both have the
     same share of a machine whose load changes. Its learning rate and resolutions are those of the job's iteration.
     """
-
-    def tell(event: Event) -> None:
-        for observer in observers:
-            observer.observe(event)
-
-    tell(Started(len(run.history), config.iterations))
+    yield Started(len(run.history), config.iterations)
     for i in range(len(run.history), config.iterations):
-        for refined in take_step(problem, config, run, i):
-            tell(refined)
+        yield from take_step(problem, config, run, i)
         if rival := run.rival:
             while rival.seconds() < run.seconds():
                 take_step(problem, config, rival, i)
-            if _due(i, config.iterations):
+            # Due after the first iteration, and after those with which a tenth of them is done.
+            if i == 0 or JUDGEMENTS * i // config.iterations < JUDGEMENTS * (i + 1) // config.iterations:
                 for each in (run, rival):
                     error = judged(problem, config, each.values, i)
                     each.history[-1] = replace(each.history[-1], picture_error=error)
-        tell(Stepped(run.history[-1]))
-        if stop.wanted():
+        yield Stepped(run.history[-1])
+        if stop.by is not None:
             break
-    tell(Stopped(len(run.history)))
+    yield Stopped(len(run.history))
 
 
 def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Refined]:
@@ -114,10 +99,14 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     Raises PathreplayError where the loss is no longer finite.
     """
     begin, i = time.perf_counter(), len(run.history)
-    refined = _refine(problem, run, position)
+    refined = []
+    for v in problem.variables:
+        if v.levels and run.values[v.key].shape != (shape := v.levels.shape_at(position)):
+            run.values[v.key] = resampled(run.values[v.key], shape)
+            refined.append(Refined(v.key, shape))
     # The last view first: what is learned of media depends on the order, and earlier versions had this one.
     shards = [
-        Shard((n,), config.spp, seeds(config.seed, ITERATION, i, view.sensor)[:1])
+        Shard((n,), config.spp, config.seeds(ITERATION, view.sensor, i)[:1])
         for n, view in reversed(list(enumerate(problem.views)))
     ]
     found = total(run.executor.run(run.values, shards, run.learned))
@@ -129,7 +118,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     decay = config.learning_rate_decay ** (position / config.iterations)
     rates = {v.key: v.learning_rate * decay for v in problem.variables}
     stepped = run.optimiser.step(run.values, found.gradients, rates)
-    run.values = {v.key: np.clip(stepped[v.key], *v.bounds()) for v in problem.variables}
+    run.values = {v.key: np.clip(stepped[v.key], *v.bounds) for v in problem.variables}
     run.learned = found.learned
     seconds = time.perf_counter() - begin
     norms = {key: float(np.linalg.norm(gradient)) for key, gradient in found.gradients.items()}
@@ -141,11 +130,11 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
 def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:
     """Pictures of all views with these values in the scene, by the job's integrator; same noise at every call."""
     put_values(problem, values)
-    pictures: dict[str, Image] = {}
-    for view in problem.views:
-        seed, _ = seeds(config.seed, PICTURE, 0, view.sensor)
-        pictures[view.name] = _picture(problem, view.sensor, problem.integrator, config.picture_spp, seed)
-    return pictures
+    spp = config.picture_spp
+    return {
+        v.name: _picture(problem, v.sensor, problem.integrator, spp, config.seeds(PICTURE, v.sensor)[0])
+        for v in problem.views
+    }
 
 
 def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> float:
@@ -160,7 +149,7 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
     for view in problem.views:
         a, b = (
             _picture(problem, view.sensor, problem.judge, config.spp, seed).astype(np.float64) - view.target
-            for seed in seeds(config.seed, JUDGEMENT, iteration, view.sensor)
+            for seed in config.seeds(JUDGEMENT, view.sensor, iteration)
         )
         total += float(np.mean(a * b)) / len(problem.views)
     return float(np.sqrt(max(total, 0.0)))
@@ -170,18 +159,3 @@ def _picture(problem: Problem, sensor: int, integrator: mi.Integrator, spp: int,
     with dr.suspend_grad():
         image = mi.render(problem.scene, sensor=sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
     return np.array(image, dtype=np.float32)
-
-
-def _due(i: int, iterations: int) -> bool:
-    """Whether a judgement is due: after the first iteration, and after those with which a tenth of them is done."""
-    return i == 0 or JUDGEMENTS * i // iterations < JUDGEMENTS * (i + 1) // iterations
-
-
-def _refine(problem: Problem, run: Run, position: int) -> list[Refined]:
-    refined = []
-    for variable in problem.variables:
-        key, shape = variable.key, variable.levels and variable.levels.shape_at(position)
-        if shape and run.values[key].shape != shape:
-            run.values[key] = resampled(run.values[key], shape)
-            refined.append(Refined(key, shape))
-    return refined

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pathreplay.inverse.checkpoint import Entry, Run
+from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.grids import matched, rmse, slices
 from pathreplay.inverse.images import Image, difference
@@ -43,10 +43,6 @@ class ViewPictures:
         if self.rival is None:
             return found
         return {**found, "rival": self.rival, "rival-difference": difference(self.rival, self.target) * DIFFERENCE_GAIN}
-
-    def error(self, picture: Image) -> float:
-        """Root mean square difference of a picture and the target; includes the noise of both."""
-        return rmse(picture, self.target)
 
 
 @dataclass(frozen=True)
@@ -178,24 +174,12 @@ class Outcome:
     """Variables as people see them, and what poses make of the scene, by key."""
     notes: tuple[str, ...]
 
-    @property
-    def history(self) -> list[Entry]:
-        return self.run.history
-
     def command(self) -> str:
         """The command line that makes this run again, or goes on with it where it was stopped."""
-        if len(self.history) < self.config.iterations:
+        if len(self.run.history) < self.config.iterations:
             return resume_command(self.folder)
         job = self.folder / "config.json" if self.source is None else self.source
         return f"pathreplay optimize {shlex.quote(str(job))}"
-
-    def dropped(self) -> int:
-        return sum(entry.dropped for entry in self.history)
-
-    def judge(self) -> str:
-        """Type of the integrator that renders the pictures by which two runs are compared."""
-        target = self.config.target
-        return self.config.integrator.type if target.images is not None else target.integrator.type
 
     def names(self) -> tuple[str, str]:
         """What the job and its rival are called: their integrators; a run against itself has one name twice."""

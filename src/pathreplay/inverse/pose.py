@@ -25,13 +25,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.scenes.parameters import get_array, is_transform
 
 PoseKind = Literal["translation", "rotation", "rigid"]
-PARTS: dict[str, tuple[str, ...]] = {
-    "translation": ("translation",),
-    "rotation": ("rotation",),
-    "rigid": ("translation", "rotation"),
-}
-
-Vector = tuple[float, float, float]
+PARTS = {"translation": ("translation",), "rotation": ("rotation",), "rigid": ("translation", "rotation")}
 
 # θ² below which series stand in for a and b: their next terms, θ⁴ / 120 and θ⁴ / 720, are below float32 rounding there.
 _SMALL = 1e-3
@@ -45,7 +39,7 @@ class Pose:
     kind: PoseKind
     base: Any
     """M₀ or the vertices, as the scene file has them; detached."""
-    pivot: Vector
+    pivot: tuple[float, float, float]
     distance: float | None
     """Length that translation errors are compared with."""
     truth: NDArray[np.float32] | None

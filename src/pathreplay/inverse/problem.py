@@ -14,9 +14,9 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.files import file_names
 from pathreplay.inverse import limits
 from pathreplay.inverse.config import Config, Parameter, Plugin
-from pathreplay.inverse.file_names import file_names
 from pathreplay.inverse.grids import Levels, make_levels, resampled
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.losses import Loss, find_loss
@@ -42,8 +42,8 @@ class Variable:
     key: str
     like: Any
     """A Dr.Jit value of its type and shape."""
-    lower: float | None
-    upper: float | None
+    bounds: tuple[float, float]
+    """Lowest and highest value that a step may end at."""
     learning_rate: float
     start: Array
     truth: Array | None
@@ -52,10 +52,6 @@ class Variable:
     """Of a grid that is refined on the way."""
     form: Form = AS_STORED
     """How Mitsuba stores it; everything here is what people see."""
-
-    def bounds(self) -> tuple[float, float]:
-        """Lowest and highest value that a step may end at."""
-        return -np.inf if self.lower is None else self.lower, np.inf if self.upper is None else self.upper
 
 
 @dataclass(frozen=True)
@@ -102,8 +98,7 @@ def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
 
 def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, Any]:
     """The scene's parameters, by key and as Mitsuba stores them; derivatives flow to the variables."""
-    parts = {name for pose in problem.poses for name in pose.parts().values()}
-    plain = {v.key: v.form.store(variables[v.key]) for v in problem.variables if v.key not in parts}
+    plain = {v.key: v.form.store(variables[v.key]) for v in problem.variables if v.key in problem.params}
     return plain | {pose.key: pose.value(variables) for pose in problem.poses}
 
 
@@ -130,7 +125,7 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     if rival is not None:
         _keys(params, config.parameters, rival)
         _edges(params, keys, rival)  # for its log: one note is enough
-    judge = integrator if config.target.images is not None else load_integrator(config.target.integrator.as_dict())
+    judge = integrator if config.target.images is not None else load_integrator(config.target.integrator.model_dump())
     # Before any target is rendered: the cheap mistakes first.
     sensors = _sensors(scene, config.sensors)
     limits.require_visible(scene, params, keys)
@@ -165,7 +160,7 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
 
 
 def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
-    integrator = load_integrator(plugin.as_dict())
+    integrator = load_integrator(plugin.model_dump())
     if not isinstance(integrator, mi.CppADIntegrator):
         raise PathreplayError(
             f"Integrator '{plugin.type}' computes no gradients; use 'pathreplay' or another AD integrator"
@@ -213,21 +208,21 @@ def _variables(
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
                 like = type(like)(start)
-            variables.append(Variable(key, like, entry.lower, entry.upper, rate, start, None, levels, form))
+            bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
+            variables.append(Variable(key, like, bounds, rate, start, None, levels, form))
             continue
         limits.require_near(scene, key, parameters.get_array(params[key]), entry)
         pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
         poses.append(pose)
         for part, name in pose.parts().items():
-            given = getattr(entry.start, part, None) or [0.0, 0.0, 0.0]
-            start = np.array(given, np.float32)
+            start = np.array(getattr(entry.start, part, None) or [0.0, 0.0, 0.0], np.float32)
             if part == "rotation":
                 # Users write degrees. A learning rate without unit is taken in radians, fit for a scene of size 1.
                 start = np.radians(start)
                 degrees = entry.rotation_learning_rate
                 rate = rate if degrees is None else float(np.radians(degrees))
             limits.require_learning_rate(name, rate, start)
-            variables.append(Variable(name, mi.Vector3f(0), None, None, rate, start, None))
+            variables.append(Variable(name, mi.Vector3f(0), (-np.inf, np.inf), rate, start, None))
     return variables, poses
 
 

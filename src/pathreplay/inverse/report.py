@@ -14,10 +14,10 @@ import jinja2
 import mitsuba as mi
 import numpy as np
 import PIL.Image
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from pathreplay.inverse.checkpoint import Entry
+from pathreplay.inverse.grids import rmse
 from pathreplay.inverse.images import Image, png_bytes
 from pathreplay.inverse.outcome import Contestant, Outcome
 
@@ -30,7 +30,7 @@ PANELS = 2
 
 def report_files(outcome: Outcome) -> dict[str, bytes]:
     """report.html, the curves (SVG, PNG) and summary.png, as file name -> content."""
-    curves = {"loss": loss_figure(outcome.history)}
+    curves = {"loss": loss_figure(outcome.run.history)}
     contestants = outcome.comparison()
     if contestants:
         curves["comparison"] = comparison_figure(contestants)
@@ -45,9 +45,10 @@ def report_files(outcome: Outcome) -> dict[str, bytes]:
     environment.filters["swatch"] = swatch
     html = environment.get_template("report.html.j2").render(
         outcome=outcome,
-        data_uri=_data_uri,
+        data_uri=lambda image, exposure=1.0: _uri("image/png", png_bytes(image, exposure)),
         curves={name: _uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves},
         contestants=contestants,
+        rmse=rmse,
         versions=versions(),
     )
     return {"report.html": html.encode(), **drawings, "summary.png": summary(outcome)}
@@ -60,9 +61,8 @@ def loss_figure(history: Sequence[Entry]) -> Figure:
     axes.plot([entry.iteration for entry in history], [entry.loss for entry in history], color=OURS, linewidth=1.5)
     if any(entry.loss > 0 for entry in history):
         axes.set_yscale("log")
-    axes.set_xlabel("iteration")
     axes.set_ylabel("loss")
-    _plain(axes)
+    _plain(axes, "iteration")
     return figure
 
 
@@ -74,24 +74,20 @@ def comparison_figure(contestants: Sequence[Contestant]) -> Figure:
         for contestant, colour in zip(contestants, (OURS, RIVAL), strict=True):
             history = contestant.run.history
             seconds = np.cumsum([entry.seconds for entry in history])
-            if key is None:
-                found = [(s, e.picture_error) for s, e in zip(seconds, history, strict=True) if e.picture_error]
-            else:
-                found = [(s, e.errors[key]) for s, e in zip(seconds, history, strict=True)]
+            errors = [entry.picture_error if key is None else entry.errors[key] for entry in history]
+            found = [(s, error) for s, error in zip(seconds, errors, strict=True) if key or error]
             marker = "o" if key is None else None
             points = zip(*found, strict=True)
             axes.plot(*points, color=colour, linewidth=1.5, marker=marker, markersize=3, label=contestant.name)
         axes.set_ylim(bottom=0)
-        axes.set_xlabel("seconds")
         axes.set_title("error of the pictures" if key is None else f"error of {key}", fontsize=9, color=GREY)
-        _plain(axes)
+        _plain(axes, "seconds")
     axes.legend(frameon=False, labelcolor=GREY)
     return figure
 
 
 def drawn(figure: Figure, kind: str) -> bytes:
     """The figure as the bytes of an image file ('svg', with a transparent ground, or 'png')."""
-    FigureCanvasAgg(figure)
     buffer = io.BytesIO()
     # No date in the file: the same run gives the same bytes.
     metadata = {"Date": None} if kind == "svg" else None
@@ -99,7 +95,8 @@ def drawn(figure: Figure, kind: str) -> bytes:
     return buffer.getvalue()
 
 
-def _plain(axes: Any) -> None:
+def _plain(axes: Any, along: str) -> None:
+    axes.set_xlabel(along)
     axes.grid(True, color=GREY, alpha=0.25, linewidth=0.5)
     axes.tick_params(which="both", colors=GREY)
     for part in (axes.xaxis.label, axes.yaxis.label):
@@ -130,13 +127,13 @@ def summary(outcome: Outcome) -> bytes:
         for column, (kind, image) in enumerate(pictures.items()):
             line[column].imshow(_shown(image, exposure), interpolation="nearest", vmin=0, vmax=1, cmap="gray")
             label = outcome.caption(kind)
-            line[column].set_title(label if column else f"{_short(name)}: {label}", fontsize=8)
-    return _with_palette(drawn(figure, "png"))
-
-
-def _short(name: str) -> str:
-    """What of a name fits over a picture: of a long key the end."""
-    return name if len(name) <= 24 else f"…{name[-23:]}"
+            short = name if len(name) <= 24 else f"…{name[-23:]}"  # what fits over a picture
+            line[column].set_title(label if column else f"{short}: {label}", fontsize=8)
+    # 256 colours: fewer bytes for noisy pictures, fit for a README or a mail. With a palette given, Pillow dithers.
+    picture = PIL.Image.open(io.BytesIO(drawn(figure, "png"))).convert("RGB")
+    buffer = io.BytesIO()
+    picture.quantize(palette=picture.quantize(256)).save(buffer, "png", optimize=True)
+    return buffer.getvalue()
 
 
 def versions() -> dict[str, str]:
@@ -165,19 +162,6 @@ def _shown(image: Image, exposure: float) -> Image:
 def _encoded(linear: np.ndarray) -> np.ndarray:
     """sRGB of linear radiance, both from 0 to 1."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
-
-
-def _with_palette(png: bytes) -> bytes:
-    """The PNG in 256 colours: fewer bytes for noisy pictures, fit for a README or a mail."""
-    picture = PIL.Image.open(io.BytesIO(png)).convert("RGB")
-    palette = picture.quantize(256)
-    buffer = io.BytesIO()
-    picture.quantize(palette=palette).save(buffer, "png", optimize=True)  # with a palette given, Pillow dithers
-    return buffer.getvalue()
-
-
-def _data_uri(image: Image, exposure: float = 1.0) -> str:
-    return _uri("image/png", png_bytes(image, exposure))
 
 
 def _uri(kind: str, data: bytes) -> str:

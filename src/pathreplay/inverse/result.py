@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 import safetensors.numpy
 
+from pathreplay.files import file_names
 from pathreplay.inverse.checkpoint import Entry, Run
-from pathreplay.inverse.config import Config
-from pathreplay.inverse.file_names import file_names
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes
 from pathreplay.inverse.outcome import Outcome, Recovered, RecoveredPose, ViewPictures, resume_command
 from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.problem import Problem, scene_values, variables_of
 from pathreplay.inverse.report import report_files
-from pathreplay.inverse.values import Array
+from pathreplay.inverse.run_folder import Job
+from pathreplay.inverse.values import Array, Arrays
 from pathreplay.media.volume_files import vol_bytes
-from pathreplay.scenes.parameters import get_array, to_value
+from pathreplay.scenes.parameters import get_array
 
 
 @dataclass(frozen=True, repr=False)
@@ -67,8 +67,7 @@ class RunResult:
 
 
 def outcome_of(
-    config: Config,
-    source: Path | None,
+    job: Job,
     folder: Path,
     problem: Problem,
     run: Run,
@@ -78,21 +77,23 @@ def outcome_of(
 ) -> Outcome:
     """All that is told of a run; ``before``, ``after`` and the ``rivals`` are pictures by view."""
     theirs = run.rival.values if run.rival else {}
-    stored = scene_values(problem, variables_of(problem, run.values))
-    values = {key: get_array(value) for key, value in stored.items()} | run.values
+    starts = _with_scene(problem, {v.key: v.start for v in problem.variables})
+    values = _with_scene(problem, run.values)
     views = tuple(
         ViewPictures(v.name, v.target, before[v.name], after[v.name], exposure_for(v.target), rivals.get(v.name))
         for v in problem.views
     )
-    poses = tuple(_recovered_pose(problem, pose, values) for pose in problem.poses)
-    parts = {name for pose in problem.poses for name in pose.parts().values()}
+    poses = tuple(
+        RecoveredPose(pose, _parts(pose, starts), _parts(pose, values), values[pose.key], starts[pose.key])
+        for pose in problem.poses
+    )
     files_of = file_names(v.key for v in problem.variables)
     recovered = tuple(
         Recovered(v.key, files_of[v.key], v.start, values[v.key], v.truth, theirs.get(v.key))
         for v in problem.variables
-        if v.key not in parts
+        if v.key in problem.params
     )
-    return Outcome(config, source, folder, views, recovered, poses, run, values, problem.notes)
+    return Outcome(job.config, job.source, folder, views, recovered, poses, run, values, problem.notes)
 
 
 def result_files(outcome: Outcome) -> dict[str, bytes]:
@@ -100,7 +101,7 @@ def result_files(outcome: Outcome) -> dict[str, bytes]:
     table = {item.key: item.as_dict() for item in outcome.recovered}
     table |= {item.pose.key: item.as_dict() for item in outcome.poses}
     files = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}
-    files |= _run_files("", outcome.history, outcome.values)
+    files |= _run_files("", outcome.run.history, outcome.values)
     if rival := outcome.run.rival:
         files |= _run_files("rival/", rival.history, rival.values)
     for view in outcome.views:
@@ -119,35 +120,30 @@ def result_files(outcome: Outcome) -> dict[str, bytes]:
 
 def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
     """What Python gets; ``stopped_by`` is the name of a signal, which may have come too late to stop anything."""
-    stopped = len(outcome.history) < outcome.config.iterations
+    stopped = len(outcome.run.history) < outcome.config.iterations
     return RunResult(
         folder=outcome.folder,
         report=outcome.folder / "report.html",
-        iterations=len(outcome.history),
+        iterations=len(outcome.run.history),
         stopped=stopped,
         stopped_by=stopped_by if stopped else None,
-        history=tuple(outcome.history),
+        history=tuple(outcome.run.history),
         parameters=outcome.values,
         errors={item.key: error for item in outcome.recovered if (error := item.error()) is not None},
         poses={item.pose.key: errors["error"] for item in outcome.poses if (errors := item.errors())},
     )
 
 
-def _recovered_pose(problem: Problem, pose: Pose, values: dict[str, Array]) -> RecoveredPose:
-    variables = {variable.key: variable for variable in problem.variables}
-    names = pose.parts()
-    at_start = {name: to_value(variables[name].like, variables[name].start) for name in names.values()}
+def _with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
+    """The values of the variables, and what they make of the scene's parameters."""
+    stored = scene_values(problem, variables_of(problem, values))
+    return {key: get_array(value) for key, value in stored.items()} | dict(values)
 
-    def seen(part: str, value: Array) -> Array:
-        return np.degrees(value) if part == "rotation" else value
 
-    return RecoveredPose(
-        pose=pose,
-        start={part: seen(part, variables[name].start) for part, name in names.items()},
-        result={part: seen(part, values[name]) for part, name in names.items()},
-        value=values[pose.key],
-        value_at_start=get_array(pose.value(at_start)),
-    )
+def _parts(pose: Pose, values: Arrays) -> dict[str, Array]:
+    """Translation and rotation vector (degrees) of a pose."""
+    parts = {part: values[name] for part, name in pose.parts().items()}
+    return {part: np.degrees(value) if part == "rotation" else value for part, value in parts.items()}
 
 
 def _run_files(folder: str, history: Sequence[Entry], values: Mapping[str, Array]) -> dict[str, bytes]:

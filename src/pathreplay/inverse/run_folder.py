@@ -8,6 +8,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -23,17 +24,22 @@ CHECKPOINT = "checkpoint.safetensors"
 RIVAL_CHECKPOINT = "rival/checkpoint.safetensors"
 
 
-class RunFolder:
-    """A folder that belongs to one run, and is locked until `close`. ``origin`` is where paths of its config start."""
+@dataclass(frozen=True)
+class Job:
+    """What a run does, the file that says so (None where Python does), and the folder where its paths start."""
 
-    def __init__(self, path: Path, origin: Path) -> None:
-        self.path, self.origin = path, origin
+    config: Config
+    source: Path | None
+    base: Path
+
+
+class RunFolder:
+    """A folder that belongs to one run, until its ``lock`` is closed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
         self.lock = FolderLock(path)
         self.identity = _identity(path)
-
-    def close(self) -> None:
-        """Unlock it."""
-        self.lock.close()
 
     def remove(self) -> None:
         """Remove it with all that is in it, where it still is the folder that was made."""
@@ -99,31 +105,25 @@ class RunFolder:
         return f"Run folder {self.path} cannot be written ({error.strerror}): mend that, {rescue}"
 
 
-def create_run_folder(
-    output: Path, config: Config, source: Path | None, base: Path, files: Mapping[str, bytes]
-) -> RunFolder:
+def create_run_folder(output: Path, job: Job, files: Mapping[str, bytes]) -> RunFolder:
     """Make ``output``, or ``output-2``, ``-3``, … where that exists, and put the job and its first files into it.
 
     The config is copied as it was written (``config.toml``), or as JSON where it came from Python. What fails leaves no
     folder behind. Raises PathreplayError where the folder cannot be made or written.
     """
-    if source is not None and source.suffix != ".json":
-        copy = {"config.toml": source.read_bytes()}
+    if job.source is not None and job.source.suffix != ".json":
+        copy = {"config.toml": job.source.read_bytes()}
     else:
-        copy = {"config.json": config.model_dump_json(indent=2, exclude_unset=True).encode()}
-    origin = {"base": str(base.resolve()), "config": None if source is None else str(source)}
+        copy = {"config.json": job.config.model_dump_json(indent=2, exclude_unset=True).encode()}
+    origin = {"base": str(job.base.resolve()), "config": None if job.source is None else str(job.source)}
     with undisturbed(), contextlib.ExitStack() as undo:
         path = _make_new(output)
         undo.callback(shutil.rmtree, path, ignore_errors=True)
-        run = RunFolder(path, base.resolve())
-        undo.callback(run.close)
+        run = RunFolder(path)
+        undo.callback(run.lock.close)
         run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
         undo.pop_all()
     return run
-
-
-# Bytes of a run.json, far above what two paths take.
-_LONGEST_ORIGIN = 2**20
 
 
 class _Origin(BaseModel):
@@ -135,8 +135,8 @@ class _Origin(BaseModel):
     config: str | None
 
 
-def open_run_folder(path: Path) -> tuple[RunFolder, Config, str | None]:
-    """An existing run folder, locked; its job, and the config path that it was started with.
+def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
+    """The job of an existing run folder, and that folder, locked.
 
     Raises PathreplayError if it is no run folder, holds no checkpoint to go on from, is damaged, or is in use.
     """
@@ -147,7 +147,7 @@ def open_run_folder(path: Path) -> tuple[RunFolder, Config, str | None]:
     if not (path / CHECKPOINT).is_file():
         raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start the job from its config")
     try:
-        if problem := file_problem(path / "run.json", _LONGEST_ORIGIN):
+        if problem := file_problem(path / "run.json", 2**20):  # far above what two paths take
             raise ValueError(f"it {problem}")
         origin = _Origin.model_validate_json((path / "run.json").read_bytes())
         if "\0" in origin.base + (origin.config or ""):
@@ -155,19 +155,17 @@ def open_run_folder(path: Path) -> tuple[RunFolder, Config, str | None]:
     except (OSError, ValueError) as error:
         what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
         raise PathreplayError(f"{path / 'run.json'} cannot be used ({what}); start the job from its config") from None
-    config = load_config(copy)
-    return RunFolder(path, Path(origin.base)), config, origin.config
+    job = Job(load_config(copy), None if origin.config is None else Path(origin.config), Path(origin.base))
+    return job, RunFolder(path)
 
 
-def default_output(source: Path | None) -> Path:
-    """``runs/<name>``, named after the config file, or after its folder where it is just called config."""
-    if source is None:
-        return Path("runs/optimize")
-    return Path("runs") / (source.resolve().parent.name if source.stem == "config" else source.stem)
-
-
-def require_output(output: str | Path) -> Path:
-    """``output`` as a path that a new folder can have; raises PathreplayError if it cannot, and says why."""
+def new_output(output: str | Path | None, source: Path | None) -> Path:
+    """Where a new folder shall be: ``output``; else in ``runs``, by the name of the config file, or of its folder where
+    it is just called config. Raises PathreplayError if no folder can be there, and says why.
+    """
+    if output is None:
+        named = "optimize" if source is None else source.stem
+        return Path("runs") / (source.resolve().parent.name if source and named == "config" else named)
     path = Path(output)
     require_writable_name(path, "--output")
     if not str(output) or path.name in ("", ".."):

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pathreplay.errors import PathreplayError
+from pathreplay.files import file_problem
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.images import Image, exr_bytes, read_image
@@ -57,9 +58,17 @@ def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
 
     Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
     """
-    _require_pictures(folder, "target", problem, {view.name: view.target for view in problem.views})
     before = {view.name: _read(folder / _picture("start", view.name)) for view in problem.views}
-    _require_pictures(folder, "start", problem, before)
+    for view in problem.views:
+        wanted = picture_shape(problem.scene.sensors()[view.sensor])
+        for kind, found in (("target", view.target), ("start", before[view.name])):
+            path = folder / _picture(kind, view.name)
+            if found.shape != wanted:
+                raise PathreplayError(
+                    f"{path} has shape {found.shape} (height, width, channels), sensor '{view.name}' renders {wanted}; "
+                    "start the job from its config"
+                )
+            require_finite_array(str(path), found)
     for name, each in _runs(run).items():
         checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables})
     return before
@@ -78,17 +87,6 @@ def _picture(kind: str, view: str) -> str:
 
 
 def _read(path: Path) -> Image:
-    return read_image(path, way_out="start the job from its config")
-
-
-def _require_pictures(folder: Path, kind: str, problem: Problem, pictures: Mapping[str, Image]) -> None:
-    """Raise PathreplayError unless the pictures of that ``kind`` fit the films of the views and are finite."""
-    for view in problem.views:
-        path, found = folder / _picture(kind, view.name), pictures[view.name]
-        wanted = picture_shape(problem.scene.sensors()[view.sensor])
-        if found.shape != wanted:
-            raise PathreplayError(
-                f"{path} has shape {found.shape} (height, width, channels), sensor '{view.name}' renders {wanted}; "
-                "start the job from its config"
-            )
-        require_finite_array(str(path), found)
+    if problem := file_problem(path):
+        raise PathreplayError(f"Image {path} {problem}; start the job from its config")
+    return read_image(path)

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import limits
-from pathreplay.inverse.config import Config, Value
+from pathreplay.inverse.config import TARGET, Config
 from pathreplay.inverse.grids import comparable
 from pathreplay.inverse.images import Image, find_image, over_black, read_image, transparent_share
-from pathreplay.inverse.seeds import TARGET, seeds
 from pathreplay.inverse.values import Array, adapted_image, make_value, require_finite_array, seen
 from pathreplay.render.film import picture_shape
 from pathreplay.scenes import parameters
-from pathreplay.scenes.descriptions import load_integrator
-from pathreplay.scenes.loading import load_scene, told
+from pathreplay.scenes.descriptions import load_integrator, told
+from pathreplay.scenes.loading import load_scene
 from pathreplay.scenes.stored import form_of
 
 
@@ -30,33 +28,26 @@ def target_scene(config: Config, base: Path) -> mi.Scene:
     scene = load_scene(spec, base, **arguments)
     params = mi.traverse(scene)
     parameters.require_finite(params)
-    values = {
-        key: _target_value(params, key, value, base)
-        for pattern, value in target.values.items()
-        for key in parameters.resolve_keys(params, pattern)
-    }
-    for key, value in values.items():
-        params[key] = value
-    params.update()
+    values = {}
+    for pattern, value in target.values.items():
+        for key in parameters.resolve_keys(params, pattern):
+            parameters.require_settable(params, key)
+            form, like = form_of(params, key), seen(params, key)
+            given = form.of_colours(key, make_value(key, like, value, base))
+            values[key] = form.store(parameters.to_value(like, given))
+    params.update(values)
     return scene
-
-
-def _target_value(params: mi.SceneParameters, key: str, value: Value, base: Path) -> Any:
-    parameters.require_settable(params, key)
-    form, like = form_of(params, key), seen(params, key)
-    return form.store(parameters.to_value(like, form.of_colours(key, make_value(key, like, value, base))))
 
 
 def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> dict[str, Array]:
     """Values of the wanted parameters in the target scene, where it has them in the same shape or as such a grid."""
     params = mi.traverse(scene)
     found = {key: parameters.get_array(seen(params, key)) for key in keys if key in params}
-    shapes = {key: parameters.get_array(seen(own, key)).shape for key in found}
-    return {key: value for key, value in found.items() if comparable(value.shape, shapes[key])}
+    return {k: value for k, value in found.items() if comparable(value.shape, parameters.get_array(seen(own, k)).shape)}
 
 
 def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -> dict[str, Image]:
-    integrator = load_integrator(config.target.integrator.as_dict())
+    integrator = load_integrator(config.target.integrator.model_dump())
     if len(scene.sensors()) <= max(sensors.values()):
         raise PathreplayError(
             f"The target scene has {len(scene.sensors())} sensors, the job uses number {max(sensors.values())} (from 0)"
@@ -64,7 +55,7 @@ def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -
     limits.require_films(scene, sensors, {"target.spp": config.target.spp})
     targets: dict[str, Image] = {}
     for name, index in sensors.items():
-        seed, _ = seeds(config.seed, TARGET, 0, index)
+        seed, _ = config.seeds(TARGET, index)
         with told(f"Integrator '{config.target.integrator.type}' cannot render the target of sensor '{name}'"):
             image = mi.render(scene, sensor=index, integrator=integrator, spp=config.target.spp, seed=mi.UInt32(seed))
             targets[name] = np.array(image, dtype=np.float32)

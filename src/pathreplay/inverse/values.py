@@ -46,7 +46,12 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
             )
         return np.broadcast_to(given, current.shape).copy()
     if current.ndim == 4 and isinstance(value, str):
-        return _volume(key, base / value, current.shape)
+        path = base / value
+        data = load_volume(path).data
+        if data.shape[3] != current.shape[3]:
+            channels = f"{data.shape[3]} channels, '{key}' has {current.shape[3]}"
+            raise PathreplayError(f"Volume {path} has {channels}; convert the volume")
+        return resampled(data, current.shape)
     picture = value if isinstance(value, Picture) else Picture(image=value)
     if current.ndim != 3:
         raise PathreplayError(
@@ -70,13 +75,6 @@ def adapted_image(name: str, image: Image, other: str, channels: int) -> Image:
         raise PathreplayError(f"{name} has {image.shape[2]} channels, {other} {channels}; convert it")
     require_finite_array(name, adapted)
     return adapted
-
-
-def _volume(key: str, path: Path, shape: tuple[int, ...]) -> Array:
-    data = load_volume(path).data
-    if data.shape[3] != shape[3]:
-        raise PathreplayError(f"Volume {path} has {data.shape[3]} channels, '{key}' has {shape[3]}; convert the volume")
-    return resampled(data, shape)
 
 
 def require_finite_array(name: str, array: Array) -> None:

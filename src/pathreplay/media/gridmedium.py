@@ -20,18 +20,12 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..plugins import on_base
 from . import cellwalk
 from .supergrid import Bounds, all_bounds, cheapest, constant_bounds, find_lattice, mean_chord, voxel_bounds
 
 #: A density that is given as a number reaches this far from the origin along each axis: beyond any scene, and far from
 #: overflow. (A `constvolume` ends at the unit cube.)
 FAR = 1e6
-
-
-def register() -> None:
-    """Registers `gridmedium` for the variant that is active now, whose base class is like no other variant's."""
-    mi.register_medium("gridmedium", on_base(GridMedium, mi.Medium))
 
 
 class GridMedium:

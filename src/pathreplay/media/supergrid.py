@@ -16,6 +16,7 @@ import operator
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 
 #: Voxels along the side of the smallest cell. Half of it makes eight times the cells, and more steps between them.
 BASE = 4
-#: Lowest, mean and highest (Floats), one entry for each voxel or cell.
+#: Lowest, mean and highest (TensorXf, z y x), one entry for each voxel or cell.
 Values = tuple[Any, Any, Any]
 #: Cost of a step from cell to cell over that of a tentative collision: see `pathreplay bench supergrid`.
 STEP_COST = 0.15
@@ -36,20 +37,19 @@ class Lattice:
     """Where the voxels of a volume lie in the world.
 
     Voxel i of an axis covers [i, i + 1] in voxel space; its value belongs to the middle. ``to_voxel`` (3 x 4) maps the
-    world there. ``size`` and ``channels`` are those of the data. ``low`` and ``high`` (voxels, per axis x, y, z) cover
+    world there. ``size`` is that of the data. ``low`` and ``high`` (voxels, per axis x, y, z) cover
     the volume's bounding box, which is larger than the grid where that is turned against the axes of the world.
     """
 
     to_voxel: NDArray[np.float64]
     size: tuple[int, ...]
-    channels: int
     low: tuple[int, ...]
     high: tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Lowest, mean and highest value in cells of ``side``³ voxels, x running fastest (Float, one entry per cell).
+    """Lowest, mean and highest value in cubic cells, x running fastest (Float, one entry per cell).
 
     ``to_cell`` (3 x 4) maps the world to cell space, where cell i of an axis covers [i, i + 1]; ``shape`` counts the
     cells along x, y, z. Of several channels they are the lowest, the mean and the highest.
@@ -102,7 +102,7 @@ def find_lattice(volume: mi.Volume, shape: tuple[int, ...]) -> Lattice | None:
     # A hundredth of a voxel is rounding, and there are bounds for half a voxel beyond the range.
     first = np.floor(reached.min(axis=1) + 0.01).astype(int)
     last = np.ceil(reached.max(axis=1) - 0.01).astype(int)
-    return Lattice(to_voxel, size, int(shape[3]), tuple(first.tolist()), tuple(np.maximum(last, first + 1).tolist()))
+    return Lattice(to_voxel, size, tuple(first.tolist()), tuple(np.maximum(last, first + 1).tolist()))
 
 
 # -------------------------------------------------- bounds by cell --------------------------------------------------
@@ -123,22 +123,26 @@ def constant_bounds(volume: mi.Volume, lowest: float, mean: float, highest: floa
 
 def voxel_bounds(lattice: Lattice, data: mi.TensorXf) -> Bounds:
     """Bounds of the values ``data`` (z y x channels) in cells of BASE³ voxels."""
-    values, counts = _channels(dr.detach(data).array, lattice.channels), list(lattice.size)
+    values = _channels(dr.detach(data))
     for axis, span in enumerate(zip(lattice.low, lattice.high, lattice.size, strict=True)):
-        values = _merged(values, counts, axis, _support(*span), _support(*span, neighbours=False))
+        values = _merged(values, axis, _support(*span), _support(*span, neighbours=False))
         dr.eval(values)
     to_cell = lattice.to_voxel.copy()
     to_cell[:, 3] -= lattice.low
-    return Bounds(to_cell / BASE, tuple(counts), *values)
+    return _bounds(to_cell / BASE, values)
+
+
+def _bounds(to_cell: NDArray[np.float64], values: Values) -> Bounds:
+    return Bounds(to_cell, tuple(values[0].shape[::-1]), *(value.array for value in values))
 
 
 def coarser(bounds: Bounds) -> Bounds:
     """The same bounds for cells twice as large along every axis."""
-    values, counts = (bounds.lowest, bounds.mean, bounds.highest), list(bounds.shape)
+    values: Any = [mi.TensorXf(v, bounds.shape[::-1]) for v in (bounds.lowest, bounds.mean, bounds.highest)]
     for axis, n in enumerate(bounds.shape):
         pairs = np.minimum(np.arange(0, n, 2)[:, None] + [0, 1], n - 1)
-        values = _merged(values, counts, axis, pairs, pairs)
-    return Bounds(bounds.to_cell / 2, tuple(counts), *values)
+        values = _merged(values, axis, pairs, pairs)
+    return _bounds(bounds.to_cell / 2, values)
 
 
 def all_bounds(bounds: Bounds) -> list[Bounds]:
@@ -150,19 +154,15 @@ def all_bounds(bounds: Bounds) -> list[Bounds]:
     return found
 
 
-def _channels(values: mi.Float, channels: int) -> Values:
+def _channels(data: mi.TensorXf) -> Values:
     """Lowest, mean and highest of the channels of every voxel."""
-    if channels == 1:
-        return values, values, values
-    index = dr.arange(mi.UInt32, dr.width(values) // channels) * channels
-    each = [dr.gather(mi.Float, values, index + k) for k in range(channels)]
-    if channels == 4:
+    if data.shape[3] == 1:
+        return 3 * (mi.TensorXf(data.array, data.shape[:3]),)
+    each = [data[..., k] for k in range(data.shape[3])]
+    if len(each) == 4:
         # Coefficients of a spectrum between 0 and 1, and its factor; of the spectrum no more is known.
-        return dr.fmin(each[3], 0), mi.Float(each[3] * 0), each[3]
-    lowest, total, highest = each[0], each[0], each[0]
-    for value in each[1:]:
-        lowest, total, highest = dr.fmin(lowest, value), total + value, dr.fmax(highest, value)
-    return lowest, total / channels, highest
+        return dr.fmin(each[3], 0), each[3] * 0, each[3]
+    return reduce(dr.fmin, each), reduce(operator.add, each) / len(each), reduce(dr.fmax, each)
 
 
 def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np.int64]:
@@ -184,33 +184,16 @@ def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np
     return np.array([(row * longest)[:longest] for row in rows])
 
 
-def _merged(values: Values, counts: list[int], axis: int, near: NDArray[np.int64], inside: NDArray[np.int64]) -> Values:
-    """Merge along one axis: extremes by the table ``near``, means by ``inside``. Brings ``counts`` up to date."""
+def _merged(values: Values, axis: int, near: NDArray[np.int64], inside: NDArray[np.int64]) -> Values:
+    """Merge along one axis (x, y, z): extremes by the table ``near``, means by ``inside``."""
+
+    def pool(value: mi.TensorXf, table: NDArray[np.int64], merge: Callable) -> mi.TensorXf:
+        before = [slice(None)] * (2 - axis)
+        return reduce(merge, [value[tuple([*before, mi.UInt32(k)])] for k in table.T.astype(np.uint32)])
+
     lowest, mean, highest = values
-    found = (
-        _pool(lowest, counts, axis, near, dr.fmin),
-        _pool(mean, counts, axis, inside, operator.add) / inside.shape[1],
-        _pool(highest, counts, axis, near, dr.fmax),
-    )
-    counts[axis] = len(near)
-    return found
-
-
-def _pool(values: mi.Float, counts: list[int], axis: int, table: NDArray[np.int64], merge: Callable) -> mi.Float:
-    """Merge along one axis of a flat array (x runs fastest, ``counts`` entries along x, y, z) as the table says."""
-    inner = int(np.prod(counts[:axis]))
-    cells, length = table.shape
-    sources = mi.UInt32(table.T.ravel().astype(np.uint32))
-    i = dr.arange(mi.UInt32, int(np.prod(counts)) // counts[axis] * cells)
-    before, rest = i % inner, i // inner
-    cell, after = rest % cells, rest // cells
-    offset = before + after * (inner * counts[axis])
-    merged = None
-    for k in range(length):
-        source = dr.gather(mi.UInt32, sources, cell + k * cells)
-        value = dr.gather(mi.Float, values, offset + source * inner)
-        merged = value if merged is None else merge(merged, value)
-    return merged
+    mean = pool(mean, inside, operator.add) / inside.shape[1]
+    return pool(lowest, near, dr.fmin), mean, pool(highest, near, dr.fmax)
 
 
 # ------------------------------------------------ the choice of cells ------------------------------------------------

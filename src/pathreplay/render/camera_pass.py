@@ -4,24 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import mitsuba as mi
 
+from ..plugins import mitsuba_integrator
 from ..transport.start import CameraStart
 
 Seed: TypeAlias = "int | mi.UInt32"
 Which: TypeAlias = "int | mi.Sensor"
 """A sensor, or its index in the scene."""
-
-
-def mitsuba_integrator() -> Any:
-    """Mitsuba's ADIntegrator of the active variant: what it does to prepare a pass is what its users' seeds mean."""
-    # The name under which Mitsuba runs its Python modules anew for every variant. Of `mitsuba.ad`, the public name, an
-    # import statement makes a copy, which stays what it was in the first variant.
-    from mitsuba.python.ad.integrators.common import ADIntegrator
-
-    return ADIntegrator
 
 
 @dataclass(frozen=True)

@@ -3,37 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..gradient.adjoint import LostPaths
-from ..transport.traits import Traits
 from ..transport.vertex import Walk
 from .edges import edges_note, keys_that_move_edges
-
-
-@dataclass(frozen=True)
-class Diagnostics:
-    """Of one or more terms and passes: they can be added.
-
-    ``counters`` count the paths that lost a part of their gradient, out of ``paths``; ``moves`` says that hit points,
-    directions or emitter samples depend on parameters with gradients.
-    """
-
-    counters: tuple[LostPaths, ...] = ()
-    paths: int = 0
-    moves: bool = False
-
-    def __add__(self, other: Diagnostics) -> Diagnostics:
-        return Diagnostics(self.counters + other.counters, self.paths + other.paths, self.moves or other.moves)
-
-    def lost(self) -> mi.UInt32 | None:
-        """How many paths lost a part of their gradient; None if nobody counted. Ask when the kernel has been launched:
-        counts are its side effects, and to add them up launches what is there."""
-        counts = [counter.count for counter in self.counters]
-        return sum(counts[1:], counts[0]) if counts else None
 
 
 def lost_note(lost: int, paths: int) -> str:
@@ -53,8 +28,7 @@ def used_before_note(seed: int) -> str:
 def doubts(walk: Walk) -> Iterator[str]:
     """One line for each thing that makes the gradient of this scene wrong or incomplete, whatever moves.
 
-    Raises:
-        PathreplayError: it would be useless.
+    Raises PathreplayError where it would be useless.
     """
     traits = walk.traits
     if traits.instances_move and walk.attach != "none":
@@ -72,11 +46,8 @@ def doubts(walk: Walk) -> Iterator[str]:
             "the opacity of a mask has gradients in a scene with media: what it does to the light of emitters "
             "that shadow rays see through it is missing from the gradient"
         )
-    if walk.attach == "all":
-        yield from _doubts_of_attached(traits)
-
-
-def _doubts_of_attached(traits: Traits) -> Iterator[str]:
+    if walk.attach != "all":
+        return
     if not traits.attachables:
         raise PathreplayError(
             "pathreplay: attach = 'all', but no BSDF of the scene can be sampled attached (diffuse, "

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import drjit as dr
 import mitsuba as mi
 
+from .. import memory
 from ..errors import PathreplayError
-from .camera_pass import Pass, Rays, mitsuba_integrator
+from ..plugins import mitsuba_integrator
+from .camera_pass import Pass, Rays
+
+# Dr.Jit counts the samples of one kernel in 32 bits.
+MOST_SAMPLES = 2**32 - 1
+# Bytes, measured (peak of the process over 2048 x 2048 pixels, LLVM): a rendering, its derivative and their files take
+# 127 a pixel. Samples take next to none.
+_A_PIXEL = 128
 
 
 def splat(view: Pass, rays: Rays, L: mi.Spectrum, valid: mi.Bool) -> mi.TensorXf:
@@ -49,8 +59,7 @@ def adjoint(view: Pass, rays: Rays, grad_in: mi.TensorXf) -> mi.Spectrum:
 def film_size(sensor: mi.Sensor) -> tuple[int, int]:
     """Width and height of what is rendered: the crop window, and the film's border where it samples one.
 
-    Raises:
-        PathreplayError: the film has no pixel.
+    Raises PathreplayError if the film has no pixel.
     """
     film = sensor.film()
     border = 2 * int(film.rfilter().border_size()) if film.sample_border() else 0
@@ -58,6 +67,25 @@ def film_size(sensor: mi.Sensor) -> tuple[int, int]:
     if width < 1 or height < 1:
         raise PathreplayError(f"The film of sensor '{sensor.id()}' is {width} x {height}; give it at least one pixel")
     return width + border, height + border
+
+
+def require_film(sensor: mi.Sensor, name: str, spp: Mapping[str, int], also: int = 0) -> None:
+    """Return quietly if Dr.Jit takes the samples of a sensor's film at once, and memory what is rendered of it.
+
+    ``spp`` (samples per pixel, by the key that asks for them); ``also`` are bytes for other things. Raises
+    PathreplayError that names the sensor as ``name`` and, of samples, the key and the largest number that would do.
+    """
+    width, height = film_size(sensor)
+    pixels = width * height
+    for key, count in spp.items():
+        if pixels * count > MOST_SAMPLES:
+            way_out = f"'{key}' up to {MOST_SAMPLES // pixels}" if pixels <= MOST_SAMPLES else "a smaller film"
+            raise PathreplayError(
+                f"'{key}' is {count}: with {name} of {width} x {height} pixels that is {pixels * count} samples, "
+                f"beyond the {MOST_SAMPLES} that Dr.Jit takes at once; take {way_out}"
+            )
+    thing = f"Rendering {name} of {width} x {height} pixels"
+    memory.require(pixels * _A_PIXEL + also, thing, "take a smaller film or fewer sensors")
 
 
 def picture_shape(sensor: mi.Sensor) -> tuple[int, int, int]:

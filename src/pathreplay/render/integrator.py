@@ -12,11 +12,10 @@ from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
-from ..plugins import on_base
 from ..transport.vertex import Walk
 from .boundary import Boundary
-from .camera_pass import Pass, Seed, Which, mitsuba_integrator
-from .diagnostics import Diagnostics, doubts, lost_note, missing_edges, used_before_note
+from .camera_pass import Pass, Seed, Which
+from .diagnostics import doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts
 from .interior import PathReplay
 from .path_integrator import UNBOUNDED, PathIntegrator
@@ -80,12 +79,13 @@ class PathReplayIntegrator(PathIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
         self.attach = choice(props, self.name, "attach", "delta", ATTACH)
+        self.moves_rays = self.attach != "none"  # gradients reach cameras, and lights that move
         self.interior = _interior(self.name, props, self.max_depth)
         self.driver, self.branch = self.interior.driver, self.interior.branch
         self.edges = choice(props, self.name, "edges", "none", EDGE_TERMS)
         self.edge_spp = whole_number(props, self.name, "edge_spp", 0, lowest=0)
         self.told: set[str] = set()  # what has been said in the log
-        self.untold = Diagnostics()  # of passes whose lost paths have not been told
+        self.untold = Found()  # of passes whose lost paths have not been told
         self.baseline: tuple[SceneFacts, Baseline] | None = None  # and the scene that it belongs to
 
     @property
@@ -93,7 +93,11 @@ class PathReplayIntegrator(PathIntegrator):
         """The interior, and edges where they are asked for."""
         if self.edges == "none":
             return (self.interior,)
-        return self.interior, Boundary(self.edges == "all", self.edge_spp)
+        return self.interior, self._boundary
+
+    @property
+    def _boundary(self) -> Boundary:
+        return Boundary(self.edges == "all", self.edge_spp)
 
     def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0) -> bool:
         """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
@@ -103,18 +107,12 @@ class PathReplayIntegrator(PathIntegrator):
         return not self._facts(scene).has_media
 
     def render_and_backward(
-        self,
-        scene: mi.Scene,
-        offset: mi.TensorXf,
-        slope: mi.TensorXf,
-        sensor: Which = 0,
-        seed: Seed = 0,
-        spp: int = 0,
+        self, scene: mi.Scene, offset: mi.TensorXf, slope: mi.TensorXf, sensor: Which = 0, seed: Seed = 0, spp: int = 0
     ) -> mi.TensorXf:
         """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
 
         ``offset`` and ``slope`` are tensors like the image (height x width x 3); the loss adds up over its values.
-        Each path is judged by the others of its pixel: see `pixel_sweep`. What is not differentiated: see `sweep`.
+        Each path is judged by the others of its pixel: see `pixel_sweep`; edges by the image. What is not differentiated: see `sweep`.
         Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
         number of samples does not, or a tensor has another shape.
         """
@@ -123,6 +121,8 @@ class PathReplayIntegrator(PathIntegrator):
             walk = self._walk(scene, view.sensor)
             self._learned(view, walk)
             found = self.interior.pixels(view, walk, loss)
+            if self.edges != "none":
+                found += self._boundary.backward(view, walk, offset + slope * found.image, None)
         self._told(view, walk, found)
         return found.image
 
@@ -132,17 +132,14 @@ class PathReplayIntegrator(PathIntegrator):
             self._tell_once(doubt)
         if walk.media is None:
             return None
-        baseline = self._baseline(walk.scene)
+        # Not by the facts of the last pass: other scenes may have been rendered between.
+        if self.baseline is None or not self.baseline[0].are_about(walk.scene):
+            self.baseline = self._facts(walk.scene), Baseline.fresh(walk.scene.bbox())
+        baseline = self.baseline[1]
         if view.key in baseline.passes:
             self._tell_once(used_before_note(view.key[0]))
             return None
         return baseline
-
-    def _baseline(self, scene: mi.Scene) -> Baseline:
-        # Not by the facts of the last pass: other scenes may have been rendered between.
-        if self.baseline is None or not self.baseline[0].are_about(scene):
-            self.baseline = self._facts(scene), Baseline.fresh(scene.bbox())
-        return self.baseline[1]
 
     def learned(self) -> dict[str, np.ndarray]:
         """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
@@ -156,18 +153,17 @@ class PathReplayIntegrator(PathIntegrator):
     def _told(self, view: Pass, walk: Walk, found: Found) -> None:
         """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see `take_lost`,
         which tells of the passes before, too."""
-        if found.diagnostics.moves:
+        if found.moves:
             self._tell_edges(walk, view.sensor)
         frozen = dr.flag(dr.JitFlag.FreezingScope)
-        self.untold = self.untold + found.diagnostics if frozen else found.diagnostics
-        if self.untold.counters and not frozen:
-            paths = self.untold.paths
-            self.tell_lost(self.take_lost(), paths)
+        self.untold = self.untold + Found(lost=found.lost) if frozen else Found()
+        if found.lost is not None and not frozen:
+            self.tell_lost(found.lost, found.paths)
         if found.seen is not None and self.baseline is not None:
             self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
 
     def _tell_edges(self, walk: Walk, sensor: mi.Sensor) -> None:
-        if EDGES in self.told:
+        if EDGES in self.told or (self.edges == "all" and walk.media is None):
             return
         note, named = missing_edges(walk, sensor)
         if named:
@@ -182,7 +178,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     def take_lost(self) -> mi.UInt32 | None:
         """How many paths lost a part of their gradient, or None: a frozen function cannot look itself."""
-        lost, self.untold = self.untold.lost(), Diagnostics()
+        lost, self.untold = self.untold.lost, Found()
         return lost
 
     def tell_lost(self, count: mi.UInt32, paths: int) -> None:
@@ -198,9 +194,3 @@ class PathReplayIntegrator(PathIntegrator):
             branch=self.branch,
             edges=self.edges,
         )
-
-
-def register() -> None:
-    """Register the plugin for the active variant, which must be an AD variant."""
-    plugin = on_base(PathReplayIntegrator, mitsuba_integrator())
-    mi.register_integrator("pathreplay", lambda props: plugin(props))

@@ -15,12 +15,13 @@ import mitsuba as mi
 from ..errors import PathreplayError
 from ..gradient.baseline import Baseline
 from ..gradient.primal import primal
+from ..plugins import mitsuba_integrator
 from ..transport.start import CameraStart
 from ..transport.traits import Tables
 from ..transport.vertex import Walk
-from .camera_pass import Pass, Seed, Which, mitsuba_integrator
+from .camera_pass import Pass, Seed, Which
 from .facts import SceneFacts
-from .interior import Interior, image
+from .interior import image
 from .properties import flag, whole_number
 from .term import Found, Term
 
@@ -29,22 +30,16 @@ UNBOUNDED = 0xFFFFFFFF
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Within this block a PathreplayError that Dr.Jit wrapped in others comes out as itself."""
+    """Within this block a PathreplayError that Dr.Jit wrapped in others, on the way out of a loop, is itself again."""
     try:
         yield
     except RuntimeError as error:
-        mended = _mendable(error)
-        if mended is error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, PathreplayError):
+            cause = cause.__cause__
+        if cause is None:
             raise
-        raise mended from None
-
-
-def _mendable(error: BaseException) -> BaseException:
-    """The PathreplayError that Dr.Jit wrapped in errors of its own on the way out of a loop; else the error itself."""
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, PathreplayError):
-        cause = cause.__cause__
-    return cause or error
+        raise cause from None
 
 
 @contextmanager
@@ -64,19 +59,6 @@ def careful() -> Iterator[None]:
             gc.enable()
 
 
-def require_usable(name: str, props: mi.Properties) -> None:
-    """Return quietly if the plugin can be made. Raises PathreplayError for bad properties and polarised variants."""
-    if mi.is_polarized:
-        raise PathreplayError(
-            f"{name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
-            f"use {mi.variant().replace('_polarized', '')!r}"
-        )
-    # All three are Mitsuba's, too, which takes what it is given or says less.
-    whole_number(props, name, "max_depth", 6, lowest=0, unbounded=True)
-    whole_number(props, name, "rr_depth", 5, lowest=1)
-    flag(props, name, "hide_emitters", False)
-
-
 class PathIntegrator:
     """A template of an integrator (see `on_base`), for those of ours.
 
@@ -87,15 +69,23 @@ class PathIntegrator:
 
     name = ""
     attach = "none"
-    interior: Interior
+    interior: Term
     max_depth: int  # these are Mitsuba's
     rr_depth: int
     skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
 
     def __init__(self, props: mi.Properties) -> None:
-        require_usable(self.name, props)
+        if mi.is_polarized:
+            raise PathreplayError(
+                f"{self.name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
+                f"use {mi.variant().replace('_polarized', '')!r}"
+            )
+        # All three are Mitsuba's, too, which takes what it is given or says less.
+        whole_number(props, self.name, "max_depth", 6, lowest=0, unbounded=True)
+        whole_number(props, self.name, "rr_depth", 5, lowest=1)
+        hide_emitters = flag(props, self.name, "hide_emitters", False)
         mitsuba_integrator().__init__(self, props)
-        self.hide_emitters = flag(props, self.name, "hide_emitters", False)
+        self.hide_emitters = hide_emitters
         self.tables: Tables | None = None  # of the scene, in a frozen function, which cannot make them
         self.facts: SceneFacts | None = None  # about the scene that was rendered last
 
@@ -149,13 +139,7 @@ class PathIntegrator:
         self._told(view, walk, found)
 
     def sample(
-        self,
-        mode: dr.ADMode,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        ray: mi.Ray3f,
-        active: bool | mi.Bool = True,
-        **_: Any,
+        self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool = True, **_: Any
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], Any]:
         """Radiance along rays, for those who have rays and no sensor, such as Mitsuba's `aov`: they start in no medium.
 

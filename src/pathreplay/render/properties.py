@@ -14,7 +14,7 @@ LARGEST = 2**31 - 1
 
 def choice(props: mi.Properties, plugin: str, name: str, default: Any, choices: tuple[Any, ...]) -> Any:
     """A property of ``plugin`` that has to be one of the choices. Raises PathreplayError for another."""
-    value = _value(props, name, default)
+    value = props.get(name, default)
     # By type, too: 1 == True.
     if not any(type(value) is type(allowed) and value == allowed for allowed in choices):
         known = ", ".join(map(repr, choices))
@@ -26,7 +26,7 @@ def whole_number(
     props: mi.Properties, plugin: str, name: str, default: int, lowest: int, unbounded: bool = False
 ) -> int:
     """A whole number from ``lowest`` to `LARGEST`, or -1 where it may be unbounded. Raises PathreplayError else."""
-    value = _value(props, name, default)
+    value = props.get(name, default)
     if type(value) is int and (lowest <= value <= LARGEST or (unbounded and value == -1)):
         return value
     besides = "-1 (unbounded) or " if unbounded else ""
@@ -37,7 +37,7 @@ def whole_number(
 
 def deviation(props: mi.Properties, plugin: str, name: str, default: float) -> float:
     """A finite standard deviation, at least 0. Raises PathreplayError for anything else."""
-    value = _value(props, name, default)
+    value = props.get(name, default)
     if type(value) not in (int, float) or not 0 <= value < float("inf"):
         raise PathreplayError(f"{plugin}: {name} = {shown(value)}: use a finite standard deviation >= 0 (0 = off)")
     return float(value)
@@ -45,11 +45,7 @@ def deviation(props: mi.Properties, plugin: str, name: str, default: float) -> f
 
 def flag(props: mi.Properties, plugin: str, name: str, default: bool) -> bool:
     """True or False. Raises PathreplayError for anything else."""
-    value = _value(props, name, default)
+    value = props.get(name, default)
     if type(value) is not bool:
         raise PathreplayError(f"{plugin}: {name} = {shown(value)}: use true or false")
     return value
-
-
-def _value(props: mi.Properties, name: str, default: Any) -> Any:
-    return props[name] if name in props else default

@@ -3,36 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Any, Protocol
 
 import mitsuba as mi
 
 from ..gradient.baseline import Baseline, Seen
 from ..transport.vertex import Walk
 from .camera_pass import Pass
-from .diagnostics import Diagnostics
 
 
 @dataclass(frozen=True)
 class Found:
-    """What terms give back, beside the gradients of parameters: that of several can be added."""
+    """What terms give back of their passes, beside the gradients of parameters: it can be added up."""
 
     image: mi.TensorXf | None = None  # tangent of the image (forward mode), or the image itself (pixel sweep)
-    diagnostics: Diagnostics = Diagnostics()  # noqa: RUF009 (it is frozen)
     seen: Seen | None = None  # of media, for later passes
+    lost: mi.UInt32 | None = None  # how many paths lost a part of their gradient, if they were counted
+    paths: int = 0  # how many they were counted out of
+    moves: bool = False  # hit points, directions or emitter samples depend on parameters with gradients
 
     def __add__(self, other: Found) -> Found:
-        diagnostics = self.diagnostics + other.diagnostics
-        return Found(_sum(self.image, other.image), diagnostics, _sum(self.seen, other.seen))
+        image, seen, lost = (_sum(getattr(self, name), getattr(other, name)) for name in ("image", "seen", "lost"))
+        return Found(image, seen, lost, self.paths + other.paths, self.moves or other.moves)
 
 
-T = TypeVar("T")
-
-
-def _sum(a: T | None, b: T | None) -> T | None:
-    if a is None or b is None:
-        return b if a is None else a
-    return a + b  # type: ignore[operator]
+def _sum(a: Any, b: Any) -> Any:
+    return b if a is None else a if b is None else a + b
 
 
 class Term(Protocol):

@@ -15,7 +15,7 @@ from ..transport.vertex import Arrival, Flight, Walk, reciprocal
 
 
 @dr.syntax
-def differentiate_flight(at: Arrival, flight: Flight, past: mi.Sampler, active: mi.Bool, adjoint: mi.Spectrum) -> None:
+def differentiate_flight(at: Arrival, flight: Flight, past: mi.Sampler, active: mi.Bool, weight: mi.Spectrum) -> None:
     """Differentiate the collisions of a flight; ``past`` is the sampler as it was when the flight drew from it."""
     medium, ray = at.medium, at.ray
     flying = active & (medium != None)  # noqa: E711 (an array of pointers)
@@ -30,22 +30,16 @@ def differentiate_flight(at: Arrival, flight: Flight, past: mi.Sampler, active: 
         past.next_1d(inside)  # had decided whether it is real
         real = inside & flight.event & (t >= flight.t)
         flying = inside & ~real
-        _differentiate(medium, ray, t, σ_bar, flying, real, adjoint)
+        _differentiate(medium, ray, t, σ_bar, flying, real, weight)
     past.next_1d(active)
 
 
 @dr.syntax
 def differentiate_shadow(
-    walk: Walk,
-    origin: mi.Interaction3f,
-    light: mi.DirectionSample3f,
-    medium: mi.MediumPtr,
-    past: mi.Sampler,
-    active: mi.Bool,
-    adjoint: mi.Spectrum,
+    walk: Walk, ray: mi.Ray3f, medium: mi.MediumPtr, past: mi.Sampler, active: mi.Bool, weight: mi.Spectrum
 ) -> None:
     """Differentiate the tentative collisions of a shadow ray that arrived. In homogeneous media there are none."""
-    stretch = Stretch.begin(dr.detach(origin.spawn_ray_to(light.p)), medium, active)
+    stretch = Stretch.begin(ray, medium, active)
     while dr.hint(stretch.active, exclude=[walk], label="pathreplay: listing, shadow"):
         hit, a, b, inside = stretch.part(walk.scene)
         σ_bar = majorant(stretch.medium, stretch.ray, inside)
@@ -56,24 +50,18 @@ def differentiate_shadow(
         while dr.hint(tracked, label="pathreplay: listing, ratio tracking"):
             t -= dr.log(1 - past.next_1d(tracked)) / σ_bar
             tracked &= t < b
-            _differentiate(stretch.medium, stretch.ray, t, σ_bar, tracked, mi.Bool(False), adjoint)
+            _differentiate(stretch.medium, stretch.ray, t, σ_bar, tracked, mi.Bool(False), weight)
         past.next_1d(inside)
         stretch = stretch.beyond(hit, mi.Spectrum(1))[0]
 
 
 def _differentiate(
-    medium: mi.MediumPtr,
-    ray: mi.Ray3f,
-    t: mi.Float,
-    σ_bar: mi.Float,
-    null: mi.Bool,
-    real: mi.Bool,
-    adjoint: mi.Spectrum,
+    medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float, σ_bar: mi.Float, null: mi.Bool, real: mi.Bool, weight: mi.Spectrum
 ) -> None:
-    """A collision at ``t`` by the radiance that has passed it, times its adjoint."""
+    """A collision at ``t``; ``weight`` is the radiance that has passed it, times its adjoint."""
     with dr.resume_grad():
         σ_s, _, σ_t = medium.get_scattering_coefficients(interaction(medium, ray, t), null | real)
         log = dr.select(null, -σ_t * dr.detach(reciprocal(σ_bar - σ_t)), 0)
         log += dr.select(real, σ_s * dr.detach(reciprocal(σ_s)), 0)
         if dr.grad_enabled(log):
-            backward(dr.sum(adjoint * log))
+            backward(dr.sum(weight * log))

@@ -11,46 +11,39 @@ from functools import partial
 
 import mitsuba as mi
 
-from ..errors import PathreplayError
-from ..gradient.adjoint import LostPaths
-from ..gradient.baseline import Seen
+from ..gradient.baseline import Baseline
 from ..gradient.driver import Driver, ForwardDriver
 from ..gradient.forward import forward
-from ..plugins import on_base
-from ..render.camera_pass import mitsuba_integrator
-from ..render.diagnostics import Diagnostics
-from ..render.interior import Interior
+from ..render.camera_pass import Pass
+from ..render.interior import back_propagate, tangent
 from ..render.path_integrator import PathIntegrator
 from ..render.properties import choice, flag
-from ..transport.start import CameraStart
+from ..render.term import Found
 from ..transport.vertex import Walk
 from .listing import listing
-from .radiative import radiative
+from .radiative import no_forward, radiative
 from .tape import tape_backward, tape_forward
 
 ATTACH = ("delta", "none")
 
 
 @dataclass(frozen=True)
-class OtherInterior(Interior):
-    """The interior term in another way, of which nothing is told.
+class OtherInterior:
+    """The interior term in another way.
 
     Media are differentiated by the score, without a baseline, and where they are empty not at all.
     """
 
-    name: str
     backwards: Driver
-    forwards: ForwardDriver | None = None
+    forwards: ForwardDriver
 
-    def tangent(self, walk: Walk, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, Diagnostics]:
-        if self.forwards is None:
-            raise PathreplayError(f"{self.name} has no forward mode: use the integrator 'pathreplay'")
-        δL, valid, _ = self.forwards(walk, start, LostPaths())
-        return δL, valid, Diagnostics()
+    def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
+        """Tangent of the image: see `Term`."""
+        return tangent(view, walk, self.forwards)
 
-    def propagate(self, walk: Walk, start: CameraStart, δL: mi.Spectrum, seen: Seen | None = None) -> Diagnostics:
-        self.backwards(walk, start, δL, LostPaths())
-        return Diagnostics()
+    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Baseline | None) -> Found:
+        """Back-propagate the adjoint of the image: see `Term`."""
+        return back_propagate(view, walk, grad_in, self.backwards)
 
 
 class TapeIntegrator(PathIntegrator):
@@ -61,7 +54,7 @@ class TapeIntegrator(PathIntegrator):
     """
 
     name = "pathreplay_tape"
-    interior = OtherInterior(name, tape_backward, tape_forward)
+    interior = OtherInterior(tape_backward, tape_forward)
 
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
@@ -80,7 +73,7 @@ class RadiativeIntegrator(PathIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
         linear = flag(props, self.name, "linear", False)
-        self.interior = OtherInterior(self.name, partial(radiative, linear=linear))
+        self.interior = OtherInterior(partial(radiative, linear=linear), no_forward)
 
 
 class ListingIntegrator(PathIntegrator):
@@ -92,11 +85,4 @@ class ListingIntegrator(PathIntegrator):
 
     name = "pathreplay_listing"
     attach = "delta"  # so that it is noticed
-    interior = OtherInterior(name, listing, forward)
-
-
-def register() -> None:
-    """Register the plugins for the active variant, which must be an AD variant."""
-    for template in (TapeIntegrator, RadiativeIntegrator, ListingIntegrator):
-        plugin = on_base(template, mitsuba_integrator())
-        mi.register_integrator(template.name, lambda props, plugin=plugin: plugin(props))
+    interior = OtherInterior(listing, forward)

@@ -68,7 +68,7 @@ def listing(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -
                 backward(dr.sum(δL * Lo))
 
         # The same for the light of the emitter sample, along its shadow ray.
-        begins = shadow_start(v, light, path.at.medium)
-        differentiate_shadow(walk, v.origin, light, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
+        ray, begins = v.origin.spawn_ray_to(light.p), shadow_start(v, light, path.at.medium)
+        differentiate_shadow(walk, ray, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
         path = onward
     return False

@@ -12,12 +12,18 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import PathreplayError
 from ..gradient.adjoint import LostPaths, backward
 from ..gradient.primal import walk_on
 from ..transport.path import PathState, next_arrival
 from ..transport.start import CameraStart
 from ..transport.step import repeat_step
 from ..transport.vertex import Walk
+
+
+def no_forward(walk: Walk, start: CameraStart, lost: LostPaths) -> tuple[mi.Spectrum, mi.Bool, bool]:
+    """There is none. Raises PathreplayError."""
+    raise PathreplayError("pathreplay_rb has no forward mode: use the integrator 'pathreplay'")
 
 
 @dr.syntax

@@ -81,9 +81,8 @@ def tape(walk: Walk, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, bool]:
     moves = path_moves(walk, start, at)
     L = mi.Spectrum(0)  # radiance so far
     β = mi.Spectrum(1)  # throughput, differentiable, and so the arrival: where, whence, density
-    o, d, pdf = mi.Point3f(at.ray.o), mi.Vector3f(at.ray.d), mi.Float(at.pdf)
-    if dr.hint(moves, mode="scalar"):
-        o, d = mi.Point3f(start.ray.o), mi.Vector3f(start.ray.d)
+    first = start.ray if moves else at.ray
+    o, d, pdf = mi.Point3f(first.o), mi.Vector3f(first.d), mi.Float(at.pdf)
 
     while dr.hint(path.active, mode="evaluated", exclude=[walk, moves], label="pathreplay: tape"):
         with dr.suspend_grad():
@@ -98,10 +97,8 @@ def tape(walk: Walk, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, bool]:
         again = repeat_step(walk, replace(v, at=at), moves, path.active)
         L += β * again.e
         β *= again.w * v.rr_weight
-        if dr.hint(moves, mode="scalar"):
-            o, d, pdf = mi.Point3f(again.ray_next.o), mi.Vector3f(again.ray_next.d), mi.Float(again.pdf)
-        else:
-            o, d, pdf = mi.Point3f(onward.at.ray.o), mi.Vector3f(onward.at.ray.d), mi.Float(onward.at.pdf)
+        ray, pdf = (again.ray_next, again.pdf) if moves else (onward.at.ray, onward.at.pdf)
+        o, d, pdf = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(pdf)
         path = onward
 
     return L, valid, moves

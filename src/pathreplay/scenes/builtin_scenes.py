@@ -83,12 +83,8 @@ def _room(radius: float) -> SceneDict:
 
 def _camera(origin: list[float], target: list[float], fov: float, resolution: int) -> SceneDict:
     film = {"type": "hdrfilm", "width": resolution, "height": resolution, "pixel_format": "rgb"}
-    return {
-        "type": "perspective",
-        "to_world": mi.ScalarTransform4f().look_at(origin=origin, target=target, up=[0, 1, 0]),
-        "fov": fov,
-        "film": {**film, "rfilter": {"type": "box"}},
-    }
+    place = mi.ScalarTransform4f().look_at(origin=origin, target=target, up=[0, 1, 0])
+    return {"type": "perspective", "to_world": place, "fov": fov, "film": {**film, "rfilter": {"type": "box"}}}
 
 
 def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
@@ -137,9 +133,8 @@ def _bumps(size: int) -> np.ndarray:
         return 0.03 * window * (np.sin(5 * x) * np.cos(4 * y) + np.cos(3 * x + 5 * y))
 
     ε = 1e-3
-    slope_x = (height(x + ε, y) - height(x - ε, y)) / (2 * ε)
-    slope_y = (height(x, y + ε) - height(x, y - ε)) / (2 * ε)
-    n = np.stack([-slope_x, -slope_y, np.ones_like(x)], axis=-1)
+    rise_x, rise_y = height(x + ε, y) - height(x - ε, y), height(x, y + ε) - height(x, y - ε)
+    n = np.stack([-rise_x, -rise_y, np.full_like(x, 2 * ε)], axis=-1)
     n /= np.linalg.norm(n, axis=-1, keepdims=True)
     return ((n + 1) / 2).astype(np.float32)
 
@@ -235,10 +230,6 @@ def _sky(rows: int) -> np.ndarray:
 
 
 BUILTINS: dict[str, Callable[..., SceneDict]] = {
-    "cornell-box": cornell_box,
-    "cornell-box-photo": cornell_box_photo,
-    "glass-pane": glass_pane,
-    "mirror-camera": mirror_camera,
-    "cloud": cloud,
+    make.__name__.replace("_", "-"): make for make in (cornell_box, cornell_box_photo, glass_pane, mirror_camera, cloud)
 }
 """Built-in scenes: name -> function that returns a Mitsuba scene dictionary."""

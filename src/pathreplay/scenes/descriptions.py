@@ -1,9 +1,10 @@
-"""Loads what a dictionary describes, after a look for what Mitsuba does not survive; its errors as one line."""
+"""Loads what a dictionary describes, after a look for what Mitsuba does not survive; Mitsuba's errors as one line."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import mitsuba as mi
@@ -26,18 +27,34 @@ def load_integrator(description: Mapping[str, Any]) -> mi.Integrator:
     """The integrator that a dictionary describes. Raises PathreplayError if it describes none that Mitsuba can make."""
     require_values(description)
     name = description.get("type")
-    try:
+    with told(f"Integrator '{name}' cannot be made", (Exception,)):  # plugins in Python raise whatever they like
         integrator = mi.load_dict(dict(description))
-    except PathreplayError:
-        raise
-    except Exception as error:  # Mitsuba raises RuntimeError, plugins in Python whatever they like
-        raise PathreplayError(f"Integrator '{name}' cannot be made: {one_line(error)}") from None
     if not isinstance(integrator, mi.Integrator):
         raise PathreplayError(
             f"'{name}' is a {type(integrator).__name__}, which is no integrator; name one, such as 'pathreplay' (or "
             "'path' for targets)"
         )
     return integrator
+
+
+@contextmanager
+def told(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -> Iterator[None]:
+    """An error of these kinds within becomes a PathreplayError, whose line begins with ``what``.
+
+    It tells the error that came first: Dr.Jit's calls and loops raise others that say nothing. A Ctrl-C that Dr.Jit has
+    turned into such an error comes out as what it was.
+    """
+    try:
+        yield
+    except PathreplayError:
+        raise
+    except kinds as error:
+        first: BaseException = error
+        while first.__cause__ is not None:
+            first = first.__cause__
+        if isinstance(first, KeyboardInterrupt):
+            raise first from None
+        raise PathreplayError(f"{what}: {one_line(first)}") from error
 
 
 def one_line(error: BaseException) -> str:

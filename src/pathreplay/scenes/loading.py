@@ -5,8 +5,8 @@ from __future__ import annotations
 import difflib
 import gc
 import inspect
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import MISSING, file_problem
 from pathreplay.scenes import parameters as scene_parameters
 from pathreplay.scenes.builtin_scenes import BUILTINS, COSTS, SceneDict
-from pathreplay.scenes.descriptions import one_line
+from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
 
 
@@ -40,11 +40,8 @@ def load_scene_with(
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
     if str(spec) in BUILTINS:
-        try:
+        with told(f"Built-in scene '{spec}' cannot be made of {parameters}"):
             return load_dict_with(_builtin_dict(str(spec), parameters), plugins)
-        except RuntimeError as error:
-            made = f"Built-in scene '{spec}' cannot be made of {parameters}"
-            raise PathreplayError(f"{made}: {one_line(error)}") from error
     path = Path(spec) if base is None else Path(base) / spec
     if (problem := file_problem(path)) == MISSING:
         raise PathreplayError(_unknown(str(spec), path))
@@ -52,18 +49,11 @@ def load_scene_with(
         raise PathreplayError(f"Scene {path} {problem}; give the path of a Mitsuba XML file")
     # As XML has them: true and not True.
     arguments = {name: str(v).lower() if isinstance(v, bool) else str(v) for name, v in parameters.items()}
-    try:
-        # Equal objects are not merged: that would lose the names by which parameters are addressed.
+    with told(f"Scene {path} cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene, exchanged = load_file_with(path, plugins, arguments)
-    except (RuntimeError, ValueError, TypeError) as error:
-        raise PathreplayError(f"Scene {path} cannot be loaded: {one_line(error)}") from error
     if not isinstance(scene, mi.Scene):
         raise PathreplayError(f"{path} describes no <scene> but a {type(scene).__name__}; wrap it in <scene>")
     return scene, exchanged
-
-
-SMOOTH_GLASS = {"dielectric": "smoothdielectric"}
-"""Mitsuba's plugin with an index that carries no derivative -> ours with one that does."""
 
 
 def load_scene_for(
@@ -86,7 +76,7 @@ def load_scene_for(
     # Dr.Jit traces calls through every instance alive, so the first scene has to go before the second one comes.
     del scene, params
     gc.collect()
-    scene, exchanged = load_scene_with(spec, SMOOTH_GLASS, base, **parameters)
+    scene, exchanged = load_scene_with(spec, {"dielectric": "smoothdielectric"}, base, **parameters)
     count = "one" if len(exchanged) == 1 else f"all {len(exchanged)}"
     return scene, (f"replaced 'dielectric' by 'smoothdielectric' ({count} of them): its eta carries a derivative",)
 
@@ -111,25 +101,3 @@ def _unknown(spec: str, path: Path) -> str:
     close = difflib.get_close_matches(Path(spec).name, [*BUILTINS, *neighbours], n=1, cutoff=0.5)
     hint = f"; did you mean '{close[0]}'?" if close else ""
     return f"No scene '{spec}': {path} is no file and no built-in has that name{hint} (built-ins: {names})"
-
-
-@contextmanager
-def told(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -> Iterator[None]:
-    """An error of these kinds within becomes a PathreplayError, whose line begins with ``what``.
-
-    It tells the error that came first: Dr.Jit's calls and loops raise others that say nothing. A Ctrl-C that Dr.Jit has
-    turned into such an error comes out as what it was.
-    """
-    try:
-        yield
-    except kinds as error:
-        first = _first(error)
-        if isinstance(first, KeyboardInterrupt):
-            raise first from None
-        raise PathreplayError(f"{what}: {one_line(first)}") from error
-
-
-def _first(error: BaseException) -> BaseException:
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return error

@@ -150,9 +150,7 @@ def carries_derivative(params: Any, key: str, integrator: Any = None) -> bool:
         return False
     if not params.flags(key) & mi.ParamFlags.NonDifferentiable:
         return True
-    # By name: this room is below the integrators.
-    ours = type(integrator).__name__ == "PathReplayIntegrator" and integrator.attach != "none"
-    return ours and needs_ray_adjoint(params, key)
+    return getattr(integrator, "moves_rays", False) and needs_ray_adjoint(params, key)
 
 
 # Marked NonDifferentiable by Mitsuba, whose integrators drop their derivatives. Each is held to finite differences in
@@ -176,14 +174,19 @@ def is_transform(value: Any) -> bool:
     return not dr.is_array_v(value) and hasattr(value, "matrix") and dr.is_diff_v(value.matrix)
 
 
+def _array(value: Any) -> Any:
+    """The Dr.Jit array that holds a value: of a transform its matrix."""
+    return value.matrix if is_transform(value) else value
+
+
 def _is_float(value: Any) -> bool:
-    inner = value.matrix if is_transform(value) else value
-    return bool(dr.is_array_v(inner) and dr.is_float_v(inner) and dr.is_diff_v(inner))
+    array = _array(value)
+    return bool(dr.is_array_v(array) and dr.is_float_v(array) and dr.is_diff_v(array))
 
 
 def is_empty(value: Any) -> bool:
     """Whether an array holds no entry, such as the texture coordinates of a mesh that has none."""
-    return 0 in dr.shape(value.matrix if is_transform(value) else value)
+    return 0 in dr.shape(_array(value))
 
 
 def require_finite(params: Any) -> None:
@@ -197,25 +200,17 @@ def require_finite(params: Any) -> None:
         if isinstance(value, float) and math.isnan(value):
             raise PathreplayError(f"Parameter '{key}' is NaN; give it a number in the scene file")
         if _is_float(value) and not is_empty(value):
-            counts[key] = dr.count(~dr.isfinite(_flat(value)))
+            counts[key] = dr.count(~dr.isfinite(dr.ravel(dr.detach(_array(value)))))
     dr.eval(*counts.values())
     for key, count in counts.items():
         if count[0] > 0:
             values = get_array(params[key])
             bad = np.argwhere(~np.isfinite(values))
-            first = tuple(int(i) for i in bad[0])
+            first = tuple(bad[0].tolist())
             raise PathreplayError(
                 f"Parameter '{key}' holds {len(bad)} NaN or infinite of {values.size} values, the first "
                 f"({values[first]}) at index {first}; mend the source file (numpy.nan_to_num helps)"
             )
-
-
-def _flat(value: Any) -> Any:
-    """All entries of a floating-point value as one flat Dr.Jit array, without derivatives."""
-    value = dr.detach(value.matrix if is_transform(value) else value)
-    if dr.is_tensor_v(value):
-        return value.array
-    return dr.ravel(value) if dr.depth_v(value) > 1 else value
 
 
 def get_array(value: Any) -> np.ndarray:
@@ -226,9 +221,7 @@ def get_array(value: Any) -> np.ndarray:
     """
     if isinstance(value, float):
         return np.array([value], np.float32)
-    if is_transform(value):
-        value = value.matrix
-    array = np.array(dr.detach(value))
+    array = np.array(dr.detach(_array(value)))
     if not dr.is_tensor_v(value) and array.ndim > 1 and array.shape[-1] == 1:
         array = array[..., 0]
     return array
@@ -245,10 +238,7 @@ def to_value(like: Any, array: Any) -> Any:
         return float(given[0])
     if is_transform(like):
         return type(like)(type(like.matrix)(given))
-    if dr.is_tensor_v(like) or dr.depth_v(like) == 1 or dr.is_matrix_v(like):
-        return type(like)(given)
-    component = dr.value_t(like)
-    return type(like)(*(component(np.atleast_1d(row)) for row in given))
+    return type(like)(given)
 
 
 def displaced(value: Any, direction: np.ndarray, t: Any) -> Any:
@@ -260,8 +250,4 @@ def displaced(value: Any, direction: np.ndarray, t: Any) -> Any:
     if is_transform(value):
         return type(value)(value.matrix + to_value(value.matrix, direction) * t)
     step = to_value(value, direction)
-    if is_empty(value):
-        return step
-    if dr.is_tensor_v(value):
-        return type(value)(value.array + step.array * dr.array_t(value)(t), value.shape)
-    return value + step * t
+    return step if is_empty(value) else value + step * t

@@ -35,7 +35,6 @@ Array = NDArray[np.float32]
 _MARGIN = 1e-4
 
 
-@dataclass(frozen=True)
 class Form:
     """Most parameters: seen as they are stored."""
 
@@ -55,7 +54,6 @@ class Form:
 AS_STORED = Form()
 
 
-@dataclass(frozen=True)
 class Half(Form):
     """Textures in half precision."""
 
@@ -124,7 +122,6 @@ class Spectra(Form):
         return (seen * factor[:, None]).reshape(colours.shape).astype(np.float32)
 
 
-@dataclass(frozen=True)
 class Lamp(Spectra):
     """The radiance of a light, whose brightness is not among its coefficients."""
 
@@ -142,8 +139,7 @@ def form_of(params: Any, key: str) -> Form:
     form: Form = Half() if isinstance(value, mi.TensorXf16) else AS_STORED
     if kind == "EnvironmentMapEmitter" and name == "data":
         form = Sky(mono=mi.is_monochromatic)
-    channels = coefficient_channels(params, key)
-    if channels == 0:
+    if not (channels := coefficient_channels(params, key)):
         return form
     return Lamp() if kind == "D65Spectrum" else Spectra(scaled=channels == 4, inner=form)
 

@@ -10,7 +10,6 @@ from typing import Any
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.files import MISSING, file_problem
 from pathreplay.scenes.descriptions import require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
 from pathreplay.threads import spare_thread
@@ -64,23 +63,12 @@ def _parsing() -> Iterator[mi.parser.ParserConfig]:
         mi.set_file_resolver(outer)
 
 
-def _require_regular_files(state: Any) -> None:
-    """Raise PathreplayError where a plugin is to read a pipe or a device: Mitsuba would wait or read for ever."""
-    for node in state.nodes:
-        name = node.props.get("filename")
-        problem = file_problem(str(mi.file_resolver().resolve(name))) if isinstance(name, str) else ""
-        if problem not in ("", MISSING):  # Mitsuba says what is missing
-            where = mi.parser.file_location(state, node)
-            raise PathreplayError(f"File '{name}' of the scene {problem}; name a regular file ({where})")
-
-
 def _instantiate(config: Any, state: Any, plugins: Mapping[str, str]) -> tuple[Any, list[str]]:
     exchanged = []
     for node in state.nodes:
         if (new := plugins.get(node.props.plugin_name())) is not None:
             exchanged.append(f"{node.props.id() or 'unnamed'} ({mi.parser.file_location(state, node)})")
             node.props.set_plugin_name(new)
-    _require_regular_files(state)
     require_sound_files(state)
     mi.parser.transform_all(config, state)
     with spare_thread():

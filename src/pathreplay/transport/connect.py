@@ -41,7 +41,7 @@ def choose(walk: Walk, v: Vertex, medium: mi.MediumPtr, u: Numbers, sampler: mi.
     lit &= dr.select(event, medium.use_emitter_sampling(), is_smooth(v.bsdf))
     light, Le = draw_emitter(walk.scene, v.origin, u.light, lit, visible=False)
     lit &= light.pdf != 0
-    dark = shadow(walk, v.origin, light, shadow_start(v, light, medium), sampler, lit)
+    dark = shadow(walk, v.origin.spawn_ray_to(light.p), shadow_start(v, light, medium), sampler, lit)
     return Connection(light, Le * dark.T, lit & dr.any(dark.T != 0), dark)
 
 
@@ -61,6 +61,6 @@ def repeat(walk: Walk, v: Vertex, again: Replayed, ctx: mi.BSDFContext, attached
         return dr.select(kept.lit, f * kept.known.w, 0)
     light, Le = redraw_emitter(walk, v.origin, again.u.light, kept.light, attached, kept.lit)
     if kept.media is not None:
-        Le *= shadow_again(walk, v.origin, light, kept.media.shadow, attached, kept.lit)
+        Le *= shadow_again(walk, v.origin.spawn_ray_to(light.p), kept.media.shadow, attached, kept.lit)
     f, pdf = towards(v, ctx, light.d, kept.lit)
     return dr.select(kept.lit, f * Connection(light, Le, kept.lit).reaches(pdf, attached), 0)

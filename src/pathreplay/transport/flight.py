@@ -63,7 +63,7 @@ def fly(walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: m
     t_null, ω_null, bare, mass, nulls = mi.Float(0), mi.Spectrum(0), mi.Float(0), mi.Float(0), mi.Float(0)
 
     while dr.hint(flying, exclude=[walk, at, media], label="pathreplay: flight"):
-        step, σ_bar = _tentative(media, medium, ray, t, b, sampler.next_1d(flying), σ_max, flying)
+        step, σ_bar = _tentative(walk, medium, ray, t, b, sampler.next_1d(flying), σ_max, flying)
         t_next = t + step
         inside = flying & (t_next < b)
         mei = interaction(medium, ray, t_next)
@@ -111,24 +111,17 @@ def fly(walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: m
 
 
 def _tentative(
-    media: Media,
-    medium: mi.MediumPtr,
-    ray: mi.Ray3f,
-    t: mi.Float,
-    b: mi.Float,
-    u: mi.Float,
-    σ_max: mi.Float,
-    active: mi.Bool,
+    walk: Walk, medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float, b: mi.Float, u: mi.Float, σ: mi.Float, active: mi.Bool
 ) -> tuple[mi.Float, mi.Float]:
-    """How far it is from ``t`` to the next tentative collision, and the majorant there."""
-    step = dr.select(σ_max > 0, -dr.log(1 - u) * dr.rcp(σ_max), dr.inf)
-    for grid in media.grids:
+    """How far it is from ``t`` to the next tentative collision, and the majorant there: σ, but in grids."""
+    step = dr.select(σ > 0, -dr.log(1 - u) * dr.rcp(σ), dr.inf)
+    for grid in walk.media.grids:
         mine = active & is_grid(grid, medium)
         onward = mi.Ray3f(ray.o + t * ray.d, ray.d, ray.time, ray.wavelengths)
         onward.maxt = b - t
         step_grid, σ_grid = grid.free_flight(onward, u, mine)
-        step, σ_max = dr.select(mine, step_grid, step), dr.select(mine, σ_grid, σ_max)
-    return step, mi.Float(σ_max)
+        step, σ = dr.select(mine, step_grid, step), dr.select(mine, σ_grid, σ)
+    return step, mi.Float(σ)
 
 
 def _reality(media: Media, βW: mi.Spectrum, σ_t: mi.Spectrum, σ_bar: mi.Float) -> mi.Float:

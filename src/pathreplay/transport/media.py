@@ -4,33 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from .traits import with_gradients
+from .traits import nodes_of, with_gradients
 
 
 @dataclass(frozen=True)
 class Media:
-    """What the walk wants to know about the media of a scene.
+    """What the walk wants to know about the media of a scene."""
 
-    ``grids`` are the media that have functions of their own for free flight and transmittance (`gridmedium`). The
-    others are known to Mitsuba only: ``plain`` says that there are any, ``homogeneous`` that some have the same
-    coefficients everywhere. ``chromatic`` says that some extinction differs between channels, ``emissive`` that some
-    medium emits, ``passes`` that some surface may let light straight through by chance, ``branches`` that the gradient
-    by some extinction would miss what collisions tell where there are none. ``around`` is the sensor's.
-    """
-
-    grids: tuple[mi.Medium, ...]
-    plain: bool
-    homogeneous: bool
-    chromatic: bool
-    emissive: bool
-    passes: bool
-    branches: bool
-    around: mi.Medium | None
+    grids: tuple[mi.Medium, ...]  # those with functions of their own for free flight and transmittance (`gridmedium`)
+    plain: bool  # there are others, which only Mitsuba knows
+    homogeneous: bool  # some of those have the same coefficients everywhere
+    chromatic: bool  # some extinction differs between channels
+    emissive: bool  # some medium emits
+    passes: bool  # some surface may let light straight through by chance
+    branches: bool  # the gradient by some extinction would miss what collisions tell where there are none
+    around: mi.Medium | None  # the one that the sensor is in
 
 
 def scene_media(media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | None) -> Media | None:
@@ -39,6 +31,7 @@ def scene_media(media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | No
         return None
     grids = tuple(medium for medium in media if hasattr(medium, "free_flight"))
     plain = [medium for medium in media if not hasattr(medium, "free_flight")]
+    below = set() if sensor is None else nodes_of(sensor)
     return Media(
         grids=grids,
         plain=bool(plain),
@@ -47,7 +40,7 @@ def scene_media(media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | No
         emissive=any(grid.emission is not None for grid in grids),
         passes=passes,
         branches=any(map(_wants_branch, media)),
-        around=None if sensor is None else _medium_around(sensor),
+        around=next((node for node in below if isinstance(node, mi.Medium)), None),
     )
 
 
@@ -62,18 +55,6 @@ def _is_chromatic(medium: mi.Medium) -> bool:
         if dr.is_tensor_v(value) or dr.is_diff_v(value)
     ]
     return not one_number or not all(one_number)
-
-
-def _medium_around(sensor: mi.Sensor) -> mi.Medium | None:
-    found: list[mi.Medium] = []
-
-    class Collector(mi.TraversalCallback):  # type: ignore[misc, name-defined]
-        def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            if name == "medium":
-                found.append(value)
-
-    sensor.traverse(Collector())
-    return found[0] if found else None
 
 
 def _wants_branch(medium: mi.Medium) -> bool:

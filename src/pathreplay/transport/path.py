@@ -103,12 +103,6 @@ def next_arrival(walk: Walk, at: Arrival, step: Chosen, active: mi.Bool) -> Arri
     camera = null & at.camera
     if walk.hide_emitters:
         hit = behind_emitters(walk, ray, hit, active & camera)
-    return Arrival(
-        ray=ray,
-        hit=hit,
-        pdf=dr.select(null, at.pdf, kept.pdf),
-        delta=dr.select(null, at.delta, kept.delta),
-        camera=camera,
-        medium=step.medium,
-        behind=dr.select(null, at.behind + dr.norm(ray.o - at.ray.o), 0),
-    )
+    pdf, delta = dr.select(null, at.pdf, kept.pdf), dr.select(null, at.delta, kept.delta)
+    behind = dr.select(null, at.behind + dr.norm(ray.o - at.ray.o), 0)
+    return Arrival(ray, hit, pdf, delta, camera, step.medium, behind)

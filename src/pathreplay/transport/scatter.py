@@ -41,35 +41,28 @@ class Sampled:
 
 
 def choose(
-    walk: Walk,
-    v: Vertex,
-    at: Arrival,
-    u: Numbers,
-    ctx: mi.BSDFContext,
-    light_d: mi.Vector3f,
-    lit: mi.Bool,
-    go_on: mi.Bool,
+    walk: Walk, v: Vertex, at: Arrival, u: Numbers, ctx: mi.BSDFContext, d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool
 ) -> Sampled:
-    """Sample the continuation, and evaluate the vertex for the direction of the emitter sample. Detached.
+    """Sample the continuation, and evaluate the vertex for the direction ``d`` of the emitter sample. Detached.
 
     ``ctx`` has the transport mode, and the lobe where it is to be a given one.
     """
     at_surface = go_on & v.surface
     if v.inside is not None and walk.media.passes:
         at_surface |= v.surface & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.Null)
-    f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(ctx, v.si, v.si.to_local(light_d), u.lobe, u.direction, at_surface)
+    f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(ctx, v.si, v.si.to_local(d), u.lobe, u.direction, at_surface)
     delta, null = (mi.has_flag(sample.sampled_type, kind) for kind in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
     kept = Kept(v.si.to_world(sample.wo), sample.pdf, delta, dr.all(w == 0), sample.sampled_component, lit)
     sampled = Sampled(f, pdf_light, w, kept, null, sample.eta, at_surface)
-    return sampled if v.inside is None else _in_medium(v, at, u, light_d, lit, go_on, sampled)
+    return sampled if v.inside is None else _in_medium(v, at, u, d, lit, go_on, sampled)
 
 
 def _in_medium(
-    v: Vertex, at: Arrival, u: Numbers, light_d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool, surface: Sampled
+    v: Vertex, at: Arrival, u: Numbers, d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool, surface: Sampled
 ) -> Sampled:
     """The same where the vertex may be a particle or a null boundary instead of a ``surface``."""
     event, through, phase, ctx = v.inside.event, v.inside.through, v.inside.phase, mi.PhaseFunctionContext(None)
-    f, pdf_light = phase.eval_pdf(ctx, v.inside.mei, light_d, lit & event)
+    f, pdf_light = phase.eval_pdf(ctx, v.inside.mei, d, lit & event)
     wo, w, pdf = phase.sample(ctx, v.inside.mei, u.lobe, u.direction, go_on & event)
     null = through | (v.surface & surface.null)
     bounce = go_on & (v.surface | event) & (~event | (pdf > 0))
@@ -80,15 +73,9 @@ def _in_medium(
         delta=dr.select(event, ~at.medium.use_emitter_sampling(), surface.kept.delta),
         lobe=dr.select(v.surface, surface.kept.lobe, 0),
     )
-    return Sampled(
-        f=dr.select(event, f, surface.f),
-        pdf_light=dr.select(event, pdf_light, surface.pdf_light),
-        w=dr.select(event, dr.select(pdf > 0, w, 0), dr.select(through, 1, surface.w)),
-        kept=kept,
-        null=null,
-        eta=dr.select(v.surface, surface.eta, 1),
-        active=bounce | null,
-    )
+    f, pdf_light = dr.select(event, f, surface.f), dr.select(event, pdf_light, surface.pdf_light)
+    w = dr.select(event, dr.select(pdf > 0, w, 0), dr.select(through, 1, surface.w))
+    return Sampled(f, pdf_light, w, kept, null, dr.select(v.surface, surface.eta, 1), bounce | null)
 
 
 def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:

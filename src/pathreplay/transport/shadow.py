@@ -27,8 +27,9 @@ class Stretch:
 
     @staticmethod
     def begin(ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool) -> Stretch:
-        """The first one of a ray that starts in ``medium``."""
-        return Stretch(mi.Ray3f(ray), mi.Float(ray.maxt), mi.Float(0), mi.MediumPtr(medium), mi.Bool(active))
+        """The first one of a ray that starts in ``medium``. Detached."""
+        ray = mi.Ray3f(dr.detach(ray))
+        return Stretch(ray, mi.Float(ray.maxt), mi.Float(0), mi.MediumPtr(medium), mi.Bool(active))
 
     def part(self, scene: mi.Scene) -> tuple[mi.PreliminaryIntersection3f, mi.Float, mi.Float, mi.Bool]:
         """The surface at its end, the part [a, b] of the ray that a medium fills, and whether there is one."""
@@ -51,16 +52,9 @@ class Stretch:
 
 
 @dr.syntax
-def shadow(
-    walk: Walk,
-    origin: mi.Interaction3f,
-    light: mi.DirectionSample3f,
-    medium: mi.MediumPtr,
-    sampler: mi.Sampler,
-    active: mi.Bool,
-) -> Shadow:
-    """Estimate the transmittance from ``origin``, in ``medium``, to the emitter sample. Detached."""
-    stretch = Stretch.begin(dr.detach(origin.spawn_ray_to(light.p)), medium, active)
+def shadow(walk: Walk, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool) -> Shadow:
+    """Estimate the transmittance along a shadow ray, which starts in ``medium``. Detached."""
+    stretch = Stretch.begin(ray, medium, active)
     T = mi.Spectrum(1)
     y, y_medium, length = mi.Float(0), dr.zeros(mi.MediumPtr), mi.Float(0)
 
@@ -118,20 +112,12 @@ def ratio_tracking(
     return T
 
 
-def shadow_again(
-    walk: Walk,
-    origin: mi.Interaction3f,
-    light: mi.DirectionSample3f,
-    kept: Shadow,
-    attached: bool,
-    active: mi.Bool,
-) -> mi.Spectrum:
+def shadow_again(walk: Walk, ray: mi.Ray3f, kept: Shadow, attached: bool, active: mi.Bool) -> mi.Spectrum:
     """The kept transmittance, differentiable in σ_t and, if ``attached``, in the two ends of the ray.
 
     The point y keeps its place between the two surfaces (or ends of the ray) next to it.
     """
     walked = active & (kept.medium != None)  # noqa: E711
-    ray = origin.spawn_ray_to(light.p)
     y, growth = kept.y, mi.Float(1)
     if attached:
         still = dr.detach(ray)

@@ -32,31 +32,22 @@ class Tables:
 
 @dataclass(frozen=True)
 class Traits:
-    """What the drivers want to know about a scene.
+    """What the drivers want to know about a scene."""
 
-    ``mirrors`` are the BSDFs with delta lobes, and ``lobes`` is one more than the largest component index of such a
-    lobe, 0 if there is none. ``attachables`` are the BSDFs whose smooth lobes may be sampled attached;
-    ``detached_names`` are the classes of the other BSDFs with smooth lobes. ``lights_deform`` says that an emitting
-    mesh has vertex positions with gradients, ``instances_move`` that an instance's ``to_world`` has, ``area_lights``
-    that there are emitters with an edge, ``two_sides`` that a surface may have another BSDF on its back,
-    ``masks_mirrors`` that a mask lies over delta lobes, ``opacity_moves`` that the opacity of a mask has gradients,
-    ``lights_vary`` that something about emitters has, or about the shapes that emit. ``outlines`` says that a point
-    of a surface may see where a shape, a lamp or a texture ends. ``tables`` tell of single BSDFs and shapes.
-    """
-
-    mirrors: tuple[mi.BSDF, ...]
-    lobes: int
-    attachables: tuple[mi.BSDF, ...]
-    detached_names: tuple[str, ...]
-    area_lights: bool
-    two_sides: bool
-    masks_mirrors: bool
-    outlines: bool
-    tables: Tables
-    lights_deform: bool = False
-    instances_move: bool = False
-    opacity_moves: bool = False
-    lights_vary: bool = False
+    mirrors: tuple[mi.BSDF, ...]  # those with delta lobes
+    lobes: int  # one more than the largest component index of a delta lobe, 0 if there is none
+    attachables: tuple[mi.BSDF, ...]  # those whose smooth lobes may be sampled attached
+    detached_names: tuple[str, ...]  # classes of the others with smooth lobes
+    area_lights: bool  # there are emitters with an edge
+    two_sides: bool  # a surface may have another BSDF on its back
+    masks_mirrors: bool  # a mask lies over delta lobes
+    outlines: bool  # a point of a surface may see where a shape, a lamp or a texture ends
+    tables: Tables  # of single BSDFs and shapes
+    # What has gradients:
+    lights_deform: bool = False  # vertex positions of a mesh that emits
+    instances_move: bool = False  # the to_world of an instance
+    opacity_moves: bool = False  # the opacity of a mask
+    lights_vary: bool = False  # something about an emitter, or about a shape that emits
 
 
 def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
@@ -149,11 +140,8 @@ def _is_attachable(bsdf: mi.BSDF) -> bool:
 
 
 def _mask_by_index(bsdfs: list[mi.BSDF]) -> mi.Bool:
-    index = [dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0] for bsdf in bsdfs]
-    mask = [False] * (max(index) + 1)
-    for i in index:
-        mask[i] = True
-    return mi.Bool(mask)
+    index = {dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0] for bsdf in bsdfs}
+    return mi.Bool([i in index for i in range(max(index) + 1)])
 
 
 def with_gradients(node: mi.Object, *names: str) -> list[Any]:
