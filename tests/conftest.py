@@ -18,6 +18,7 @@ import pytest
 
 from pathreplay.backend import set_variant  # before mitsuba: points Dr.Jit at a libLLVM
 
+import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
 VARIANT = "llvm_ad_rgb"
@@ -29,8 +30,12 @@ LONGEST = ("test_truth_media", "test_motion_noise", "test_truth_attached", "test
 
 
 def pytest_configure() -> None:
-    """Set the variant before test modules are imported, so that module-level `mi.<Type>` works in them."""
+    """Set the variant before test modules are imported, so that module-level `mi.<Type>` works in them.
+
+    Processes that run tests side by side share the cores: threads that wait for work keep a core from the others.
+    """
     set_variant(VARIANT)
+    dr.set_thread_count(max(1, dr.thread_count() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

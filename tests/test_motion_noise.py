@@ -284,7 +284,7 @@ def test_narrow_lobes_follow_their_samples(lobe: str) -> None:
     assert all(share < 1.5 for share in shares.values())
 
 
-@pytest.mark.parametrize("alpha", [0.05, 0.2])
+@pytest.mark.parametrize("alpha", [0.05, pytest.param(0.2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("lobe", LOBES)
 def test_narrow_lobes_are_right(lobe: str, alpha: float) -> None:
     make, key, move = LOBES[lobe]
