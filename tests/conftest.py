@@ -20,6 +20,10 @@ from pathreplay.backend import set_variant  # before mitsuba: points Dr.Jit at a
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
+import numpy as np  # isort: skip
+
+from pathreplay.inverse import report  # isort: skip
+from pathreplay.inverse.images import png_bytes  # isort: skip
 
 VARIANT = "llvm_ad_rgb"
 #: Far above what any of these takes (a few seconds): a hanging process must not hang the tests.
@@ -49,6 +53,14 @@ def _variant() -> Iterator[None]:
     """Hold every test to leaving the variant as it found it."""
     yield
     assert mi.variant() == VARIANT, "a test that needs another variant runs in a Python of its own (run_python)"
+
+
+@pytest.fixture(autouse=True)
+def _sketched(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out matplotlib's drawing, which takes half of the time of a small job, but where a test is marked drawn."""
+    if not request.node.get_closest_marker("drawn"):
+        images = {"svg": b"<svg/>", "png": png_bytes(np.zeros((1, 1, 3), np.float32))}
+        monkeypatch.setattr(report, "drawn", lambda figure, kind: images[kind])
 
 
 @pytest.fixture

@@ -94,6 +94,7 @@ def test_recovers_texture_and_colour(integrator: str) -> None:
     assert result.history[-1].loss < 0.25 * result.history[0].loss  # the noise of 8 samples stays in the loss
 
 
+@pytest.mark.drawn
 def test_run_folder_is_complete_and_the_report_self_contained() -> None:
     result = run()
     names = {str(p.relative_to(result.folder)) for p in result.folder.rglob("*") if p.is_file()}

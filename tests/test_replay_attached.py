@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -39,6 +40,7 @@ def environment() -> dict[str, Any]:
 
 
 def scene_with(origin: list[float], target: list[float], **objects: Any) -> mi.Scene:
+    gc.collect()  # Dr.Jit traces calls through every scene alive
     camera = {
         "type": "perspective",
         "fov": 20,

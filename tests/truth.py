@@ -41,7 +41,7 @@ class Case:
     reference: str = "path"  # the plugin whose images are differenced
     reference_spp: int = 0  # of the reference; 0: spp
     stencil: Stencil = CENTRAL
-    same_seed_spp: int = 16  # forward by reverse: they add up the same terms in another order, and more of them round more
+    same_seed_spp: int = 16  # forward by reverse: they add up in another order, and rounding shows with more samples
     lanes: float | None = 1e-3  # largest relative L1 error lane by lane; None: random choices depend on the parameter
 
 
