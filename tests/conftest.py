@@ -29,8 +29,9 @@ VARIANT = "llvm_ad_rgb"
 #: Far above what any of these takes (a few seconds): a hanging process must not hang the tests.
 TIMEOUT_S = 120
 #: Files that take longest, begun first, so that of several processes none is left alone with one of them.
-LONGEST = ("test_truth_media", "test_motion_noise", "test_truth_attached", "test_truth_materials", "test_primal_media",
-           "test_replay_attached", "test_pixel_sweep", "test_variants")  # fmt: skip
+LONGEST = ("test_truth_media", "test_pixel_sweep", "test_replay_attached", "test_ordinary_use", "test_primal_media",
+           "test_truth_materials", "test_truth_attached", "test_rivals", "test_inverse_run", "test_motion_noise",
+           "test_variants", "test_inverse_grids", "test_deterministic", "test_volume_example")  # fmt: skip
 
 
 def pytest_configure() -> None:

@@ -85,7 +85,7 @@ def interrupt_at(iteration: int, monkeypatch: pytest.MonkeyPatch, times: int = 1
     monkeypatch.setattr(Progress, "advance", hook)
 
 
-@pytest.mark.parametrize("integrator", ["prb", "pathreplay"])
+@pytest.mark.parametrize("integrator", [pytest.param("prb", marks=pytest.mark.slow), "pathreplay"])
 def test_recovers_texture_and_colour(integrator: str) -> None:
     result = run(iterations=60, spp=8, integrator={"type": integrator, "max_depth": 3})
     # The start is off by 0.1 to 0.4; what is left is the noise of 8 samples per pixel in Adam's last, decayed steps.

@@ -34,6 +34,7 @@ from truth import (
     under_sky,
 )
 
+SLOW = pytest.mark.slow
 MIRROR = {"type": "conductor", "material": "none"}
 METAL = {"type": "roughconductor", "alpha": 0.3, "distribution": "ggx"}
 
@@ -88,7 +89,9 @@ def opened() -> Iterator:
         bench.release()
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, id=c.name, marks=SLOW if c.name == "painted floor, many samples" else ()) for c in CASES]
+)
 def test_image_and_gradient_are_those_of_a_quadratic_loss(case: Case, opened) -> None:
     """The loss is Σ W (I - T)² with a target T close to the picture, so that judging a path by itself would show."""
     bench = opened(case)
@@ -129,7 +132,6 @@ def test_the_same_seed_gives_the_same_gradient_in_one_thread_and_many(opened) ->
     assert abs(other - one) > 1e-3 * abs(one)
 
 
-SLOW = pytest.mark.slow
 REASONS = ["gaussian filter", "alpha", "xyz", "stratified", "moving camera", "too deep", "one sample"]
 
 

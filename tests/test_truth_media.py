@@ -53,7 +53,7 @@ def cell(name: str, scene: Callable[[], dict], key: str, move: Move, **options: 
         "step": 0.15,
         "depth": 8,
         "spp": 32,
-        "reference_spp": 128,
+        "reference_spp": 64,
         "same_seed_spp": 32,  # in media there is a kernel for each number of lanes
         "lanes": None,
     }
@@ -185,7 +185,7 @@ EMISSION = [
 CASES = GRIDS + HOMOGENEOUS + PLACES + EMISSION
 
 QUICK = {
-    "constant density", "binary density, full voxels", "binary density, empty voxels", "black albedo",
+    "constant density", "binary density, empty voxels", "black albedo",
     "chromatic density", "phase g", "homogeneous chromatic density", "fog on a lit floor, density",
     "sensor inside, density", "in a mirror, its index", "gridmedium scale", "gridmedium emission",
 }  # fmt: skip
@@ -228,7 +228,7 @@ class Fixed:
     passes: frozenset = frozenset()
 
     def __init__(self, scene: mi.Scene, b: float) -> None:
-        self.b, self.branching = b, dr.opaque(mi.Float, 0.2)
+        self.b, self.branching = dr.opaque(mi.Float, b), dr.opaque(mi.Float, 0.2)
         self.cells = BaselineCells.of(scene.bbox())
 
     def look(self, *_: Any) -> Any:
