@@ -46,6 +46,13 @@ def where(mask: np.ndarray, scale: float = 1.0) -> Move:
     return lambda value, t: value + t * mi.TensorXf(direction.astype(np.float32))
 
 
+QUICK = {
+    "constant density", "binary density, empty voxels", "black albedo",
+    "chromatic density", "phase g", "homogeneous chromatic density", "fog on a lit floor, density",
+    "sensor inside, density", "in a mirror, its index", "gridmedium scale", "gridmedium emission",
+}  # fmt: skip
+
+
 def cell(name: str, scene: Callable[[], dict], key: str, move: Move, **options: Any) -> Case:
     common = {
         "reference": "volpath",
@@ -53,8 +60,8 @@ def cell(name: str, scene: Callable[[], dict], key: str, move: Move, **options: 
         "step": 0.15,
         "depth": 8,
         "spp": 32,
-        "reference_spp": 64,
-        "same_seed_spp": 32,  # in media there is a kernel for each number of lanes
+        "reference_spp": 64 if name in QUICK else 128,  # those of a quick cell leave its error far below the limit
+        "same_seed_spp": 32 if name in QUICK else 16,  # in media there is a kernel for each number of lanes
         "lanes": None,
     }
     return Case(name, scene, key, move, **{**common, **options})
@@ -183,12 +190,6 @@ EMISSION = [
 ]  # fmt: skip
 
 CASES = GRIDS + HOMOGENEOUS + PLACES + EMISSION
-
-QUICK = {
-    "constant density", "binary density, empty voxels", "black albedo",
-    "chromatic density", "phase g", "homogeneous chromatic density", "fog on a lit floor, density",
-    "sensor inside, density", "in a mirror, its index", "gridmedium scale", "gridmedium emission",
-}  # fmt: skip
 
 
 @pytest.mark.parametrize(
