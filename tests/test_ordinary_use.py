@@ -89,6 +89,7 @@ def optimize(folder: Path, use: Use, command: Command) -> None:
     assert not list(run.rglob("*.part"))
 
 
+@pytest.mark.drawn
 @pytest.mark.parametrize(
     "write", [pytest.param(s, id=s.__name__, marks=[pytest.mark.slow] * (s.__name__ in SLOW)) for s in SCENES]
 )
