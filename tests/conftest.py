@@ -19,13 +19,18 @@ import pytest
 from pathreplay.backend import set_variant  # before mitsuba: points Dr.Jit at a libLLVM
 
 import mitsuba as mi  # isort: skip
+import numpy as np  # isort: skip
+
+from pathreplay.inverse import report  # isort: skip
+from pathreplay.inverse.images import png_bytes  # isort: skip
 
 VARIANT = "llvm_ad_rgb"
 #: Far above what any of these takes (a few seconds): a hanging process must not hang the tests.
 TIMEOUT_S = 120
 #: Files that take longest, begun first, so that of several processes none is left alone with one of them.
-LONGEST = ("test_truth_media", "test_motion_noise", "test_truth_attached", "test_truth_materials", "test_primal_media",
-           "test_replay_attached", "test_pixel_sweep", "test_variants")  # fmt: skip
+LONGEST = ("test_truth_media", "test_pixel_sweep", "test_replay_attached", "test_ordinary_use", "test_primal_media",
+           "test_truth_materials", "test_truth_attached", "test_rivals", "test_inverse_run", "test_motion_noise",
+           "test_variants", "test_inverse_grids", "test_deterministic", "test_volume_example")  # fmt: skip
 
 
 def pytest_configure() -> None:
@@ -44,6 +49,14 @@ def _variant() -> Iterator[None]:
     """Hold every test to leaving the variant as it found it."""
     yield
     assert mi.variant() == VARIANT, "a test that needs another variant runs in a Python of its own (run_python)"
+
+
+@pytest.fixture(autouse=True)
+def _sketched(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out matplotlib's drawing, which takes half of the time of a small job, but where a test is marked drawn."""
+    if not request.node.get_closest_marker("drawn"):
+        images = {"svg": b"<svg/>", "png": png_bytes(np.zeros((1, 1, 3), np.float32))}
+        monkeypatch.setattr(report, "drawn", lambda figure, kind: images[kind])
 
 
 @pytest.fixture

@@ -49,13 +49,12 @@ def adam(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize(
     ("job", "number"),
     [
-        ("sweep", signal.SIGKILL),
-        ("medium", signal.SIGTERM),
+        ("medium", signal.SIGKILL),
         *(
             pytest.param(job, number, marks=SLOW)
             for job in JOBS
             for number in (signal.SIGKILL, signal.SIGTERM)
-            if (job, number) not in {("sweep", signal.SIGKILL), ("medium", signal.SIGTERM)}
+            if (job, number) != ("medium", signal.SIGKILL)
         ),
     ],
 )

@@ -7,8 +7,8 @@ import pytest
 from fixed_scenes import SCENES, Scene
 from fixed_set import compared, differs, incomparable
 
-QUICK = {"room", "glass", "fog"}
-"""Scenes of the quick tests: surfaces, what moves, media."""
+QUICK = {"fog"}
+"""Scenes of the quick tests: surfaces and a medium, by nearly every driver."""
 
 
 @pytest.mark.parametrize(

@@ -160,11 +160,12 @@ ROUNDING = 1e-5
 def test_one_thread_and_many_agree_and_a_seed_repeats(driver: str) -> None:
     scene, params, key = _textured()
     integrator = plugin(driver=driver)
-    many = _gradient(scene, params, key, integrator)
-    again = _gradient(scene, params, key, integrator)
-    other = _gradient(scene, params, key, integrator, seed=4)
     threads = dr.thread_count()
     try:
+        dr.set_thread_count(max(2, threads))
+        many = _gradient(scene, params, key, integrator)
+        again = _gradient(scene, params, key, integrator)
+        other = _gradient(scene, params, key, integrator, seed=4)
         dr.set_thread_count(1)
         one = _gradient(scene, params, key, integrator)
     finally:

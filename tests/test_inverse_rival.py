@@ -26,6 +26,7 @@ def history(path: Path) -> list[dict[str, object]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
+@pytest.mark.drawn
 def test_rival_gets_the_same_time_and_both_are_shown() -> None:
     result = run(rival=RIVAL)
     own, others = history(result.folder / "history.jsonl"), history(result.folder / "rival/history.jsonl")

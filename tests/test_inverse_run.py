@@ -85,7 +85,7 @@ def interrupt_at(iteration: int, monkeypatch: pytest.MonkeyPatch, times: int = 1
     monkeypatch.setattr(Progress, "advance", hook)
 
 
-@pytest.mark.parametrize("integrator", ["prb", "pathreplay"])
+@pytest.mark.parametrize("integrator", [pytest.param("prb", marks=pytest.mark.slow), "pathreplay"])
 def test_recovers_texture_and_colour(integrator: str) -> None:
     result = run(iterations=60, spp=8, integrator={"type": integrator, "max_depth": 3})
     # The start is off by 0.1 to 0.4; what is left is the noise of 8 samples per pixel in Adam's last, decayed steps.
@@ -94,6 +94,7 @@ def test_recovers_texture_and_colour(integrator: str) -> None:
     assert result.history[-1].loss < 0.25 * result.history[0].loss  # the noise of 8 samples stays in the loss
 
 
+@pytest.mark.drawn
 def test_run_folder_is_complete_and_the_report_self_contained() -> None:
     result = run()
     names = {str(p.relative_to(result.folder)) for p in result.folder.rglob("*") if p.is_file()}

@@ -15,6 +15,7 @@ from pathreplay.check import check_gradient
 from pathreplay.errors import PathreplayError
 from pathreplay.files import LONGEST, file_names
 from pathreplay.inverse import RunResult, make_config, optimize
+from pathreplay.inverse.images import exr_bytes
 from pathreplay.scenes import parameters
 from pathreplay.scenes.loading import load_scene
 
@@ -77,7 +78,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     for kind, text in MESHES.items():
         (tmp_path / f"quad.{kind}").write_text(text)
-    mi.Bitmap(np.full((2, 2, 3), 0.4, np.float32)).write(str(tmp_path / "t.exr"))
+    (tmp_path / "t.exr").write_bytes(exr_bytes(np.full((2, 2, 3), 0.4, np.float32)))
     return tmp_path
 
 

@@ -33,6 +33,7 @@ from truth import (
     under_sky,
 )
 
+SLOW = pytest.mark.slow
 MIRROR = {"type": "conductor", "material": "none"}
 METAL = {"type": "roughconductor", "alpha": 0.3, "distribution": "ggx"}
 
@@ -87,7 +88,9 @@ def opened() -> Iterator:
         bench.release()
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, id=c.name, marks=SLOW if c.name == "painted floor, many samples" else ()) for c in CASES]
+)
 def test_image_and_gradient_are_those_of_a_quadratic_loss(case: Case, opened) -> None:
     """The loss is Σ W (I - T)² with a target T close to the picture, so that judging a path by itself would show."""
     bench = opened(case)
@@ -118,10 +121,11 @@ def test_the_same_seed_gives_the_same_gradient_in_one_thread_and_many(opened) ->
     try:
         dr.set_thread_count(1)
         image, one = swept(bench, integrator, 1, *adjoint)
+        dr.set_thread_count(max(2, threads))
+        again, many = swept(bench, integrator, 1, *adjoint)
+        _, other = swept(bench, integrator, 2, *adjoint)
     finally:
         dr.set_thread_count(threads)
-    again, many = swept(bench, integrator, 1, *adjoint)
-    _, other = swept(bench, integrator, 2, *adjoint)
     np.testing.assert_allclose(again, image, rtol=1e-5, atol=1e-6)
     assert many == pytest.approx(one, rel=1e-4)
     assert abs(other - one) > 1e-3 * abs(one)
@@ -230,16 +234,18 @@ def test_two_swept_views_add_up(changes: dict, tmp_path) -> None:
     ("changes", "swept"),
     [
         pytest.param({}, False, id="gaussian filter"),
-        pytest.param({"loss": "l1"}, False, id="l1"),
+        pytest.param({"loss": "l1"}, False, id="l1", marks=SLOW),
         pytest.param({"integrator": {"type": "pathreplay", "driver": "replay"}}, False, id="replay"),
         pytest.param({"integrator": {"type": "prb", "max_depth": 3}}, False, id="prb"),
-        pytest.param({"integrator": {"type": "prb_basic", "max_depth": 3}}, False, id="prb_basic"),
+        pytest.param({"integrator": {"type": "prb_basic", "max_depth": 3}}, False, id="prb_basic", marks=SLOW),
         pytest.param(POSE, False, id="moving"),
-        pytest.param(POSE | {"integrator": {"type": "pathreplay", "attach": "all"}}, False, id="moving, all attached"),
+        pytest.param(
+            POSE | {"integrator": {"type": "pathreplay", "attach": "all"}}, False, id="moving, all attached", marks=SLOW
+        ),
         pytest.param(GLASS, True, id="index of a plugin in Python"),
         pytest.param(BOXED, True, id="box filter"),
         pytest.param(BOXED | {"loss": "log"}, False, id="box filter, log"),
-        pytest.param(BOXED | {"integrator": {"type": "prb", "max_depth": 3}}, False, id="box filter, prb"),
+        pytest.param(BOXED | {"integrator": {"type": "prb", "max_depth": 3}}, False, id="box filter, prb", marks=SLOW),
     ],
 )
 def test_steps_that_were_recorded_are_those_that_are_traced(

@@ -19,7 +19,9 @@ from small_job import TIMEOUT_S, ended, hear_signals, kill_at_checkpoint, start,
 ENDLESS = {"iterations": 100_000, "checkpoint_every": 1}
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGHUP, signal.SIGINT))]
+)
 def test_first_signal_stops_with_everything_written(number: signal.Signals, tmp_path: Path) -> None:
     process = start(tmp_path, str(write_job(tmp_path, **ENDLESS)), "--quiet")
     kill_at_checkpoint(tmp_path, process, 2, number)

@@ -12,6 +12,7 @@ import pathreplay  # noqa: F401 (registers the plugins)
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images import exr_bytes
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
+from pathreplay.threads import spare_thread
 
 SMOOTH = {"dielectric": "smoothdielectric"}
 SCENE = """<scene version="3.0.0">
@@ -52,7 +53,8 @@ def scene_file(tmp_path):
 
 
 def test_file_keeps_keys_and_image(scene_file):
-    plain = mi.load_file(str(scene_file), optimize=False, index="1.7")
+    with spare_thread():
+        plain = mi.load_file(str(scene_file), optimize=False, index="1.7")
     scene, exchanged = load_file_with(scene_file, SMOOTH, {"index": "1.7"})
     assert [line.split()[0] for line in exchanged] == ["gem", "glass", "unnamed"]
     assert "materials.xml" in exchanged[0] and "scene.xml (line" in exchanged[1]

@@ -161,7 +161,8 @@ JOBS = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "in turn" else n for n in JOBS])
+@pytest.mark.slow  # the quick tests check and optimise scenes of test_ordinary_use in these variants
+@pytest.mark.parametrize("name", JOBS)
 def test_the_main_job_runs_in_every_variant(run_python, tmp_path, name: str) -> None:
     done = run_python(MAIN_JOB, args=(str(tmp_path), *JOBS[name]))
     assert done.returncode == 0, done.stderr[-3000:]

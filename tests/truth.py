@@ -41,6 +41,7 @@ class Case:
     reference: str = "path"  # the plugin whose images are differenced
     reference_spp: int = 0  # of the reference; 0: spp
     stencil: Stencil = CENTRAL
+    same_seed_spp: int = 16  # forward by reverse: they add up in another order, and rounding shows with more samples
     lanes: float | None = 1e-3  # largest relative L1 error lane by lane; None: random choices depend on the parameter
 
 
@@ -59,8 +60,6 @@ class Row:
 
 
 ROWS: list[Row] = []
-# Forward and reverse add up the same terms in another order; with more samples float32 rounding of the sums shows.
-SAME_SEED_SPP = 16
 
 
 def table() -> str:
@@ -136,7 +135,10 @@ class Bench(Objective):
         self.weigh(np.random.default_rng(0).uniform(0, 1, (RES, RES, 3)).astype(np.float32) / RES**2)
 
     def integrator(self, plugin: str = "pathreplay", **options: Any) -> mi.Integrator:
-        return mi.load_dict({"type": plugin, "max_depth": self.case.depth, **options})
+        made = mi.load_dict({"type": plugin, "max_depth": self.case.depth, **options})
+        if plugin.startswith("pathreplay"):
+            made.rr_depth = dr.opaque(mi.UInt32, made.rr_depth)  # with roulette and without it: the same kernels
+        return made
 
     def reference(self, count: int, spp: int = 0, **options: Any) -> np.ndarray:
         """Finite differences of the weighted image by the case's reference, for so many seeds."""
@@ -188,7 +190,7 @@ def measure(case: Case) -> list[Row]:
             else:
                 g = bench.backwards(integrator)
                 same = bench.integrator(rr_depth=1000, **props)
-                transpose = bench.transpose_error(steady, same, 1, SAME_SEED_SPP)
+                transpose = bench.transpose_error(steady, same, 1, case.same_seed_spp)
             rows.append(Row(case.name, driver, g.mean(), reference.mean(), *gap(g, reference)[1:], lanes, transpose))
     finally:
         bench.release()
