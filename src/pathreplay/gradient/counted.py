@@ -18,6 +18,11 @@ class Counted:
     def of(key: mi.UInt32) -> Counted:
         return Counted(mi.UInt32(key), mi.UInt32(0))
 
+    @staticmethod
+    def at_vertex(key: mi.UInt32, k: mi.UInt32) -> Counted:
+        """Those of the k-th vertex (see `Numbers.draw`) of a path whose first has the first."""
+        return Counted(mi.UInt32(key), mi.UInt32(6 * k))
+
     def next_1d(self, active: bool | mi.Bool = True) -> mi.Float:
         x = mi.sample_tea_float32(self.key, self.index)
         self.index += 1

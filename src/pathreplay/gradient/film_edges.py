@@ -10,6 +10,10 @@ with B(s, π) = 0 on the edge, f_a and f_b the radiances at its two sides, and w
 B = n·(o + t d - z): z is the point of the near surface, glued to it, o + t d the same point on the path, and n normal
 to both edge and ray. Where two surfaces meet, B is the difference of their distances.
 
+Lights without extent cast hard shadows, the borders of which are in the image as well. There the point x that is seen
+slides with the path, and B = n·(x + r d - z), with the point z of what is in the way, r away in the direction d of the
+light.
+
 Both sides of an edge share their random numbers, and so the lobes before it. Where lobes differ, because they are
 chosen with another probability, there is no edge: that is a choice of the walk.
 """
@@ -22,11 +26,12 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.emitters import draw_emitter
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, place_met
 from ..transport.start import CameraStart
 from ..transport.surface import held_point
-from ..transport.vertex import Arrival, Walk
+from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
 from .adjoint import LostPaths
 from .counted import Counted
 from .crofton import Crossed, Sight, bisect, search
@@ -63,6 +68,18 @@ class Fork:
     b: Arrival
     β: mi.Spectrum  # throughput before
     found: mi.Bool
+    shade_a: Shade | None = None  # where there are lights that cast hard shadows
+    shade_b: Shade | None = None
+
+
+@dataclass
+class Shade:
+    """What is between a point and a light without extent."""
+
+    u: mi.Point2f  # which light
+    ray: mi.Ray3f  # towards it
+    hit: mi.PreliminaryIntersection3f
+    hidden: mi.Bool
 
 
 @dataclass
@@ -76,6 +93,8 @@ class FilmCrossing:
     far: mi.PreliminaryIntersection3f
     meets: mi.Bool  # two surfaces meet there
     n: mi.Vector3f
+    shadow: mi.Bool  # it is the border of a hard shadow
+    shade: Shade | None
     jump: mi.Spectrum  # (f_a - f_b) · π/2 / (l p(c) N)
     active: mi.Bool
 
@@ -105,12 +124,12 @@ def film_edges(
     records, reached = _record_chain(walk, places.ray(c.s, c.line.key)[0], c, layout, records)
     c = replace(c, active=reached, k=dr.select(reached, c.k, 0))
 
-    edges = Edges(c.s, c.line.key, c.k, c.near.ray, layout, records, lambda ray: mi.Spectrum(_gap(c, ray)))
+    edges = Edges(c.s, c.line.key, c.k, c.near.ray, layout, records, lambda ray: mi.Spectrum(_gap(walk, c, ray)))
     slope = _slope(walk, places, edges, lost)
     n = dr.norm(slope)
     K = c.jump * (dr.sign(dr.dot(c.line.w, slope)) / n)
     K = dr.select(c.active & (n > 0) & dr.all(dr.isfinite(K)), K, 0)
-    return replace(edges, motion=lambda ray: -K * _gap(c, ray))
+    return replace(edges, motion=lambda ray: -K * _gap(walk, c, ray))
 
 
 def without_roulette(walk: Walk) -> Walk:
@@ -133,6 +152,9 @@ def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> S
     sight = Sight.nothing()
     while dr.hint(path.active, exclude=[walk], label="pathreplay: chain"):
         here = _sight(walk, path.at, path.active)
+        if dr.hint(walk.traits.hard_lights, mode="scalar"):
+            hidden = _shade(walk, path.at, key, path.depth, path.active).hidden
+            here.signature = mixed(here.signature, dr.select(hidden, mi.UInt32(1), 0))
         path.active &= _slides(path.at.hit)
         u, step = path.choose(walk, numbers)
         step.active &= step.kept.delta
@@ -152,6 +174,17 @@ def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
     return hit.is_valid() & mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Delta)
 
 
+def _shade(walk: Walk, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Bool) -> Shade:
+    """What is between the k-th vertex and the light that is sampled there, if that has no extent."""
+    u = Numbers.draw(Counted.at_vertex(key, k)).light
+    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+    lit = active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < walk.max_depth)
+    light, _ = draw_emitter(walk.scene, si, u, lit, visible=False)
+    ray = si.spawn_ray_to(light.p)
+    hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, active=lit & light.delta & (light.pdf != 0))
+    return Shade(u, ray, hit, hit.is_valid())
+
+
 @dr.syntax
 def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: mi.Bool) -> Fork:
     """Where two chains with the same random numbers part: at the first vertex where they meet different things."""
@@ -161,19 +194,23 @@ def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: m
     found = active & _sight(walk, a.at, active).differs(_sight(walk, b.at, active))
     go_on = active & ~found
     while dr.hint(go_on, exclude=[walk], label="pathreplay: fork"):
-        a.active &= _slides(a.at.hit)
-        b.active &= _slides(b.at.hit)
+        go_on &= _slides(a.at.hit)
+        a.active, b.active = mi.Bool(go_on), mi.Bool(go_on)
         u_a, step_a = a.choose(walk, numbers_a)
         u_b, step_b = b.choose(walk, numbers_b)
-        both = step_a.active & step_b.active & step_a.kept.delta & step_b.kept.delta
-        both &= step_a.kept.lobe == step_b.kept.lobe
-        step_a.active &= both
-        step_b.active &= both
-        a, b = a.advance(walk, u_a, step_a)[0], b.advance(walk, u_b, step_b)[0]
-        go_on &= a.active & b.active
+        go_on &= step_a.active & step_b.active & step_a.kept.delta & step_b.kept.delta
+        go_on &= step_a.kept.lobe == step_b.kept.lobe
+        step_a.active, step_b.active = mi.Bool(go_on), mi.Bool(go_on)
+        next_a, next_b = a.advance(walk, u_a, step_a)[0], b.advance(walk, u_b, step_b)[0]
+        go_on &= next_a.active & next_b.active
+        a, b = dr.select(go_on, next_a, a), dr.select(go_on, next_b, b)
         found |= go_on & _sight(walk, a.at, go_on).differs(_sight(walk, b.at, go_on))
         go_on &= ~found
-    return Fork(a.depth, a.at, b.at, a.β, found)
+    fork = Fork(a.depth, a.at, b.at, a.β, found)
+    if dr.hint(walk.traits.hard_lights, mode="scalar"):
+        fork.shade_a, fork.shade_b = (_shade(walk, at, key, fork.k, active & ~found) for at in (a.at, b.at))
+        fork.found |= fork.shade_a.hidden != fork.shade_b.hidden
+    return fork
 
 
 def _weighed(walk: Walk, places: Places, found: Crossed, per_line: float) -> FilmCrossing:
@@ -186,15 +223,22 @@ def _weighed(walk: Walk, places: Places, found: Crossed, per_line: float) -> Fil
     f = []
     for side in (fork.a, fork.b):
         path = PathState(side, mi.Spectrum(1), None, mi.Float(1), mi.UInt32(fork.k), mi.Bool(active))
-        f.append(walk_on(walk, Counted(line.key, mi.UInt32(0x20000)), path)[0])
+        f.append(walk_on(walk, Counted.at_vertex(line.key, fork.k), path)[0])
     jump = weight * fork.β * (f[0] - f[1]) * (per_line * found.weight)
 
     t_a, t_b = (dr.select(side.hit.is_valid(), side.hit.t, dr.inf) for side in (fork.a, fork.b))
-    near_a = t_a <= t_b
+    near_a, meet, shadow = t_a <= t_b, _meet(fork), mi.Bool(False)
+    if fork.shade_a is not None:
+        shadow = fork.shade_a.hidden != fork.shade_b.hidden
+        near_a = dr.select(shadow, fork.shade_a.hidden, near_a)
     near, far = dr.select(near_a, fork.a, fork.b), dr.select(near_a, fork.b.hit, fork.a.hit)
+    shade = None if fork.shade_a is None else dr.select(near_a, fork.shade_a, fork.shade_b)
     active &= near.hit.is_valid()
     n = edge_normal(near.hit, near.ray, active)
-    return FilmCrossing(line, dr.select(near_a, *ends), fork.k, near, far, _meet(fork), n, jump, active)
+    if shade is not None:
+        n = dr.select(shadow, edge_normal(shade.hit, shade.ray, active & shadow), n)
+    s = dr.select(near_a, *ends)
+    return FilmCrossing(line, s, fork.k, near, far, meet & ~shadow, n, shadow, shade, jump, active)
 
 
 def _meet(fork: Fork) -> mi.Bool:
@@ -206,14 +250,25 @@ def _meet(fork: Fork) -> mi.Bool:
     return both & angle & (dr.abs(a.hit.t - b.hit.t) < MEETS * dr.minimum(a.hit.t, b.hit.t))
 
 
-def _gap(c: FilmCrossing, ray: mi.Ray3f) -> mi.Float:
+def _gap(walk: Walk, c: FilmCrossing, ray: mi.Ray3f) -> mi.Float:
     """B: zero on the edge; differentiable in the ray that arrives, and in the shapes."""
     z = held_point(c.near.hit, dr.detach(ray), c.active).p
     t0 = dr.select(c.active, c.near.hit.t, 0)
     outline = dr.select(c.active, dr.dot(c.n, ray.o + t0 * ray.d - z), 0)
     both = c.active & c.meets
     t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, both).t for hit in (c.near.hit, c.far)]
-    return dr.select(both, t[0] - t[1], outline)
+    B = dr.select(both, t[0] - t[1], outline)
+    return B if c.shade is None else dr.select(c.shadow, _shadow_gap(walk, c, c.shade, ray), B)
+
+
+def _shadow_gap(walk: Walk, c: FilmCrossing, shade: Shade, ray: mi.Ray3f) -> mi.Float:
+    """The same at the border of a hard shadow."""
+    active = c.active & c.shadow
+    si = c.near.hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+    light, _ = walk.scene.sample_emitter_direction(si, shade.u, False, active)
+    z = held_point(shade.hit, dr.detach(shade.ray), active).p
+    r = dr.select(active, shade.hit.t, 0)
+    return dr.select(active, dr.dot(c.n, si.p + r * light.d - z), 0)
 
 
 @dr.syntax

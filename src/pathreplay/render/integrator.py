@@ -58,16 +58,16 @@ class PathReplayIntegrator(PathIntegrator):
 
     Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
     (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``, ``none``), ``noise``
-    (0.01; of ray adjoints with the replay driver: see `Recovery`) and ``branch`` (``auto``, True, False). ``auto``
-    drivers sweep unless ``max_depth`` is more than the sweep can hold. Forward mode is the same whatever the
-    driver.
+    (0.01; of ray adjoints with the replay driver: see `Recovery`), ``branch`` (``auto``, True, False), ``edges``
+    (``none``, ``film``, ``all``: see `Boundary`) and ``edge_spp`` (0: the samples of the pass). ``auto`` drivers sweep
+    unless ``max_depth`` is more than the sweep can hold. Forward mode is the same whatever the driver.
 
     Media are differentiated where paths went, less a baseline that is learned from earlier gradient passes of this
     integrator (with other seeds). ``branch`` walks one more path from where a medium might have scattered and did
     not, without which a gradient by extinction is wrong where it is zero; ``auto`` does so where extinction with
     gradients varies in space or is zero, which mostly takes less time for the same noise, too.
 
-    Not differentiated: visibility; with ``attach='none'`` all motion of shapes, cameras and directions; by
+    Not differentiated: visibility, as far as ``edges`` leaves it out; with ``attach='none'`` all motion of shapes, cameras and directions; by
     extinction where it is zero if ``branch`` is off; with the replay driver, by weights that are exactly zero.
     Raises PathreplayError for unknown or unusable properties and in polarised variants.
     """
@@ -112,7 +112,8 @@ class PathReplayIntegrator(PathIntegrator):
         """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
 
         ``offset`` and ``slope`` are tensors like the image (height x width x 3); the loss adds up over its values.
-        Each path is judged by the others of its pixel: see `pixel_sweep`; edges by the image. What is not differentiated: see `sweep`.
+        Each path is judged by the others of its pixel: see `pixel_sweep`; edges, by the image. What is not
+        differentiated: see `sweep`.
         Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
         number of samples does not, or a tensor has another shape.
         """

@@ -39,6 +39,7 @@ class Traits:
     attachables: tuple[mi.BSDF, ...]  # those whose smooth lobes may be sampled attached
     detached_names: tuple[str, ...]  # classes of the others with smooth lobes
     area_lights: bool  # there are emitters with an edge
+    hard_lights: bool  # there are emitters whose shadows are hard
     two_sides: bool  # a surface may have another BSDF on its back
     masks_mirrors: bool  # a mask lies over delta lobes
     outlines: bool  # a point of a surface may see where a shape, a lamp or a texture ends
@@ -67,6 +68,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         attachables=tuple(attachables),
         detached_names=tuple(sorted({bsdf.class_name() for bsdf in others})),
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
+        hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         outlines=not _seamless(shapes, nodes),
