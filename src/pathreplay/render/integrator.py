@@ -67,8 +67,9 @@ class PathReplayIntegrator(PathIntegrator):
     not, without which a gradient by extinction is wrong where it is zero; ``auto`` does so where extinction with
     gradients varies in space or is zero, which mostly takes less time for the same noise, too.
 
-    Not differentiated: visibility, as far as ``edges`` leaves it out; with ``attach='none'`` all motion of shapes, cameras and directions; by
-    extinction where it is zero if ``branch`` is off; with the replay driver, by weights that are exactly zero.
+    Not differentiated: visibility, as far as ``edges`` leaves it out; with ``attach='none'`` all motion of shapes,
+    cameras and directions; by extinction where it is zero if ``branch`` is off; with the replay driver, by weights
+    that are exactly zero.
     Raises PathreplayError for unknown or unusable properties and in polarised variants.
     """
 
