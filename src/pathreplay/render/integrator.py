@@ -85,6 +85,11 @@ class PathReplayIntegrator(PathIntegrator):
         self.driver, self.branch = self.interior.driver, self.interior.branch
         self.edges = choice(props, self.name, "edges", "none", EDGE_TERMS)
         self.edge_spp = whole_number(props, self.name, "edge_spp", 0, lowest=0)
+        if self.edges != "none" and self.attach != "delta":
+            raise PathreplayError(
+                f"{self.name}: edges = '{self.edges}' with attach = '{self.attach}': edges know what moves with "
+                "attach = 'delta' only: use that, or edges = 'none'"
+            )
         self.told: set[str] = set()  # what has been said in the log
         self.untold = Found()  # of passes whose lost paths have not been told
         self.baseline: tuple[SceneFacts, Baseline] | None = None  # and the scene that it belongs to

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-from scipy import integrate
 
 from ..gradient.counted import Counted
 from .camera_pass import Pass
 
-QUADRATURE = 4097
+QUADRATURE = 128
 """Points of the integral over a filter."""
 
 
@@ -87,21 +85,25 @@ class FilmPlaces:
     def _developed(self, pixels: mi.TensorXf) -> mi.TensorXf:
         """The image of a block without weights: those of its pixels are ∫ h_j."""
         film, block = self.view.sensor.film(), self._block()
-        whole = mi.TensorXf(self._weights(block).ravel(), pixels.shape) + pixels
+        height, width, channels = pixels.shape
+        index = dr.arange(mi.UInt32, height * width * channels)
+        place = index // channels
+        x, y = self._reach(block, place % width, 0), self._reach(block, place // width, 1)
+        weights = dr.select(index % channels == channels - 1, x * y, 0)
+        whole = mi.TensorXf(weights, pixels.shape) + pixels
         film.put_block(mi.ImageBlock(whole, block.offset(), film.rfilter(), block.has_border()))
         return film.develop()
 
-    def _weights(self, block: mi.ImageBlock) -> np.ndarray:
-        """∫ h_j over the places, in the last of a block's channels; zero in the others."""
-        rfilter, border = self.view.sensor.film().rfilter(), block.border_size()
-        x = np.linspace(-rfilter.radius(), rfilter.radius(), QUADRATURE)
-        h = np.ones(QUADRATURE) if rfilter.is_box_filter() else rfilter.eval(mi.Float(x)).numpy()
-        until = integrate.cumulative_trapezoid(h, x, initial=0)
-        sides = []
-        for axis in range(2):
-            pixel = np.arange(block.size()[axis] + 2 * border) + block.offset()[axis] - border + 0.5
-            begin, end = self.corner[axis], self.corner[axis] + self.size[axis]
-            sides.append(np.interp(end - pixel, x, until) - np.interp(begin - pixel, x, until))
-        weights = np.zeros((len(sides[1]), len(sides[0]), block.channel_count()), np.float32)
-        weights[..., -1] = np.outer(sides[1], sides[0])
-        return weights
+    def _reach(self, block: mi.ImageBlock, number: mi.UInt32, axis: int) -> mi.Float:
+        """∫ h_j along one axis, over the places, of pixels by their number."""
+        rfilter = self.view.sensor.film().rfilter()
+        if rfilter.is_box_filter():
+            return mi.Float(1)
+        pixel = mi.Float(number) + (block.offset()[axis] - block.border_size() + 0.5)
+        begin, end = self.corner[axis], self.corner[axis] + self.size[axis]
+        step = 2 * rfilter.radius() / QUADRATURE
+        total = mi.Float(0)
+        for k in range(QUADRATURE):
+            x = (k + 0.5) * step - rfilter.radius()
+            total += dr.select((pixel + x >= begin) & (pixel + x < end), rfilter.eval(mi.Float(x)), 0)
+        return total * step
