@@ -33,6 +33,7 @@ from ..transport.start import CameraStart
 from ..transport.surface import held_point
 from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
 from .adjoint import LostPaths
+from .centres import Centres
 from .counted import Counted
 from .crofton import Crossed, Sight, bisect, search
 from .edges import Edges, Places, attached_ray, ray_adjoint, ray_to_camera
@@ -41,6 +42,7 @@ from .record import Layout, record, record_type
 
 MAX_CHAIN = 16
 """Vertices of a chain of delta lobes, at most."""
+LOOKS = 8
 MEETS = 1e-3
 """Relative difference of two distances, and angle, from which on surfaces meet at an edge."""
 
@@ -51,6 +53,7 @@ class FilmLine:
 
     c: mi.Point2f
     w: mi.Vector2f  # its direction
+    density: mi.Float  # of its centre, per pixel
     key: mi.UInt32  # of the random numbers that its paths share
     begin: mi.Float
     end: mi.Float
@@ -102,23 +105,17 @@ class FilmCrossing:
 def film_edges(
     walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lines: int, l: float, lost: LostPaths
 ) -> Edges:
-    """Find an edge on the film in each lane, by ``lines`` lines of length ``l`` (pixels). Detached."""
+    """Find an edge on the film in each lane, by ``lines`` lines of length ``l`` (pixels). Detached.
+
+    A first look with a line for every `LOOKS`-th lane decides where lines are thrown.
+    """
     walk = without_roulette(walk)
-    pick = mi.PCG32(dr.width(lane), initstate=seed, initseq=lane)
-    size = places.size + 2 * l
-
-    def draw(j: mi.UInt32) -> tuple[FilmLine, mi.Bool]:
-        i = lane * lines + j
-        key = mixed(mixed(i, seed), mi.UInt32(0x51ED270B))
-        turn = dr.two_pi * mi.sample_tea_float32(key, mi.UInt32(0x30000))
-        w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
-        return FilmLine(quasi_random(i, seed) * size - l, w, key, mi.Float(-0.5 * l), mi.Float(0.5 * l)), mi.Bool(True)
-
-    def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:
-        return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)
-
-    found = bisect(look, search(draw, look, lines, pick), pick)
-    c = _weighed(walk, places, found, 0.5 * dr.pi * size.x * size.y / (l * dr.width(lane) * lines))
+    even = Centres.even(places.size, l)
+    few = dr.arange(mi.UInt32, max(dr.width(lane) // LOOKS, 1))
+    look = _find(walk, places, even, few, seed ^ 0x7F4A7C15, lines, 2 * l, bisected=False)
+    centres = even.refined(look.line.c + l, look.weight)
+    found = _find(walk, places, centres, lane, seed, lines, l)
+    c = _weighed(walk, places, found, 0.5 * dr.pi / (l * dr.width(lane) * lines))
     layout = Layout.of(walk, True)
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)
     records, reached = _record_chain(walk, places.ray(c.s, c.line.key)[0], c, layout, records)
@@ -130,6 +127,34 @@ def film_edges(
     K = c.jump * (dr.sign(dr.dot(c.line.w, slope)) / n)
     K = dr.select(c.active & (n > 0) & dr.all(dr.isfinite(K)), K, 0)
     return replace(edges, motion=lambda ray: -K * _gap(walk, c, ray))
+
+
+def _find(
+    walk: Walk,
+    places: Places,
+    centres: Centres,
+    lane: mi.UInt32,
+    seed: mi.UInt32,
+    lines: int,
+    l: float,
+    bisected: bool = True,
+) -> Crossed:
+    """A piece of a line with an edge for each lane, or at first the whole line."""
+    pick = mi.PCG32(dr.width(lane), initstate=seed, initseq=lane)
+
+    def draw(j: mi.UInt32) -> tuple[FilmLine, mi.Bool]:
+        i = lane * lines + j
+        key = mixed(mixed(i, seed), mi.UInt32(0x51ED270B))
+        turn = dr.two_pi * mi.sample_tea_float32(key, mi.UInt32(0x30000))
+        w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
+        c, density = centres.draw(quasi_random(i, seed))
+        return FilmLine(c - l, w, density, key, mi.Float(-0.5 * l), mi.Float(0.5 * l)), mi.Bool(True)
+
+    def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:
+        return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)
+
+    found = search(draw, look, lines, pick)
+    return bisect(look, found, pick) if bisected else found
 
 
 def without_roulette(walk: Walk) -> Walk:
@@ -224,7 +249,7 @@ def _weighed(walk: Walk, places: Places, found: Crossed, per_line: float) -> Fil
     for side in (fork.a, fork.b):
         path = PathState(side, mi.Spectrum(1), None, mi.Float(1), mi.UInt32(fork.k), mi.Bool(active))
         f.append(walk_on(walk, Counted.at_vertex(line.key, fork.k), path)[0])
-    jump = weight * fork.β * (f[0] - f[1]) * (per_line * found.weight)
+    jump = weight * fork.β * (f[0] - f[1]) * (per_line * found.weight / line.density)
 
     t_a, t_b = (dr.select(side.hit.is_valid(), side.hit.t, dr.inf) for side in (fork.a, fork.b))
     near_a, meet, shadow = t_a <= t_b, _meet(fork), mi.Bool(False)

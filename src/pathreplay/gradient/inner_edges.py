@@ -14,7 +14,7 @@ seen. Multiple importance sampling belongs to both integrands, which thus add up
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -31,7 +31,7 @@ from .crofton import Sight, bisect, search
 from .edges import Edges, Places
 from .film_edges import quasi_random
 from .primal import walk_on
-from .record import Layout, record, record_type, room_for
+from .record import Layout, deepest, record, record_type, room_for
 
 BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
@@ -269,6 +269,7 @@ def inner_edges(
     ``lengths`` are those in the square and on the sphere (radians). ``W`` (place, ray) -> Spectrum is what light counts
     that arrives at a place of the film: it decides which paths are worth looking at.
     """
+    walk = replace(walk, max_depth=min(walk.max_depth, deepest(walk)))
     key = mixed(mixed(lane, seed), mi.UInt32(0x2545F491))
     pick = mi.PCG32(dr.width(lane), initstate=seed + 1, initseq=lane)
     s = quasi_random(lane, seed) * places.size

@@ -54,10 +54,12 @@ class Boundary:
         def importance(s: mi.Point2f, ray: mi.Ray3f) -> mi.Spectrum:
             return places.importance(grad_in, s, ray.wavelengths)
 
+        lost, paths = LostPaths(), 0
         for edges in self._searches(view, walk, places, importance):
-            edges_backward(walk, places, edges, importance(edges.s, edges.ray), LostPaths())
+            edges_backward(walk, places, edges, importance(edges.s, edges.ray), lost)
+            paths += dr.width(edges.s)
         dr.eval()
-        return Found()
+        return Found(lost=lost.count, paths=paths, moves=True) if paths else Found()
 
     def _searches(
         self, view: Pass, walk: Walk, places: FilmPlaces, importance: Callable[..., mi.Spectrum]

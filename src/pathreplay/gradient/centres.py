@@ -1,0 +1,47 @@
+"""Where on the film lines are worth throwing: at random by pixel, more often where a first look has found edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+EVENLY = 0.25
+"""Share of the lines that are thrown evenly, so that what the first look missed is found, too."""
+
+
+@dataclass(frozen=True)
+class Centres:
+    """A distribution of places: constant in each pixel of a grid that covers the film, and l beyond."""
+
+    width: int
+    height: int
+    until: mi.Float | None = None  # of each pixel, the probability of those up to it; None: all alike
+
+    @staticmethod
+    def even(size: mi.ScalarVector2f, l: float) -> Centres:
+        """All places alike, of a film of so many pixels and lines of length l."""
+        return Centres(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1))
+
+    def refined(self, c: mi.Point2f, found: mi.Float) -> Centres:
+        """More often where there was something: at places ``c`` so much."""
+        index = mi.UInt32(c.y) * self.width + mi.UInt32(c.x)
+        n = self.width * self.height
+        counts = dr.zeros(mi.Float, n)
+        dr.scatter_add(counts, dr.minimum(found, 1), index)
+        share = dr.fma(counts, (1 - EVENLY) / dr.maximum(dr.sum(counts), 1), EVENLY / n)
+        until = dr.cumsum(share)
+        return Centres(self.width, self.height, until / dr.gather(mi.Float, until, n - 1))
+
+    def draw(self, u: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
+        """A place, from the corner of the grid, and its density, from random numbers in the unit square."""
+        n = self.width * self.height
+        if self.until is None:
+            return u * mi.Point2f(self.width, self.height), mi.Float(1 / n)
+        below = lambda i: dr.gather(mi.Float, self.until, i) <= u.x  # noqa: E731
+        i = dr.minimum(dr.binary_search(0, n - 1, below), n - 1)
+        begin = dr.select(i > 0, dr.gather(mi.Float, self.until, i - 1, i > 0), 0)
+        share = dr.gather(mi.Float, self.until, i) - begin
+        x = dr.clip((u.x - begin) / share, 0, dr.one_minus_epsilon(mi.Float))
+        return mi.Point2f(mi.Float(i % self.width) + x, mi.Float(i // self.width) + u.y), share
