@@ -10,11 +10,13 @@ import mitsuba as mi
 
 from ..gradient.adjoint import LostPaths
 from ..gradient.baseline import Baseline
+from ..gradient.counted import Counted
 from ..gradient.edges import Edges, edges_backward, edges_forward
 from ..gradient.film_edges import film_edges
 from ..gradient.inner_edges import inner_edges
 from ..transport.motion import path_moves
 from ..transport.path import PathState
+from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 from .camera_pass import Pass
 from .places import FilmPlaces
@@ -30,8 +32,8 @@ INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
 class Boundary:
     """A term: edges that the camera sees, directly or by mirrors and glass, and those that surfaces see.
 
-    Not differentiated: edges in scenes with media; those seen from points that lights without extent illuminate; those
-    of textures and of masks.
+    Not differentiated: edges in scenes with media; hard shadows beyond the first vertex that scatters; edges of
+    textures and of masks; alpha.
     """
 
     inner: bool  # also those that surfaces see
@@ -65,9 +67,7 @@ class Boundary:
         self, view: Pass, walk: Walk, places: FilmPlaces, importance: Callable[..., mi.Spectrum]
     ) -> Iterator[Edges]:
         """The edges of each search; none where nothing moves, or with media."""
-        rays = view.rays()
-        moves = path_moves(walk, rays.start, PathState.begin(walk, rays.start).at)
-        if not moves or walk.media is not None:
+        if walk.media is not None or not _moves(walk, places):
             return
         size = int(places.size.x) * int(places.size.y)
         lane = dr.arange(mi.UInt32, max(size * (self.spp or view.spp) // LINES, 1))
@@ -75,3 +75,12 @@ class Boundary:
         yield film_edges(walk, places, lane, seed ^ 0x5EED, LINES, FILM_LENGTH, LostPaths())
         if self.inner:
             yield inner_edges(walk, places, lane, seed ^ 0x5EED, LINES, INNER_LENGTHS, importance)
+
+
+def _moves(walk: Walk, places: FilmPlaces) -> bool:
+    """Whether paths move with the parameters: if not, edges do not either."""
+    key = mi.UInt32(0)
+    with dr.resume_grad():
+        ray, _ = places.ray(mi.Point2f(0.5), key)
+    start = CameraStart(ray, Counted.of(key), mi.Bool(True))
+    return path_moves(walk, start, PathState.begin(walk, start).at)
