@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,9 +42,8 @@ class LostPaths:
 
 def _attached_arrival(at: Arrival) -> Arrival:
     """A copy of an arrival whose ray and density are AD variables of their own."""
-    ray = mi.Ray3f(at.ray)
-    ray.o, ray.d, pdf = mi.Point3f(dr.detach(ray.o)), mi.Vector3f(dr.detach(ray.d)), mi.Float(dr.detach(at.pdf))
-    dr.enable_grad(ray.o, ray.d, pdf)
+    ray, pdf = _attached_ray(at.ray), mi.Float(dr.detach(at.pdf))
+    dr.enable_grad(pdf)
     return replace(at, ray=ray, pdf=pdf)
 
 
@@ -93,6 +93,50 @@ def forward_step(
         step = repeat_step(walk, replace(v, at=at), attached, active)
         δe, δw, δo, δd, δpdf = tangents(step.e, step.w, step.ray_next.o, step.ray_next.d, step.pdf)
     return step, δe, δw, RayDerivative(δo, δd, δpdf)
+
+
+def backward_ray(ray: mi.Ray3f, f: Callable[[mi.Ray3f], mi.Float]) -> RayDerivative:
+    """Back-propagate a function of a ray into the parameters; gives the adjoint of the ray, where that is finite."""
+    with dr.resume_grad():
+        ray = _attached_ray(ray)
+        backward(f(ray))
+        return RayDerivative(dr.grad(ray.o), dr.grad(ray.d), mi.Float(0)).finite_part()[0]
+
+
+def forward_ray(ray: mi.Ray3f, tangent: RayDerivative, f: Callable[[mi.Ray3f], mi.Spectrum]) -> mi.Spectrum:
+    """The tangent of a function of a ray, from those of the ray and of the parameters."""
+    with dr.resume_grad():
+        ray = _attached_ray(ray)
+        dr.set_grad(ray.o, tangent.o)
+        dr.set_grad(ray.d, tangent.d)
+        return tangents(f(ray))[0]
+
+
+def derivative_by_ray(ray: mi.Ray3f, f: Callable[[mi.Ray3f], mi.Float]) -> RayDerivative:
+    """The derivative of a function by a ray, where that is finite. Reaches no parameter."""
+    with dr.resume_grad():
+        ray = _attached_ray(ray)
+    with dr.resume_grad(ray.o, ray.d):
+        dr.backward_from(f(ray))
+        return RayDerivative(dr.grad(ray.o), dr.grad(ray.d), mi.Float(0)).finite_part()[0]
+
+
+def derivative_by_place(s: mi.Point2f, f: Callable[[mi.Point2f], mi.Float]) -> mi.Vector2f:
+    """The derivative of a function by a place in the plane. Reaches no parameter."""
+    s = mi.Point2f(dr.detach(s))
+    with dr.resume_grad():
+        dr.enable_grad(s)
+    with dr.resume_grad(s):
+        dr.backward_from(f(s))
+        return mi.Vector2f(dr.grad(s))
+
+
+def _attached_ray(ray: mi.Ray3f) -> mi.Ray3f:
+    """A copy of a ray, origin and direction of which are variables of their own."""
+    ray = mi.Ray3f(ray)
+    ray.o, ray.d = mi.Point3f(dr.detach(ray.o)), mi.Vector3f(dr.detach(ray.d))
+    dr.enable_grad(ray.o, ray.d)
+    return ray
 
 
 def tangents(*values: Any) -> list[Any]:

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.vertex import Walk
-from .adjoint import LostPaths, RayDerivative, backward, forward_step, tangents
+from .adjoint import LostPaths, RayDerivative, backward, backward_ray, forward_ray, forward_step, tangents
 from .record import Layout, read_back
 from .two_walks import walk_back
 
@@ -49,10 +49,8 @@ class Edges:
 
 def edges_backward(walk: Walk, places: Places, found: Edges, W: mi.Spectrum, lost: LostPaths) -> None:
     """Back-propagate W·motion into the parameters; ``W`` is the adjoint of radiance that arrives at the places."""
-    at = attached_ray(found.ray)
-    with dr.resume_grad():
-        backward(dr.sum(W * found.motion(at)))
-    q = ray_to_camera(walk, places, found, ray_adjoint(at), lost)
+    q = backward_ray(found.ray, lambda ray: dr.sum(W * found.motion(ray)))
+    q = ray_to_camera(walk, places, found, q, lost)
     with dr.resume_grad():
         ray, _ = places.ray(found.s, found.key)
         if dr.grad_enabled(ray.o, ray.d):
@@ -73,12 +71,7 @@ def edges_forward(walk: Walk, places: Places, found: Edges) -> mi.Spectrum:
         v = read_back(layout, records, i, k, ray0)
         δ = forward_step(walk, v, True, δ, mi.Bool(True))[3].finite_part()[0]
         i += 1
-    at = attached_ray(found.ray)
-    with dr.resume_grad():
-        dr.set_grad(at.o, δ.o)
-        dr.set_grad(at.d, δ.d)
-        (δ_motion,) = tangents(found.motion(at))
-    return δ_motion
+    return forward_ray(found.ray, δ, found.motion)
 
 
 def ray_to_camera(
@@ -91,18 +84,3 @@ def ray_to_camera(
     return walk_back(
         walk, found.layout, found.records, first, count, last, ray0, none, none, q, lost, rays_only=rays_only
     )[1]
-
-
-def attached_ray(ray: mi.Ray3f) -> mi.Ray3f:
-    """A copy of a ray, origin and direction of which are variables of their own."""
-    ray = mi.Ray3f(ray)
-    ray.o, ray.d = mi.Point3f(dr.detach(ray.o)), mi.Vector3f(dr.detach(ray.d))
-    with dr.resume_grad():
-        dr.enable_grad(ray.o, ray.d)
-    return ray
-
-
-def ray_adjoint(ray: mi.Ray3f) -> RayDerivative:
-    """What was back-propagated into a ray, where that is finite."""
-    with dr.resume_grad():
-        return RayDerivative(dr.grad(ray.o), dr.grad(ray.d), mi.Float(0)).finite_part()[0]

@@ -32,11 +32,11 @@ from ..transport.signature import edge_normal, mixed, place_met
 from ..transport.start import CameraStart
 from ..transport.surface import held_point
 from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
-from .adjoint import LostPaths
+from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
 from .centres import Centres
 from .counted import Counted
 from .crofton import Crossed, Sight, bisect, search
-from .edges import Edges, Places, attached_ray, ray_adjoint, ray_to_camera
+from .edges import Edges, Places, ray_to_camera
 from .primal import walk_on
 from .record import Layout, record, record_type
 
@@ -313,14 +313,11 @@ def _record_chain(walk: Walk, ray: mi.Ray3f, c: FilmCrossing, layout: Layout, re
 
 def _slope(walk: Walk, places: Places, edges: Edges, lost: LostPaths) -> mi.Vector2f:
     """∂B/∂s: how fast the edge is passed on the film. Reaches no parameter."""
-    at = attached_ray(edges.ray)
-    with dr.resume_grad(at.o, at.d):
-        dr.backward(edges.motion(at)[0])
-    q = ray_to_camera(walk, places, edges, ray_adjoint(at), lost, rays_only=True)
-    s = mi.Point2f(dr.detach(edges.s))
-    with dr.resume_grad():
-        dr.enable_grad(s)
-    with dr.resume_grad(s):
+    q = derivative_by_ray(edges.ray, lambda ray: edges.motion(ray)[0])
+    q = ray_to_camera(walk, places, edges, q, lost, rays_only=True)
+
+    def along(s: mi.Point2f) -> mi.Float:
         ray, _ = places.ray(s, edges.key)
-        dr.backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
-        return mi.Vector2f(dr.grad(s))
+        return dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d)
+
+    return derivative_by_place(edges.s, along)

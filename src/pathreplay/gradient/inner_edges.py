@@ -26,6 +26,7 @@ from ..transport.start import CameraStart
 from ..transport.surface import held_point
 from ..transport.velocity import held_direction, moved_direction
 from ..transport.vertex import Arrival, Walk, is_smooth, mis_weight
+from .adjoint import derivative_by_place
 from .counted import Counted
 from .crofton import Sight, bisect, search
 from .edges import Edges, Places
@@ -172,12 +173,7 @@ def shadow_gap(x: Chosen, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
 
 def shadow_weight(x: Chosen, c: Shaded) -> mi.Spectrum:
     """K in full: with the derivative of B along the line."""
-    with dr.resume_grad():
-        u = mi.Point2f(dr.detach(c.u))
-        dr.enable_grad(u)
-    with dr.resume_grad(u):
-        dr.backward(shadow_gap(x, c, x.at.ray, u))
-        slope = mi.Vector2f(dr.grad(u))
+    slope = derivative_by_place(c.u, lambda u: shadow_gap(x, c, x.at.ray, u))
     n = dr.norm(slope)
     K = c.K * (dr.sign(dr.dot(c.line.w, slope)) / n)
     return dr.select(c.active & dr.all(dr.isfinite(K)) & (n > 0), K, 0)

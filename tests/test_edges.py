@@ -1,0 +1,168 @@
+"""The parts of the boundary term: places on the film, lines that find edges, and what is refused or costs nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from pathreplay.errors import PathreplayError
+from pathreplay.gradient.centres import Centres
+from pathreplay.gradient.crofton import Sight, bisect, search
+from pathreplay.gradient.film_edges import quasi_random
+from pathreplay.render.camera_pass import Pass
+from pathreplay.render.places import FilmPlaces
+
+
+def world(**film: Any) -> mi.Scene:
+    """A square before a sky."""
+    picture = {"type": "hdrfilm", "width": 12, "height": 8, "component_format": "float32", "pixel_format": "rgb"} | film
+    to_world = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    camera = {"type": "perspective", "fov": 40, "to_world": to_world, "film": picture}
+    square = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
+    sky = {"type": "constant", "radiance": 0.7}
+    return mi.load_dict({"type": "scene", "camera": camera, "square": square, "sky": sky})
+
+
+FILMS = {
+    "box": {"rfilter": {"type": "box"}},
+    "gaussian": {"rfilter": {"type": "gaussian"}},
+    "tent, border": {"rfilter": {"type": "tent"}, "sample_border": True},
+    "crop": {
+        "rfilter": {"type": "gaussian"},
+        "crop_offset_x": 3,
+        "crop_offset_y": 2,
+        "crop_width": 6,
+        "crop_height": 5,
+    },
+    "alpha": {"rfilter": {"type": "box"}, "pixel_format": "rgba"},
+    "luminance": {"rfilter": {"type": "box"}, "pixel_format": "luminance"},
+}
+
+
+def some_places(view: Pass, n: int = 20000) -> tuple[FilmPlaces, mi.Point2f]:
+    places = FilmPlaces.of(view)
+    return places, quasi_random(dr.arange(mi.UInt32, n), mi.UInt32(1)) * places.size
+
+
+@pytest.mark.parametrize("film", FILMS.values(), ids=FILMS)
+def test_importance_is_the_transpose_of_the_image(film: dict[str, Any]) -> None:
+    places, s = some_places(Pass.of(world(**film), 0, 0, 1), 500)
+    rng = np.random.default_rng(0)
+    L = mi.Color3f(rng.random((3, 500), np.float32))
+    with dr.suspend_grad():
+        image = np.array(places.image(s, L, []))
+        wanted = rng.random(image.shape, np.float32)
+        W = places.importance(mi.TensorXf(wanted), s, [])
+    assert np.sum(wanted * image) == pytest.approx(float(dr.sum(dr.dot(W, L))[0]), rel=1e-4)
+
+
+@pytest.mark.parametrize("film", FILMS.values(), ids=FILMS)
+def test_light_that_is_one_everywhere_makes_an_image_of_ones(film: dict[str, Any]) -> None:
+    places, s = some_places(Pass.of(world(**film), 0, 0, 1))
+    area = places.size.x * places.size.y / dr.width(s)
+    with dr.suspend_grad():
+        image = np.array(places.image(s, mi.Color3f(area), []))
+    assert np.abs(image[..., :3] - 1).max() < 0.02  # 80 places or more in each pixel
+
+
+def test_nothing_comes_from_outside_of_the_film() -> None:
+    places, _ = some_places(Pass.of(world(**FILMS["gaussian"]), 0, 0, 1))
+    outside = mi.Point2f([-0.1, 12.1, 5, 5], [4, 4, -0.1, 8.1])
+    with dr.suspend_grad():
+        W = places.importance(dr.ones(mi.TensorXf, (8, 12, 3)), outside, [])
+    assert dr.all(W == 0, axis=None)
+
+
+def test_centres_are_drawn_with_their_density() -> None:
+    even = Centres.even(mi.ScalarVector2f(5, 3), 0.5)
+    rng = np.random.default_rng(1)
+    seen = mi.Point2f(2.5, 1.5) + 0 * mi.Float(rng.random(50))
+    centres = even.refined(seen, mi.Float(1))
+    n = 200000
+    c, density = centres.draw(mi.Point2f(rng.random((2, n), np.float32)))
+    pixel = np.array(mi.UInt32(c.y) * centres.width + mi.UInt32(c.x))
+    counts = np.bincount(pixel, minlength=centres.width * centres.height) / n
+    told = np.zeros_like(counts)
+    told[pixel] = np.array(density)
+    assert told.sum() == pytest.approx(1, rel=1e-4)
+    assert np.abs(counts - told).max() < 5 * (0.25 / n) ** 0.5
+    assert counts.argmax() == centres.width + 2
+    # 1 / density is an unbiased estimate of the area.
+    assert np.mean(1 / np.array(density)) == pytest.approx(centres.width * centres.height, rel=0.01)
+
+
+def sight(signature: int, p: list[float], n: list[float]) -> Sight:
+    return Sight(mi.UInt32(signature), mi.Point3f(p), mi.Normal3f(n))
+
+
+def test_a_shape_that_hides_itself_is_seen() -> None:
+    here = sight(7, [0, 0, 0], [0, 0, 1])
+    assert not here.differs(sight(7, [1, 0.3, 0.01], [0, 0.1, 1]))[0]  # on, around a slight bend
+    assert here.differs(sight(7, [0.1, 0, -3], [0, 0, 1]))[0]  # behind
+    assert here.differs(sight(8, [0.1, 0, 0], [0, 0, 1]))[0]
+    assert not Sight.nothing().differs(Sight.nothing())[0]
+
+
+@dataclass
+class Line:
+    c: mi.Point2f
+    w: mi.Vector2f
+    begin: mi.Float
+    end: mi.Float
+
+
+def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
+    """Crofton: four sides and four corners, at which two crossings of one line go unseen by its ends."""
+
+    @dr.syntax
+    def count(n: int, l: float, seed: int) -> mi.Float:
+        pick = mi.PCG32(n, initstate=seed)
+
+        def draw(j: mi.UInt32) -> tuple[Line, mi.Bool]:
+            turn = dr.two_pi * pick.next_float32()
+            c = mi.Point2f(pick.next_float32(), pick.next_float32()) * (1 + 2 * l) - l
+            return Line(c, mi.Vector2f(dr.cos(turn), dr.sin(turn)), mi.Float(-l / 2), mi.Float(l / 2)), mi.Bool(True)
+
+        def look(line: Line, t: mi.Float, active: mi.Bool) -> Sight:
+            p = line.c + t * line.w
+            inside = (p.x > 0.3) & (p.y > 0.4) & (p.x < 0.8) & (p.y < 0.7)
+            return Sight(mi.UInt32(inside), mi.Point3f(0), mi.Normal3f(0))
+
+        found = bisect(look, search(draw, look, 2, pick), pick)
+        return 0.5 * dr.pi * dr.sum(found.weight) * (1 + 2 * l) ** 2 / (l * n * 2)
+
+    lengths = [count(1 << 15, 0.1, seed)[0] for seed in range(1, 9)]
+    error = np.std(lengths, ddof=1) / len(lengths) ** 0.5
+    assert error < 0.01
+    assert abs(np.mean(lengths) - 1.6) < 4 * error
+
+
+@pytest.mark.parametrize("attach", ["all", "none"])
+def test_edges_of_what_follows_its_samples_are_refused(attach: str) -> None:
+    with pytest.raises(PathreplayError, match=f"edges = 'film' with attach = '{attach}'"):
+        mi.load_dict({"type": "pathreplay", "edges": "film", "attach": attach})
+
+
+def test_where_nothing_moves_nothing_is_added() -> None:
+    """A reflectance has no edges: the same gradient, from as many kernels."""
+    found = {}
+    for edges in ("none", "all"):
+        scene = world()
+        params = mi.traverse(scene)
+        integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": edges})
+        key = "square.bsdf.reflectance.value"
+        dr.enable_grad(params[key])
+        params.update()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (8, 12, 3)), spp=4)
+            grad = np.array(dr.grad(params[key]))
+            kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+        found[edges] = grad, len(kernels)
+    assert np.array_equal(found["none"][0], found["all"][0])
+    assert found["none"][1] == found["all"][1]
