@@ -12,6 +12,9 @@ METHODS: dict[str, dict[str, object]] = {
     "rb linear": {"type": "pathreplay_rb", "linear": True},
     "sweep": {"type": "pathreplay", "driver": "sweep"},
     "replay": {"type": "pathreplay", "driver": "replay"},
+    "film edges": {"type": "pathreplay", "edges": "film"},
+    "all edges": {"type": "pathreplay", "edges": "all"},
+    "prb_projective": {"type": "prb_projective"},
     "volpath": {"type": "volpath"},
     "prbvolpath": {"type": "prbvolpath"},
     "score": {"type": "pathreplay"},
@@ -20,7 +23,7 @@ METHODS: dict[str, dict[str, object]] = {
 }
 
 #: Mitsuba's own: what ours is compared with, and not held to anything when two records are compared.
-STOCK = ("prb", "prb_basic", "prbvolpath", "volpath", "finite differences", "half steps")
+STOCK = ("prb", "prb_basic", "prb_projective", "prbvolpath", "volpath", "finite differences", "half steps")
 
 #: Ways: the loop of an optimisation step, and what a new process does first.
 USUAL, OWN = "usual loop", "own loop"
