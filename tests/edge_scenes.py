@@ -155,7 +155,7 @@ def by_a_side_wall(wall: Callable[[], dict], side: Callable[[], dict]) -> Callab
 def mirror() -> dict:
     glass = T().rotate([0, 1, 0], -25).scale([1.5, 1.5, 1])
     light = T().translate([-3, 0.2, 2.5]).rotate([0, 1, 0], 120).scale([0.6, 0.5, 1])
-    return scene(mirror=shape(glass, {"type": "conductor"}), lamp=lamp(light, 1))
+    return scene(mirror=shape(glass, {"type": "conductor"}), lamp=lamp(light, rgb(3, 0, 0)))
 
 
 def ball_of_glass() -> dict:
