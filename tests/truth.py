@@ -29,7 +29,7 @@ class Case:
 
     name: str
     scene: Callable[[], dict]
-    key: str
+    key: str | tuple[str, ...]  # several: they move together
     move: Move
     depth: int = 4
     rr_depth: int = 3
@@ -119,6 +119,15 @@ def tilt_vertices(scale: float = 0.3) -> Move:
     return move
 
 
+def turn_vertices(x: float, y: float, z: float) -> Move:
+    """Flat vertex positions, rotated by t radians about the axis (x, y, z)."""
+
+    def move(value: Any, t: Any) -> Any:
+        return dr.ravel(mi.Transform4f().rotate([x, y, z], dr.rad2deg(t)) @ dr.unravel(mi.Point3f, value))
+
+    return move
+
+
 def translate_vertices(x: float, y: float, z: float) -> Move:
     """Flat vertex positions, translated by t (x, y, z)."""
     return lambda value, t: value + t * mi.Float(np.tile(np.array([x, y, z], np.float32), dr.width(value) // 3))
@@ -131,7 +140,10 @@ class Bench(Objective):
         gc.collect()  # scenes of earlier cases would be traced, too
         self.case = case
         scene = mi.load_dict(case.scene(), optimize=False)
-        super().__init__(scene, mi.traverse(scene), case.key, case.move)
+        params = mi.traverse(scene)
+        key, *others = (case.key,) if isinstance(case.key, str) else case.key
+        super().__init__(scene, params, key, case.move)
+        self.others = {name: dr.copy(params[name]) for name in others}
         self.weigh(np.random.default_rng(0).uniform(0, 1, (RES, RES, 3)).astype(np.float32) / RES**2)
 
     def integrator(self, plugin: str = "pathreplay", **options: Any) -> mi.Integrator:
@@ -163,9 +175,20 @@ class Bench(Objective):
         tangent = self.forward(ahead, seed, spp)
         return abs(self.dot(tangent) - self.backward(back, seed, spp)) / self.dot(np.abs(tangent))
 
+    def put(self, t: mi.Float) -> None:
+        for name, value in self.others.items():
+            self.params[name] = self.move(value, t)
+        super().put(t)
+
+    def collect(self, t: mi.Float) -> float:
+        for name in self.others:
+            dr.enqueue(dr.ADMode.Backward, self.params[name])
+        return super().collect(t)
+
     def release(self) -> None:
         """Detach the parameter: Dr.Jit traces virtual calls through all scenes alive, and trips over attached ones."""
-        self.params[self.key] = self.value
+        for name, value in {self.key: self.value, **self.others}.items():
+            self.params[name] = value
         self.params.update()
 
 

@@ -1,0 +1,247 @@
+"""Scenes whose edges move: small rooms of one wall, one lamp and one thing before them, and what moves in each.
+
+`CELLS` are cases of truth tests, whose pictures are weighed by `weights`. Where a light's radiance or a wall's paint
+varies, it is bilinear noise, so that no side of an edge is constant. Steps are small against what moves, and
+differences of fourth order, since outlines bend.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.check.stencil import WIDE
+from truth import RES, Case, Move, add, bitmap, camera, noise, rgb, translate, translate_vertices, turn_vertices
+
+Place = Any
+T = mi.ScalarTransform4f
+
+# ------------------------------ Parts ------------------------------
+
+
+def paint(*value: float) -> dict:
+    return {"type": "twosided", "inner": {"type": "diffuse", "reflectance": rgb(*value)}}
+
+
+BLACK = paint(0, 0, 0)
+GLASS = {"type": "smoothdielectric", "int_ior": 1.5}
+BACK = T().translate([0, 0, -1]).scale([6, 6, 1])
+
+
+def picture() -> dict:
+    return {**bitmap(noise(8, 3, 0.1, 1.0)), "filter_type": "bilinear"}
+
+
+def patterned() -> dict:
+    return {"type": "twosided", "inner": {"type": "diffuse", "reflectance": picture()}}
+
+
+def shape(place: Place, bsdf: dict, kind: str = "rectangle", **more: Any) -> dict:
+    return {"type": kind, "to_world": place, "bsdf": bsdf, **more}
+
+
+def lamp(place: Place, radiance: Any = 10.0, kind: str = "rectangle", bsdf: dict = BLACK) -> dict:
+    radiance = radiance if isinstance(radiance, dict) else rgb(*3 * [radiance])
+    return shape(place, bsdf, kind, emitter={"type": "area", "radiance": radiance})
+
+
+def glow() -> dict:
+    """A patterned wall that shines by itself."""
+    return lamp(BACK, picture())
+
+
+def scene(fov: float = 45, **parts: Any) -> dict:
+    return {"type": "scene", "camera": camera((0, 0, 4), fov), **parts}
+
+
+def cube8(place: Place, bsdf: dict) -> mi.Mesh:
+    """The cube [-1, 1]³ with eight vertices, so that faces share their edges."""
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(bsdf)
+    mesh = mi.Mesh("object", 8, 12, props=props)
+    corners = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.ravel([np.array(place @ mi.ScalarPoint3f(*p)).ravel() for p in corners])
+    params["faces"] = np.ravel([t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))])
+    params.update()
+    return mesh
+
+
+def cube24(place: Place, bsdf: dict) -> dict:
+    """The same as Mitsuba has it: every face has vertices of its own."""
+    return shape(place, bsdf, "cube", face_normals=True)
+
+
+def sky() -> dict:
+    texels = np.random.default_rng(5).uniform(0.1, 2, (4, 8, 3)).astype(np.float32)
+    return {"type": "envmap", "bitmap": mi.Bitmap(texels.repeat(4, 0).repeat(4, 1))}
+
+
+# ------------------------------ What the camera sees ------------------------------
+
+CARD = T().translate([0.7, 0.5, 0.9]).rotate([0, 0, 1], 20).scale([0.35, 0.3, 1])
+BOX = T().translate([0.1, 0.1, 0]).rotate([1, 0.4, 0], 30).scale(0.4)
+OVERHEAD = T().translate([1.6, 1.2, 2.5]).look_at([0, 0, 0], [-1.6, -1.2, -3.5], [0, 1, 0]).scale([0.5, 0.5, 1])
+
+
+def before_a_glow(thing: Any) -> Callable[[], dict]:
+    return lambda: scene(wall=glow(), object=thing())
+
+
+def lit_box(make: Callable[[Place, dict], Any]) -> Callable[[], dict]:
+    return lambda: scene(wall=shape(BACK, patterned()), lamp=lamp(OVERHEAD), object=make(BOX, paint(0.5, 0.5, 0.2)))
+
+
+def lamp_seen() -> dict:
+    place = T().translate([0.2, 0.1, 0.3]).rotate([0, 1, 0], 200).scale([0.5, 0.4, 1])
+    return scene(wall=shape(BACK, patterned()), lamp=lamp(place, 3), other=lamp(OVERHEAD, 6))
+
+
+# ------------------------------ Shadows ------------------------------
+
+SHADE = T().translate([1.3, 0.9, 1.2])
+
+
+def shadow(thing: Any = None, wall: Any = patterned, light: Any = None) -> Callable[[], dict]:
+    """A wall, a lamp, and between them something that the camera does not see."""
+    thing = thing or (lambda: shape(SHADE.scale([0.35, 0.3, 1]), BLACK))
+    light = light or (lambda: lamp(OVERHEAD))
+    return lambda: scene(30, wall=shape(BACK, wall()), lamp=light(), object=thing())
+
+
+def plain() -> dict:
+    return paint(0.7, 0.6, 0.5)
+
+
+def ball_lamp() -> dict:
+    return lamp(T().translate([1.6, 1.2, 2.5]).scale(0.4), kind="sphere")
+
+
+def shadow_of_sky() -> dict:
+    place = T().translate([0.9, 0.9, 0.2]).scale([0.8, 0.6, 1])
+    return scene(30, wall=shape(BACK, patterned()), sky=sky(), object=shape(place, BLACK))
+
+
+def lamp_lights() -> dict:
+    """A lamp that the camera sees from behind, and that lights the wall."""
+    place = T().translate([0.9, 0.8, 0.6]).rotate([0, 1, 0], 160).scale([0.4, 0.3, 1])
+    return scene(30, wall=shape(BACK, patterned()), lamp=lamp(place, 5), other=lamp(OVERHEAD))
+
+
+def copies_shade() -> dict:
+    box = shape(T().rotate([1, 0.4, 0], 30).scale(0.25), BLACK, "cube", face_normals=True)
+    group = {"type": "shapegroup", "box": box}
+    copy = {"type": "instance", "to_world": SHADE, "group": {"type": "ref", "id": "group"}}
+    return scene(30, wall=shape(BACK, patterned()), lamp=lamp(OVERHEAD), group=group, copy=copy)
+
+
+def by_a_side_wall(wall: Callable[[], dict], side: Callable[[], dict]) -> Callable[[], dict]:
+    """Light that reaches the wall by another, past something that hides a part of it."""
+    aside = T().translate([2.2, 0, 0]).rotate([0, 1, 0], -90).scale([2, 2, 1])
+    above = T().translate([0.6, 2.6, 0.5]).look_at([0, 0, 0], [1.6, -2.4, 0], [0, 0, 1]).scale([0.4, 0.4, 1])
+    card = T().translate([1.5, 0.2, 0.2]).rotate([0, 1, 0], 60).scale([0.5, 0.5, 1])
+    return lambda: scene(
+        30, wall=shape(BACK, wall()), side=shape(aside, side()), lamp=lamp(above, 20), object=shape(card, paint(0.3))
+    )
+
+
+# ------------------------------ Glass and mirrors ------------------------------
+
+
+def mirror() -> dict:
+    glass = T().rotate([0, 1, 0], -25).scale([1.5, 1.5, 1])
+    light = T().translate([-3, 0.2, 2.5]).rotate([0, 1, 0], 120).scale([0.6, 0.5, 1])
+    return scene(mirror=shape(glass, {"type": "conductor"}), lamp=lamp(light, rgb(3, 0, 0)))
+
+
+def ball_of_glass() -> dict:
+    light = T().translate([0.2, 0.1, -3]).scale([0.7, 0.5, 1])
+    return scene(24, ball=shape(T(), GLASS, "sphere"), lamp=lamp(light, 3))
+
+
+def glowing_behind_glass() -> dict:
+    """A glowing wall and a brighter card before it, behind a ball of glass: every edge is seen through the glass."""
+    far, card = T().translate([0, 0, -3]).scale([8, 8, 1]), T().translate([0.3, 0.2, -2]).scale([0.4, 0.3, 1])
+    bright = lamp(card, rgb(3, 2, 1))
+    return scene(24, ball=shape(T().scale(0.9), GLASS, "sphere"), wall=lamp(far, picture()), object=bright)
+
+
+# ------------------------------ Cells ------------------------------
+
+
+def weights() -> np.ndarray:
+    """Of a picture: smooth, and another wave in each channel, so that what moves across it does not cancel."""
+    y, x = np.mgrid[0:RES, 0:RES]
+    waves = [1.2 + np.sin(0.74 * x + 0.11 * y), 1.2 + np.cos(0.23 * x - 0.62 * y), np.ones_like(x)]
+    return np.stack(waves, -1).astype(np.float32) / (3 * RES**2)
+
+
+ASIDE = (1.0, 0.3, 0.0)
+SEVERAL = ("wall.to_world", "lamp.to_world", "object.to_world")
+
+
+def cell(name: str, make: Callable[[], dict], key: str, move: Move, depth: int = 2, **more: Any) -> Case:
+    """A case of everything moving but what paths choose at random; roulette would depend on the parameter."""
+    settings: dict[str, Any] = dict(
+        step=0.02, spp=256, seeds=8, reference_spp=1024, rr_depth=1000, options={"edges": "all"}, drivers=("sweep",),
+        stencil=WIDE, lanes=None,
+    )  # fmt: skip
+    return Case(name, make, key, move, depth, **{**settings, **more})
+
+
+def disk() -> dict:
+    return shape(T().translate([0.1, 0.1, 0.2]).rotate([0, 1, 0], 30).scale(0.5), BLACK, "disk")
+
+
+def ball() -> dict:
+    return shape(T().translate([0.1, 0.1, 0]).scale(0.5), BLACK, "sphere")
+
+
+SHADE_BOX = SHADE.rotate([1, 0.4, 0], 30).scale(0.25)
+TURN, UP = turn_vertices(0, 1, 0), translate(0, 0, 1)
+OBJECT, VERTICES = "object.to_world", "object.vertex_positions"
+
+CELLS = [
+    # Seen by the camera.
+    cell("rect_black", before_a_glow(lambda: shape(CARD, BLACK)), OBJECT, translate(*ASIDE)),
+    cell("rect_emit", lambda: scene(object=lamp(T().translate([0.1, 0.05, 0]).scale([0.4, 0.3, 1]), 1)),
+         OBJECT, translate(1, 0, 0)),
+    cell("sphere_black", before_a_glow(ball), OBJECT, translate(*ASIDE)),
+    cell("disk_black", before_a_glow(disk), OBJECT, translate(*ASIDE)),
+    cell("cube8_turns", before_a_glow(lambda: cube8(BOX, BLACK)), VERTICES, TURN),
+    cell("cube24_turns", before_a_glow(lambda: cube24(BOX, BLACK)), VERTICES, TURN),
+    cell("cube8_lit", lit_box(cube8), VERTICES, TURN),
+    cell("cube24_lit", lit_box(cube24), VERTICES, TURN),
+    cell("camera_moves", before_a_glow(lambda: shape(CARD, BLACK)), "camera.to_world", translate(*ASIDE)),
+    cell("lamp_seen", lamp_seen, "lamp.to_world", translate(*ASIDE)),
+    # Shadows.
+    cell("shadow_occluder", shadow(), OBJECT, translate(*ASIDE)),
+    cell("shadow_lamp", shadow(), "lamp.to_world", translate(*ASIDE)),
+    cell("shadow_receiver", shadow(wall=plain), "wall.to_world", UP),
+    cell("shadow_all", shadow(wall=plain), SEVERAL, UP),
+    cell("shadow_sphere", shadow(lambda: shape(SHADE.scale(0.3), BLACK, "sphere")), OBJECT, translate(*ASIDE)),
+    cell("shadow_cube8", shadow(lambda: cube8(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
+    cell("shadow_cube24", shadow(lambda: cube24(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
+    cell("shadow_copy", copies_shade, "group.box.vertex_positions", translate_vertices(*ASIDE)),
+    cell("sphere_lamp", shadow(light=ball_lamp), "lamp.to_world", translate(*ASIDE)),
+    cell("shadow_env", shadow_of_sky, OBJECT, translate(*ASIDE)),
+    cell("lamp_lights", lamp_lights, "lamp.to_world", translate(*ASIDE)),
+    # One bounce more.
+    cell("indirect", by_a_side_wall(patterned, lambda: paint(0.8, 0.7, 0.3)), OBJECT, translate(1, 0.3, 0.4), 3),
+    cell("indirect_rough", by_a_side_wall(
+        lambda: {"type": "twosided", "inner": {"type": "roughconductor", "alpha": 0.3}}, patterned),
+        OBJECT, translate(1, 0.3, 0.4), 3),
+    # Through delta lobes.
+    cell("mirror_z", mirror, "mirror.to_world", UP, 3),
+    cell("mirror_x", mirror, "mirror.to_world", translate(1, 0, 0), 3),
+    cell("glass_index", ball_of_glass, "ball.bsdf.eta", add(1.0), 5, step=0.01),
+    cell("glass_moves", ball_of_glass, "ball.to_world", translate(1, 0, 0), 5, step=0.01),
+    cell("emit_eta", glowing_behind_glass, "ball.bsdf.eta", add(1.0), 6, step=0.01),
+    cell("emit_blocker", glowing_behind_glass, OBJECT, translate(1, 0, 0), 6),
+    cell("emit_sphere", glowing_behind_glass, "ball.to_world", translate(*ASIDE), 6, step=0.01),
+]  # fmt: skip
+BY_NAME = {each.name: each for each in CELLS}
