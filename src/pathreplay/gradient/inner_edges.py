@@ -176,7 +176,8 @@ def shadow_weight(x: Chosen, c: Shaded) -> mi.Spectrum:
         u = mi.Point2f(dr.detach(c.u))
         dr.enable_grad(u)
     with dr.resume_grad(u):
-        dr.backward(shadow_gap(x, c, x.at.ray, u))
+        # Of a light without extent it is the same everywhere.
+        dr.backward(shadow_gap(x, c, x.at.ray, u), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         slope = mi.Vector2f(dr.grad(u))
     n = dr.norm(slope)
     K = c.K * (dr.sign(dr.dot(c.line.w, slope)) / n)
