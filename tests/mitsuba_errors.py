@@ -133,11 +133,10 @@ def row(name: str, found: Found, limits: Limits) -> str:
     """A line of the table."""
     primal, forward = found.primal, found.forward
     errors = f"{primal[0]:11.4f} {primal[1]:7.3f} {forward[0]:12.4f} {forward[1]:7.3f} {found.reverse:9.5f}"
+    held = f"{limits.mean:7g} {limits.most:6g} {limits.reverse:9g}"
     misses = found.misses(limits)
     verdict = f"misses {', '.join(misses)}" if misses else ""
-    return (
-        f"{name:28s} {errors} {found.z:+5.1f} {found.transpose:8.0e} | {limits.mean:7g} {limits.most:6g} {limits.reverse:9g} {verdict}"
-    )
+    return f"{name:28s} {errors} {found.z:+5.1f} {found.transpose:8.0e} | {held} {verdict}"
 
 
 def main(names: list[str], full: bool, plugin: str = "pathreplay") -> None:

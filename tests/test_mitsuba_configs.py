@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
+
 from mitsuba_configs import CONFIGS, EDGES
 from mitsuba_errors import measure, row
-
 from pathreplay.check.verdict import Z_LIMIT
 
 QUICK = ("lamp", "plane under a projector", "disk that glows")
