@@ -1,10 +1,10 @@
-"""How far an integrator is from finite differences on Mitsuba's own configurations, in Mitsuba's measure.
+"""How far derivatives are from finite differences on Mitsuba's own configurations, in Mitsuba's measure.
 
 There an integrator passes with its picture, its forward derivative value by value against differences, and its reverse
 derivative against their sum: 24 configurations, 72 tests. References are made as there, by `path` with 12 000 samples
 per pixel and common random numbers on both sides.
 
-    python tests/mitsuba_errors.py [--full] [NAME ...]
+    python tests/mitsuba_errors.py [--full] [--edges none] [NAME ...]
 
 prints what is found. Films are small, which is stricter: edges take a larger share of their pixels. `--full` takes
 Mitsuba's films, and half an hour.
@@ -12,8 +12,8 @@ Mitsuba's films, and half an hour.
 
 from __future__ import annotations
 
+import argparse
 import gc
-import sys
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -85,12 +85,12 @@ class Setup(Objective):
         return np.array([picture(seed + k, spp // passes) for k in range(passes)])
 
 
-def measure(config: Config, full: bool = False, plugin: str = "pathreplay", **options: Any) -> Found:
-    """Errors of an integrator's picture, forward and reverse derivative."""
+def measure(config: Config, full: bool = False, **options: Any) -> Found:
+    """Errors of pathreplay's picture, forward and reverse derivative."""
     size = config.res if full else min(SMALL, config.res)
     setup = Setup(config, size)
     plain = mi.load_dict({"type": "path", "max_depth": config.depth})
-    ours = mi.load_dict({"type": plugin, "max_depth": config.depth, **options})
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": config.depth, **options})
 
     def difference(seed: int, spp: int) -> np.ndarray:
         return setup.difference(plain, CENTRAL, config.step / 2, seed, spp)
@@ -139,16 +139,21 @@ def row(name: str, found: Found, limits: Limits) -> str:
     return f"{name:28s} {errors} {found.z:+5.1f} {found.transpose:8.0e} | {held} {verdict}"
 
 
-def main(names: list[str], full: bool, plugin: str = "pathreplay") -> None:
+def main() -> None:
     """Print the table; without names all of it."""
+    parser = argparse.ArgumentParser(description="Errors on Mitsuba's own configurations, and its limits.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of a configuration: {', '.join(CONFIGS)}")
+    parser.add_argument("--full", action="store_true", help="films of Mitsuba's size")
+    parser.add_argument("--edges", default="all", help="which edges: all, film or none")
+    given = parser.parse_args()
     set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     print(HEAD)
-    for name in names or CONFIGS:
+    for name in given.names or CONFIGS:
         begun = time.time()
-        found = measure(CONFIGS[name], full, plugin, **({"edges": "all"} if plugin == "pathreplay" else {}))
+        found = measure(CONFIGS[name], given.full, edges=given.edges)
         print(f"{row(name, found, CONFIGS[name].limits)} ({time.time() - begun:.0f} s)", flush=True)
 
 
 if __name__ == "__main__":
-    main([name for name in sys.argv[1:] if not name.startswith("--")], "--full" in sys.argv)
+    main()
