@@ -127,7 +127,8 @@ def derivative_by_place(s: mi.Point2f, f: Callable[[mi.Point2f], mi.Float]) -> m
     with dr.resume_grad():
         dr.enable_grad(s)
     with dr.resume_grad(s):
-        dr.backward_from(f(s))
+        # What is the same everywhere, such as the direction of a light without extent, has no gradient.
+        dr.backward_from(f(s), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         return mi.Vector2f(dr.grad(s))
 
 

@@ -8,7 +8,8 @@ jump times the area that is swept. Edges are found by short lines on the film (s
 
 with B(s, π) = 0 on the edge, f_a and f_b the radiances at its two sides, and w the direction from a to b. At an outline
 B = n·(o + t d - z): z is the point of the near surface, glued to it, o + t d the same point on the path, and n normal
-to both edge and ray. Where two surfaces meet, B is the difference of their distances.
+to both edge and ray. Where two surfaces meet, B is the difference of their distances. A smooth mesh goes dark where its
+shading normal is at right angles to the ray, a little before its outline; there B is their product.
 
 Lights without extent cast hard shadows, the borders of which are in the image as well. There the point x that is seen
 slides with the path, and B = n·(x + r d - z), with the point z of what is in the way, r away in the direction d of the
@@ -35,7 +36,7 @@ from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
 from .centres import Centres
 from .counted import Counted
-from .crofton import Crossed, Sight, bisect, search
+from .crofton import Crossed, Sight, bisect, hides_itself, search
 from .edges import Edges, Places, ray_to_camera
 from .primal import walk_on
 from .record import Layout, record, record_type
@@ -95,6 +96,7 @@ class FilmCrossing:
     near: Arrival
     far: mi.PreliminaryIntersection3f
     meets: mi.Bool  # two surfaces meet there
+    turns: mi.Bool  # a surface turns away there, by its shading normal
     n: mi.Vector3f
     shadow: mi.Bool  # it is the border of a hard shadow
     shade: Shade | None
@@ -190,8 +192,9 @@ def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> S
 
 
 def _sight(walk: Walk, at: Arrival, active: mi.Bool) -> Sight:
-    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.Minimal, active)
-    return Sight(place_met(walk, at.hit, active), si.p, si.n)
+    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
+    turned = dr.dot(si.sh_frame.n, at.ray.d) > 0
+    return Sight(mixed(place_met(walk, at.hit, active), dr.select(turned, mi.UInt32(1), 0)), si.p, si.n)
 
 
 def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
@@ -252,9 +255,10 @@ def _weighed(walk: Walk, places: Places, found: Crossed, per_line: float) -> Fil
     jump = weight * fork.β * (f[0] - f[1]) * (per_line * found.weight / line.density)
 
     t_a, t_b = (dr.select(side.hit.is_valid(), side.hit.t, dr.inf) for side in (fork.a, fork.b))
-    near_a, meet, shadow = t_a <= t_b, _meet(fork), mi.Bool(False)
+    near_a, meet, turns, shadow = t_a <= t_b, _meet(fork), _turns(walk, fork), mi.Bool(False)
     if fork.shade_a is not None:
         shadow = fork.shade_a.hidden != fork.shade_b.hidden
+        meet, turns = meet & ~shadow, turns & ~shadow
         near_a = dr.select(shadow, fork.shade_a.hidden, near_a)
     near, far = dr.select(near_a, fork.a, fork.b), dr.select(near_a, fork.b.hit, fork.a.hit)
     shade = None if fork.shade_a is None else dr.select(near_a, fork.shade_a, fork.shade_b)
@@ -263,7 +267,7 @@ def _weighed(walk: Walk, places: Places, found: Crossed, per_line: float) -> Fil
     if shade is not None:
         n = dr.select(shadow, edge_normal(shade.hit, shade.ray, active & shadow), n)
     s = dr.select(near_a, *ends)
-    return FilmCrossing(line, s, fork.k, near, far, meet & ~shadow, n, shadow, shade, jump, active)
+    return FilmCrossing(line, s, fork.k, near, far, meet, turns, n, shadow, shade, jump, active)
 
 
 def _meet(fork: Fork) -> mi.Bool:
@@ -275,6 +279,14 @@ def _meet(fork: Fork) -> mi.Bool:
     return both & angle & (dr.abs(a.hit.t - b.hit.t) < MEETS * dr.minimum(a.hit.t, b.hit.t))
 
 
+def _turns(walk: Walk, fork: Fork) -> mi.Bool:
+    """Whether it is one sheet of one surface, the shading normal of which is at right angles to the path there."""
+    a, b = fork.a, fork.b
+    both = fork.found & a.hit.is_valid() & (place_met(walk, a.hit, fork.found) == place_met(walk, b.hit, fork.found))
+    si_a, si_b = (x.hit.compute_surface_interaction(x.ray, mi.RayFlags.Minimal, both) for x in (a, b))
+    return both & ~hides_itself(si_a.p, si_a.n, si_b.p, si_b.n)
+
+
 def _gap(walk: Walk, c: FilmCrossing, ray: mi.Ray3f) -> mi.Float:
     """B: zero on the edge; differentiable in the ray that arrives, and in the shapes."""
     z = held_point(c.near.hit, dr.detach(ray), c.active).p
@@ -282,7 +294,9 @@ def _gap(walk: Walk, c: FilmCrossing, ray: mi.Ray3f) -> mi.Float:
     outline = dr.select(c.active, dr.dot(c.n, ray.o + t0 * ray.d - z), 0)
     both = c.active & c.meets
     t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, both).t for hit in (c.near.hit, c.far)]
-    B = dr.select(both, t[0] - t[1], outline)
+    turns = c.active & c.turns
+    si = c.near.hit.compute_surface_interaction(ray, mi.RayFlags.All, turns)
+    B = dr.select(both, t[0] - t[1], dr.select(turns, dr.dot(si.sh_frame.n, ray.d), outline))
     return B if c.shade is None else dr.select(c.shadow, _shadow_gap(walk, c, c.shade, ray), B)
 
 

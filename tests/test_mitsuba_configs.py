@@ -1,0 +1,31 @@
+"""Mitsuba's own tests of derivatives, static, moving and with edges, at its thresholds: see `mitsuba_errors`."""
+
+from __future__ import annotations
+
+import pytest
+
+from mitsuba_configs import CONFIGS, EDGES
+from mitsuba_errors import measure, row
+from pathreplay.check.verdict import Z_LIMIT
+
+QUICK = ("lamp", "plane under a projector", "disk that glows")
+# Float32 rounding of sums in another order, relative to the sum of magnitudes.
+TRANSPOSE_MAX = 1e-5
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in CONFIGS])
+def test_errors_are_below_the_limits(name: str) -> None:
+    config = CONFIGS[name]
+    found = measure(config, edges="all")
+    told = row(name, found, config.limits)
+    assert not found.misses(config.limits), told
+    # The limits allow much where the image is mostly dark.
+    assert abs(found.z) < Z_LIMIT, told
+    assert found.transpose < TRANSPOSE_MAX, told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EDGES)
+def test_without_edges_the_sum_is_wrong(name: str) -> None:
+    found = measure(CONFIGS[name], edges="none")
+    assert abs(found.z) > Z_LIMIT, row(name, found, CONFIGS[name].limits)
