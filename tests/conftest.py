@@ -7,7 +7,6 @@ are then no longer instances of the classes that those modules show.)
 
 from __future__ import annotations
 
-import gc
 import os
 import subprocess
 import sys
@@ -50,17 +49,6 @@ def _variant() -> Iterator[None]:
     """Hold every test to leaving the variant as it found it."""
     yield
     assert mi.variant() == VARIANT, "a test that needs another variant runs in a Python of its own (run_python)"
-
-
-@pytest.fixture(autouse=True)
-def _no_garbage() -> Iterator[None]:
-    """Collect no garbage within a test: a scene that vanishes while a kernel is traced makes Dr.Jit abort.
-
-    Our passes see to it themselves; tests also call what is inside of them.
-    """
-    gc.disable()
-    yield
-    gc.enable()
 
 
 @pytest.fixture(autouse=True)
