@@ -18,12 +18,17 @@ import pytest
 
 from pathreplay.backend import set_variant  # before mitsuba: points Dr.Jit at a libLLVM
 
+import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
 
 from pathreplay.inverse import report  # isort: skip
 from pathreplay.inverse.images import png_bytes  # isort: skip
 
+#: Files that compute and neither read nor write pictures, which a pool of one thread would wait for for ever.
+COMPUTING = {"test_truth_media", "test_pixel_sweep", "test_replay_attached", "test_primal_media", "test_rivals",
+             "test_truth_materials", "test_truth_attached", "test_motion_noise", "test_fixed_set", "test_drivers",
+             "test_terms", "test_evaluated", "test_step"}  # fmt: skip
 VARIANT = "llvm_ad_rgb"
 #: Far above what any of these takes (a few seconds): a hanging process must not hang the tests.
 TIMEOUT_S = 120
@@ -49,6 +54,18 @@ def _variant() -> Iterator[None]:
     """Hold every test to leaving the variant as it found it."""
     yield
     assert mi.variant() == VARIANT, "a test that needs another variant runs in a Python of its own (run_python)"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _own_core(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Share the cores among processes that compute side by side: threads that wait for work keep a core from others."""
+    threads, processes = dr.thread_count(), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if request.module.__name__ not in COMPUTING or processes == 1:
+        yield
+        return
+    dr.set_thread_count(max(1, threads // processes))
+    yield
+    dr.set_thread_count(threads)
 
 
 @pytest.fixture(autouse=True)

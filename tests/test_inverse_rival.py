@@ -69,6 +69,7 @@ def test_a_stopped_rival_goes_on_with_its_job(monkeypatch: pytest.MonkeyPatch) -
     )  # the last one is judged when it is over
 
 
+@pytest.mark.slow
 def test_a_rival_goes_through_the_same_resolutions() -> None:
     grid = [{"key": TEXTURE, "initial": 0.5, "lower": 0.0, "upper": 1.0, "resolutions": [2, 5], "refine_at": [3]}]
     result = run(rival=RIVAL, parameters=grid)

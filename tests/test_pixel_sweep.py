@@ -236,7 +236,7 @@ def test_two_swept_views_add_up(changes: dict, tmp_path) -> None:
         pytest.param({}, False, id="gaussian filter"),
         pytest.param({"loss": "l1"}, False, id="l1", marks=SLOW),
         pytest.param({"integrator": {"type": "pathreplay", "driver": "replay"}}, False, id="replay"),
-        pytest.param({"integrator": {"type": "prb", "max_depth": 3}}, False, id="prb"),
+        pytest.param({"integrator": {"type": "prb", "max_depth": 3}}, False, id="prb", marks=SLOW),
         pytest.param({"integrator": {"type": "prb_basic", "max_depth": 3}}, False, id="prb_basic", marks=SLOW),
         pytest.param(POSE, False, id="moving"),
         pytest.param(

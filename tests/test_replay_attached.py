@@ -224,7 +224,7 @@ def test_noise_leaves_the_gradient_unbiased(scene: Any, depth: int, recovery: Re
     ("bsdf", "attach", "key"),
     [
         (DIFFUSE, "delta", "obj.to_world"),
-        (DIFFUSE, "delta", "camera.to_world"),
+        pytest.param(DIFFUSE, "delta", "camera.to_world", marks=pytest.mark.slow),
         (ROUGH, "delta", "light.to_world"),
         (ROUGH, "all", "obj.to_world"),
     ],

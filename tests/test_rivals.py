@@ -79,7 +79,9 @@ SLOW = [
 CASES = [TEXTURE, VERTICES, DENSITY, *(pytest.param(case, marks=pytest.mark.slow) for case in SLOW)]
 LISTED = [
     replace(DENSITY, name="listed density"),
-    replace(DENSITY, name="listed albedo", scene=coloured_fog, key="object.interior_medium.albedo.data", step=0.1),
+    pytest.param(
+        replace(DENSITY, name="listed albedo", scene=coloured_fog, key="object.interior_medium.albedo.data", step=0.1),
+        marks=pytest.mark.slow),
     pytest.param(
         replace(DENSITY, name="listed g", scene=fog_before_the_sun, key="object.interior_medium.phase_function.g",
                 move=add(), step=0.1), marks=pytest.mark.slow),

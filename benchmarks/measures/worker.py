@@ -94,7 +94,7 @@ def peak_mib() -> float:
 
 def told(error: BaseException) -> str:
     """What an exception says, short enough for a table."""
-    from pathreplay.scenes.loading import one_line
+    from pathreplay.scenes.descriptions import one_line
 
     text = one_line(error)
     if isinstance(error, MemoryError) or "out of memory" in text:

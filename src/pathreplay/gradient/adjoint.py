@@ -22,10 +22,15 @@ class RayDerivative:
     d: mi.Vector3f
     pdf: mi.Float
 
+    @staticmethod
+    def zero() -> RayDerivative:
+        # Not dr.zeros, which remembers the types of the variant in which it saw a class first.
+        return RayDerivative(mi.Point3f(0), mi.Vector3f(0), mi.Float(0))
+
     def finite_part(self) -> tuple[RayDerivative, mi.Bool]:
         """The derivative where it is finite and zero elsewhere, and where that is."""
         ok = dr.all(dr.isfinite(self.o)) & dr.all(dr.isfinite(self.d)) & dr.isfinite(self.pdf)
-        return dr.select(ok, self, dr.zeros(RayDerivative)), ok
+        return dr.select(ok, self, RayDerivative.zero()), ok
 
 
 class LostPaths:

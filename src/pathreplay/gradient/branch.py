@@ -34,6 +34,11 @@ class Branch:
     depth: mi.UInt32  # vertices before
     η: mi.Float  # relative index of refraction since the camera
 
+    @staticmethod
+    def none() -> Branch:
+        o, d, black = mi.Point3f(0), mi.Vector3f(0), mi.Spectrum(0)
+        return Branch(o, d, dr.zeros(mi.MediumPtr), black, black, mi.Float(0), mi.Float(0), mi.UInt32(0), mi.Float(1))
+
     def offer(self, path: PathState, step: Chosen) -> Branch:
         """This one, or the null collision of one more flight, by their masses."""
         ray, null = path.at.ray, step.kept.media.flight.null

@@ -34,7 +34,7 @@ def forward(walk: Walk, start: CameraStart, lost: LostPaths) -> tuple[mi.Spectru
     ray0 = path.at.ray
     valid = mi.Bool(walk.background_is_opaque) & path.active
     moves = path_moves(walk, start, path.at)
-    branch = dr.zeros(Branch)
+    branch = Branch.none()
 
     while dr.hint(path.active, exclude=[walk, moves, lost], label="pathreplay: forward"):
         u, step = path.choose(walk, sampler)

@@ -71,7 +71,7 @@ def pixel_sweep(
     while dr.hint(s > 0, exclude=[walk, ray0, lost, loss, layout, start], label="pathreplay: pixel, backwards"):
         s -= 1
         δL = (loss.offset + loss.slope * ((total - ends[s]) / (paths - 1))) / paths
-        none, still = mi.Spectrum(0), dr.zeros(RayDerivative)
+        none, still = mi.Spectrum(0), RayDerivative.zero()
         first, count = s * room, mi.UInt32(counts[s])
         walk_back(walk, layout, records, first, count, first + count - 1, ray0, δL, none, still, lost)
 

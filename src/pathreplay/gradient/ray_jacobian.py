@@ -104,7 +104,7 @@ def length_scale(scene: mi.Scene) -> float:
 def emission_slope(walk: Walk, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
     """How weight·e (detached weight) changes with the density of an arrival and the distance it came."""
     if not has_smooth_lobes(walk):
-        return dr.zeros(Slope)
+        return Slope(mi.Float(0), mi.Float(0))
     slopes = []
     for k in range(2):
         x = [at.pdf, mi.Float(0)]

@@ -76,7 +76,7 @@ def _replay_still(walk: Walk, start: CameraStart, path: PathState, δL: mi.Spect
     """
     sampler, ray0 = start.sampler, path.at.ray
     L = walk_on(walk, sampler.clone(), dr.copy(path))[0]  # β_i L_i, peeled on the way
-    branch = dr.zeros(Branch)
+    branch = Branch.none()
 
     while dr.hint(path.active, exclude=[walk], label="pathreplay: replay"):
         u, step = path.choose(walk, sampler)

@@ -25,7 +25,7 @@ def first_walk(
     """
     L = mi.Spectrum(0)  # radiance so far
     count = mi.UInt32(0)  # vertices, and null boundaries
-    branch = dr.zeros(Branch)
+    branch = Branch.none()
 
     while dr.hint(path.active, exclude=[walk, layout, lost], label="pathreplay: record"):
         u, step = path.choose(walk, sampler)
