@@ -20,7 +20,20 @@ from .measures.job import Record
 from .pages import fill, pages
 from .runner import run_jobs
 from .tables import footnote
-from .tasks import attached, depth, edges, events, gridmedium, iteration, media, noise, startup, supergrid, surface, truth
+from .tasks import (
+    attached,
+    depth,
+    edges,
+    events,
+    gridmedium,
+    iteration,
+    media,
+    noise,
+    startup,
+    supergrid,
+    surface,
+    truth,
+)
 
 # Quick ones first, so that a run that is cut short has most of the answers.
 _TASKS = (startup, surface, iteration, attached, edges, truth, noise, depth, events, supergrid, gridmedium, media)
