@@ -10,7 +10,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.errors import PathreplayError
 from pathreplay.gradient.centres import Centres
 from pathreplay.gradient.crofton import Sight, bisect, search
 from pathreplay.gradient.film_edges import quasi_random
@@ -44,7 +43,7 @@ FILMS = {
 }
 
 
-def some_places(view: Pass, n: int = 20000) -> tuple[FilmPlaces, mi.Point2f]:
+def some_places(view: Pass, n: int = 100000) -> tuple[FilmPlaces, mi.Point2f]:
     places = FilmPlaces.of(view)
     return places, quasi_random(dr.arange(mi.UInt32, n), mi.UInt32(1)) * places.size
 
@@ -67,7 +66,7 @@ def test_light_that_is_one_everywhere_makes_an_image_of_ones(film: dict[str, Any
     area = places.size.x * places.size.y / dr.width(s)
     with dr.suspend_grad():
         image = np.array(places.image(s, mi.Color3f(area), []))
-    assert np.abs(image[..., :3] - 1).max() < 0.02  # 80 places or more in each pixel
+    assert np.abs(image[..., :3] - 1).max() < 0.02  # a thousand places in each pixel
 
 
 def test_nothing_comes_from_outside_of_the_film() -> None:
@@ -136,7 +135,7 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
         found = bisect(look, search(draw, look, 2, pick), pick)
         return 0.5 * dr.pi * dr.sum(found.weight) * (1 + 2 * l) ** 2 / (l * n * 2)
 
-    lengths = [count(1 << 15, 0.1, seed)[0] for seed in range(1, 9)]
+    lengths = [count(1 << 18, 0.1, seed)[0] for seed in range(1, 9)]
     error = np.std(lengths, ddof=1) / len(lengths) ** 0.5
     assert error < 0.01
     assert abs(np.mean(lengths) - 1.6) < 4 * error
@@ -144,7 +143,7 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
 
 @pytest.mark.parametrize("attach", ["all", "none"])
 def test_edges_of_what_follows_its_samples_are_refused(attach: str) -> None:
-    with pytest.raises(PathreplayError, match=f"edges = 'film' with attach = '{attach}'"):
+    with pytest.raises(RuntimeError, match=f"edges = 'film' with attach = '{attach}'"):
         mi.load_dict({"type": "pathreplay", "edges": "film", "attach": attach})
 
 

@@ -260,4 +260,4 @@ def test_differentiation_is_called_in_one_place() -> None:
         for node in ast.walk(tree)
         if differentiates(node)
     }
-    assert places == {"gradient/adjoint.py", "render/film.py"}
+    assert places == {"gradient/adjoint.py", "render/film.py", "render/places.py"}
