@@ -94,20 +94,21 @@ def measure(config: Config, full: bool = False, edges: str = "all") -> Found:
     plain = mi.load_dict({"type": "path", "max_depth": config.depth})
     ours = mi.load_dict({"type": "pathreplay", "max_depth": config.depth, "edges": edges} | config.options)
 
+    # As many samples in a row of pixels as with the large film; for reverse mode, in all.
+    wide = config.res // size
+    reference_spp, spp = REFERENCE_SPP * wide, config.spp * wide
+
     def difference(seed: int, spp: int) -> np.ndarray:
         return setup.difference(plain, CENTRAL, config.step / 2, seed, spp)
 
-    expected = setup.pictures(lambda seed, spp: setup.image(plain, seed, spp), REFERENCE_SPP, 1000).mean(axis=0)
-    slopes = setup.pictures(difference, REFERENCE_SPP, 2000)
-    # As many samples in a row of pixels, and in all, as with the large film.
-    wide = config.res // size
-    image = setup.pictures(lambda seed, spp: setup.image(ours, seed, spp), config.spp * wide, 1).mean(axis=0)
-    tangents = setup.pictures(lambda seed, spp: setup.forward(ours, seed, spp), config.spp, 1)
+    expected = setup.pictures(lambda seed, spp: setup.image(plain, seed, spp), reference_spp, 1000).mean(axis=0)
+    slopes = setup.pictures(difference, reference_spp, 2000)
+    image = setup.pictures(lambda seed, spp: setup.image(ours, seed, spp), spp, 1).mean(axis=0)
+    tangents = setup.pictures(lambda seed, spp: setup.forward(ours, seed, spp), spp, 1)
     slope, tangent = slopes.mean(axis=0), tangents.mean(axis=0)
 
-    spp = config.reverse_spp * wide**2
     setup.weigh(np.full(image.shape, ADJOINT / image.size))
-    gradient, sum_of_slope = setup.backward(ours, 1, spp), setup.dot(slope)
+    gradient, sum_of_slope = setup.backward(ours, 1, config.reverse_spp * wide**2), setup.dot(slope)
     reverse = abs(gradient - sum_of_slope) / max(abs(sum_of_slope), FLOOR_REVERSE)
 
     # Grey, since the weights take part in the choice of vertices.
