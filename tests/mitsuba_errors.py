@@ -16,7 +16,7 @@ import argparse
 import gc
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -37,6 +37,8 @@ ADJOINT = 1e-3
 """What reverse mode is given for each value of the image."""
 PASSES, LANES = 8, 1 << 22
 """With how many seeds, at least, and how many samples in one of them, at most."""
+TINY = 1e-6
+"""Derivatives of the weighted mean that count as zero."""
 
 
 class Found(NamedTuple):
@@ -85,33 +87,36 @@ class Setup(Objective):
         return np.array([picture(seed + k, spp // passes) for k in range(passes)])
 
 
-def measure(config: Config, full: bool = False, **options: Any) -> Found:
+def measure(config: Config, full: bool = False, edges: str = "all") -> Found:
     """Errors of pathreplay's picture, forward and reverse derivative."""
     size = config.res if full else min(SMALL, config.res)
     setup = Setup(config, size)
     plain = mi.load_dict({"type": "path", "max_depth": config.depth})
-    ours = mi.load_dict({"type": "pathreplay", "max_depth": config.depth, **options})
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": config.depth, "edges": edges} | config.options)
+
+    # As many samples in a row of pixels as with the large film; for reverse mode, in all.
+    wide = config.res // size
+    reference_spp, spp = REFERENCE_SPP * wide, config.spp * wide
 
     def difference(seed: int, spp: int) -> np.ndarray:
         return setup.difference(plain, CENTRAL, config.step / 2, seed, spp)
 
-    expected = setup.pictures(lambda seed, spp: setup.image(plain, seed, spp), REFERENCE_SPP, 1000).mean(axis=0)
-    slopes = setup.pictures(difference, REFERENCE_SPP, 2000)
-    image = setup.pictures(lambda seed, spp: setup.image(ours, seed, spp), config.spp, 1).mean(axis=0)
-    tangents = setup.pictures(lambda seed, spp: setup.forward(ours, seed, spp), config.spp, 1)
+    expected = setup.pictures(lambda seed, spp: setup.image(plain, seed, spp), reference_spp, 1000).mean(axis=0)
+    slopes = setup.pictures(difference, reference_spp, 2000)
+    image = setup.pictures(lambda seed, spp: setup.image(ours, seed, spp), spp, 1).mean(axis=0)
+    tangents = setup.pictures(lambda seed, spp: setup.forward(ours, seed, spp), spp, 1)
     slope, tangent = slopes.mean(axis=0), tangents.mean(axis=0)
 
-    # As many samples in all as with the large film.
-    spp = config.reverse_spp * (config.res // size) ** 2
     setup.weigh(np.full(image.shape, ADJOINT / image.size))
-    gradient, sum_of_slope = setup.backward(ours, 1, spp), setup.dot(slope)
+    gradient, sum_of_slope = setup.backward(ours, 1, config.reverse_spp * wide**2), setup.dot(slope)
     reverse = abs(gradient - sum_of_slope) / max(abs(sum_of_slope), FLOOR_REVERSE)
 
     # Grey, since the weights take part in the choice of vertices.
     weights = np.random.default_rng(0).uniform(0, 1, (*image.shape[:2], 1))
     setup.weigh(np.broadcast_to(weights, image.shape) / image.size)
     z = gap(*([setup.dot(x) for x in samples] for samples in (tangents, slopes))).z
-    transpose = setup.transpose_error(ours, ours, 1, 16)
+    ahead, back = setup.forward(ours, 1, 16), setup.backward(ours, 1, 16)
+    transpose = abs(setup.dot(ahead) - back) / max(setup.dot(np.abs(ahead)), TINY)
     setup.put(mi.Float(0))
     primal, forward = relative(image, expected, FLOOR_PRIMAL), relative(tangent, slope, FLOOR_FORWARD)
     return Found(primal, forward, reverse, z, transpose)
