@@ -170,11 +170,6 @@ class Bench(Objective):
         found, expected = self.forward(integrator, seed, spp), self.difference(integrator, CENTRAL, h, seed, spp)
         return float(np.abs(found - expected).sum() / np.abs(expected).sum())
 
-    def transpose_error(self, ahead: mi.Integrator, back: mi.Integrator, seed: int, spp: int) -> float:
-        """|<W, J v> - <J^T W, v>| / Σ |W J v|: a forward pass against a reverse pass with the same random numbers."""
-        tangent = self.forward(ahead, seed, spp)
-        return abs(self.dot(tangent) - self.backward(back, seed, spp)) / self.dot(np.abs(tangent))
-
     def put(self, t: mi.Float) -> None:
         for name, value in self.others.items():
             self.params[name] = self.move(value, t)

@@ -128,6 +128,11 @@ class Objective:
         integrator.render_backward(self.scene, self.params, self.adjoint, self.sensor, seed=seed, spp=spp)
         return self.collect(t)
 
+    def transpose_error(self, ahead: mi.Integrator, back: mi.Integrator, seed: int, spp: int) -> float:
+        """|<W, J v> - <J^T W, v>| / Σ |W J v|: a forward pass against a reverse pass with the same random numbers."""
+        tangent = self.forward(ahead, seed, spp)
+        return abs(self.dot(tangent) - self.backward(back, seed, spp)) / self.dot(np.abs(tangent))
+
     def collect(self, t: mi.Float) -> float:
         """Bring what a reverse pass left at the parameter back to t."""
         dr.enqueue(dr.ADMode.Backward, self.params[self.key])

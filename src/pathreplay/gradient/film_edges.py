@@ -117,7 +117,8 @@ def film_edges(
     look = _find(walk, places, even, few, seed ^ 0x7F4A7C15, lines, 2 * l, bisected=False)
     centres = even.refined(look.line.c + l, look.weight)
     found = _find(walk, places, centres, lane, seed, lines, l)
-    c = _weighed(walk, places, found, 0.5 * dr.pi / (l * dr.width(lane) * lines))
+    per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * dr.width(lane) * lines))  # one kernel for all numbers of samples
+    c = _weighed(walk, places, found, per_line)
     layout = Layout.of(walk, True)
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)
     records, reached = _record_chain(walk, places.ray(c.s, c.line.key)[0], c, layout, records)
@@ -241,7 +242,7 @@ def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: m
     return fork
 
 
-def _weighed(walk: Walk, places: Places, found: Crossed, per_line: float) -> FilmCrossing:
+def _weighed(walk: Walk, places: Places, found: Crossed, per_line: mi.Float) -> FilmCrossing:
     """What the jump of radiance is, with the same random numbers on both sides."""
     line, active = found.line, found.weight > 0
     ends = line.at(found.a), line.at(found.b)

@@ -272,7 +272,7 @@ def inner_edges(
     ray0, weight = dr.detach(places.ray(s, key))
     layout = Layout.of(walk, True)
     records = dr.alloc_local(record_type(layout), room_for(walk))
-    β = weight * (places.size.x * places.size.y / dr.width(lane))
+    β = weight * dr.opaque(mi.Float, places.size.x * places.size.y / dr.width(lane))
     records, x = choose_vertex(walk, Counted.of(key), ray0, W(s, ray0), layout, records)
     x.β *= β
 

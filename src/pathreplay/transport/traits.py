@@ -27,7 +27,7 @@ class Tables:
 
     attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: nowhere)
     blend_lengths: mi.Float  # those of `velocity`, by shape
-    faceted: mi.Bool  # this shape is a mesh without vertex normals
+    faceted: mi.Bool  # this shape is a mesh that is shaded flat
 
 
 @dataclass(frozen=True)
@@ -77,11 +77,17 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
 
 
 def _faceted(shapes: list[mi.Shape]) -> mi.Bool:
-    """Of each shape, by registry index: a mesh without vertex normals."""
+    """Of each shape, by registry index: a mesh that is shaded flat.
+
+    It has no vertex normals, or hardly any vertices that triangles share: a welded mesh has half as many vertices as
+    triangles, one that was split at every edge has twice as many or more.
+    """
     flat = {0: False}
     for shape in shapes:
         index = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]
-        flat[index] = shape.is_mesh() and (shape.has_face_normals() or not shape.has_vertex_normals())
+        flat[index] = shape.is_mesh() and (
+            shape.has_face_normals() or not shape.has_vertex_normals() or shape.vertex_count() >= 2 * shape.face_count()
+        )
     return mi.Bool([flat.get(i, False) for i in range(max(flat) + 1)])
 
 
