@@ -89,7 +89,8 @@ def test_without_edges_they_do_not(name: str) -> None:
     assert abs(found.z) > Z_LIMIT, found
 
 
-@pytest.mark.parametrize("name", some(COUNTED_TWICE, ("shadow_all",)))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COUNTED_TWICE)
 def test_nor_do_they_where_edges_ignore_what_the_interior_follows(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """∫ (f_near - f_far) n·V_edge over all edges that a surface sees is right for directions that are kept only.
 
