@@ -184,8 +184,8 @@ def _keys(params: mi.SceneParameters, entries: list[Parameter], integrator: mi.I
 def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
     """What is to be said of edges that move. An integrator of ours need not say it once more."""
     moving = [key for key in keys if moves_edges(params, key)]
-    # By name: Mitsuba's projective integrators sample edges.
-    if not moving or "Projective" in type(integrator).__name__:
+    # By name: Mitsuba's projective integrators sample edges. Ours tells itself what it leaves out.
+    if not moving or "Projective" in type(integrator).__name__ or getattr(integrator, "edges", "none") == "all":
         return ()
     if hasattr(integrator, "told"):
         integrator.told.add(EDGES)
