@@ -39,6 +39,6 @@ def edges_note(keys: Iterable[str]) -> str:
     more = f" (and {len(others)} more)" if others else ""
     return (
         f"'{first}'{more} moves, and the gradient leaves out what moving edges do (silhouettes, shadows, borders of "
-        "lights): use edges = 'all' of the integrator 'pathreplay', or let paint or shading show the motion rather than "
-        "outlines, and measure what is missing with 'pathreplay check'; see docs/edges.md"
+        "lights): use edges = 'all' of the integrator 'pathreplay', or let paint or shading show the motion rather "
+        "than outlines, and measure what is missing with 'pathreplay check'; see docs/edges.md"
     )
