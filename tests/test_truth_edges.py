@@ -19,7 +19,7 @@ from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
 from pathreplay.gradient import inner_edges
 from truth import ROWS, TRANSPOSE_MAX, Bench, Row
 
-QUICK = ("rect_emit", "cube8_lit", "camera_moves", "shadow_all")
+QUICK = ("rect_emit", "cube8_lit", "shadow_all")
 """Cells that say most in a few seconds."""
 COUNTED_TWICE = ("shadow_lamp", "shadow_all", "lamp_lights", "lamp_seen", "cube8_lit", "sphere_lamp")
 """Cells in which something moves that the interior follows, and that edges could add again."""
