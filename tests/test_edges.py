@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -11,8 +10,8 @@ import numpy as np
 import pytest
 
 from pathreplay.gradient.centres import Centres
-from pathreplay.gradient.crofton import Sight, bisect, search
-from pathreplay.gradient.film_edges import quasi_random
+from pathreplay.gradient.counted import quasi_random
+from pathreplay.gradient.crofton import PlaneLine, Sight, bisect, search
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.places import FilmPlaces
 
@@ -56,7 +55,7 @@ def test_importance_is_the_transpose_of_the_image(film: dict[str, Any]) -> None:
     with dr.suspend_grad():
         image = np.array(places.image(s, L, []))
         wanted = rng.random(image.shape, np.float32)
-        W = places.importance(mi.TensorXf(wanted), s, [])
+        W = places.importance(places.undeveloped(mi.TensorXf(wanted)), s, [])
     assert np.sum(wanted * image) == pytest.approx(float(dr.sum(dr.dot(W, L))[0]), rel=1e-4)
 
 
@@ -73,7 +72,7 @@ def test_nothing_comes_from_outside_of_the_film() -> None:
     places, _ = some_places(Pass.of(world(**FILMS["gaussian"]), 0, 0, 1))
     outside = mi.Point2f([-0.1, 12.1, 5, 5], [4, 4, -0.1, 8.1])
     with dr.suspend_grad():
-        W = places.importance(dr.ones(mi.TensorXf, (8, 12, 3)), outside, [])
+        W = places.importance(places.undeveloped(dr.ones(mi.TensorXf, (8, 12, 3))), outside, [])
     assert dr.all(W == 0, axis=None)
 
 
@@ -107,14 +106,6 @@ def test_a_shape_that_hides_itself_is_seen() -> None:
     assert not Sight.nothing().differs(Sight.nothing())[0]
 
 
-@dataclass
-class Line:
-    c: mi.Point2f
-    w: mi.Vector2f
-    begin: mi.Float
-    end: mi.Float
-
-
 def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
     """Crofton: four sides and four corners, at which two crossings of one line go unseen by its ends."""
 
@@ -122,13 +113,14 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
     def count(n: int, l: float, seed: int) -> mi.Float:
         pick = mi.PCG32(n, initstate=seed)
 
-        def draw(j: mi.UInt32) -> tuple[Line, mi.Bool]:
+        def draw(j: mi.UInt32) -> tuple[PlaneLine, mi.Bool]:
             turn = dr.two_pi * pick.next_float32()
             c = mi.Point2f(pick.next_float32(), pick.next_float32()) * (1 + 2 * l) - l
-            return Line(c, mi.Vector2f(dr.cos(turn), dr.sin(turn)), mi.Float(-l / 2), mi.Float(l / 2)), mi.Bool(True)
+            w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
+            return PlaneLine(c, w, mi.Float(-l / 2), mi.Float(l / 2)), mi.Bool(True)
 
-        def look(line: Line, t: mi.Float, active: mi.Bool) -> Sight:
-            p = line.c + t * line.w
+        def look(line: PlaneLine, t: mi.Float, active: mi.Bool) -> Sight:
+            p = line.at(t)
             inside = (p.x > 0.3) & (p.y > 0.4) & (p.x < 0.8) & (p.y < 0.7)
             return Sight(mi.UInt32(inside), mi.Point3f(0), mi.Normal3f(0))
 

@@ -1,4 +1,4 @@
-"""Random numbers that are counted: those of a key are the same each time, for paths side by side."""
+"""Random numbers that are counted: those of a key are the same each time, for paths and lines side by side."""
 
 from __future__ import annotations
 
@@ -31,3 +31,10 @@ class Counted:
     def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
         x = self.next_1d()
         return mi.Point2f(x, self.next_1d())
+
+
+def quasi_random(i: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
+    """The i-th point of the R2 sequence in the unit square (Roberts, 2018), shifted by the seed."""
+    x = i * mi.UInt32(3242174889) + mi.sample_tea_32(seed, mi.UInt32(1))[0]
+    y = i * mi.UInt32(2447445413) + mi.sample_tea_32(seed, mi.UInt32(2))[0]
+    return mi.Point2f(mi.Float(x >> 8), mi.Float(y >> 8)) * 2**-24

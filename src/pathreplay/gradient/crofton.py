@@ -51,6 +51,25 @@ def hides_itself(p: mi.Point3f, n: mi.Normal3f, p_other: mi.Point3f, n_other: mi
 
 
 @dataclass
+class PlaneLine:
+    """A line in a plane: places t from ``begin`` to ``end``."""
+
+    c: mi.Point2f
+    w: mi.Vector2f  # its direction
+    begin: mi.Float
+    end: mi.Float
+
+    def at(self, t: mi.Float) -> mi.Point2f:
+        return self.c + t * self.w
+
+    def passed(self, jump: mi.Spectrum, slope: mi.Vector2f, active: mi.Bool) -> mi.Spectrum:
+        """K: jump · sgn(w·∂B) / |∂B|, zero where that is not finite; ``slope`` is ∂B, ``jump`` the rest of K."""
+        n = dr.norm(slope)
+        K = jump * (dr.sign(dr.dot(self.w, slope)) / n)
+        return dr.select(active & (n > 0) & dr.all(dr.isfinite(K)), K, 0)
+
+
+@dataclass
 class Crossed:
     """A piece of a line, from ``a`` to ``b``, with an edge on it."""
 

@@ -29,14 +29,13 @@ import mitsuba as mi
 
 from ..transport.emitters import draw_emitter
 from ..transport.path import PathState
-from ..transport.signature import edge_normal, mixed, place_met
+from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
-from ..transport.surface import held_point
 from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
 from .centres import Centres
-from .counted import Counted
-from .crofton import Crossed, Sight, bisect, hides_itself, search
+from .counted import Counted, quasi_random
+from .crofton import Crossed, PlaneLine, Sight, bisect, hides_itself, search
 from .edges import Edges, Places, ray_to_camera
 from .primal import walk_on
 from .record import Layout, record, record_type
@@ -44,23 +43,17 @@ from .record import Layout, record, record_type
 MAX_CHAIN = 16
 """Vertices of a chain of delta lobes, at most."""
 LOOKS = 8
+"""For so many lanes one takes a first look."""
 MEETS = 1e-3
 """Relative difference of two distances, and angle, from which on surfaces meet at an edge."""
 
 
 @dataclass
-class FilmLine:
+class FilmLine(PlaneLine):
     """A line on the film."""
 
-    c: mi.Point2f
-    w: mi.Vector2f  # its direction
     density: mi.Float  # of its centre, per pixel
     key: mi.UInt32  # of the random numbers that its paths share
-    begin: mi.Float
-    end: mi.Float
-
-    def at(self, t: mi.Float) -> mi.Point2f:
-        return self.c + t * self.w
 
 
 @dataclass
@@ -104,9 +97,7 @@ class FilmCrossing:
     active: mi.Bool
 
 
-def film_edges(
-    walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lines: int, l: float, lost: LostPaths
-) -> Edges:
+def film_edges(walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lines: int, l: float) -> Edges:
     """Find an edge on the film in each lane, by ``lines`` lines of length ``l`` (pixels). Detached.
 
     A first look with a line for every `LOOKS`-th lane decides where lines are thrown.
@@ -125,10 +116,7 @@ def film_edges(
     c = replace(c, active=reached, k=dr.select(reached, c.k, 0))
 
     edges = Edges(c.s, c.line.key, c.k, c.near.ray, layout, records, lambda ray: mi.Spectrum(_gap(walk, c, ray)))
-    slope = _slope(walk, places, edges, lost)
-    n = dr.norm(slope)
-    K = c.jump * (dr.sign(dr.dot(c.line.w, slope)) / n)
-    K = dr.select(c.active & (n > 0) & dr.all(dr.isfinite(K)), K, 0)
+    K = c.line.passed(c.jump, _slope(walk, places, edges), c.active)
     return replace(edges, motion=lambda ray: -K * _gap(walk, c, ray))
 
 
@@ -151,7 +139,7 @@ def _find(
         turn = dr.two_pi * mi.sample_tea_float32(key, mi.UInt32(0x30000))
         w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
         c, density = centres.draw(quasi_random(i, seed))
-        return FilmLine(c - l, w, density, key, mi.Float(-0.5 * l), mi.Float(0.5 * l)), mi.Bool(True)
+        return FilmLine(c - l, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key), mi.Bool(True)
 
     def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:
         return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)
@@ -163,13 +151,6 @@ def _find(
 def without_roulette(walk: Walk) -> Walk:
     """The walk as chains take it: roulette would end paths beside an edge in different places."""
     return replace(walk, rr_depth=0xFFFFFFFF, max_depth=min(walk.max_depth, MAX_CHAIN))
-
-
-def quasi_random(i: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
-    """The i-th point of the R2 sequence in the unit square (Roberts, 2018), shifted by the seed."""
-    x = i * mi.UInt32(3242174889) + mi.sample_tea_32(seed, mi.UInt32(1))[0]
-    y = i * mi.UInt32(2447445413) + mi.sample_tea_32(seed, mi.UInt32(2))[0]
-    return mi.Point2f(mi.Float(x >> 8), mi.Float(y >> 8)) * 2**-24
 
 
 @dr.syntax
@@ -255,8 +236,7 @@ def _weighed(walk: Walk, places: Places, found: Crossed, per_line: mi.Float) -> 
         f.append(walk_on(walk, Counted.at_vertex(line.key, fork.k), path)[0])
     jump = weight * fork.β * (f[0] - f[1]) * (per_line * found.weight / line.density)
 
-    t_a, t_b = (dr.select(side.hit.is_valid(), side.hit.t, dr.inf) for side in (fork.a, fork.b))
-    near_a, meet, turns, shadow = t_a <= t_b, _meet(fork), _turns(walk, fork), mi.Bool(False)
+    near_a, meet, turns, shadow = fork.a.hit.t <= fork.b.hit.t, _meet(fork), _turns(walk, fork), mi.Bool(False)
     if fork.shade_a is not None:
         shadow = fork.shade_a.hidden != fork.shade_b.hidden
         meet, turns = meet & ~shadow, turns & ~shadow
@@ -290,9 +270,7 @@ def _turns(walk: Walk, fork: Fork) -> mi.Bool:
 
 def _gap(walk: Walk, c: FilmCrossing, ray: mi.Ray3f) -> mi.Float:
     """B: zero on the edge; differentiable in the ray that arrives, and in the shapes."""
-    z = held_point(c.near.hit, dr.detach(ray), c.active).p
-    t0 = dr.select(c.active, c.near.hit.t, 0)
-    outline = dr.select(c.active, dr.dot(c.n, ray.o + t0 * ray.d - z), 0)
+    outline = outline_gap(c.n, ray.o, ray.d, c.near.hit, ray, c.active)
     both = c.active & c.meets
     t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, both).t for hit in (c.near.hit, c.far)]
     turns = c.active & c.turns
@@ -306,9 +284,7 @@ def _shadow_gap(walk: Walk, c: FilmCrossing, shade: Shade, ray: mi.Ray3f) -> mi.
     active = c.active & c.shadow
     si = c.near.hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
     light, _ = walk.scene.sample_emitter_direction(si, shade.u, False, active)
-    z = held_point(shade.hit, dr.detach(shade.ray), active).p
-    r = dr.select(active, shade.hit.t, 0)
-    return dr.select(active, dr.dot(c.n, si.p + r * light.d - z), 0)
+    return outline_gap(c.n, si.p, light.d, shade.hit, shade.ray, active)
 
 
 @dr.syntax
@@ -326,10 +302,10 @@ def _record_chain(walk: Walk, ray: mi.Ray3f, c: FilmCrossing, layout: Layout, re
     return records, c.active & (count == c.k + 1)
 
 
-def _slope(walk: Walk, places: Places, edges: Edges, lost: LostPaths) -> mi.Vector2f:
+def _slope(walk: Walk, places: Places, edges: Edges) -> mi.Vector2f:
     """∂B/∂s: how fast the edge is passed on the film. Reaches no parameter."""
     q = derivative_by_ray(edges.ray, lambda ray: edges.motion(ray)[0])
-    q = ray_to_camera(walk, places, edges, q, lost, rays_only=True)
+    q = ray_to_camera(walk, places, edges, q, LostPaths(), rays_only=True)
 
     def along(s: mi.Point2f) -> mi.Float:
         ray, _ = places.ray(s, edges.key)

@@ -21,16 +21,14 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.path import PathState
-from ..transport.signature import edge_normal, mixed, place_met
+from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
-from ..transport.surface import held_point
 from ..transport.velocity import held_direction, moved_direction
 from ..transport.vertex import Arrival, Walk, is_smooth, mis_weight
 from .adjoint import derivative_by_place
-from .counted import Counted
-from .crofton import Sight, bisect, search
+from .counted import Counted, quasi_random
+from .crofton import PlaneLine, Sight, bisect, search
 from .edges import Edges, Places
-from .film_edges import quasi_random
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
 
@@ -53,18 +51,11 @@ class Chosen:
 
 
 @dataclass
-class SquareLine:
+class SquareLine(PlaneLine):
     """A line in the unit square of samples of one emitter."""
 
-    c: mi.Point2f
-    w: mi.Vector2f
     emitter: mi.EmitterPtr
     share: mi.Float  # 1 / probability of the emitter
-    begin: mi.Float
-    end: mi.Float
-
-    def at(self, t: mi.Float) -> mi.Point2f:
-        return self.c + t * self.w
 
 
 @dataclass
@@ -135,7 +126,7 @@ def emitter_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, p
         inside = x.active & (begin < end)
         emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, x.active)
         begin, end = dr.select(inside, begin, 0), dr.select(inside, end, 0)
-        return SquareLine(c, w, emitter, share, begin, end), inside
+        return SquareLine(c, w, begin, end, emitter, share), inside
 
     def shadowed(line: SquareLine, t: mi.Float, active: mi.Bool) -> tuple[Any, ...]:
         light, Le = line.emitter.sample_direction(si, line.at(t), active)
@@ -167,16 +158,13 @@ def shadow_gap(x: Chosen, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
     """B: distance of the line to the emitter sample from the edge; differentiable in all that moves."""
     si = x.at.hit.compute_surface_interaction(at, mi.RayFlags.All, c.active)
     light, _ = c.line.emitter.sample_direction(si, u, c.active)
-    z = held_point(c.hit, dr.detach(c.ray), c.active).p
-    return dr.select(c.active, dr.dot(c.n, si.p + dr.select(c.active, c.hit.t, 0) * light.d - z), 0)
+    return outline_gap(c.n, si.p, light.d, c.hit, c.ray, c.active)
 
 
 def shadow_weight(x: Chosen, c: Shaded) -> mi.Spectrum:
     """K in full: with the derivative of B along the line."""
     slope = derivative_by_place(c.u, lambda u: shadow_gap(x, c, x.at.ray, u))
-    n = dr.norm(slope)
-    K = c.K * (dr.sign(dr.dot(c.line.w, slope)) / n)
-    return dr.select(c.active & dr.all(dr.isfinite(K)) & (n > 0), K, 0)
+    return c.line.passed(c.K, slope, c.active)
 
 
 @dataclass
@@ -220,8 +208,7 @@ def arc_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick:
     line, active = found.line, found.weight > 0
     ray_a, a = hit(line.at(found.a), active)
     ray_b, b = hit(line.at(found.b), active)
-    t_a, t_b = (dr.select(h.is_valid(), h.t, dr.inf) for h in (a, b))
-    near_a = t_a <= t_b
+    near_a = a.t <= b.t
     near, far = dr.select(near_a, a, b), dr.select(near_a, b, a)
     ray_near, ray_far = dr.select(near_a, ray_a, ray_b), dr.select(near_a, ray_b, ray_a)
     active &= near.is_valid()

@@ -42,6 +42,8 @@ class Boundary:
     def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
         """Tangent of the image: see `Term`."""
         places = FilmPlaces.of(view)
+        if not _moves(walk, places):
+            return Found()
         image = None
         for edges in self._searches(view, walk, places, lambda s, ray: mi.Spectrum(1)):
             δL = edges_forward(walk, places, edges)
@@ -52,33 +54,36 @@ class Boundary:
     def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Baseline | None) -> Found:
         """Back-propagate the adjoint of the image: see `Term`."""
         places = FilmPlaces.of(view)
+        if not _moves(walk, places):
+            return Found()
+        wanted = places.undeveloped(grad_in)
 
         def importance(s: mi.Point2f, ray: mi.Ray3f) -> mi.Spectrum:
-            return places.importance(grad_in, s, ray.wavelengths)
+            return places.importance(wanted, s, ray.wavelengths)
 
         lost, paths = LostPaths(), 0
         for edges in self._searches(view, walk, places, importance):
             edges_backward(walk, places, edges, importance(edges.s, edges.ray), lost)
             paths += dr.width(edges.s)
         dr.eval()
-        return Found(lost=lost.count, paths=paths, moves=True) if paths else Found()
+        return Found(lost=lost.count, paths=paths, moves=True)
 
     def _searches(
         self, view: Pass, walk: Walk, places: FilmPlaces, importance: Callable[..., mi.Spectrum]
     ) -> Iterator[Edges]:
-        """The edges of each search; none where nothing moves, or with media."""
-        if walk.media is not None or not _moves(walk, places):
-            return
+        """The edges of each search."""
         size = int(places.size.x) * int(places.size.y)
         lane = dr.arange(mi.UInt32, max(size * (self.spp or view.spp) // LINES, 1))
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
-        yield film_edges(walk, places, lane, seed ^ 0x5EED, LINES, FILM_LENGTH, LostPaths())
+        yield film_edges(walk, places, lane, seed ^ 0x5EED, LINES, FILM_LENGTH)
         if self.inner:
             yield inner_edges(walk, places, lane, seed ^ 0x5EED, LINES, INNER_LENGTHS, importance)
 
 
 def _moves(walk: Walk, places: FilmPlaces) -> bool:
-    """Whether paths move with the parameters: if not, edges do not either."""
+    """Whether paths move with the parameters: if not, edges do not either. With media they are left out."""
+    if walk.media is not None:
+        return False
     key = mi.UInt32(0)
     with dr.resume_grad():
         ray, _ = places.ray(mi.Point2f(0.5), key)

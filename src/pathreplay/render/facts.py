@@ -7,9 +7,8 @@ from dataclasses import replace
 import mitsuba as mi
 
 from ..transport.media import Media, scene_media
-from ..transport.traits import INSTANCE, MASK, Traits, fixed_traits, is_null, nodes_of, with_gradients
+from ..transport.traits import INSTANCE, MASK, Traits, blend_lengths, fixed_traits, is_null, nodes_of, with_gradients
 from ..transport.traits import Tables as Tables
-from ..transport.velocity import blend_lengths
 
 
 class SceneFacts:

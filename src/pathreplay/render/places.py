@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..gradient.counted import Counted
+from ..plugins import mitsuba_integrator
 from .camera_pass import Pass
 
 QUADRATURE = 128
@@ -38,21 +39,24 @@ class FilmPlaces:
         ray, weight = sensor.sample_ray(time, wavelength, place, aperture)
         return mi.Ray3f(ray), dr.detach(weight)
 
-    def importance(self, grad_in: mi.TensorXf, s: mi.Point2f, wavelengths: mi.Spectrum) -> mi.Spectrum:
-        """What ``grad_in``, the adjoint of the image, wants of radiance at places, per pixel of film; outside nothing.
-
-        W(s) = Σ_j g_j h_j(s) / ∫ h_j, with the filter h_j of pixel j.
-        """
-        inside = dr.all((s >= 0) & (s < self.size))
+    def undeveloped(self, grad_in: mi.TensorXf) -> mi.TensorXf:
+        """The adjoint of a film block's pixels, from that of the image: g_j / ∫ h_j, with the filter h_j of pixel j."""
         with dr.resume_grad():
-            raw = self._block()
-            pixels = mi.TensorXf(raw.tensor())
+            pixels = mi.TensorXf(self._block().tensor())
             dr.enable_grad(pixels)
             image = self._developed(pixels)
             dr.set_grad(image, grad_in)
             dr.enqueue(dr.ADMode.Backward, image)
             dr.traverse(dr.ADMode.Backward)
-            wanted = dr.grad(pixels)
+            return dr.grad(pixels)
+
+    def importance(self, wanted: mi.TensorXf, s: mi.Point2f, wavelengths: mi.Spectrum) -> mi.Spectrum:
+        """W(s) = Σ_j g_j h_j(s) / ∫ h_j, what is wanted of radiance at places, per pixel of film; outside nothing.
+
+        ``wanted`` is the adjoint of a block: see `undeveloped`.
+        """
+        inside = dr.all((s >= 0) & (s < self.size))
+        with dr.resume_grad():
             L = dr.full(mi.Spectrum, 1.0, dr.width(s))
             dr.enable_grad(L)
             block = self._block()
@@ -75,12 +79,10 @@ class FilmPlaces:
         return film.create_block()
 
     def _put(self, block: mi.ImageBlock, s: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> None:
-        if mi.is_spectral:
-            rgb = mi.spectrum_to_srgb(L, wavelengths)
-        else:
-            rgb = mi.Color3f(L.x if mi.is_monochromatic else L)
-        alpha = [mi.Float(0)] * (block.channel_count() - 4)
-        block.put(self.corner + s, [rgb.x, rgb.y, rgb.z, *alpha, mi.Float(0)])
+        film, place = self.view.sensor.film(), self.corner + s
+        mitsuba_integrator()._splat_to_block(
+            block, film, place, value=L, weight=mi.Float(0), alpha=mi.Float(0), aovs=[], wavelengths=wavelengths
+        )
 
     def _developed(self, pixels: mi.TensorXf) -> mi.TensorXf:
         """The image of a block without weights: those of its pixels are ∫ h_j."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .surface import held_point
 from .vertex import Walk
 
 # Cosine between ray and normal of a cylinder below which an edge is its limb rather than its rim.
@@ -51,6 +52,22 @@ def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Boo
         side = dr.select(on_mesh, _nearest_side(hit, ray, on_mesh), dr.select(square, side, si.dp_dv))
         straight = on_mesh | square | rim
         return dr.normalize(dr.select(straight, dr.cross(side, ray.d), si.n - dr.dot(si.n, ray.d) * ray.d))
+
+
+def outline_gap(
+    n: mi.Vector3f,
+    o: mi.Point3f,
+    d: mi.Vector3f,
+    hit: mi.PreliminaryIntersection3f,
+    ray: mi.Ray3f,
+    active: mi.Bool,
+) -> mi.Float:
+    """B = n·(o + t d - z): distance, along n, of a line from a point of an outline, z, that ``ray`` hit at t.
+
+    z is glued to its shape. Differentiable in o, d and the shape; zero where not ``active``.
+    """
+    z = held_point(hit, dr.detach(ray), active).p
+    return dr.select(active, dr.dot(n, o + dr.select(active, hit.t, 0) * d - z), 0)
 
 
 def _nearest_side(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:

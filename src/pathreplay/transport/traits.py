@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
-from .velocity import blend_lengths
+from .velocity import blend_length
 
 # Classes by name: Mitsuba's objects do not tell these things of themselves.
 # Sampling is a smooth function of the random numbers, and no choice among lobes depends on a parameter.
@@ -16,6 +17,9 @@ ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
 MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
 FRAMES = frozenset({"NormalMap", "BumpMap", TWO_SIDED})
 INSTANCE = "Instance"
+
+T = TypeVar("T")
+V = TypeVar("V")
 
 
 @dataclass
@@ -72,23 +76,34 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         outlines=not _seamless(shapes, nodes),
-        tables=Tables(_mask_by_index(attachables) if attachables else None, blend_lengths(shapes), _faceted(shapes)),
+        tables=Tables(
+            mi.Bool(_by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)) if attachables else None,
+            blend_lengths(shapes),
+            mi.Bool(_by_index(mi.ShapePtr, shapes, _is_faceted, False)),
+        ),
     )
 
 
-def _faceted(shapes: list[mi.Shape]) -> mi.Bool:
-    """Of each shape, by registry index: a mesh that is shaded flat.
+def blend_lengths(shapes: list[mi.Shape]) -> mi.Float:
+    """The table of each shape's `blend_length`."""
+    return mi.Float(_by_index(mi.ShapePtr, shapes, blend_length, 0.0))
+
+
+def _is_faceted(shape: mi.Shape) -> bool:
+    """Whether it is a mesh that is shaded flat.
 
     It has no vertex normals, or hardly any vertices that triangles share: a welded mesh has half as many vertices as
     triangles, one that was split at every edge has twice as many or more.
     """
-    flat = {0: False}
-    for shape in shapes:
-        index = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]
-        flat[index] = shape.is_mesh() and (
-            shape.has_face_normals() or not shape.has_vertex_normals() or shape.vertex_count() >= 2 * shape.face_count()
-        )
-    return mi.Bool([flat.get(i, False) for i in range(max(flat) + 1)])
+    return shape.is_mesh() and (
+        shape.has_face_normals() or not shape.has_vertex_normals() or shape.vertex_count() >= 2 * shape.face_count()
+    )
+
+
+def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], otherwise: V) -> list[V]:
+    """The values of objects by their index in Dr.Jit's registry."""
+    found = {dr.reinterpret_array(mi.UInt32, pointer(x))[0]: value(x) for x in objects}
+    return [found.get(i, otherwise) for i in range(max(found, default=0) + 1)]
 
 
 def is_null(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:
@@ -145,11 +160,6 @@ def _is_attachable(bsdf: mi.BSDF) -> bool:
     if name in FRAMES:
         return all(_is_attachable(nested) for nested in nodes_of(bsdf) if isinstance(nested, mi.BSDF))
     return name in ATTACHABLE
-
-
-def _mask_by_index(bsdfs: list[mi.BSDF]) -> mi.Bool:
-    index = {dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0] for bsdf in bsdfs}
-    return mi.Bool([i in index for i in range(max(index) + 1)])
 
 
 def with_gradients(node: mi.Object, *names: str) -> list[Any]:

@@ -32,14 +32,10 @@ from .surface import HeldPoint, held_point
 BLEND = 0.01
 
 
-def blend_lengths(shapes: list[mi.Shape]) -> mi.Float:
-    """h0 of each shape (by registry index): BLEND times the diagonal of its bounding box."""
-    lengths = {0: 0.0}
-    for shape in shapes:
-        size = sum(float(x) ** 2 for x in shape.bbox().extents()) ** 0.5
-        if math.isfinite(size):  # an empty group has none
-            lengths[dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]] = BLEND * size
-    return mi.Float([lengths.get(i, 0.0) for i in range(max(lengths) + 1)])
+def blend_length(shape: mi.Shape) -> float:
+    """h0 of a shape: BLEND times the diagonal of its bounding box; 0 of an empty group, which has none."""
+    size = sum(float(x) ** 2 for x in shape.bbox().extents()) ** 0.5
+    return BLEND * size if math.isfinite(size) else 0.0
 
 
 def moved_direction(
@@ -47,7 +43,7 @@ def moved_direction(
 ) -> tuple[mi.Vector3f, mi.Float]:
     """The kept direction ``d`` and J, as V moves them: their values are ``d`` and 1.
 
-    ``lengths`` are the `blend_lengths` of the scene and ``hit`` is what the continuation from ``origin`` along ``d``
+    ``lengths`` are each shape's `blend_length` and ``hit`` is what the continuation from ``origin`` along ``d``
     hit; rays that left the scene keep their direction. Differentiable in ``origin`` and in the shape that was hit.
     """
     found = active & hit.is_valid()
