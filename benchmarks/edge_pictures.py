@@ -158,7 +158,9 @@ def _label(axes: Axes, x: float, y: float, text: str, colour: str = "black", **m
 
 
 def _ray(axes: Axes, begin: tuple[float, float], end: tuple[float, float], colour: str) -> None:
-    axes.annotate("", end, begin, arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0})
+    axes.annotate(
+        "", end, begin, arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0}
+    )
 
 
 def _ends(axes: Axes, a: tuple[float, float], b: tuple[float, float]) -> None:
