@@ -207,7 +207,8 @@ def everything() -> dict:
         wall=shape(BACK, patterned()), lamp=lamp(OVERHEAD), sky=sky(),
         bulb=lamp(T().translate([-1.5, 1.8, 1.5]).scale(0.2), 20, "sphere"),
         point={"type": "point", "position": [0.5, 2.5, 2.0], "intensity": rgb(9, 8, 7)},
-        mirror=shape(tilted, {"type": "conductor"}), ball=shape(T().translate([0.9, -0.5, 0.3]).scale(0.4), GLASS, "sphere"),
+        mirror=shape(tilted, {"type": "conductor"}),
+        ball=shape(T().translate([0.9, -0.5, 0.3]).scale(0.4), GLASS, "sphere"),
         object=cube24(IN_THE_BACK, paint(0.8, 0.8, 0.3)), can=can(BOX, paint(0.5, 0.5, 0.2)),
     )  # fmt: skip
 
