@@ -14,6 +14,7 @@ from pathreplay.gradient.counted import quasi_random
 from pathreplay.gradient.crofton import PlaneLine, Sight, bisect, search
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.places import FilmPlaces
+from pathreplay.transport.pieces import smooth_pieces
 
 
 def world(**film: Any) -> mi.Scene:
@@ -104,6 +105,24 @@ def test_a_shape_that_hides_itself_is_seen() -> None:
     assert here.differs(sight(7, [0.1, 0, -3], [0, 0, 1]))[0]  # behind
     assert here.differs(sight(8, [0.1, 0, 0], [0, 0, 1]))[0]
     assert not Sight.nothing().differs(Sight.nothing())[0]
+
+
+def test_a_mesh_falls_into_pieces_where_vertices_are_written_twice() -> None:
+    """Where a piece meets itself, the triangles at the tear are pieces of their own."""
+    square = np.array([[0, 1, 2], [0, 2, 3]])
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    assert not smooth_pieces(square, corners).any()
+    assert not smooth_pieces(np.zeros((0, 3), int), np.zeros((0, 3))).any()
+    folded = np.concatenate([corners, corners[[0, 1]], [[1, 0, 1], [0, 0, 1]]])
+    assert list(smooth_pieces(np.concatenate([square, square + 4]), folded)) == [0, 0, 1, 1]
+    n = 8
+    turns = 2 * np.pi * np.append(np.arange(n), 0) / n  # closed by places, open by vertices
+    ring = np.stack([np.cos(turns), np.sin(turns), 0 * turns], 1)
+    i = np.arange(n)
+    faces = np.concatenate([np.stack([i, i + 1, i + n + 2], 1), np.stack([i, i + n + 2, i + n + 1], 1)])
+    pieces = smooth_pieces(faces, np.concatenate([ring, ring + np.array([0, 0, 1])]))
+    apart = np.bincount(pieces)[pieces] == 1
+    assert list(np.flatnonzero(apart)) == [n - 1, n]  # the triangles at the tear
 
 
 def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:

@@ -33,9 +33,10 @@ from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
 from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
+from .bends import Bend
 from .centres import Centres
 from .counted import Counted, quasi_random
-from .crofton import Crossed, PlaneLine, Sight, bisect, hides_itself, search
+from .crofton import Crossed, PlaneLine, Sight, bisect, search
 from .edges import Edges, Places, ray_to_camera
 from .primal import walk_on
 from .record import Layout, record, record_type
@@ -44,8 +45,6 @@ MAX_CHAIN = 16
 """Vertices of a chain of delta lobes, at most."""
 LOOKS = 8
 """For so many lanes one takes a first look."""
-MEETS = 1e-3
-"""Relative difference of two distances, and angle, from which on surfaces meet at an edge."""
 
 
 @dataclass
@@ -87,9 +86,7 @@ class FilmCrossing:
     s: mi.Point2f  # on its near side
     k: mi.UInt32  # vertices before
     near: Arrival
-    far: mi.PreliminaryIntersection3f
-    meets: mi.Bool  # two surfaces meet there
-    turns: mi.Bool  # a surface turns away there, by its shading normal
+    bend: Bend
     n: mi.Vector3f
     shadow: mi.Bool  # it is the border of a hard shadow
     shade: Shade | None
@@ -236,46 +233,25 @@ def _weighed(walk: Walk, places: Places, found: Crossed, per_line: mi.Float) -> 
         f.append(walk_on(walk, Counted.at_vertex(line.key, fork.k), path)[0])
     jump = weight * fork.β * (f[0] - f[1]) * (per_line * found.weight / line.density)
 
-    near_a, meet, turns, shadow = fork.a.hit.t <= fork.b.hit.t, _meet(fork), _turns(walk, fork), mi.Bool(False)
+    near_a, shadow = fork.a.hit.t <= fork.b.hit.t, mi.Bool(False)
     if fork.shade_a is not None:
         shadow = fork.shade_a.hidden != fork.shade_b.hidden
-        meet, turns = meet & ~shadow, turns & ~shadow
         near_a = dr.select(shadow, fork.shade_a.hidden, near_a)
-    near, far = dr.select(near_a, fork.a, fork.b), dr.select(near_a, fork.b.hit, fork.a.hit)
+    near = dr.select(near_a, fork.a, fork.b)
     shade = None if fork.shade_a is None else dr.select(near_a, fork.shade_a, fork.shade_b)
     active &= near.hit.is_valid()
+    bend = Bend.of(walk, ((fork.a.hit, fork.a.ray), (fork.b.hit, fork.b.ray)), active & ~shadow)
     n = edge_normal(near.hit, near.ray, active)
     if shade is not None:
         n = dr.select(shadow, edge_normal(shade.hit, shade.ray, active & shadow), n)
     s = dr.select(near_a, *ends)
-    return FilmCrossing(line, s, fork.k, near, far, meet, turns, n, shadow, shade, jump, active)
-
-
-def _meet(fork: Fork) -> mi.Bool:
-    """Whether two surfaces meet where paths part, at an angle."""
-    a, b = fork.a, fork.b
-    both = a.hit.is_valid() & b.hit.is_valid()
-    n_a, n_b = (x.hit.compute_surface_interaction(x.ray, mi.RayFlags.Minimal, both).n for x in (a, b))
-    angle = dr.squared_norm(dr.cross(n_a, n_b)) > dr.square(MEETS)
-    return both & angle & (dr.abs(a.hit.t - b.hit.t) < MEETS * dr.minimum(a.hit.t, b.hit.t))
-
-
-def _turns(walk: Walk, fork: Fork) -> mi.Bool:
-    """Whether it is one sheet of one surface, the shading normal of which is at right angles to the path there."""
-    a, b = fork.a, fork.b
-    both = fork.found & a.hit.is_valid() & (place_met(walk, a.hit, fork.found) == place_met(walk, b.hit, fork.found))
-    si_a, si_b = (x.hit.compute_surface_interaction(x.ray, mi.RayFlags.Minimal, both) for x in (a, b))
-    return both & ~hides_itself(si_a.p, si_a.n, si_b.p, si_b.n)
+    return FilmCrossing(line, s, fork.k, near, bend, n, shadow, shade, jump, active)
 
 
 def _gap(walk: Walk, c: FilmCrossing, ray: mi.Ray3f) -> mi.Float:
     """B: zero on the edge; differentiable in the ray that arrives, and in the shapes."""
     outline = outline_gap(c.n, ray.o, ray.d, c.near.hit, ray, c.active)
-    both = c.active & c.meets
-    t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, both).t for hit in (c.near.hit, c.far)]
-    turns = c.active & c.turns
-    si = c.near.hit.compute_surface_interaction(ray, mi.RayFlags.All, turns)
-    B = dr.select(both, t[0] - t[1], dr.select(turns, dr.dot(si.sh_frame.n, ray.d), outline))
+    B = dr.select(c.bend.meets | c.bend.turns, c.bend.gap(ray, c.active), outline)
     return B if c.shade is None else dr.select(c.shadow, _shadow_gap(walk, c, c.shade, ray), B)
 
 

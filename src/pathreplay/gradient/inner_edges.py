@@ -25,7 +25,8 @@ from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
 from ..transport.velocity import held_direction, moved_direction
 from ..transport.vertex import Arrival, Walk, is_smooth, mis_weight
-from .adjoint import derivative_by_place
+from .adjoint import derivative_by_place, derivative_by_ray
+from .bends import Bend
 from .counted import Counted, quasi_random
 from .crofton import PlaneLine, Sight, bisect, search
 from .edges import Edges, Places
@@ -34,7 +35,8 @@ from .record import Layout, deepest, record, record_type, room_for
 
 BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
-
+EVENLY = 0.25
+"""Share of the arcs that are thrown evenly: those that begin below the horizon, or where lobes are weak, count, too."""
 
 Importance = Callable[..., "mi.Spectrum"]
 
@@ -169,13 +171,15 @@ def shadow_weight(x: Chosen, c: Shaded) -> mi.Spectrum:
 
 @dataclass
 class Hiding:
-    """A crossing on an arc: one surface hides another."""
+    """A crossing on an arc: one surface hides another, or bends."""
 
     near: mi.PreliminaryIntersection3f
     far: mi.PreliminaryIntersection3f  # may be none
     d_near: mi.Vector3f
     d_far: mi.Vector3f
     n: mi.Vector3f  # from near to far
+    bend: Bend
+    slope: mi.Float  # of its B, along n
     K_near: mi.Spectrum
     K_far: mi.Spectrum
     active: mi.Bool
@@ -189,20 +193,28 @@ def arc_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick:
     def draw(j: mi.UInt32) -> tuple[Arc, mi.Bool]:
         numbers = Counted(key, 0x100 + 8 * j)
         sample, _ = si.bsdf().sample(ctx, si, numbers.next_1d(), numbers.next_2d(), x.active)
-        ok = x.active & (sample.pdf > 0) & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-        c = dr.select(ok, si.to_world(sample.wo), mi.Vector3f(0, 0, 1))
+        evenly = numbers.next_1d() < EVENLY
+        wo = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), sample.wo)
+        smooth = (sample.pdf > 0) & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        ok = x.active & (evenly | smooth)
+        pdf = dr.lerp(si.bsdf().pdf(ctx, si, wo, ok), dr.inv_four_pi, EVENLY)
+        c = dr.select(ok, si.to_world(wo), mi.Vector3f(0, 0, 1))
         turn = dr.two_pi * numbers.next_1d()
         w = mi.Frame3f(c).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
-        return Arc(c, w, dr.select(ok, sample.pdf, 1), mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
+        return Arc(c, w, dr.select(ok, pdf, 1), mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
 
     def hit(d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
         ray = si.spawn_ray(d)
         return ray, scene.ray_intersect_preliminary(ray, coherent=False, active=active)
 
+    through = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
+
     def look(line: Arc, t: mi.Float, active: mi.Bool) -> Sight:
-        ray, seen = hit(line.at(t), active)
-        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-        return Sight(place_met(walk, seen, active, facets=False), at.p, at.n)
+        above = mi.Frame3f.cos_theta(si.to_local(line.at(t))) * mi.Frame3f.cos_theta(si.wi) > 0
+        ray, seen = hit(line.at(t), active & (above | through))
+        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
+        turned = dr.select(dr.dot(at.sh_frame.n, ray.d) > 0, mi.UInt32(1), 0)
+        return Sight(mixed(place_met(walk, seen, active, facets=False), turned), at.p, at.n)
 
     found = bisect(look, search(draw, look, lines, pick), pick)
     line, active = found.line, found.weight > 0
@@ -213,7 +225,10 @@ def arc_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick:
     ray_near, ray_far = dr.select(near_a, ray_a, ray_b), dr.select(near_a, ray_b, ray_a)
     active &= near.is_valid()
 
-    n = edge_normal(near, ray_near, active)
+    bend = Bend.of(walk, ((near, ray_near), (far, ray_far)), active)
+    slope = derivative_by_ray(ray_near, lambda ray: bend.gap(ray, active)).d
+    slope -= dr.dot(slope, ray_near.d) * ray_near.d
+    n = dr.select(bend.meets | bend.turns, dr.normalize(slope), edge_normal(near, ray_near, active))
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
     f, pdf = si.bsdf().eval_pdf(ctx, si, si.to_local(ray_far.d), active)
     common = x.β * f * (0.5 * dr.pi / (l * lines) * found.weight / line.pdf)
@@ -224,7 +239,7 @@ def arc_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick:
         path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), x.k + 1, active & (x.k + 1 < walk.max_depth))
         L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
         K.append(dr.select(active, common * L, 0))
-    return Hiding(near, far, ray_near.d, ray_far.d, n, K[0], K[1], active)
+    return Hiding(near, far, ray_near.d, ray_far.d, n, bend, dr.dot(slope, n), K[0], K[1], active)
 
 
 def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
@@ -234,7 +249,14 @@ def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum
     edge = held_direction(si, c.d_near, c.near, c.active)
     d_near, _ = moved_direction(lengths, si, c.d_near, c.near, c.active)
     d_far, _ = moved_direction(lengths, si, c.d_far, c.far, c.active)
-    swept = c.K_near * dr.dot(c.n, edge - d_near) - c.K_far * dr.dot(c.n, edge - d_far)
+    bends = c.bend.meets | c.bend.turns
+
+    def gap(d: mi.Vector3f) -> mi.Float:
+        """How far a direction is from the edge, along n."""
+        ray = mi.Ray3f(si.spawn_ray(dr.detach(d)).o, d)
+        return dr.select(bends, -c.bend.gap(ray, c.active) / c.slope, dr.dot(c.n, edge - d))
+
+    swept = c.K_near * gap(d_near) - c.K_far * gap(d_far)
     return dr.select(c.active, swept, 0)
 
 

@@ -8,7 +8,9 @@ from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from .pieces import mesh_pieces
 from .velocity import blend_length
 
 # Classes by name: Mitsuba's objects do not tell these things of themselves.
@@ -17,6 +19,8 @@ ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
 MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
 FRAMES = frozenset({"NormalMap", "BumpMap", TWO_SIDED})
 INSTANCE = "Instance"
+WHOLE, FACETS = 0, 0xFFFFFFFF
+"""Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
 
 T = TypeVar("T")
 V = TypeVar("V")
@@ -31,7 +35,8 @@ class Tables:
 
     attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: nowhere)
     blend_lengths: mi.Float  # those of `velocity`, by shape
-    faceted: mi.Bool  # this shape is a mesh that is shaded flat
+    pieces_at: mi.UInt32  # by shape: where the pieces of its triangles begin, if not `WHOLE` or `FACETS`
+    pieces: mi.UInt32  # of all such meshes (see `pieces`), in a row; the first is no triangle's
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         tables=Tables(
             mi.Bool(_by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)) if attachables else None,
             blend_lengths(shapes),
-            mi.Bool(_by_index(mi.ShapePtr, shapes, _is_faceted, False)),
+            *pieces_of(shapes),
         ),
     )
 
@@ -89,15 +94,23 @@ def blend_lengths(shapes: list[mi.Shape]) -> mi.Float:
     return mi.Float(_by_index(mi.ShapePtr, shapes, blend_length, 0.0))
 
 
-def _is_faceted(shape: mi.Shape) -> bool:
-    """Whether it is a mesh that is shaded flat.
+def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
+    """The tables of pieces: where those of each shape begin, and what they are."""
+    found: list[np.ndarray] = [np.zeros(1, np.uint32)]
 
-    It has no vertex normals, or hardly any vertices that triangles share: a welded mesh has half as many vertices as
-    triangles, one that was split at every edge has twice as many or more.
-    """
-    return shape.is_mesh() and (
-        shape.has_face_normals() or not shape.has_vertex_normals() or shape.vertex_count() >= 2 * shape.face_count()
-    )
+    def begin(shape: mi.Shape) -> int:
+        if not shape.is_mesh():
+            return WHOLE
+        if shape.has_face_normals() or not shape.has_vertex_normals():
+            return FACETS
+        pieces = mesh_pieces(shape)
+        if not pieces.any():
+            return WHOLE
+        found.append(pieces)
+        return sum(map(len, found[:-1]))
+
+    begins = _by_index(mi.ShapePtr, shapes, begin, WHOLE)
+    return mi.UInt32(begins), mi.UInt32(np.concatenate(found).astype(np.uint32))
 
 
 def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], otherwise: V) -> list[V]:
