@@ -36,8 +36,9 @@ class Boundary:
     textures and of masks; alpha.
     """
 
-    inner: bool  # also those that surfaces see
-    spp: int  # lines per pixel, of each kind; 0: samples of the pass
+    film: bool = True  # edges that the camera sees
+    inner: bool = True  # those that surfaces see
+    spp: int = 0  # lines per pixel, of each kind; 0: samples of the pass
 
     def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
         """Tangent of the image: see `Term`."""
@@ -75,7 +76,8 @@ class Boundary:
         size = int(places.size.x) * int(places.size.y)
         lane = dr.arange(mi.UInt32, max(size * (self.spp or view.spp) // LINES, 1))
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
-        yield film_edges(walk, places, lane, seed ^ 0x5EED, LINES, FILM_LENGTH)
+        if self.film:
+            yield film_edges(walk, places, lane, seed ^ 0x5EED, LINES, FILM_LENGTH)
         if self.inner:
             yield inner_edges(walk, places, lane, seed ^ 0x5EED, LINES, INNER_LENGTHS, importance)
 
