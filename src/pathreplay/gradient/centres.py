@@ -17,12 +17,13 @@ class Centres:
 
     width: int
     height: int
+    margin: float  # l
     until: mi.Float | None = None  # of each pixel, the probability of those up to it; None: all alike
 
     @staticmethod
     def even(size: mi.ScalarVector2f, l: float) -> Centres:
         """All places alike, of a film of so many pixels and lines of length l."""
-        return Centres(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1))
+        return Centres(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
 
     def refined(self, c: mi.Point2f, found: mi.Float) -> Centres:
         """More often where there was something: at places ``c`` so much."""
@@ -32,7 +33,7 @@ class Centres:
         dr.scatter_add(counts, dr.minimum(found, 1), index)
         share = dr.fma(counts, (1 - EVENLY) / dr.maximum(dr.sum(counts), 1), EVENLY / n)
         until = dr.cumsum(share)
-        return Centres(self.width, self.height, until / dr.gather(mi.Float, until, n - 1))
+        return Centres(self.width, self.height, self.margin, until / dr.gather(mi.Float, until, n - 1))
 
     def draw(self, u: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
         """A place, from the corner of the grid, and its density, from random numbers in the unit square."""

@@ -36,7 +36,7 @@ from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
 from .bends import Bend
 from .centres import Centres
 from .counted import Counted, quasi_random
-from .crofton import Crossed, PlaneLine, Sight, bisect, search
+from .crofton import Crossed, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places, ray_to_camera
 from .primal import walk_on
 from .record import Layout, record, record_type
@@ -44,7 +44,7 @@ from .record import Layout, record, record_type
 MAX_CHAIN = 16
 """Vertices of a chain of delta lobes, at most."""
 LOOKS = 8
-"""For so many lanes one takes a first look."""
+"""For so many lines one takes a first look."""
 
 
 @dataclass
@@ -94,19 +94,32 @@ class FilmCrossing:
     active: mi.Bool
 
 
-def film_edges(walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lines: int, l: float) -> Edges:
-    """Find an edge on the film in each lane, by ``lines`` lines of length ``l`` (pixels). Detached.
+def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UInt32, l: float) -> Edges:
+    """Find edges on the film by so many lines of length ``l`` (pixels), and look ``closer`` at as many. Detached.
 
-    A first look with a line for every `LOOKS`-th lane decides where lines are thrown.
+    A first look, with one line for `LOOKS`, decides where lines are thrown.
     """
     walk = without_roulette(walk)
-    even = Centres.even(places.size, l)
-    few = dr.arange(mi.UInt32, max(dr.width(lane) // LOOKS, 1))
-    look = _find(walk, places, even, few, seed ^ 0x7F4A7C15, lines, 2 * l, bisected=False)
-    centres = even.refined(look.line.c + l, look.weight)
-    found = _find(walk, places, centres, lane, seed, lines, l)
-    per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * dr.width(lane) * lines))  # one kernel for all numbers of samples
-    c = _weighed(walk, places, found, per_line)
+
+    def line(centres: Centres, i: mi.UInt32, seed: mi.UInt32, l: float) -> FilmLine:
+        key = mixed(mixed(i, seed), mi.UInt32(0x51ED270B))
+        turn = dr.two_pi * mi.sample_tea_float32(key, mi.UInt32(0x30000))
+        c, density = centres.draw(quasi_random(i, seed))
+        w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
+        return FilmLine(c - centres.margin, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key)
+
+    def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:
+        return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)
+
+    centres = Centres.even(places.size, l)
+    first = line(centres, dr.arange(mi.UInt32, max(lines // LOOKS, 1)), seed ^ 0x7F4A7C15, 2 * l)
+    centres = centres.refined(first.c + centres.margin, glance(look, first, mi.Bool(True)))
+    found = glance(look, line(centres, dr.arange(mi.UInt32, lines), seed, l), mi.Bool(True))
+    chosen = Picked.of(found, closer, seed)
+    pick = mi.PCG32(closer, initstate=seed, initseq=dr.arange(mi.UInt32, closer))
+    crossed = bisect(look, line(centres, chosen.index, seed, l), chosen.weight, pick)
+    per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * lines))  # one kernel for all numbers of samples
+    c = _weighed(walk, places, crossed, per_line)
     layout = Layout.of(walk, True)
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)
     records, reached = _record_chain(walk, places.ray(c.s, c.line.key)[0], c, layout, records)
@@ -115,34 +128,6 @@ def film_edges(walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lin
     edges = Edges(c.s, c.line.key, c.k, c.near.ray, layout, records, lambda ray: mi.Spectrum(_gap(walk, c, ray)))
     K = c.line.passed(c.jump, _slope(walk, places, edges), c.active)
     return replace(edges, motion=lambda ray: -K * _gap(walk, c, ray))
-
-
-def _find(
-    walk: Walk,
-    places: Places,
-    centres: Centres,
-    lane: mi.UInt32,
-    seed: mi.UInt32,
-    lines: int,
-    l: float,
-    bisected: bool = True,
-) -> Crossed:
-    """A piece of a line with an edge for each lane, or at first the whole line."""
-    pick = mi.PCG32(dr.width(lane), initstate=seed, initseq=lane)
-
-    def draw(j: mi.UInt32) -> tuple[FilmLine, mi.Bool]:
-        i = lane * lines + j
-        key = mixed(mixed(i, seed), mi.UInt32(0x51ED270B))
-        turn = dr.two_pi * mi.sample_tea_float32(key, mi.UInt32(0x30000))
-        w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
-        c, density = centres.draw(quasi_random(i, seed))
-        return FilmLine(c - l, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key), mi.Bool(True)
-
-    def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:
-        return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)
-
-    found = search(draw, look, lines, pick)
-    return bisect(look, found, pick) if bisected else found
 
 
 def without_roulette(walk: Walk) -> Walk:

@@ -28,7 +28,7 @@ from ..transport.vertex import Arrival, Walk, is_smooth, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
 from .bends import Bend
 from .counted import Counted, quasi_random
-from .crofton import PlaneLine, Sight, bisect, search
+from .crofton import Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
@@ -78,24 +78,41 @@ class Arc:
 def choose_vertex(
     walk: Walk, numbers: Counted, ray: mi.Ray3f, W: mi.Spectrum, layout: Layout, records: Any
 ) -> tuple[Any, Chosen]:
-    """Record a camera path, and choose one of the vertices that scatter smoothly, by what they count."""
+    """Walk along a camera path, and choose one of the vertices that scatter smoothly, by what they count.
+
+    Vertices up to the chosen one are recorded, if there are ``records``. The last vertex that ``walk`` allows scatters
+    nothing: the walk ends before.
+    """
+    walk = replace(walk, max_depth=max(walk.max_depth - 1, 0))
     path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))
     chosen = Chosen(path.at, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), mi.Bool(False))
     mass = mi.Float(0)
     count = mi.UInt32(0)
     while dr.hint(path.active, exclude=[walk, layout, W], label="pathreplay: choose a vertex"):
-        here = path.at.hit.is_valid() & is_smooth(path.at.hit.shape.bsdf()) & (path.depth + 1 < walk.max_depth)
+        here = path.at.hit.is_valid() & is_smooth(path.at.hit.shape.bsdf())
         m = dr.select(path.active & here, dr.mean(dr.abs(path.β * W)), 0)
         mass += m
         take = (m > 0) & (numbers.next_1d() * mass < m)
         chosen = dr.select(take, Chosen(path.at, count, path.β, m, mi.Bool(True)), chosen)
         u, step = path.choose(walk, numbers)
         onward, v = path.advance(walk, u, step)
-        records[count] = record(layout, v)
+        if dr.hint(records is not None, mode="scalar"):
+            records[count] = record(layout, v)
         path = onward
         count += 1
     chosen.β *= mass / dr.maximum(chosen.mass, dr.smallest(mi.Float))
     return records, chosen
+
+
+@dataclass
+class Search:
+    """How a search looks at its lines: it glances at all, or looks closer at some."""
+
+    chosen: mi.Float | None = None  # what the line of each lane stands for, or None: glance
+    pick: mi.PCG32 | None = None
+
+    def closer(self, look: Look, line: Any, active: mi.Bool) -> Crossed:
+        return bisect(look, line, dr.select(active, self.chosen, 0), self.pick)
 
 
 @dataclass
@@ -111,24 +128,27 @@ class Shaded:
     active: mi.Bool
 
 
-def emitter_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick: mi.PCG32) -> Shaded:
-    """Find the edge of a shadow among the samples of an emitter, and weigh it. Detached."""
+def emitter_line(scene: mi.Scene, x: Chosen, l: float, key: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
+    """A line among the samples of an emitter, and whether there is one."""
+    numbers = Counted(key, mi.UInt32(0))
+    index, share, _ = scene.sample_emitter(numbers.next_1d())
+    turn = dr.two_pi * numbers.next_1d()
+    c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(dr.cos(turn), dr.sin(turn))
+    begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)
+    for axis in range(2):  # the part that is inside
+        cuts = (BORDER - c[axis]) / w[axis], (1 - BORDER - c[axis]) / w[axis]
+        begin, end = dr.maximum(begin, dr.minimum(*cuts)), dr.minimum(end, dr.maximum(*cuts))
+    inside = x.active & (begin < end)
+    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, x.active)
+    begin, end = dr.select(inside, begin, 0), dr.select(inside, end, 0)
+    return SquareLine(c, w, begin, end, emitter, share), inside
+
+
+def emitter_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -> Any:
+    """Find the edge of a shadow among the samples of an emitter, and weigh it: see `Search`. Detached."""
     scene = walk.scene
     si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
-
-    def draw(j: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
-        numbers = Counted(key, 8 * j)
-        index, share, _ = scene.sample_emitter(numbers.next_1d())
-        turn = dr.two_pi * numbers.next_1d()
-        c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(dr.cos(turn), dr.sin(turn))
-        begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)
-        for axis in range(2):  # the part that is inside
-            cuts = (BORDER - c[axis]) / w[axis], (1 - BORDER - c[axis]) / w[axis]
-            begin, end = dr.maximum(begin, dr.minimum(*cuts)), dr.minimum(end, dr.maximum(*cuts))
-        inside = x.active & (begin < end)
-        emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, x.active)
-        begin, end = dr.select(inside, begin, 0), dr.select(inside, end, 0)
-        return SquareLine(c, w, begin, end, emitter, share), inside
+    line, inside = emitter_line(scene, x, l, key)
 
     def shadowed(line: SquareLine, t: mi.Float, active: mi.Bool) -> tuple[Any, ...]:
         light, Le = line.emitter.sample_direction(si, line.at(t), active)
@@ -142,8 +162,10 @@ def emitter_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, p
     def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
         return Sight(mi.UInt32(shadowed(line, t, active)[-1]), mi.Point3f(0), mi.Normal3f(0))
 
-    found = bisect(look, search(draw, look, lines, pick), pick)
-    line, active = found.line, found.weight > 0
+    if search.chosen is None:
+        return glance(look, line, inside)
+    found = search.closer(look, line, inside)
+    active = found.weight > 0
     a_hidden = shadowed(line, found.a, active)[-1]
     light, Le, *_ = shadowed(line, dr.select(a_hidden, found.b, found.a), active)
     t = dr.select(a_hidden, found.a, found.b)
@@ -152,7 +174,7 @@ def emitter_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, p
     f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
     density = light.pdf / line.share
     F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density, pdf))
-    K = 0.5 * dr.pi * dr.square(1 + l) / (l * lines) * found.weight * F * dr.select(a_hidden, -1, 1)
+    K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a_hidden, -1, 1)
     return Shaded(line, line.at(t), hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
 
 
@@ -185,23 +207,29 @@ class Hiding:
     active: mi.Bool
 
 
-def arc_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick: mi.PCG32) -> Hiding:
-    """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides. Detached."""
-    scene, ctx = walk.scene, mi.BSDFContext()
-    si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
+def arc(si: mi.SurfaceInteraction3f, l: float, key: mi.UInt32, active: mi.Bool) -> tuple[Arc, mi.Bool]:
+    """An arc around a direction in which a point scatters, and whether there is one."""
+    numbers, ctx = Counted(key, mi.UInt32(0x100)), mi.BSDFContext()
+    sample, _ = si.bsdf().sample(ctx, si, numbers.next_1d(), numbers.next_2d(), active)
+    evenly = numbers.next_1d() < EVENLY
+    wo = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), sample.wo)
+    smooth = (sample.pdf > 0) & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    ok = active & (evenly | smooth)
+    pdf = dr.lerp(si.bsdf().pdf(ctx, si, wo, ok), dr.inv_four_pi, EVENLY)
+    c = dr.select(ok, si.to_world(wo), mi.Vector3f(0, 0, 1))
+    turn = dr.two_pi * numbers.next_1d()
+    w = mi.Frame3f(c).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
+    return Arc(c, w, dr.select(ok, pdf, 1), mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
 
-    def draw(j: mi.UInt32) -> tuple[Arc, mi.Bool]:
-        numbers = Counted(key, 0x100 + 8 * j)
-        sample, _ = si.bsdf().sample(ctx, si, numbers.next_1d(), numbers.next_2d(), x.active)
-        evenly = numbers.next_1d() < EVENLY
-        wo = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), sample.wo)
-        smooth = (sample.pdf > 0) & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-        ok = x.active & (evenly | smooth)
-        pdf = dr.lerp(si.bsdf().pdf(ctx, si, wo, ok), dr.inv_four_pi, EVENLY)
-        c = dr.select(ok, si.to_world(wo), mi.Vector3f(0, 0, 1))
-        turn = dr.two_pi * numbers.next_1d()
-        w = mi.Frame3f(c).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
-        return Arc(c, w, dr.select(ok, pdf, 1), mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
+
+def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -> Any:
+    """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides: see `Search`.
+
+    Detached.
+    """
+    scene = walk.scene
+    si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
+    line, ok = arc(si, l, key, x.active)
 
     def hit(d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
         ray = si.spawn_ray(d)
@@ -216,8 +244,10 @@ def arc_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick:
         turned = dr.select(dr.dot(at.sh_frame.n, ray.d) > 0, mi.UInt32(1), 0)
         return Sight(mixed(place_met(walk, seen, active, facets=False), turned), at.p, at.n)
 
-    found = bisect(look, search(draw, look, lines, pick), pick)
-    line, active = found.line, found.weight > 0
+    if search.chosen is None:
+        return glance(look, line, ok)
+    found = search.closer(look, line, ok)
+    active = found.weight > 0
     ray_a, a = hit(line.at(found.a), active)
     ray_b, b = hit(line.at(found.b), active)
     near_a = a.t <= b.t
@@ -230,8 +260,8 @@ def arc_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick:
     slope -= dr.dot(slope, ray_near.d) * ray_near.d
     n = dr.select(bend.meets | bend.turns, dr.normalize(slope), edge_normal(near, ray_near, active))
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
-    f, pdf = si.bsdf().eval_pdf(ctx, si, si.to_local(ray_far.d), active)
-    common = x.β * f * (0.5 * dr.pi / (l * lines) * found.weight / line.pdf)
+    f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ray_far.d), active)
+    common = x.β * f * (0.5 * dr.pi / l * found.weight / line.pdf)
     active &= dr.any(common != 0)
     K = []
     for ray, seen in ((ray_near, near), (ray_far, far)):
@@ -263,35 +293,50 @@ def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum
 def inner_edges(
     walk: Walk,
     places: Places,
-    lane: mi.UInt32,
-    seed: mi.UInt32,
     lines: int,
+    closer: int,
+    seed: mi.UInt32,
     lengths: tuple[float, float],
     W: Importance,
 ) -> Edges:
-    """Find an edge that a vertex sees in each lane, by ``lines`` lines of each kind. Detached.
+    """Find edges that vertices see by so many lines of each kind, and look ``closer`` at as many. Detached.
 
     ``lengths`` are those in the square and on the sphere (radians). ``W`` (place, ray) -> Spectrum is what light counts
     that arrives at a place of the film: it decides which paths are worth looking at.
     """
     walk = replace(walk, max_depth=min(walk.max_depth, deepest(walk)))
-    key = mixed(mixed(lane, seed), mi.UInt32(0x2545F491))
-    pick = mi.PCG32(dr.width(lane), initstate=seed + 1, initseq=lane)
-    s = quasi_random(lane, seed) * places.size
-    ray0, weight = dr.detach(places.ray(s, key))
     layout = Layout.of(walk, True)
-    records = dr.alloc_local(record_type(layout), room_for(walk))
-    β = weight * dr.opaque(mi.Float, places.size.x * places.size.y / dr.width(lane))
-    records, x = choose_vertex(walk, Counted.of(key), ray0, W(s, ray0), layout, records)
-    x.β *= β
-
     square, arc = lengths
-    shaded = emitter_edges(walk, x, lines, square, key ^ 0x1B873593, pick)
+    per_line = dr.opaque(mi.Float, places.size.x * places.size.y / lines)
+
+    def path(i: mi.UInt32, records: Any) -> tuple[Any, ...]:
+        key = mixed(mixed(i, seed), mi.UInt32(0x2545F491))
+        s = quasi_random(i, seed) * places.size
+        ray, weight = dr.detach(places.ray(s, key))
+        wanted = W(s, ray)
+        records, x = choose_vertex(walk, Counted.of(key), ray, wanted, layout, records)
+        x.β *= weight * per_line
+        return s, key, wanted, records, x
+
+    i = dr.arange(mi.UInt32, lines)
+    _, key, _, _, x = path(i, None)
+    mass = dr.zeros(mi.Float, 2 * lines)  # of squares, and of arcs
+    dr.scatter(mass, emitter_edges(walk, x, square, key ^ 0x1B873593, Search()), i)
+    dr.scatter(mass, arc_edges(walk, x, arc, key ^ 0x38B34AE5, Search()), i + lines)
+    chosen = Picked.of(mass, closer, seed)
+
+    on_arc = chosen.index >= lines
+    i = dr.select(on_arc, chosen.index - lines, chosen.index)
+    pick = mi.PCG32(closer, initstate=seed + 1, initseq=dr.arange(mi.UInt32, closer))
+    s, key, wanted, records, x = path(i, dr.alloc_local(record_type(layout), room_for(walk)))
+    x.active &= chosen.weight > 0
+    of_square, of_arc = dr.select(on_arc, 0, chosen.weight), dr.select(on_arc, chosen.weight, 0)
+    shaded = emitter_edges(walk, x, square, key ^ 0x1B873593, Search(of_square, pick))
     K = shadow_weight(x, shaded)
-    hiding = arc_edges(walk, x, lines, arc, key ^ 0x38B34AE5, pick)
+    hiding = arc_edges(walk, x, arc, key ^ 0x38B34AE5, Search(of_arc, pick))
 
     def motion(ray: mi.Ray3f) -> mi.Spectrum:
         return hiding_motion(walk, x, hiding, ray) - K * shadow_gap(x, shaded, ray, shaded.u)
 
     k = dr.select(x.active, x.k, 0)
-    return Edges(s, key, k, x.at.ray, layout, records, motion)
+    return Edges(s, key, k, x.at.ray, layout, records, motion, wanted)

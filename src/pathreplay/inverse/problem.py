@@ -23,7 +23,7 @@ from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.targets import read_targets, rendered_targets, target_scene, truth_of
 from pathreplay.inverse.values import Array, Arrays, make_value, seen
-from pathreplay.render.edges import edges_note, moves_edges
+from pathreplay.render.edge_notes import edges_note, moves_edges
 from pathreplay.render.integrator import EDGES
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator

@@ -22,8 +22,8 @@ from .camera_pass import Pass
 from .places import FilmPlaces
 from .term import Found
 
-LINES = 4
-"""Lines that a lane looks at, of each kind: it keeps one with an edge."""
+CLOSER = 4
+"""For so many lines of a kind one is looked at closer, of those with an edge."""
 FILM_LENGTH = 0.5  # pixels
 INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
 
@@ -36,8 +36,9 @@ class Boundary:
     textures and of masks; alpha.
     """
 
-    inner: bool  # also those that surfaces see
-    spp: int  # lines per pixel, of each kind; 0: samples of the pass
+    film: bool = True  # edges that the camera sees
+    inner: bool = True  # those that surfaces see
+    spp: int = 0  # lines per pixel, of each kind; 0: samples of the pass
 
     def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
         """Tangent of the image: see `Term`."""
@@ -63,7 +64,8 @@ class Boundary:
 
         lost, paths = LostPaths(), 0
         for edges in self._searches(view, walk, places, importance):
-            edges_backward(walk, places, edges, importance(edges.s, edges.ray), lost)
+            W = importance(edges.s, edges.ray) if edges.W is None else edges.W
+            edges_backward(walk, places, edges, W, lost)
             paths += dr.width(edges.s)
         dr.eval()
         return Found(lost=lost.count, paths=paths, moves=True)
@@ -72,12 +74,13 @@ class Boundary:
         self, view: Pass, walk: Walk, places: FilmPlaces, importance: Callable[..., mi.Spectrum]
     ) -> Iterator[Edges]:
         """The edges of each search."""
-        size = int(places.size.x) * int(places.size.y)
-        lane = dr.arange(mi.UInt32, max(size * (self.spp or view.spp) // LINES, 1))
+        lines = max(int(places.size.x) * int(places.size.y) * (self.spp or view.spp), 1)
+        closer = max(lines // CLOSER, 1)
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
-        yield film_edges(walk, places, lane, seed ^ 0x5EED, LINES, FILM_LENGTH)
+        if self.film:
+            yield film_edges(walk, places, lines, closer, seed ^ 0x5EED, FILM_LENGTH)
         if self.inner:
-            yield inner_edges(walk, places, lane, seed ^ 0x5EED, LINES, INNER_LENGTHS, importance)
+            yield inner_edges(walk, places, lines, closer, seed ^ 0x5EED, INNER_LENGTHS, importance)
 
 
 def _moves(walk: Walk, places: FilmPlaces) -> bool:

@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from ..errors import PathreplayError
 from ..transport.vertex import Walk
-from .edges import edges_note, keys_that_move_edges
+from .edge_notes import edges_note, keys_that_move_edges
 
 
 def lost_note(lost: int, paths: int) -> str:

@@ -103,7 +103,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     @property
     def _boundary(self) -> Boundary:
-        return Boundary(self.edges == "all", self.edge_spp)
+        return Boundary(inner=self.edges == "all", spp=self.edge_spp)
 
     def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0) -> bool:
         """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
