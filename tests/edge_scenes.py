@@ -23,6 +23,7 @@ T = mi.ScalarTransform4f
 
 
 def paint(*value: float) -> dict:
+    value = value * 3 if len(value) == 1 else value
     return {"type": "twosided", "inner": {"type": "diffuse", "reflectance": rgb(*value)}}
 
 
@@ -162,7 +163,11 @@ def by_a_side_wall(wall: Callable[[], dict], side: Callable[[], dict]) -> Callab
     above = T().translate([0.6, 2.6, 0.5]).look_at([0, 0, 0], [1.6, -2.4, 0], [0, 0, 1]).scale([0.4, 0.4, 1])
     card = T().translate([1.5, 0.2, 0.2]).rotate([0, 1, 0], 60).scale([0.5, 0.5, 1])
     return lambda: scene(
-        30, wall=shape(BACK, wall()), side=shape(aside, side()), lamp=lamp(above, 20), object=shape(card, paint(0.3))
+        30,
+        wall=shape(BACK, wall()),
+        side=shape(aside, side()),
+        lamp=lamp(above, 20),
+        object=shape(card, paint(0.3)),
     )
 
 
@@ -282,9 +287,9 @@ CELLS = [
     cell("indirect_rough", by_a_side_wall(
         lambda: {"type": "twosided", "inner": {"type": "roughconductor", "alpha": 0.3}}, patterned),
         OBJECT, translate(1, 0.3, 0.4), 3),
-    cell("cube_in_wall", stands_in_the_wall, OBJECT, translate(*ASIDE), 3),
-    cell("indirect_contact", on_a_side_wall(lambda: cube24(IN_THE_WALL, paint(0.9))), OBJECT, translate(0.3, 1, 0.2),
-         3),
+    cell("cube_in_wall", stands_in_the_wall, VERTICES, translate_vertices(*ASIDE), 3),
+    cell("indirect_contact", on_a_side_wall(lambda: cube24(IN_THE_WALL, paint(0.9))), VERTICES,
+         translate_vertices(0.3, 1, 0.2), 3),
     cell("indirect_can", on_a_side_wall(lambda: can(BESIDE, paint(0.9), 5)), VERTICES, turn_vertices(0, 1, 0.3), 3),
     # Through delta lobes.
     cell("mirror_z", mirror, "mirror.to_world", UP, 3),
@@ -296,5 +301,5 @@ CELLS = [
     cell("emit_sphere", glowing_behind_glass, "ball.to_world", translate(*ASIDE), 6, step=0.01),
 ]  # fmt: skip
 ALL_MOVE = cell("all_move", everything, ("wall.to_world", "lamp.to_world", "bulb.to_world", "mirror.to_world",
-    "ball.to_world", "object.to_world"), translate(*ASIDE), 3)  # fmt: skip
+    "ball.to_world"), translate(*ASIDE), 3)  # fmt: skip
 BY_NAME = {each.name: each for each in CELLS}

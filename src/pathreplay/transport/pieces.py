@@ -13,8 +13,10 @@ from scipy.sparse.csgraph import connected_components
 
 
 def mesh_pieces(mesh: mi.Mesh) -> np.ndarray:
-    """The `smooth_pieces` of a mesh that has vertex normals."""
+    """The `smooth_pieces` of a mesh that has vertex normals; Mitsuba's rectangle, which hides its mesh, is one."""
     params = mi.traverse(mesh)
+    if "faces" not in params:
+        return np.zeros(mesh.face_count(), int)
     faces, positions = (np.array(params[key]).reshape(-1, 3) for key in ("faces", "vertex_positions"))
     return smooth_pieces(faces, positions)
 
