@@ -129,9 +129,11 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
     """Crofton: four sides and four corners, at which two crossings of one line go unseen by its ends."""
 
     def count(n: int, l: float, seed: int) -> mi.Float:
+        number = dr.opaque(mi.UInt32, seed)
+
         def line(i: mi.UInt32) -> PlaneLine:
-            c = quasi_random(i, mi.UInt32(seed)) * (1 + 2 * l) - l
-            turn = dr.two_pi * mi.sample_tea_float32(i, mi.UInt32(seed))
+            c = quasi_random(i, number) * (1 + 2 * l) - l
+            turn = dr.two_pi * mi.sample_tea_float32(i, number)
             return PlaneLine(c, mi.Vector2f(dr.cos(turn), dr.sin(turn)), mi.Float(-l / 2), mi.Float(l / 2))
 
         def look(line: PlaneLine, t: mi.Float, active: mi.Bool) -> Sight:
@@ -140,8 +142,8 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
             return Sight(mi.UInt32(inside), mi.Point3f(0), mi.Normal3f(0))
 
         mass = glance(look, line(dr.arange(mi.UInt32, n)), mi.Bool(True))
-        picked = Picked.of(mass, n // 4, mi.UInt32(seed))
-        found = bisect(look, line(picked.index), picked.weight, mi.PCG32(n // 4, initstate=seed))
+        picked = Picked.of(mass, n // 4, number)
+        found = bisect(look, line(picked.index), picked.weight, mi.PCG32(n // 4, initstate=number))
         return 0.5 * dr.pi * dr.sum(found.weight) * (1 + 2 * l) ** 2 / (l * n)
 
     lengths = [count(1 << 18, 0.1, seed)[0] for seed in range(1, 9)]
@@ -156,7 +158,7 @@ def test_lines_are_picked_as_often_as_they_count() -> None:
     mass = np.where(rng.random(1000) < 0.1, rng.choice([1, 4], 1000), 0).astype(np.float32)
     found = np.zeros(1000)
     for seed in range(200):
-        picked = Picked.of(mi.Float(mass), 50, mi.UInt32(seed))
+        picked = Picked.of(mi.Float(mass), 50, dr.opaque(mi.UInt32, seed))
         np.add.at(found, np.array(picked.index), np.array(picked.weight) / 200)
     assert (found[mass == 0] == 0).all()
     assert np.abs(found[mass > 0] - 1).max() < 5 * (mass.sum() / 50 / 200) ** 0.5

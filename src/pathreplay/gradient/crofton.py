@@ -106,6 +106,7 @@ class Picked:
     @staticmethod
     def of(mass: mi.Float, lanes: int, seed: mi.UInt32) -> Picked:
         """As often as ``mass`` says, which is that of each line."""
+        dr.eval(mass)  # before it is used twice
         n = dr.width(mass)
         until = dr.cumsum(mi.Float64(mass))
         total = dr.gather(mi.Float64, until, n - 1)

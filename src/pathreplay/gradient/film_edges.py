@@ -135,9 +135,16 @@ def without_roulette(walk: Walk) -> Walk:
     return replace(walk, rr_depth=0xFFFFFFFF, max_depth=min(walk.max_depth, MAX_CHAIN))
 
 
-@dr.syntax
 def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> Sight:
     """What a path meets from the camera to the first vertex where it is scattered."""
+    if walk.traits.mirrors or walk.traits.hard_lights or walk.media is not None:
+        return _chain_sight(walk, ray, key, active)
+    start = CameraStart(ray, Counted.of(key), active)
+    return _sight(walk, PathState.begin(walk, start).at, active)
+
+
+@dr.syntax
+def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> Sight:
     numbers = Counted.of(key)
     path = PathState.begin(walk, CameraStart(ray, numbers, active))
     sight = Sight.nothing()
@@ -255,6 +262,7 @@ def _record_chain(walk: Walk, ray: mi.Ray3f, c: FilmCrossing, layout: Layout, re
     path = PathState.begin(walk, CameraStart(ray, numbers, c.active))
     count = mi.UInt32(0)
     while dr.hint(path.active & (count <= c.k), exclude=[walk, layout], label="pathreplay: record chain"):
+        path.active &= count < c.k  # of the last one only the arrival will be read
         u, step = path.choose(walk, numbers)
         onward, v = path.advance(walk, u, step)
         records[count] = record(layout, v)

@@ -320,10 +320,10 @@ def inner_edges(
 
     i = dr.arange(mi.UInt32, lines)
     _, key, _, _, x = path(i, None)
-    mass = dr.zeros(mi.Float, 2 * lines)  # of squares, and of arcs
-    dr.scatter(mass, emitter_edges(walk, x, square, key ^ 0x1B873593, Search()), i)
-    dr.scatter(mass, arc_edges(walk, x, arc, key ^ 0x38B34AE5, Search()), i + lines)
-    chosen = Picked.of(mass, closer, seed)
+    in_squares = emitter_edges(walk, x, square, key ^ 0x1B873593, Search()) + dr.zeros(mi.Float, lines)
+    on_arcs = arc_edges(walk, x, arc, key ^ 0x38B34AE5, Search()) + dr.zeros(mi.Float, lines)
+    dr.eval(in_squares, on_arcs)
+    chosen = Picked.of(dr.concat((in_squares, on_arcs)), closer, seed)
 
     on_arc = chosen.index >= lines
     i = dr.select(on_arc, chosen.index - lines, chosen.index)
