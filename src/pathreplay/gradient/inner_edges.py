@@ -81,20 +81,21 @@ class Arc:
 def choose_vertex(
     walk: Walk, numbers: Counted, ray: mi.Ray3f, W: mi.Spectrum, layout: Layout, records: Any
 ) -> tuple[Any, Chosen]:
-    """Walk along a camera path, and choose one of the vertices that scatter smoothly, by what they count.
+    """Walk along a camera path, and choose one of the vertices that scatter smoothly, by its throughput.
 
+    Not by the colour of ``W``: forward mode, which has none, has to choose the same. Where it is zero, there is none.
     Vertices up to the chosen one are recorded, if there are ``records``. The last vertex that ``walk`` allows scatters
     nothing: the walk ends before.
     """
     walk = replace(walk, max_depth=max(walk.max_depth - 1, 0))
-    path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))
+    path = PathState.begin(walk, CameraStart(ray, numbers, dr.any(W != 0)))
     chosen = Chosen(path.at, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), mi.Bool(False), mi.Bool(False))
     mass = mi.Float(0)
     count = mi.UInt32(0)
     moves = mi.Bool(False)
-    while dr.hint(path.active, exclude=[walk, layout, W], label="pathreplay: choose a vertex"):
+    while dr.hint(path.active, exclude=[walk, layout], label="pathreplay: choose a vertex"):
         here = path.at.hit.is_valid() & is_smooth(path.at.hit.shape.bsdf())
-        m = dr.select(path.active & here, dr.mean(dr.abs(path.β * W)), 0)
+        m = dr.select(path.active & here, dr.mean(path.β), 0)
         mass += m
         moves |= may_move(walk, path.at.hit)
         take = (m > 0) & (numbers.next_1d() * mass < m)
@@ -276,8 +277,10 @@ def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -
     bend = Bend.of(walk, ((near, ray_near), (far, ray_far)), active)
     slope = derivative_by_ray(ray_near, lambda ray: bend.gap(ray, active)).d
     slope -= dr.dot(slope, ray_near.d) * ray_near.d
-    n = dr.select(bend.meets | bend.turns, dr.normalize(slope), edge_normal(near, ray_near, active))
+    bent = (bend.meets | bend.turns) & (dr.squared_norm(slope) > 0)
+    n = dr.select(bent, dr.normalize(slope), edge_normal(near, ray_near, active))
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
+    steep = dr.select(bent, dr.dot(slope, n), 1)
     f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ray_far.d), active)
     common = x.β * f * (0.5 * dr.pi / l * found.weight / line.pdf)
     active &= dr.any(common != 0)
@@ -287,7 +290,7 @@ def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -
         path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), x.k + 1, active & (x.k + 1 < walk.max_depth))
         L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
         K.append(dr.select(active, common * L, 0))
-    return Hiding(near, far, ray_near.d, ray_far.d, n, bend, dr.dot(slope, n), K[0], K[1], active)
+    return Hiding(near, far, ray_near.d, ray_far.d, n, bend, steep, K[0], K[1], active)
 
 
 def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
@@ -320,7 +323,7 @@ def inner_edges(
     """Find edges that vertices see by so many lines of each kind, and look ``closer`` at as many. Detached.
 
     ``lengths`` are those in the square and on the sphere (radians). ``W`` (place, ray) -> Spectrum is what light counts
-    that arrives at a place of the film: it decides which paths are worth looking at.
+    that arrives at a place of the film: where that is nothing, nobody looks for edges.
     """
     walk = replace(walk, max_depth=min(walk.max_depth, deepest(walk)))
     layout = Layout.of(walk, True)
