@@ -62,7 +62,8 @@ def loaded(name: str) -> Iterator[Loaded]:
 def backwards(bench: Bench, seeds: int = 0, **options: Any) -> np.ndarray:
     """The gradient at places all along the interval of a central difference: their mean is what that measures.
 
-    So steps may be large, which makes differences of images less noisy, and curves as bent as they like.
+    So steps may be large, which makes differences of images less noisy, and curves as bent as they like. A straight
+    line through the gradients is taken out, since its mean is zero.
     """
     case, move = bench.case, bench.move
     integrator = bench.integrator(rr_depth=case.rr_depth, **{**case.options, **options})
@@ -75,7 +76,7 @@ def backwards(bench: Bench, seeds: int = 0, **options: Any) -> np.ndarray:
             found.append(bench.backward(integrator, k + 1, case.spp))
     finally:
         bench.move = move
-    return np.array(found)
+    return np.array(found) - np.polyfit(places, found, 1)[0] * places
 
 
 def some(names: tuple[str, ...]) -> list[Any]:
