@@ -267,7 +267,7 @@ CELLS = [
     cell("cube24_turns", before_a_glow(lambda: cube24(BOX, BLACK)), VERTICES, TURN),
     cell("cube8_lit", lit_box(cube8), VERTICES, TURN),
     cell("cube24_lit", lit_box(cube24), VERTICES, TURN),
-    cell("can_turns", lit_box(can), VERTICES, turn_vertices(1, 0, 0.3)),
+    cell("can_turns", lit_box(can), VERTICES, turn_vertices(0, 0.3, 1)),
     cell("camera_moves", before_a_glow(lambda: shape(CARD, BLACK)), "camera.to_world", translate(*ASIDE)),
     cell("lamp_seen", lamp_seen, "lamp.to_world", translate(*ASIDE)),
     # Shadows.
