@@ -13,7 +13,6 @@ seen. Multiple importance sampling belongs to both integrands, which thus add up
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,8 +36,6 @@ BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
 EVENLY = 0.25
 """Share of the arcs that are thrown evenly: those that begin below the horizon, or where lobes are weak, count, too."""
-
-Importance = Callable[..., "mi.Spectrum"]
 
 
 @dataclass
@@ -75,9 +72,7 @@ class Arc:
 
 
 @dr.syntax
-def choose_vertex(
-    walk: Walk, numbers: Counted, ray: mi.Ray3f, W: mi.Spectrum, layout: Layout, records: Any
-) -> tuple[Any, Chosen]:
+def choose_vertex(walk: Walk, numbers: Counted, ray: mi.Ray3f, layout: Layout, records: Any) -> tuple[Any, Chosen]:
     """Walk along a camera path, and choose one of the vertices that scatter smoothly, by what they count.
 
     Vertices up to the chosen one are recorded, if there are ``records``. The last vertex that ``walk`` allows scatters
@@ -88,9 +83,9 @@ def choose_vertex(
     chosen = Chosen(path.at, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), mi.Bool(False))
     mass = mi.Float(0)
     count = mi.UInt32(0)
-    while dr.hint(path.active, exclude=[walk, layout, W], label="pathreplay: choose a vertex"):
+    while dr.hint(path.active, exclude=[walk, layout], label="pathreplay: choose a vertex"):
         here = path.at.hit.is_valid() & is_smooth(path.at.hit.shape.bsdf())
-        m = dr.select(path.active & here, dr.mean(dr.abs(path.β * W)), 0)
+        m = dr.select(path.active & here, dr.mean(dr.abs(path.β)), 0)
         mass += m
         take = (m > 0) & (numbers.next_1d() * mass < m)
         chosen = dr.select(take, Chosen(path.at, count, path.β, m, mi.Bool(True)), chosen)
@@ -297,12 +292,11 @@ def inner_edges(
     closer: int,
     seed: mi.UInt32,
     lengths: tuple[float, float],
-    W: Importance,
 ) -> Edges:
     """Find edges that vertices see by so many lines of each kind, and look ``closer`` at as many. Detached.
 
-    ``lengths`` are those in the square and on the sphere (radians). ``W`` (place, ray) -> Spectrum is what light counts
-    that arrives at a place of the film: it decides which paths are worth looking at.
+    ``lengths`` are those in the square and on the sphere (radians). What light counts that arrives at the film decides
+    nothing here, since forward mode would not know it and choose otherwise.
     """
     walk = replace(walk, max_depth=min(walk.max_depth, deepest(walk)))
     layout = Layout.of(walk, True)
@@ -313,13 +307,12 @@ def inner_edges(
         key = mixed(mixed(i, seed), mi.UInt32(0x2545F491))
         s = quasi_random(i, seed) * places.size
         ray, weight = dr.detach(places.ray(s, key))
-        wanted = W(s, ray)
-        records, x = choose_vertex(walk, Counted.of(key), ray, wanted, layout, records)
+        records, x = choose_vertex(walk, Counted.of(key), ray, layout, records)
         x.β *= weight * per_line
-        return s, key, wanted, records, x
+        return s, key, records, x
 
     i = dr.arange(mi.UInt32, lines)
-    _, key, _, _, x = path(i, None)
+    _, key, _, x = path(i, None)
     in_squares = emitter_edges(walk, x, square, key ^ 0x1B873593, Search()) + dr.zeros(mi.Float, lines)
     on_arcs = arc_edges(walk, x, arc, key ^ 0x38B34AE5, Search()) + dr.zeros(mi.Float, lines)
     dr.eval(in_squares, on_arcs)
@@ -328,7 +321,7 @@ def inner_edges(
     on_arc = chosen.index >= lines
     i = dr.select(on_arc, chosen.index - lines, chosen.index)
     pick = mi.PCG32(closer, initstate=seed + 1, initseq=dr.arange(mi.UInt32, closer))
-    s, key, wanted, records, x = path(i, dr.alloc_local(record_type(layout), room_for(walk)))
+    s, key, records, x = path(i, dr.alloc_local(record_type(layout), room_for(walk)))
     x.active &= chosen.weight > 0
     of_square, of_arc = dr.select(on_arc, 0, chosen.weight), dr.select(on_arc, chosen.weight, 0)
     shaded = emitter_edges(walk, x, square, key ^ 0x1B873593, Search(of_square, pick))
@@ -339,4 +332,4 @@ def inner_edges(
         return hiding_motion(walk, x, hiding, ray) - K * shadow_gap(x, shaded, ray, shaded.u)
 
     k = dr.select(x.active, x.k, 0)
-    return Edges(s, key, k, x.at.ray, layout, records, motion, wanted)
+    return Edges(s, key, k, x.at.ray, layout, records, motion)

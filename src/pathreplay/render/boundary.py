@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import drjit as dr
@@ -46,7 +46,7 @@ class Boundary:
         if not _moves(walk, places):
             return Found()
         image = None
-        for edges in self._searches(view, walk, places, lambda s, ray: mi.Spectrum(1)):
+        for edges in self._searches(view, walk, places):
             δL = edges_forward(walk, places, edges)
             part = places.image(edges.s, δL, edges.ray.wavelengths)
             image = part if image is None else image + part
@@ -59,20 +59,15 @@ class Boundary:
             return Found()
         wanted = places.undeveloped(grad_in)
 
-        def importance(s: mi.Point2f, ray: mi.Ray3f) -> mi.Spectrum:
-            return places.importance(wanted, s, ray.wavelengths)
-
         lost, paths = LostPaths(), 0
-        for edges in self._searches(view, walk, places, importance):
-            W = importance(edges.s, edges.ray) if edges.W is None else edges.W
+        for edges in self._searches(view, walk, places):
+            W = places.importance(wanted, edges.s, edges.ray.wavelengths)
             edges_backward(walk, places, edges, W, lost)
             paths += dr.width(edges.s)
         dr.eval()
         return Found(lost=lost.count, paths=paths, moves=True)
 
-    def _searches(
-        self, view: Pass, walk: Walk, places: FilmPlaces, importance: Callable[..., mi.Spectrum]
-    ) -> Iterator[Edges]:
+    def _searches(self, view: Pass, walk: Walk, places: FilmPlaces) -> Iterator[Edges]:
         """The edges of each search."""
         lines = max(int(places.size.x) * int(places.size.y) * (self.spp or view.spp), 1)
         closer = max(lines // CLOSER, 1)
@@ -80,7 +75,7 @@ class Boundary:
         if self.film:
             yield film_edges(walk, places, lines, closer, seed ^ 0x5EED, FILM_LENGTH)
         if self.inner:
-            yield inner_edges(walk, places, lines, closer, seed ^ 0x5EED, INNER_LENGTHS, importance)
+            yield inner_edges(walk, places, lines, closer, seed ^ 0x5EED, INNER_LENGTHS)
 
 
 def _moves(walk: Walk, places: FilmPlaces) -> bool:
