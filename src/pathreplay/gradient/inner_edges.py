@@ -9,6 +9,7 @@ the share φ, see `velocity`). At an edge the integrand jumps from f_near to f_f
 One vertex of each camera path is chosen. Edges are found by short lines (see `crofton`) in the unit square of emitter
 samples, where the visibility changes, and by short arcs around samples of the BSDF, where it is another surface that is
 seen. Multiple importance sampling belongs to both integrands, which thus add up. What moves x goes back along the path.
+Where x does not move, all that does not move looks alike, so that no line is spent on edges that stay where they are.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.motion import may_move
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
@@ -46,6 +48,7 @@ class Chosen:
     k: mi.UInt32  # vertices before
     β: mi.Spectrum  # throughput before, over the probability of the choice
     mass: mi.Float  # by which it was chosen
+    moves: mi.Bool  # it, or a vertex before, may move
     active: mi.Bool
 
 
@@ -80,15 +83,17 @@ def choose_vertex(walk: Walk, numbers: Counted, ray: mi.Ray3f, layout: Layout, r
     """
     walk = replace(walk, max_depth=max(walk.max_depth - 1, 0))
     path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))
-    chosen = Chosen(path.at, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), mi.Bool(False))
+    chosen = Chosen(path.at, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), mi.Bool(False), mi.Bool(False))
     mass = mi.Float(0)
     count = mi.UInt32(0)
+    moves = mi.Bool(False)
     while dr.hint(path.active, exclude=[walk, layout], label="pathreplay: choose a vertex"):
         here = path.at.hit.is_valid() & is_smooth(path.at.hit.shape.bsdf())
         m = dr.select(path.active & here, dr.mean(dr.abs(path.β)), 0)
         mass += m
+        moves |= may_move(walk, path.at.hit)
         take = (m > 0) & (numbers.next_1d() * mass < m)
-        chosen = dr.select(take, Chosen(path.at, count, path.β, m, mi.Bool(True)), chosen)
+        chosen = dr.select(take, Chosen(path.at, count, path.β, m, moves, mi.Bool(True)), chosen)
         u, step = path.choose(walk, numbers)
         onward, v = path.advance(walk, u, step)
         if dr.hint(records is not None, mode="scalar"):
@@ -155,13 +160,16 @@ def emitter_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Searc
         return light, Le, ray, hit, hidden
 
     def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
-        return Sight(mi.UInt32(shadowed(line, t, active)[-1]), mi.Point3f(0), mi.Normal3f(0))
+        *_, hit, hidden = shadowed(line, t, active)
+        moves = x.moves | _lamp_moves(walk, line.emitter) | may_move(walk, hit)
+        return Sight(mi.UInt32(hidden & moves), mi.Point3f(0), mi.Normal3f(0))
 
     if search.chosen is None:
         return glance(look, line, inside)
     found = search.closer(look, line, inside)
     active = found.weight > 0
-    a_hidden = shadowed(line, found.a, active)[-1]
+    a_hidden, b_hidden = (shadowed(line, t, active)[-1] for t in (found.a, found.b))
+    active &= a_hidden != b_hidden
     light, Le, *_ = shadowed(line, dr.select(a_hidden, found.b, found.a), active)
     t = dr.select(a_hidden, found.a, found.b)
     _, _, ray, hit, hidden = shadowed(line, t, active)
@@ -171,6 +179,15 @@ def emitter_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Searc
     F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density, pdf))
     K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a_hidden, -1, 1)
     return Shaded(line, line.at(t), hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
+
+
+def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
+    moving = walk.traits.moving
+    moves = mi.Bool(moving is None)
+    for shape in moving or ():
+        if shape.is_emitter():
+            moves |= emitter == mi.EmitterPtr(shape.emitter())
+    return moves
 
 
 def shadow_gap(x: Chosen, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
@@ -237,7 +254,8 @@ def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -
         ray, seen = hit(line.at(t), active & (above | through))
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
         turned = dr.select(dr.dot(at.sh_frame.n, ray.d) > 0, mi.UInt32(1), 0)
-        return Sight(mixed(place_met(walk, seen, active, facets=False), turned), at.p, at.n)
+        sight = Sight(mixed(place_met(walk, seen, active, facets=False), turned), at.p, at.n)
+        return dr.select(x.moves | may_move(walk, seen), sight, Sight.nothing())
 
     if search.chosen is None:
         return glance(look, line, ok)

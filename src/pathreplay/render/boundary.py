@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +14,7 @@ from ..gradient.counted import Counted
 from ..gradient.edges import Edges, edges_backward, edges_forward
 from ..gradient.film_edges import film_edges
 from ..gradient.inner_edges import inner_edges
-from ..transport.motion import path_moves
+from ..transport.motion import moving_shapes, path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
@@ -69,6 +69,7 @@ class Boundary:
 
     def _searches(self, view: Pass, walk: Walk, places: FilmPlaces) -> Iterator[Edges]:
         """The edges of each search."""
+        walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
         lines = max(int(places.size.x) * int(places.size.y) * (self.spp or view.spp), 1)
         closer = max(lines // CLOSER, 1)
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)

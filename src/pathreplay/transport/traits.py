@@ -58,6 +58,7 @@ class Traits:
     instances_move: bool = False  # the to_world of an instance
     opacity_moves: bool = False  # the opacity of a mask
     lights_vary: bool = False  # something about an emitter, or about a shape that emits
+    moving: tuple[mi.Shape, ...] | None = None  # the shapes that may move, or None: all, and the camera, too
 
 
 def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
