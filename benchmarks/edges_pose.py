@@ -24,7 +24,7 @@ DARK = 0.5
 
 
 def overlap(folder: Path) -> str:
-    """Of each view, and of the whole picture."""
+    """Of each view."""
     shares = []
     for path in sorted((folder / "images").glob("target-*.exr")):
         target, start = (
