@@ -302,9 +302,9 @@ def glass_ball(resolution: int = 32) -> SceneDict:
         "glass": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
         "ball": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "ref", "id": "glass"}},
         "back": _panel(at(0, 0, -3, 6, 6), 0.3, 0.4, 0.6),
-        "red": _panel(at(-0.35, 0.2, -1.6, 0.15, 0.3), 0.9, 0.2, 0.1),
-        "green": _panel(at(0.3, 0.3, -1.2, 0.2, 0.12), 0.2, 0.8, 0.3),
-        "white": _panel(at(0.15, -0.3, -1.4, 0.25, 0.12), 0.9, 0.9, 0.9),
+        "red": _panel(at(-0.35, 0.2, -1.6, 0.25, 0.35), 0.9, 0.2, 0.1),
+        "green": _panel(at(0.3, 0.3, -1.2, 0.25, 0.2), 0.2, 0.8, 0.3),
+        "white": _panel(at(0.15, -0.3, -1.4, 0.35, 0.2), 0.9, 0.9, 0.9),
     }
 
 
