@@ -16,7 +16,7 @@ from pathreplay.check.objective import integrator_name
 from pathreplay.check.reference import integrator_under_test
 from pathreplay.cli import app
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
+from pathreplay.inverse import load_config, make_config, optimize
 from pathreplay.inverse.surface import Surface
 from pathreplay.scenes.bodies import ball, knobs, mesh
 from pathreplay.scenes.loading import load_scene
@@ -179,3 +179,40 @@ def test_a_body_is_closed_and_turned_outwards() -> None:
     assert np.ptp(points, axis=0).max() == pytest.approx(1)
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     assert set(np.unique(sides, axis=0, return_counts=True)[1]) == {2}
+
+
+# ------------------------------ The examples, shorter ------------------------------
+
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def example(name: str, **changes: Any) -> Any:
+    config = load_config(EXAMPLES / name / "config.toml")
+    return optimize(config.model_copy(update={"rival": None, "picture_spp": 16, **changes}), progress=False)
+
+
+@pytest.mark.slow
+def test_an_outline_tells_where_a_body_is() -> None:
+    result = example("silhouettes", iterations=120, spp=16)
+    error = result.poses[KEY]
+    assert result.history[0].errors[f"{KEY}:position"] > 0.35 and result.history[0].errors[f"{KEY}:degrees"] > 40
+    assert error.position < 0.01 and error.degrees < 1
+
+
+@pytest.mark.slow
+def test_borders_of_colours_tell_where_a_camera_stands() -> None:
+    result = example("camera-by-edges", iterations=100)
+    assert result.poses["camera.to_world"].relative < 0.005  # from 14 %
+
+
+@pytest.mark.slow
+def test_borders_seen_in_glass_tell_its_index_and_its_place() -> None:
+    result = example("glass-ball", iterations=60)
+    assert result.errors["glass.eta"] < 0.01 and result.poses["ball.to_world"].position < 0.01
+
+
+@pytest.mark.slow
+def test_outlines_and_shadows_make_a_body_of_a_ball() -> None:
+    result = example("mesh-by-shadows", iterations=25)
+    assert result.history[-1].loss < 0.25 * result.history[0].loss
