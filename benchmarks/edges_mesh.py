@@ -2,8 +2,8 @@
 
     python -m benchmarks.edges_mesh
 
-runs examples/mesh-by-shadows and prints root mean square distances at the start and at the end: of vertices from the true
-surface, and of points of the true surface from the vertices. The body is 1 long.
+runs examples/mesh-by-shadows and prints root mean square distances at the start and at the end: of vertices from the
+true surface, and of points of the true surface from the vertices. The body is 1 long.
 """
 
 from __future__ import annotations

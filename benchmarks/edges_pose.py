@@ -2,15 +2,15 @@
 
     python -m benchmarks.edges_pose [EXAMPLE ...]
 
-runs the jobs in examples/, each with several seeds, and prints a table. Both integrators have the same start, targets,
-samples and seconds, in turns. The overlap is the share of the dark in the target that is dark at the start, too.
+runs the jobs in examples/, each with several seeds, prints a table, and leaves reports in runs/edges-pose. Both integrators
+have the same start, targets, samples and seconds, in turns. The overlap is the share of the dark in the target that is
+dark at the start, too.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-import tempfile
 from pathlib import Path
 
 from pathreplay.inverse import load_config, optimize
@@ -18,6 +18,7 @@ from pathreplay.inverse.config import Config
 from pathreplay.inverse.images import read_image
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
+RUNS = Path("runs/edges-pose")
 JOBS = ("silhouettes", "silhouette-in-mirror")
 SEEDS = (0, 1, 2)
 DARK = 0.5
@@ -44,14 +45,13 @@ def ended(path: Path) -> tuple[str, str, str, str]:
 
 def rows(name: str, config: Config) -> None:
     """Run the job; print a row for each of the two."""
-    with tempfile.TemporaryDirectory() as folder:
-        result = optimize(config, output=Path(folder) / name, progress=False)
-        runs = {config.integrator.type: "history.jsonl"}
-        if config.rival is not None:
-            runs[config.rival.type] = "rival/history.jsonl"
-        for integrator, history in runs.items():
-            cells = name, overlap(result.folder), str(config.seed), integrator, *ended(result.folder / history)
-            print(f"| {' | '.join(cells)} |", flush=True)
+    result = optimize(config, output=RUNS / f"{name}-seed-{config.seed}", progress=False)
+    runs = {config.integrator.type: "history.jsonl"}
+    if config.rival is not None:
+        runs[config.rival.type] = "rival/history.jsonl"
+    for integrator, history in runs.items():
+        cells = name, overlap(result.folder), str(config.seed), integrator, *ended(result.folder / history)
+        print(f"| {' | '.join(cells)} |", flush=True)
 
 
 def main(names: list[str]) -> None:
