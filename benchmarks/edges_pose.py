@@ -2,9 +2,9 @@
 
     python -m benchmarks.edges_pose [EXAMPLE ...]
 
-runs the jobs in examples/, each with several seeds, prints a table, and leaves reports in runs/edges-pose. Both integrators
-have the same start, targets, samples and seconds, in turns. The overlap is the share of the dark in the target that is
-dark at the start, too.
+runs the jobs in examples/, each with several seeds, prints a table, and leaves reports in runs/edges-pose. Both have the same
+start, targets, samples and seconds, in turns. The overlap is the share of the dark in the target that is dark at the
+start, too.
 """
 
 from __future__ import annotations
@@ -46,6 +46,8 @@ def ended(path: Path) -> tuple[str, str, str, str]:
 def rows(name: str, config: Config) -> None:
     """Run the job; print a row for each of the two."""
     result = optimize(config, output=RUNS / f"{name}-seed-{config.seed}", progress=False)
+    if result.stopped:
+        raise SystemExit(f"stopped by {result.stopped_by}")
     runs = {config.integrator.type: "history.jsonl"}
     if config.rival is not None:
         runs[config.rival.type] = "rival/history.jsonl"
