@@ -172,7 +172,7 @@ class PathReplayIntegrator(PathIntegrator):
     def _tell_edges(self, walk: Walk, sensor: mi.Sensor) -> None:
         if EDGES in self.told or (self.edges == "all" and walk.media is None):
             return
-        note, named = missing_edges(walk, sensor)
+        note, named = missing_edges(walk, sensor, self.edges)
         if named:
             self.told.add(EDGES)
         if note:

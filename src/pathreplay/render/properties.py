@@ -29,9 +29,9 @@ def whole_number(
     value = props.get(name, default)
     if type(value) is int and (lowest <= value <= LARGEST or (unbounded and value == -1)):
         return value
-    besides = "-1 (unbounded) or " if unbounded else ""
+    besides, what = "-1 (unbounded) or " if unbounded else "", "depth" if name.endswith("depth") else "number"
     raise PathreplayError(
-        f"{plugin}: {name} = {shown(value)}: use {besides}a depth >= {lowest}, a whole number of at most {LARGEST}"
+        f"{plugin}: {name} = {shown(value)}: use {besides}a {what} >= {lowest}, a whole number of at most {LARGEST}"
     )
 
 
