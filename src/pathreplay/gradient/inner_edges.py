@@ -323,7 +323,7 @@ def inner_edges(
 
     def path(i: mi.UInt32, records: Any) -> tuple[Any, ...]:
         key = mixed(mixed(i, seed), mi.UInt32(0x2545F491))
-        s = quasi_random(i, seed) * places.size
+        s = quasi_random(i, lines, seed) * places.size
         ray, weight = dr.detach(places.ray(s, key))
         records, x = choose_vertex(walk, Counted.of(key), ray, layout, records)
         x.β *= weight * per_line
