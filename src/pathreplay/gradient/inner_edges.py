@@ -271,8 +271,10 @@ def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -
     bend = Bend.of(walk, ((near, ray_near), (far, ray_far)), active)
     slope = derivative_by_ray(ray_near, lambda ray: bend.gap(ray, active)).d
     slope -= dr.dot(slope, ray_near.d) * ray_near.d
-    n = dr.select(bend.meets | bend.turns, dr.normalize(slope), edge_normal(near, ray_near, active))
+    bent = (bend.meets | bend.turns) & (dr.squared_norm(slope) > 0)
+    n = dr.select(bent, dr.normalize(slope), edge_normal(near, ray_near, active))
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
+    steep = dr.select(bent, dr.dot(slope, n), 1)
     f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ray_far.d), active)
     common = x.β * f * (0.5 * dr.pi / l * found.weight / line.pdf)
     active &= dr.any(common != 0)
@@ -282,7 +284,7 @@ def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -
         path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), x.k + 1, active & (x.k + 1 < walk.max_depth))
         L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
         K.append(dr.select(active, common * L, 0))
-    return Hiding(near, far, ray_near.d, ray_far.d, n, bend, dr.dot(slope, n), K[0], K[1], active)
+    return Hiding(near, far, ray_near.d, ray_far.d, n, bend, steep, K[0], K[1], active)
 
 
 def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
