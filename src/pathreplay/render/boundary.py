@@ -22,8 +22,8 @@ from .camera_pass import Pass
 from .places import FilmPlaces
 from .term import Found
 
-CLOSER = 4
-"""For so many lines of a kind one is looked at closer, of those with an edge."""
+FILM_CLOSER, INNER_CLOSER = 4, 8
+"""For so many lines one is looked at closer, of those with an edge."""
 FILM_LENGTH = 0.5  # pixels
 INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
 
@@ -71,12 +71,11 @@ class Boundary:
         """The edges of each search."""
         walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
         lines = max(int(places.size.x) * int(places.size.y) * (self.spp or view.spp), 1)
-        closer = max(lines // CLOSER, 1)
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
         if self.film:
-            yield film_edges(walk, places, lines, closer, seed ^ 0x5EED, FILM_LENGTH)
+            yield film_edges(walk, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
         if self.inner:
-            yield inner_edges(walk, places, lines, closer, seed ^ 0x5EED, INNER_LENGTHS)
+            yield inner_edges(walk, places, lines, max(lines // INNER_CLOSER, 1), seed ^ 0x5EED, INNER_LENGTHS)
 
 
 def _moves(walk: Walk, places: FilmPlaces) -> bool:
