@@ -2,7 +2,7 @@
 
     python -m benchmarks.edges_pose [EXAMPLE ...]
 
-runs the jobs in examples/, each with several seeds, prints a table, and leaves reports in runs/edges-pose. Both have the same
+runs the jobs in examples/, each with two seeds, prints a table, and leaves reports in runs/edges-pose. Both have the same
 start, targets, samples and seconds, in turns. The overlap is the share of the dark in the target that is dark at the
 start, too.
 """
@@ -20,7 +20,7 @@ from pathreplay.inverse.images import read_image
 EXAMPLES = Path(__file__).parent.parent / "examples"
 RUNS = Path("runs/edges-pose")
 JOBS = ("silhouettes", "silhouette-in-mirror")
-SEEDS = (0, 1, 2)
+SEEDS = (0, 1)
 DARK = 0.5
 
 
