@@ -2,9 +2,9 @@
 
     python -m benchmarks.edges_pose [EXAMPLE ...]
 
-runs the jobs in examples/, each with several seeds, prints a table, and leaves reports in runs/edges-pose. Both have the same
-start, targets, samples and seconds, in turns. The overlap is the share of the dark in the target that is dark at the
-start, too.
+runs the jobs in examples/, each with two seeds, prints a table, and leaves reports in runs/edges-pose. Both integrators
+have the same start, targets, samples and seconds, in turns. The overlap is the dark that target and start share, over
+the dark of the target, in each view.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathreplay.inverse.images import read_image
 EXAMPLES = Path(__file__).parent.parent / "examples"
 RUNS = Path("runs/edges-pose")
 JOBS = ("silhouettes", "silhouette-in-mirror")
-SEEDS = (0, 1, 2)
+SEEDS = (0, 1)
 DARK = 0.5
 
 
