@@ -84,7 +84,7 @@ class PathReplayIntegrator(PathIntegrator):
         self.interior = _interior(self.name, props, self.max_depth)
         self.driver, self.branch = self.interior.driver, self.interior.branch
         self.edges = choice(props, self.name, "edges", "none", EDGE_TERMS)
-        self.edge_spp = whole_number(props, self.name, "edge_spp", 0, lowest=0)
+        self.edge_spp = whole_number(props, self.name, "edge_spp", 0, lowest=0, kind="number of lines per pixel")
         if self.edges != "none" and self.attach != "delta":
             raise PathreplayError(
                 f"{self.name}: edges = '{self.edges}' with attach = '{self.attach}': edges know what moves with "
