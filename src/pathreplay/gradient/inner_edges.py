@@ -2,7 +2,8 @@
 
 At a vertex x that scatters, light arrives from a direction ω, which the interior lets move with a velocity V when
 parameters move: it follows the number u that drew it (emitter samples), or the point that it hit (other samples, with
-the share φ, see `velocity`). At an edge the integrand jumps from f_near to f_far, and what V does not follow is
+the share φ, see `velocity`; in narrow lobes it stays, see `keeps_direction`). At an edge the integrand jumps from
+f_near to f_far, and what V does not follow is
 
     dJ/dπ = ∫ [f_near (V_edge - V_near) - f_far (V_edge - V_far)]·n dl,        n normal to the edge, from near to far.
 
@@ -21,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.path import PathState
+from ..transport.scatter import keeps_direction
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
 from ..transport.velocity import held_direction, moved_direction
@@ -205,6 +207,7 @@ class Hiding:
     K_near: mi.Spectrum
     K_far: mi.Spectrum
     active: mi.Bool
+    keeps: mi.Bool  # directions are kept rather than what they hit
 
 
 def arc(si: mi.SurfaceInteraction3f, l: float, key: mi.UInt32, active: mi.Bool) -> tuple[Arc, mi.Bool]:
@@ -229,6 +232,7 @@ def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -
     """
     scene = walk.scene
     si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
+    keeps = keeps_direction(walk, si, x.active)  # and slides over facets, too
     line, ok = arc(si, l, key, x.active)
 
     def hit(d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
@@ -242,7 +246,8 @@ def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -
         ray, seen = hit(line.at(t), active & (above | through))
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
         turned = dr.select(dr.dot(at.sh_frame.n, ray.d) > 0, mi.UInt32(1), 0)
-        return Sight(mixed(place_met(walk, seen, active, facets=False), turned), at.p, at.n)
+        place = dr.select(keeps, place_met(walk, seen, active), place_met(walk, seen, active, facets=False))
+        return Sight(mixed(place, turned), at.p, at.n)
 
     if search.chosen is None:
         return glance(look, line, ok)
@@ -269,7 +274,7 @@ def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -
         path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), x.k + 1, active & (x.k + 1 < walk.max_depth))
         L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
         K.append(dr.select(active, common * L, 0))
-    return Hiding(near, far, ray_near.d, ray_far.d, n, bend, dr.dot(slope, n), K[0], K[1], active)
+    return Hiding(near, far, ray_near.d, ray_far.d, n, bend, dr.dot(slope, n), K[0], K[1], active, keeps)
 
 
 def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
@@ -277,8 +282,9 @@ def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum
     si = x.at.hit.compute_surface_interaction(at, mi.RayFlags.All, c.active)
     lengths = walk.traits.tables.blend_lengths
     edge = held_direction(si, c.d_near, c.near, c.active)
-    d_near, _ = moved_direction(lengths, si, c.d_near, c.near, c.active)
-    d_far, _ = moved_direction(lengths, si, c.d_far, c.far, c.active)
+    holds = c.active & ~c.keeps
+    d_near, _ = moved_direction(lengths, si, c.d_near, c.near, holds)
+    d_far, _ = moved_direction(lengths, si, c.d_far, c.far, holds)
     bends = c.bend.meets | c.bend.turns
 
     def gap(d: mi.Vector3f) -> mi.Float:

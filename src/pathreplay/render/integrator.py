@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -100,6 +101,10 @@ class PathReplayIntegrator(PathIntegrator):
         if self.edges == "none":
             return (self.interior,)
         return self.interior, self._boundary
+
+    def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> Walk:
+        walk = PathIntegrator._walk(self, scene, sensor)
+        return replace(walk, edges=self.edges == "all" and walk.media is None)
 
     @property
     def _boundary(self) -> Boundary:

@@ -18,6 +18,8 @@ from .velocity import blend_length
 ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
 MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
 FRAMES = frozenset({"NormalMap", "BumpMap", TWO_SIDED})
+# Those without a narrow lobe of their own, and a texture that jumps within itself.
+DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
 INSTANCE = "Instance"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
@@ -51,6 +53,7 @@ class Traits:
     hard_lights: bool  # there are emitters whose shadows are hard
     two_sides: bool  # a surface may have another BSDF on its back
     masks_mirrors: bool  # a mask lies over delta lobes
+    glossy: bool  # a surface may have a narrow smooth lobe, and no texture has seams
     outlines: bool  # a point of a surface may see where a shape, a lamp or a texture ends
     tables: Tables  # of single BSDFs and shapes
     # What has gradients:
@@ -80,6 +83,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
+        glossy=_is_glossy(bsdfs, nodes),
         outlines=not _seamless(shapes, nodes),
         tables=Tables(
             mi.Bool(_by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)) if attachables else None,
@@ -145,6 +149,12 @@ def nodes_of(root: mi.Object) -> set[mi.Object]:
 
     root.traverse(Collector())
     return seen
+
+
+def _is_glossy(bsdfs: list[mi.BSDF], nodes: set[mi.Object]) -> bool:
+    """Whether a surface may have a narrow smooth lobe, and no texture has a seam that such lobes would slide over."""
+    narrow = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) and b.class_name() not in DULL for b in bsdfs)
+    return narrow and not any(node.class_name() == CHECKERED for node in nodes)
 
 
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
