@@ -183,6 +183,7 @@ def test_where_nothing_moves_nothing_is_added() -> None:
         dr.enable_grad(params[key])
         params.update()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.eval()  # what other tests have left
             dr.kernel_history_clear()
             integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (8, 12, 3)), spp=4)
             grad = np.array(dr.grad(params[key]))

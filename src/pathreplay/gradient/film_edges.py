@@ -28,6 +28,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.emitters import draw_emitter
+from ..transport.motion import may_move
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
@@ -136,20 +137,21 @@ def without_roulette(walk: Walk) -> Walk:
 
 
 def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> Sight:
-    """What a path meets from the camera to the first vertex where it is scattered."""
+    """What a path meets from the camera to the first vertex where it is scattered; until something moves, nothing."""
     if walk.traits.mirrors or walk.traits.hard_lights or walk.media is not None:
         return _chain_sight(walk, ray, key, active)
-    start = CameraStart(ray, Counted.of(key), active)
-    return _sight(walk, PathState.begin(walk, start).at, active)
+    at = PathState.begin(walk, CameraStart(ray, Counted.of(key), active)).at
+    return dr.select(may_move(walk, at.hit), _sight(walk, at, active), Sight.nothing())
 
 
 @dr.syntax
 def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> Sight:
     numbers = Counted.of(key)
     path = PathState.begin(walk, CameraStart(ray, numbers, active))
-    sight = Sight.nothing()
+    sight, moves = Sight.nothing(), mi.Bool(False)
     while dr.hint(path.active, exclude=[walk], label="pathreplay: chain"):
-        here = _sight(walk, path.at, path.active)
+        moves |= may_move(walk, path.at.hit)
+        here = dr.select(moves, _sight(walk, path.at, path.active), Sight.nothing())
         if dr.hint(walk.traits.hard_lights, mode="scalar"):
             hidden = _shade(walk, path.at, key, path.depth, path.active).hidden
             here.signature = mixed(here.signature, dr.select(hidden, mi.UInt32(1), 0))

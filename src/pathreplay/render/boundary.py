@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +15,7 @@ from ..gradient.counted import Counted
 from ..gradient.edges import Edges, edges_backward, edges_forward
 from ..gradient.film_edges import film_edges
 from ..gradient.inner_edges import inner_edges
-from ..transport.motion import path_moves
+from ..transport.motion import moving_shapes, path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
@@ -49,7 +49,7 @@ class Boundary:
         if not _moves(walk, places):
             return Found()
         image = None
-        for edges in self._searches(view, walk, places, lambda s, ray: mi.Spectrum(1)):
+        for edges in self._searches(view, walk, places):
             δL = edges_forward(walk, places, edges)
             part = places.image(edges.s, δL, edges.ray.wavelengths)
             image = part if image is None else image + part
@@ -62,33 +62,29 @@ class Boundary:
             return Found()
         wanted = places.undeveloped(grad_in)
 
-        def importance(s: mi.Point2f, ray: mi.Ray3f) -> mi.Spectrum:
-            return places.importance(wanted, s, ray.wavelengths)
-
         lost, paths = LostPaths(), 0
-        for edges in self._searches(view, walk, places, importance):
-            W = importance(edges.s, edges.ray) if edges.W is None else edges.W
+        for edges in self._searches(view, walk, places):
+            W = places.importance(wanted, edges.s, edges.ray.wavelengths)
             edges_backward(walk, places, edges, W, lost)
             paths += dr.width(edges.s)
         dr.eval()
         return Found(lost=lost.count, paths=paths, moves=True)
 
-    def _searches(
-        self, view: Pass, walk: Walk, places: FilmPlaces, importance: Callable[..., mi.Spectrum]
-    ) -> Iterator[Edges]:
+    def _searches(self, view: Pass, walk: Walk, places: FilmPlaces) -> Iterator[Edges]:
         """The edges of each search."""
         if view.sensor.class_name() == BATCH:
             raise PathreplayError(
                 f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
                 "put its sensors into the scene one by one, or use edges = 'none'"
             )
+        walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
         lines = max(int(places.size.x) * int(places.size.y) * (self.spp or view.spp), 1)
         closer = max(lines // CLOSER, 1)
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
         if self.film:
             yield film_edges(walk, places, lines, closer, seed ^ 0x5EED, FILM_LENGTH)
         if self.inner:
-            yield inner_edges(walk, places, lines, closer, seed ^ 0x5EED, INNER_LENGTHS, importance)
+            yield inner_edges(walk, places, lines, closer, seed ^ 0x5EED, INNER_LENGTHS)
 
 
 def _moves(walk: Walk, places: FilmPlaces) -> bool:

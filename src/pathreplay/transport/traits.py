@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .pieces import mesh_pieces
+from .pieces import mesh_areas, mesh_pieces
 from .velocity import blend_length
 
 # Classes by name: Mitsuba's objects do not tell these things of themselves.
@@ -39,6 +39,8 @@ class Tables:
     blend_lengths: mi.Float  # those of `velocity`, by shape
     pieces_at: mi.UInt32  # by shape: where the pieces of its triangles begin, if not `WHOLE` or `FACETS`
     pieces: mi.UInt32  # of all such meshes (see `pieces`), in a row; the first is no triangle's
+    strips_of: mi.UInt32  # emitters, for each strip of their unit squares of samples (see `strips_of`)
+    strips: mi.Float  # and where it ends
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Traits:
     instances_move: bool = False  # the to_world of an instance
     opacity_moves: bool = False  # the opacity of a mask
     lights_vary: bool = False  # something about an emitter, or about a shape that emits
+    moving: tuple[mi.Shape, ...] | None = None  # the shapes that may move, or None: all, and the camera, too
 
 
 def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
@@ -89,6 +92,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
             mi.Bool(_by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)) if attachables else None,
             blend_lengths(shapes),
             *pieces_of(shapes),
+            *strips_of(scene.emitters(), shapes),
         ),
     )
 
@@ -115,6 +119,17 @@ def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
 
     begins = _by_index(mi.ShapePtr, shapes, begin, WHOLE)
     return mi.UInt32(begins), mi.UInt32(np.concatenate(found).astype(np.uint32))
+
+
+def strips_of(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.Float]:
+    """The strips of the unit squares of emitter samples, by emitter: of mesh lamps, which triangle a number chooses."""
+    areas = {shape.emitter(): mesh_areas(shape) for shape in shapes if shape.is_emitter() and shape.is_mesh()}
+    ends = []
+    for emitter in emitters:
+        painted = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+        ends.append(np.cumsum(areas[emitter]) if emitter in areas and not painted else np.ones(1))
+    lamps = np.repeat(np.arange(len(ends)), [len(x) for x in ends])
+    return mi.UInt32(lamps.astype(np.uint32)), mi.Float(np.concatenate([x / x[-1] for x in ends] or [np.ones(1)]))
 
 
 def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], otherwise: V) -> list[V]:
