@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import PathreplayError
 from ..gradient.adjoint import LostPaths
 from ..gradient.baseline import Baseline
 from ..gradient.counted import Counted
@@ -24,6 +25,8 @@ from .term import Found
 
 FILM_CLOSER, INNER_CLOSER = 4, 8
 """For so many lines one is looked at closer, of those with an edge."""
+BATCH = "BatchSensor"
+"""By class: Dr.Jit ends the process where its rays are differentiated by their place."""
 FILM_LENGTH = 0.5  # pixels
 INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
 
@@ -69,6 +72,11 @@ class Boundary:
 
     def _searches(self, view: Pass, walk: Walk, places: FilmPlaces) -> Iterator[Edges]:
         """The edges of each search."""
+        if view.sensor.class_name() == BATCH:
+            raise PathreplayError(
+                f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
+                "put its sensors into the scene one by one, or use edges = 'none'"
+            )
         walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
         lines = max(int(places.size.x) * int(places.size.y) * (self.spp or view.spp), 1)
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
