@@ -129,6 +129,7 @@ def test_nor_do_they_where_edges_ignore_what_the_interior_follows(name: str, mon
 # ------------------------------ What the sum does not depend on ------------------------------
 
 
+@pytest.mark.slow
 def test_forward_is_reverse_where_all_moves() -> None:
     """Lamps, a mirror, glass, a wall and what stands in it, each with its edges, three vertices deep."""
     bench = Bench(ALL_MOVE)
