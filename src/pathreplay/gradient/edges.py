@@ -45,7 +45,6 @@ class Edges:
     layout: Layout
     records: Any  # of the path, and one more: of the vertex that sees the edge
     motion: Callable[[mi.Ray3f], mi.Spectrum]  # zero where nothing was found
-    W: mi.Spectrum | None = None  # what light counts at the places, where the search has asked for it
 
 
 def edges_backward(walk: Walk, places: Places, found: Edges, W: mi.Spectrum, lost: LostPaths) -> None:

@@ -102,10 +102,10 @@ def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
     """
     walk = without_roulette(walk)
 
-    def line(centres: Centres, i: mi.UInt32, seed: mi.UInt32, l: float) -> FilmLine:
+    def line(centres: Centres, i: mi.UInt32, n: int, seed: mi.UInt32, l: float) -> FilmLine:
         key = mixed(mixed(i, seed), mi.UInt32(0x51ED270B))
         turn = dr.two_pi * mi.sample_tea_float32(key, mi.UInt32(0x30000))
-        c, density = centres.draw(quasi_random(i, seed))
+        c, density = centres.draw(quasi_random(i, n, seed))
         w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
         return FilmLine(c - centres.margin, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key)
 
@@ -113,12 +113,13 @@ def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
         return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)
 
     centres = Centres.even(places.size, l)
-    first = line(centres, dr.arange(mi.UInt32, max(lines // LOOKS, 1)), seed ^ 0x7F4A7C15, 2 * l)
+    few = max(lines // LOOKS, 1)
+    first = line(centres, dr.arange(mi.UInt32, few), few, seed ^ 0x7F4A7C15, 2 * l)
     centres = centres.refined(first.c + centres.margin, glance(look, first, mi.Bool(True)))
-    found = glance(look, line(centres, dr.arange(mi.UInt32, lines), seed, l), mi.Bool(True))
-    chosen = Picked.of(found, closer, seed)
+    every = line(centres, dr.arange(mi.UInt32, lines), lines, seed, l)
+    chosen = Picked.of(glance(look, every, mi.Bool(True)) / every.density, closer, seed)
     pick = mi.PCG32(closer, initstate=seed, initseq=dr.arange(mi.UInt32, closer))
-    crossed = bisect(look, line(centres, chosen.index, seed, l), chosen.weight, pick)
+    crossed = bisect(look, line(centres, chosen.index, lines, seed, l), chosen.weight, pick)
     per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * lines))  # one kernel for all numbers of samples
     c = _weighed(walk, places, crossed, per_line)
     layout = Layout.of(walk, True)

@@ -2,7 +2,8 @@
 
 At a vertex x that scatters, light arrives from a direction ω, which the interior lets move with a velocity V when
 parameters move: it follows the number u that drew it (emitter samples), or the point that it hit (other samples, with
-the share φ, see `velocity`). At an edge the integrand jumps from f_near to f_far, and what V does not follow is
+the share φ, see `velocity`; in narrow lobes it stays, see `keeps_direction`). At an edge the integrand jumps from
+f_near to f_far, and what V does not follow is
 
     dJ/dπ = ∫ [f_near (V_edge - V_near) - f_far (V_edge - V_far)]·n dl,        n normal to the edge, from near to far.
 
@@ -14,7 +15,6 @@ Where x does not move, all that does not move looks alike, so that no line is sp
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,24 +23,26 @@ import mitsuba as mi
 
 from ..transport.motion import may_move
 from ..transport.path import PathState
+from ..transport.scatter import keeps_direction
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
+from ..transport.traits import Tables
 from ..transport.velocity import held_direction, moved_direction
 from ..transport.vertex import Arrival, Walk, is_smooth, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
 from .bends import Bend
 from .counted import Counted, quasi_random
-from .crofton import Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
+from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
 
 BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
+JUMP = 4.0
+"""So many times as far from an edge as its slope says is the other end of a line where a sample of an emitter jumps."""
 EVENLY = 0.25
 """Share of the arcs that are thrown evenly: those that begin below the horizon, or where lobes are weak, count, too."""
-
-Importance = Callable[..., "mi.Spectrum"]
 
 
 @dataclass
@@ -57,10 +59,20 @@ class Chosen:
 
 @dataclass
 class SquareLine(PlaneLine):
-    """A line in the unit square of samples of one emitter."""
+    """A line in a strip of the unit square of samples of one emitter: of a mesh, that of a triangle.
+
+    Its own coordinates are from 0 to 1 in the strip, since samples jump from strip to strip.
+    """
 
     emitter: mi.EmitterPtr
     share: mi.Float  # 1 / probability of the emitter
+    strip: mi.Float  # where it begins
+    width: mi.Float
+
+    def sample(self, t: mi.Float) -> mi.Point2f:
+        """A place of the line in the unit square."""
+        at = self.at(t)
+        return mi.Point2f(at.x, dr.fma(at.y, self.width, self.strip))
 
 
 @dataclass
@@ -78,24 +90,21 @@ class Arc:
 
 
 @dr.syntax
-def choose_vertex(
-    walk: Walk, numbers: Counted, ray: mi.Ray3f, W: mi.Spectrum, layout: Layout, records: Any
-) -> tuple[Any, Chosen]:
-    """Walk along a camera path, and choose one of the vertices that scatter smoothly, by its throughput.
+def choose_vertex(walk: Walk, numbers: Counted, ray: mi.Ray3f, layout: Layout, records: Any) -> tuple[Any, Chosen]:
+    """Walk along a camera path, and choose one of the vertices that scatter smoothly, by what they count.
 
-    Not by the colour of ``W``: forward mode, which has none, has to choose the same. Where it is zero, there is none.
     Vertices up to the chosen one are recorded, if there are ``records``. The last vertex that ``walk`` allows scatters
     nothing: the walk ends before.
     """
     walk = replace(walk, max_depth=max(walk.max_depth - 1, 0))
-    path = PathState.begin(walk, CameraStart(ray, numbers, dr.any(W != 0)))
+    path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))
     chosen = Chosen(path.at, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), mi.Bool(False), mi.Bool(False))
     mass = mi.Float(0)
     count = mi.UInt32(0)
     moves = mi.Bool(False)
     while dr.hint(path.active, exclude=[walk, layout], label="pathreplay: choose a vertex"):
         here = path.at.hit.is_valid() & is_smooth(path.at.hit.shape.bsdf())
-        m = dr.select(path.active & here, dr.mean(path.β), 0)
+        m = dr.select(path.active & here, dr.mean(dr.abs(path.β)), 0)
         mass += m
         moves |= may_move(walk, path.at.hit)
         take = (m > 0) & (numbers.next_1d() * mass < m)
@@ -127,6 +136,7 @@ class Shaded:
 
     line: SquareLine
     u: mi.Point2f  # at the side in the shadow
+    u_lit: mi.Point2f  # and at the other
     hit: mi.PreliminaryIntersection3f  # of what casts it
     ray: mi.Ray3f
     n: mi.Vector3f
@@ -134,9 +144,9 @@ class Shaded:
     active: mi.Bool
 
 
-def emitter_line(scene: mi.Scene, x: Chosen, l: float, key: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
+def emitter_line(walk: Walk, x: Chosen, l: float, key: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
     """A line among the samples of an emitter, and whether there is one."""
-    numbers = Counted(key, mi.UInt32(0))
+    numbers, scene = Counted(key, mi.UInt32(0)), walk.scene
     index, share, _ = scene.sample_emitter(numbers.next_1d())
     turn = dr.two_pi * numbers.next_1d()
     c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(dr.cos(turn), dr.sin(turn))
@@ -147,17 +157,33 @@ def emitter_line(scene: mi.Scene, x: Chosen, l: float, key: mi.UInt32) -> tuple[
     inside = x.active & (begin < end)
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, x.active)
     begin, end = dr.select(inside, begin, 0), dr.select(inside, end, 0)
-    return SquareLine(c, w, begin, end, emitter, share), inside
+    strip, width = _strip(walk.traits.tables, index, numbers.next_1d(), x.active)
+    return SquareLine(c, w, begin, end, emitter, share, strip, width), inside
+
+
+def _strip(tables: Tables, emitter: mi.UInt32, u: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    """Where a strip of the square begins in which u is, and how wide it is."""
+    lamps, until = tables.strips_of, tables.strips
+    n = dr.width(until)
+
+    def before(i: mi.UInt32) -> mi.Bool:
+        lamp = dr.gather(mi.UInt32, lamps, i, active)
+        return (lamp < emitter) | ((lamp == emitter) & (dr.gather(mi.Float, until, i, active) <= u))
+
+    i = dr.minimum(dr.binary_search(0, n - 1, before), n - 1)
+    first = (i == 0) | (dr.gather(mi.UInt32, lamps, dr.maximum(i, 1) - 1, active) != emitter)
+    begin = dr.select(first, 0, dr.gather(mi.Float, until, dr.maximum(i, 1) - 1, active))
+    return begin, dr.gather(mi.Float, until, i, active) - begin
 
 
 def emitter_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -> Any:
     """Find the edge of a shadow among the samples of an emitter, and weigh it: see `Search`. Detached."""
     scene = walk.scene
     si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
-    line, inside = emitter_line(scene, x, l, key)
+    line, inside = emitter_line(walk, x, l, key)
 
     def shadowed(line: SquareLine, t: mi.Float, active: mi.Bool) -> tuple[Any, ...]:
-        light, Le = line.emitter.sample_direction(si, line.at(t), active)
+        light, Le = line.emitter.sample_direction(si, line.sample(t), active)
         ray = si.spawn_ray_to(light.p)
         lit = active & (light.pdf != 0)
         hit = scene.ray_intersect_preliminary(ray, coherent=False, active=lit)
@@ -184,7 +210,8 @@ def emitter_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Searc
     density = light.pdf / line.share
     F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density, pdf))
     K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a_hidden, -1, 1)
-    return Shaded(line, line.at(t), hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
+    ends = line.sample(t), line.sample(dr.select(a_hidden, found.b, found.a))
+    return Shaded(line, *ends, hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
 
 
 def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
@@ -206,7 +233,10 @@ def shadow_gap(x: Chosen, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
 def shadow_weight(x: Chosen, c: Shaded) -> mi.Spectrum:
     """K in full: with the derivative of B along the line."""
     slope = derivative_by_place(c.u, lambda u: shadow_gap(x, c, x.at.ray, u))
-    return c.line.passed(c.K, slope, c.active)
+    # Where a sample of the emitter jumps there is no edge: its other side is far off.
+    off = dr.abs(shadow_gap(x, c, x.at.ray, c.u_lit) - shadow_gap(x, c, x.at.ray, c.u))
+    jumps = off > JUMP * dr.norm(slope) * dr.norm(c.u_lit - c.u) + ROUNDING * (dr.norm(c.ray.o) + c.hit.t)
+    return c.line.passed(c.K, mi.Vector2f(slope.x, slope.y * c.line.width), c.active & ~jumps)
 
 
 @dataclass
@@ -223,6 +253,7 @@ class Hiding:
     K_near: mi.Spectrum
     K_far: mi.Spectrum
     active: mi.Bool
+    keeps: mi.Bool  # directions are kept rather than what they hit
 
 
 def arc(si: mi.SurfaceInteraction3f, l: float, key: mi.UInt32, active: mi.Bool) -> tuple[Arc, mi.Bool]:
@@ -247,6 +278,7 @@ def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -
     """
     scene = walk.scene
     si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
+    keeps = keeps_direction(walk, si, x.active)  # and slides over facets, too
     line, ok = arc(si, l, key, x.active)
 
     def hit(d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
@@ -260,7 +292,8 @@ def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -
         ray, seen = hit(line.at(t), active & (above | through))
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
         turned = dr.select(dr.dot(at.sh_frame.n, ray.d) > 0, mi.UInt32(1), 0)
-        sight = Sight(mixed(place_met(walk, seen, active, facets=False), turned), at.p, at.n)
+        place = dr.select(keeps, place_met(walk, seen, active), place_met(walk, seen, active, facets=False))
+        sight = Sight(mixed(place, turned), at.p, at.n)
         return dr.select(x.moves | may_move(walk, seen), sight, Sight.nothing())
 
     if search.chosen is None:
@@ -290,7 +323,7 @@ def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -
         path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), x.k + 1, active & (x.k + 1 < walk.max_depth))
         L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
         K.append(dr.select(active, common * L, 0))
-    return Hiding(near, far, ray_near.d, ray_far.d, n, bend, steep, K[0], K[1], active)
+    return Hiding(near, far, ray_near.d, ray_far.d, n, bend, steep, K[0], K[1], active, keeps)
 
 
 def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
@@ -298,8 +331,9 @@ def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum
     si = x.at.hit.compute_surface_interaction(at, mi.RayFlags.All, c.active)
     lengths = walk.traits.tables.blend_lengths
     edge = held_direction(si, c.d_near, c.near, c.active)
-    d_near, _ = moved_direction(lengths, si, c.d_near, c.near, c.active)
-    d_far, _ = moved_direction(lengths, si, c.d_far, c.far, c.active)
+    holds = c.active & ~c.keeps
+    d_near, _ = moved_direction(lengths, si, c.d_near, c.near, holds)
+    d_far, _ = moved_direction(lengths, si, c.d_far, c.far, holds)
     bends = c.bend.meets | c.bend.turns
 
     def gap(d: mi.Vector3f) -> mi.Float:
@@ -318,12 +352,11 @@ def inner_edges(
     closer: int,
     seed: mi.UInt32,
     lengths: tuple[float, float],
-    W: Importance,
 ) -> Edges:
     """Find edges that vertices see by so many lines of each kind, and look ``closer`` at as many. Detached.
 
-    ``lengths`` are those in the square and on the sphere (radians). ``W`` (place, ray) -> Spectrum is what light counts
-    that arrives at a place of the film: where that is nothing, nobody looks for edges.
+    ``lengths`` are those in the square and on the sphere (radians). What light counts that arrives at the film decides
+    nothing here, since forward mode would not know it and choose otherwise.
     """
     walk = replace(walk, max_depth=min(walk.max_depth, deepest(walk)))
     layout = Layout.of(walk, True)
@@ -332,15 +365,14 @@ def inner_edges(
 
     def path(i: mi.UInt32, records: Any) -> tuple[Any, ...]:
         key = mixed(mixed(i, seed), mi.UInt32(0x2545F491))
-        s = quasi_random(i, seed) * places.size
+        s = quasi_random(i, lines, seed) * places.size
         ray, weight = dr.detach(places.ray(s, key))
-        wanted = W(s, ray)
-        records, x = choose_vertex(walk, Counted.of(key), ray, wanted, layout, records)
+        records, x = choose_vertex(walk, Counted.of(key), ray, layout, records)
         x.β *= weight * per_line
-        return s, key, wanted, records, x
+        return s, key, records, x
 
     i = dr.arange(mi.UInt32, lines)
-    _, key, _, _, x = path(i, None)
+    _, key, _, x = path(i, None)
     in_squares = emitter_edges(walk, x, square, key ^ 0x1B873593, Search()) + dr.zeros(mi.Float, lines)
     on_arcs = arc_edges(walk, x, arc, key ^ 0x38B34AE5, Search()) + dr.zeros(mi.Float, lines)
     dr.eval(in_squares, on_arcs)
@@ -349,7 +381,7 @@ def inner_edges(
     on_arc = chosen.index >= lines
     i = dr.select(on_arc, chosen.index - lines, chosen.index)
     pick = mi.PCG32(closer, initstate=seed + 1, initseq=dr.arange(mi.UInt32, closer))
-    s, key, wanted, records, x = path(i, dr.alloc_local(record_type(layout), room_for(walk)))
+    s, key, records, x = path(i, dr.alloc_local(record_type(layout), room_for(walk)))
     x.active &= chosen.weight > 0
     of_square, of_arc = dr.select(on_arc, 0, chosen.weight), dr.select(on_arc, chosen.weight, 0)
     shaded = emitter_edges(walk, x, square, key ^ 0x1B873593, Search(of_square, pick))
@@ -360,4 +392,4 @@ def inner_edges(
         return hiding_motion(walk, x, hiding, ray) - K * shadow_gap(x, shaded, ray, shaded.u)
 
     k = dr.select(x.active, x.k, 0)
-    return Edges(s, key, k, x.at.ray, layout, records, motion, wanted)
+    return Edges(s, key, k, x.at.ray, layout, records, motion)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import PathreplayError
 from ..gradient.adjoint import LostPaths
 from ..gradient.baseline import Baseline
 from ..gradient.counted import Counted
@@ -22,8 +23,10 @@ from .camera_pass import Pass
 from .places import FilmPlaces
 from .term import Found
 
-CLOSER = 4
-"""For so many lines of a kind one is looked at closer, of those with an edge."""
+FILM_CLOSER, INNER_CLOSER = 4, 8
+"""For so many lines one is looked at closer, of those with an edge."""
+BATCH = "BatchSensor"
+"""By class: Dr.Jit ends the process where its rays are differentiated by their place."""
 FILM_LENGTH = 0.5  # pixels
 INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
 
@@ -46,7 +49,7 @@ class Boundary:
         if not _moves(walk, places):
             return Found()
         image = None
-        for edges in self._searches(view, walk, places, lambda s, ray: mi.Spectrum(1)):
+        for edges in self._searches(view, walk, places):
             δL = edges_forward(walk, places, edges)
             part = places.image(edges.s, δL, edges.ray.wavelengths)
             image = part if image is None else image + part
@@ -59,29 +62,28 @@ class Boundary:
             return Found()
         wanted = places.undeveloped(grad_in)
 
-        def importance(s: mi.Point2f, ray: mi.Ray3f) -> mi.Spectrum:
-            return places.importance(wanted, s, ray.wavelengths)
-
         lost, paths = LostPaths(), 0
-        for edges in self._searches(view, walk, places, importance):
-            W = importance(edges.s, edges.ray) if edges.W is None else edges.W
+        for edges in self._searches(view, walk, places):
+            W = places.importance(wanted, edges.s, edges.ray.wavelengths)
             edges_backward(walk, places, edges, W, lost)
             paths += dr.width(edges.s)
         dr.eval()
         return Found(lost=lost.count, paths=paths, moves=True)
 
-    def _searches(
-        self, view: Pass, walk: Walk, places: FilmPlaces, importance: Callable[..., mi.Spectrum]
-    ) -> Iterator[Edges]:
+    def _searches(self, view: Pass, walk: Walk, places: FilmPlaces) -> Iterator[Edges]:
         """The edges of each search."""
+        if view.sensor.class_name() == BATCH:
+            raise PathreplayError(
+                f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
+                "put its sensors into the scene one by one, or use edges = 'none'"
+            )
         walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
         lines = max(int(places.size.x) * int(places.size.y) * (self.spp or view.spp), 1)
-        closer = max(lines // CLOSER, 1)
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
         if self.film:
-            yield film_edges(walk, places, lines, closer, seed ^ 0x5EED, FILM_LENGTH)
+            yield film_edges(walk, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
         if self.inner:
-            yield inner_edges(walk, places, lines, closer, seed ^ 0x5EED, INNER_LENGTHS, importance)
+            yield inner_edges(walk, places, lines, max(lines // INNER_CLOSER, 1), seed ^ 0x5EED, INNER_LENGTHS)
 
 
 def _moves(walk: Walk, places: FilmPlaces) -> bool:

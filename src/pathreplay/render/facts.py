@@ -16,6 +16,7 @@ from ..transport.traits import (
     is_null,
     nodes_of,
     pieces_of,
+    strips_of,
     with_gradients,
 )
 from ..transport.traits import Tables as Tables
@@ -35,6 +36,7 @@ class SceneFacts:
         self._shapes = [node for node in nodes if isinstance(node, mi.Shape)]
         self._boxes = [shape.bbox() for shape in self._shapes]
         self._sizes = _sizes(self._shapes)
+        self._lights = scene.emitters()
         self._emitters = [*scene.emitters(), *(shape for shape in self._shapes if shape.is_emitter())]
         self._lamps = [shape for shape in self._shapes if shape.is_mesh() and shape.is_emitter()]
         self._instances = [shape for shape in self._shapes if shape.class_name() == INSTANCE]
@@ -71,7 +73,10 @@ class SceneFacts:
         """Made anew when shapes have changed their sizes, or meshes the number of their triangles."""
         boxes = [shape.bbox() for shape in self._shapes]
         if boxes != self._boxes:
-            tables = replace(self._traits.tables, blend_lengths=blend_lengths(self._shapes))
+            lamps, strips = strips_of(self._lights, self._shapes)
+            tables = replace(
+                self._traits.tables, blend_lengths=blend_lengths(self._shapes), strips_of=lamps, strips=strips
+            )
             self._traits, self._boxes = replace(self._traits, tables=tables), boxes
         if (sizes := _sizes(self._shapes)) != self._sizes:
             begins, pieces = pieces_of(self._shapes)

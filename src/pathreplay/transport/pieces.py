@@ -12,6 +12,16 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 
+def mesh_areas(mesh: mi.Mesh) -> np.ndarray:
+    """Twice the areas of its triangles; Mitsuba's rectangle, which hides its mesh, is one."""
+    params = mi.traverse(mesh)
+    if "faces" not in params:
+        return np.ones(1)
+    positions = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
+    a, b, c = (positions[corner] for corner in np.array(params["faces"]).reshape(-1, 3).T)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
 def mesh_pieces(mesh: mi.Mesh) -> np.ndarray:
     """The `smooth_pieces` of a mesh that has vertex normals; Mitsuba's rectangle, which hides its mesh, is one."""
     params = mi.traverse(mesh)
