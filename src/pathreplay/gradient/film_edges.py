@@ -35,7 +35,7 @@ from ..transport.start import CameraStart
 from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
 from .bends import Bend
-from .centres import Centres
+from .centres import LOOKS, Centres
 from .counted import Counted, quasi_random
 from .crofton import Crossed, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places, ray_to_camera
@@ -44,8 +44,6 @@ from .record import Layout, record, record_type
 
 MAX_CHAIN = 16
 """Vertices of a chain of delta lobes, at most."""
-LOOKS = 8
-"""For so many lines one takes a first look."""
 
 
 @dataclass

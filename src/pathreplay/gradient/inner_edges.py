@@ -31,6 +31,7 @@ from ..transport.velocity import held_direction, moved_direction
 from ..transport.vertex import Arrival, Walk, is_smooth, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
 from .bends import Bend
+from .centres import LOOKS, Centres
 from .counted import Counted, quasi_random
 from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places
@@ -361,27 +362,32 @@ def inner_edges(
     walk = replace(walk, max_depth=min(walk.max_depth, deepest(walk)))
     layout = Layout.of(walk, True)
     square, arc = lengths
-    per_line = dr.opaque(mi.Float, places.size.x * places.size.y / lines)
 
-    def path(i: mi.UInt32, records: Any) -> tuple[Any, ...]:
+    def path(centres: Centres, i: mi.UInt32, n: int, seed: mi.UInt32, records: Any) -> tuple[Any, ...]:
         key = mixed(mixed(i, seed), mi.UInt32(0x2545F491))
-        s = quasi_random(i, lines, seed) * places.size
+        s, density = centres.draw(quasi_random(i, n, seed))
         ray, weight = dr.detach(places.ray(s, key))
         records, x = choose_vertex(walk, Counted.of(key), ray, layout, records)
-        x.β *= weight * per_line
-        return s, key, records, x
+        x.β *= weight / (density * dr.opaque(mi.Float, n))
+        return s, density, key, records, x
 
-    i = dr.arange(mi.UInt32, lines)
-    _, key, _, x = path(i, None)
-    in_squares = emitter_edges(walk, x, square, key ^ 0x1B873593, Search()) + dr.zeros(mi.Float, lines)
-    on_arcs = arc_edges(walk, x, arc, key ^ 0x38B34AE5, Search()) + dr.zeros(mi.Float, lines)
-    dr.eval(in_squares, on_arcs)
-    chosen = Picked.of(dr.concat((in_squares, on_arcs)), closer, seed)
+    def glances(centres: Centres, n: int, seed: mi.UInt32) -> tuple[mi.Point2f, mi.Float, mi.Float]:
+        s, density, key, _, x = path(centres, dr.arange(mi.UInt32, n), n, seed, None)
+        in_squares = emitter_edges(walk, x, square, key ^ 0x1B873593, Search()) / density
+        on_arcs = arc_edges(walk, x, arc, key ^ 0x38B34AE5, Search()) / density
+        return s, in_squares + dr.zeros(mi.Float, n), on_arcs + dr.zeros(mi.Float, n)
+
+    centres = Centres(int(places.size.x), int(places.size.y), 0.0)
+    s, *found = glances(centres, max(lines // LOOKS, 1), seed ^ 0x7F4A7C15)
+    centres = centres.refined(s, found[0] + found[1])
+    _, *found = glances(centres, lines, seed)
+    dr.eval(found)
+    chosen = Picked.of(dr.concat(found), closer, seed)
 
     on_arc = chosen.index >= lines
     i = dr.select(on_arc, chosen.index - lines, chosen.index)
     pick = mi.PCG32(closer, initstate=seed + 1, initseq=dr.arange(mi.UInt32, closer))
-    s, key, records, x = path(i, dr.alloc_local(record_type(layout), room_for(walk)))
+    s, _, key, records, x = path(centres, i, lines, seed, dr.alloc_local(record_type(layout), room_for(walk)))
     x.active &= chosen.weight > 0
     of_square, of_arc = dr.select(on_arc, 0, chosen.weight), dr.select(on_arc, chosen.weight, 0)
     shaded = emitter_edges(walk, x, square, key ^ 0x1B873593, Search(of_square, pick))
