@@ -28,6 +28,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.emitters import draw_emitter
+from ..transport.passage import beyond_null
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
@@ -39,6 +40,7 @@ from .crofton import Crossed, PlaneLine, Sight, bisect, hides_itself, search
 from .edges import Edges, Places, ray_to_camera
 from .primal import walk_on
 from .record import Layout, record, record_type
+from .through_media import SHORT_OF, clear, going_on, left_of_light
 
 MAX_CHAIN = 16
 """Vertices of a chain of delta lobes, at most."""
@@ -102,14 +104,14 @@ def film_edges(walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lin
 
     A first look with a line for every `LOOKS`-th lane decides where lines are thrown.
     """
-    walk = without_roulette(walk)
+    full, walk = walk, clear(without_roulette(walk))
     even = Centres.even(places.size, l)
     few = dr.arange(mi.UInt32, max(dr.width(lane) // LOOKS, 1))
     look = _find(walk, places, even, few, seed ^ 0x7F4A7C15, lines, 2 * l, bisected=False)
     centres = even.refined(look.line.c + l, look.weight)
     found = _find(walk, places, centres, lane, seed, lines, l)
     per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * dr.width(lane) * lines))  # one kernel for all numbers of samples
-    c = _weighed(walk, places, found, per_line)
+    c = _weighed(walk, full, places, found, per_line)
     layout = Layout.of(walk, True)
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)
     records, reached = _record_chain(walk, places.ray(c.s, c.line.key)[0], c, layout, records)
@@ -192,6 +194,8 @@ def _shade(walk: Walk, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Boo
     light, _ = draw_emitter(walk.scene, si, u, lit, visible=False)
     ray = si.spawn_ray_to(light.p)
     hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, active=lit & light.delta & (light.pdf != 0))
+    if walk.clear:
+        hit = beyond_null(walk.scene, ray, hit, lit)
     return Shade(u, ray, hit, hit.is_valid())
 
 
@@ -223,17 +227,23 @@ def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: m
     return fork
 
 
-def _weighed(walk: Walk, places: Places, found: Crossed, per_line: mi.Float) -> FilmCrossing:
-    """What the jump of radiance is, with the same random numbers on both sides."""
+def _weighed(walk: Walk, full: Walk, places: Places, found: Crossed, per_line: mi.Float) -> FilmCrossing:
+    """What the jump of radiance is, with the same random numbers on both sides. ``full`` is the walk with media."""
     line, active = found.line, found.weight > 0
     ends = line.at(found.a), line.at(found.b)
     (ray_a, weight), (ray_b, _) = (places.ray(s, line.key) for s in ends)
     fork = _fork(walk, (ray_a, ray_b), line.key, active)
     active &= fork.found
+    sides, onward = [fork.a, fork.b], walk
+    if full.media is not None:
+        onward, t = full, SHORT_OF * dr.minimum(fork.a.hit.t, fork.b.hit.t)
+        T, medium = left_of_light(full, ray_a, line.key, fork.k, t, active)
+        active &= dr.any(T != 0)
+        sides, weight = [going_on(full, side, t, medium, active) for side in sides], weight * T
     f = []
-    for side in (fork.a, fork.b):
+    for side in sides:
         path = PathState(side, mi.Spectrum(1), None, mi.Float(1), mi.UInt32(fork.k), mi.Bool(active))
-        f.append(walk_on(walk, Counted.at_vertex(line.key, fork.k), path)[0])
+        f.append(walk_on(onward, Counted.at_vertex(line.key, fork.k), path)[0])
     jump = weight * fork.β * (f[0] - f[1]) * (per_line * found.weight / line.density)
 
     near_a, meet, turns, shadow = fork.a.hit.t <= fork.b.hit.t, _meet(fork), _turns(walk, fork), mi.Bool(False)

@@ -1,4 +1,4 @@
-"""Edges that points of surfaces see: shadows, and what moves in and out of indirect light.
+"""Edges that points of surfaces see, and particles of media: shadows, and what moves in and out of indirect light.
 
 At a vertex x that scatters, light arrives from a direction ω, which the interior lets move with a velocity V when
 parameters move: it follows the number u that drew it (emitter samples), or the point that it hit (other samples, with
@@ -24,13 +24,14 @@ from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
 from ..transport.velocity import held_direction, moved_direction
-from ..transport.vertex import Arrival, Walk, is_smooth, mis_weight
+from ..transport.vertex import Arrival, Flight, Walk, mis_weight
 from .adjoint import derivative_by_place
 from .counted import Counted, quasi_random
 from .crofton import PlaneLine, Sight, bisect, search
 from .edges import Edges, Places
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
+from .seer import Seer, may_see
 
 BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
@@ -44,10 +45,12 @@ class Chosen:
     """The vertex of a camera path that looks for edges."""
 
     at: Arrival
-    k: mi.UInt32  # vertices before
+    k: mi.UInt32  # records before
+    depth: mi.UInt32  # vertices before: as many, but null boundaries are none
     β: mi.Spectrum  # throughput before, over the probability of the choice
     mass: mi.Float  # by which it was chosen
     active: mi.Bool
+    flight: Flight | None = None  # before it, with media
 
 
 @dataclass
@@ -78,16 +81,21 @@ def choose_vertex(
 ) -> tuple[Any, Chosen]:
     """Record a camera path, and choose one of the vertices that scatter smoothly, by what they count."""
     path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))
-    chosen = Chosen(path.at, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), mi.Bool(False))
+    none, flight = mi.UInt32(0), None if walk.media is None else Flight.none(walk.media)
+    chosen = Chosen(path.at, none, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), mi.Bool(False), flight)
     mass = mi.Float(0)
     count = mi.UInt32(0)
     while dr.hint(path.active, exclude=[walk, layout, W], label="pathreplay: choose a vertex"):
-        here = path.at.hit.is_valid() & is_smooth(path.at.hit.shape.bsdf()) & (path.depth + 1 < walk.max_depth)
-        m = dr.select(path.active & here, dr.mean(dr.abs(path.β * W)), 0)
-        mass += m
-        take = (m > 0) & (numbers.next_1d() * mass < m)
-        chosen = dr.select(take, Chosen(path.at, count, path.β, m, mi.Bool(True)), chosen)
+        pick = numbers.next_1d()
         u, step = path.choose(walk, numbers)
+        here, w = may_see(walk, path.at, step)
+        here &= path.active & (path.depth + 1 < walk.max_depth)
+        m = dr.select(here, dr.mean(dr.abs(path.β * w * W)), 0)
+        mass += m
+        take = (m > 0) & (pick * mass < m)
+        flight = None if walk.media is None else step.kept.media.flight
+        seer = Chosen(path.at, count, path.depth, path.β * w, m, mi.Bool(True), flight)
+        chosen = dr.select(take, seer, chosen)
         onward, v = path.advance(walk, u, step)
         records[count] = record(layout, v)
         path = onward
@@ -109,10 +117,9 @@ class Shaded:
     active: mi.Bool
 
 
-def emitter_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick: mi.PCG32) -> Shaded:
+def emitter_edges(walk: Walk, x: Chosen, seer: Seer, lines: int, l: float, key: mi.UInt32, pick: mi.PCG32) -> Shaded:
     """Find the edge of a shadow among the samples of an emitter, and weigh it. Detached."""
-    scene = walk.scene
-    si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
+    scene, origin = walk.scene, seer.origin
 
     def draw(j: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
         numbers = Counted(key, 8 * j)
@@ -129,10 +136,10 @@ def emitter_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, p
         return SquareLine(c, w, begin, end, emitter, share), inside
 
     def shadowed(line: SquareLine, t: mi.Float, active: mi.Bool) -> tuple[Any, ...]:
-        light, Le = line.emitter.sample_direction(si, line.at(t), active)
-        ray = si.spawn_ray_to(light.p)
+        light, Le = line.emitter.sample_direction(origin, line.at(t), active)
+        ray = origin.spawn_ray_to(light.p)
         lit = active & (light.pdf != 0)
-        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=lit)
+        hit = seer.behind(ray, seer.hit(ray, lit), lit)
         # A lamp's own limb hides it by rounding only.
         hidden = lit & hit.is_valid() & (hit.shape.emitter() != light.emitter)
         return light, Le, ray, hit, hidden
@@ -147,23 +154,24 @@ def emitter_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, p
     t = dr.select(a_hidden, found.a, found.b)
     _, _, ray, hit, hidden = shadowed(line, t, active)
     active &= hidden
-    f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
+    f, pdf = seer.towards(light.d, active)
     density = light.pdf / line.share
+    Le *= seer.share_of_lamps(light, key, active)
     F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density, pdf))
     K = 0.5 * dr.pi * dr.square(1 + l) / (l * lines) * found.weight * F * dr.select(a_hidden, -1, 1)
     return Shaded(line, line.at(t), hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
 
 
-def shadow_gap(x: Chosen, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
+def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
     """B: distance of the line to the emitter sample from the edge; differentiable in all that moves."""
-    si = x.at.hit.compute_surface_interaction(at, mi.RayFlags.All, c.active)
-    light, _ = c.line.emitter.sample_direction(si, u, c.active)
-    return outline_gap(c.n, si.p, light.d, c.hit, c.ray, c.active)
+    origin = seer.moved(at)
+    light, _ = c.line.emitter.sample_direction(origin, u, c.active)
+    return outline_gap(c.n, origin.p, light.d, c.hit, c.ray, c.active)
 
 
-def shadow_weight(x: Chosen, c: Shaded) -> mi.Spectrum:
+def shadow_weight(seer: Seer, c: Shaded) -> mi.Spectrum:
     """K in full: with the derivative of B along the line."""
-    slope = derivative_by_place(c.u, lambda u: shadow_gap(x, c, x.at.ray, u))
+    slope = derivative_by_place(c.u, lambda u: shadow_gap(seer, c, seer.at.ray, u))
     return c.line.passed(c.K, slope, c.active)
 
 
@@ -171,7 +179,8 @@ def shadow_weight(x: Chosen, c: Shaded) -> mi.Spectrum:
 class Hiding:
     """A crossing on an arc: one surface hides another."""
 
-    near: mi.PreliminaryIntersection3f
+    edge: mi.PreliminaryIntersection3f  # of the one that hides
+    near: mi.PreliminaryIntersection3f  # what the direction at its side hits: it, or a null boundary before it
     far: mi.PreliminaryIntersection3f  # may be none
     d_near: mi.Vector3f
     d_far: mi.Vector3f
@@ -181,59 +190,62 @@ class Hiding:
     active: mi.Bool
 
 
-def arc_edges(walk: Walk, x: Chosen, lines: int, l: float, key: mi.UInt32, pick: mi.PCG32) -> Hiding:
+def arc_edges(walk: Walk, x: Chosen, seer: Seer, lines: int, l: float, key: mi.UInt32, pick: mi.PCG32) -> Hiding:
     """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides. Detached."""
-    scene, ctx = walk.scene, mi.BSDFContext()
-    si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
 
     def draw(j: mi.UInt32) -> tuple[Arc, mi.Bool]:
         numbers = Counted(key, 0x100 + 8 * j)
-        sample, _ = si.bsdf().sample(ctx, si, numbers.next_1d(), numbers.next_2d(), x.active)
-        ok = x.active & (sample.pdf > 0) & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-        c = dr.select(ok, si.to_world(sample.wo), mi.Vector3f(0, 0, 1))
+        c, pdf, ok = seer.sample(numbers.next_1d(), numbers.next_2d())
         turn = dr.two_pi * numbers.next_1d()
         w = mi.Frame3f(c).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
-        return Arc(c, w, dr.select(ok, sample.pdf, 1), mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
-
-    def hit(d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
-        ray = si.spawn_ray(d)
-        return ray, scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        return Arc(c, w, pdf, mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
 
     def look(line: Arc, t: mi.Float, active: mi.Bool) -> Sight:
-        ray, seen = hit(line.at(t), active)
+        ray = seer.origin.spawn_ray(line.at(t))
+        first = seer.hit(ray, active)
+        seen = seer.behind(ray, first, active)
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-        return Sight(place_met(walk, seen, active, facets=False), at.p, at.n)
+        place = place_met(walk, seen, active, facets=False)
+        if walk.media is not None:  # directions follow null boundaries, too
+            place = mixed(place, place_met(walk, first, active, facets=False))
+        return Sight(place, at.p, at.n)
 
     found = bisect(look, search(draw, look, lines, pick), pick)
     line, active = found.line, found.weight > 0
-    ray_a, a = hit(line.at(found.a), active)
-    ray_b, b = hit(line.at(found.b), active)
-    near_a = a.t <= b.t
-    near, far = dr.select(near_a, a, b), dr.select(near_a, b, a)
-    ray_near, ray_far = dr.select(near_a, ray_a, ray_b), dr.select(near_a, ray_b, ray_a)
-    active &= near.is_valid()
+    rays = [seer.origin.spawn_ray(line.at(t)) for t in (found.a, found.b)]
+    firsts = [seer.hit(ray, active) for ray in rays]
+    edges = firsts
+    if walk.media is not None:  # the edge of what was met first or, where that is one null boundary, of what is behind
+        behind = [seer.behind(ray, first, active) for ray, first in zip(rays, firsts, strict=True)]
+        places = [place_met(walk, first, active, facets=False) for first in firsts]
+        edges = [dr.select(places[0] == places[1], seen, first) for seen, first in zip(behind, firsts, strict=True)]
+    near_a = edges[0].t <= edges[1].t
+    edge = dr.select(near_a, *edges)
+    near, far = dr.select(near_a, *firsts), dr.select(near_a, *firsts[::-1])
+    ray_near, ray_far = dr.select(near_a, *rays), dr.select(near_a, *rays[::-1])
+    active &= edge.is_valid()
 
-    n = edge_normal(near, ray_near, active)
+    n = edge_normal(edge, ray_near, active)
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
-    f, pdf = si.bsdf().eval_pdf(ctx, si, si.to_local(ray_far.d), active)
+    f, pdf = seer.towards(ray_far.d, active)
     common = x.β * f * (0.5 * dr.pi / (l * lines) * found.weight / line.pdf)
     active &= dr.any(common != 0)
     K = []
     for ray, seen in ((ray_near, near), (ray_far, far)):
-        arrival = Arrival(ray, seen, pdf, mi.Bool(False), mi.Bool(False))
-        path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), x.k + 1, active & (x.k + 1 < walk.max_depth))
+        arrival, depth = seer.arrival(ray, seen, pdf), x.depth + 1
+        path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < walk.max_depth))
         L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
         K.append(dr.select(active, common * L, 0))
-    return Hiding(near, far, ray_near.d, ray_far.d, n, K[0], K[1], active)
+    return Hiding(edge, near, far, ray_near.d, ray_far.d, n, K[0], K[1], active)
 
 
-def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
+def hiding_motion(walk: Walk, seer: Seer, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
     """What the edge sweeps that the directions at its sides do not follow; differentiable in all that moves."""
-    si = x.at.hit.compute_surface_interaction(at, mi.RayFlags.All, c.active)
+    origin = seer.moved(at)
     lengths = walk.traits.tables.blend_lengths
-    edge = held_direction(si, c.d_near, c.near, c.active)
-    d_near, _ = moved_direction(lengths, si, c.d_near, c.near, c.active)
-    d_far, _ = moved_direction(lengths, si, c.d_far, c.far, c.active)
+    edge = held_direction(origin, c.d_near, c.edge, c.active)
+    d_near, _ = moved_direction(lengths, origin, c.d_near, c.near, seer.holds(c.near, c.active))
+    d_far, _ = moved_direction(lengths, origin, c.d_far, c.far, seer.holds(c.far, c.active))
     swept = c.K_near * dr.dot(c.n, edge - d_near) - c.K_far * dr.dot(c.n, edge - d_far)
     return dr.select(c.active, swept, 0)
 
@@ -264,12 +276,13 @@ def inner_edges(
     x.β *= β
 
     square, arc = lengths
-    shaded = emitter_edges(walk, x, lines, square, key ^ 0x1B873593, pick)
-    K = shadow_weight(x, shaded)
-    hiding = arc_edges(walk, x, lines, arc, key ^ 0x38B34AE5, pick)
+    seer = Seer(walk, x.at, x.flight, x.active)
+    shaded = emitter_edges(walk, x, seer, lines, square, key ^ 0x1B873593, pick)
+    K = shadow_weight(seer, shaded)
+    hiding = arc_edges(walk, x, seer, lines, arc, key ^ 0x38B34AE5, pick)
 
     def motion(ray: mi.Ray3f) -> mi.Spectrum:
-        return hiding_motion(walk, x, hiding, ray) - K * shadow_gap(x, shaded, ray, shaded.u)
+        return hiding_motion(walk, seer, hiding, ray) - K * shadow_gap(seer, shaded, ray, shaded.u)
 
     k = dr.select(x.active, x.k, 0)
     return Edges(s, key, k, x.at.ray, layout, records, motion)

@@ -60,7 +60,7 @@ def shadow(walk: Walk, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler,
 
     while dr.hint(stretch.active, exclude=[walk], label="pathreplay: shadow"):
         hit, a, b, inside = stretch.part(walk.scene)
-        T = dr.select(inside, T * _transmittance(walk, stretch.medium, stretch.ray, a, b, sampler, inside), T)
+        T = dr.select(inside, T * transmittance(walk, stretch.medium, stretch.ray, a, b, sampler, inside), T)
         length += b - a
         u = sampler.next_1d(inside) * length
         picked = inside & (u < b - a)
@@ -71,7 +71,7 @@ def shadow(walk: Walk, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler,
     return Shadow(T=T, y=y, medium=y_medium, length=length)
 
 
-def _transmittance(
+def transmittance(
     walk: Walk, medium: mi.MediumPtr, ray: mi.Ray3f, a: mi.Float, b: mi.Float, sampler: mi.Sampler, active: mi.Bool
 ) -> mi.Spectrum:
     """An unbiased estimate of the transmittance of one medium between the distances a and b."""
