@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from edge_scenes import ASIDE, BACK, BLACK, CARD, OVERHEAD, T, cell, glow, lamp, paint, patterned, shape
+from edge_scenes import ASIDE, BACK, BLACK, CARD, OVERHEAD, T, cell, glow, lamp, paint, patterned, picture, shape
 from media_scenes import FORWARD, NULL, heterogeneous, homogeneous, smooth
 from truth import Case, Move, add, camera, rgb, translate
 
@@ -25,6 +25,10 @@ def in_fog(medium: dict, fov: float = 45, **parts: Any) -> dict:
 def in_a_box(medium: dict, **parts: Any) -> dict:
     """A scene with a box of fog, the cube [-1, 1]³ or a larger one, and the camera outside."""
     return {"type": "scene", "camera": camera((0, 0, 4), 45), "box": shape(T(), NULL, "cube", interior=medium), **parts}
+
+
+BEHIND = T().translate([0, 0, -1.5]).scale([7, 7, 1])
+"""A wall that does not touch the box."""
 
 
 def thin(**more: Any) -> dict:
@@ -44,7 +48,7 @@ def card_before_a_glow() -> dict:
 
 
 def card_in_clouds(plugin: str) -> Callable[[], dict]:
-    return lambda: in_a_box(clouds(plugin), wall=glow(), object=shape(T().translate([0.2, 0.1, 0.3]).scale(0.4), BLACK))
+    return lambda: in_a_box(clouds(plugin), wall=lamp(BEHIND, picture()), object=shape(T().translate([0.2, 0.1, 0.3]).scale(0.4), BLACK))
 
 
 BEAM = T().translate([1.0, 0.8, 1.4]).scale([0.4, 0.35, 1])
@@ -76,7 +80,7 @@ def ball_of_fog() -> dict:
 def lamp_behind_a_ball() -> dict:
     """Its edge is seen by particles through the boundary of the ball, and by the camera through all of it."""
     ball = {"type": "sphere", "to_world": T().scale(0.7), "bsdf": NULL, "interior": homogeneous(1.0, 0.8, FORWARD)}
-    light = T().translate([0.1, 0.1, -1.2]).scale([0.5, 0.4, 1])
+    light = T().translate([0.1, 0.1, -0.9]).scale([0.5, 0.4, 1])
     return {"type": "scene", "camera": camera((0, 0, 4), 35), "wall": shape(BACK, patterned()), "lamp": lamp(light, 4),
             "ball": ball}  # fmt: skip
 

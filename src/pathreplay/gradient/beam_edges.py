@@ -19,9 +19,8 @@ import mitsuba as mi
 
 from ..transport.emitters import draw_emitter
 from ..transport.media import interaction
-from ..transport.passage import beyond_null, passage
+from ..transport.passage import beyond_null, passage, past
 from ..transport.path import PathState
-from ..transport.shadow import shadow
 from ..transport.signature import edge_normal, mixed, outline_gap
 from ..transport.start import CameraStart
 from ..transport.step import choose_step
@@ -99,7 +98,7 @@ def beam_edges(walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lin
     around = walk.media.around
     medium = dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)
     T = passage(walk, camera_ray, line.τ, medium, others, active)[0]
-    T *= shadow(walk, bright.ray, at.medium, others, active).T
+    T *= past(walk, bright.ray, dark.hit.t, at.medium, others, active)
     f = weight * T * flight.σ_s * seer.towards(bright.ray.d, active)[0] * bright.Le
     jump = f * (found.weight * 0.5 * dr.pi / (l * lines * dr.width(lane)) / line.density)
     jump *= dr.select(a.hidden, -1, 1)  # from begin to end of the line

@@ -28,7 +28,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.emitters import draw_emitter
-from ..transport.passage import beyond_null
+from ..transport.passage import SHORT_OF, beyond_null
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
@@ -40,7 +40,7 @@ from .crofton import Crossed, PlaneLine, Sight, bisect, hides_itself, search
 from .edges import Edges, Places, ray_to_camera
 from .primal import walk_on
 from .record import Layout, record, record_type
-from .through_media import SHORT_OF, clear, going_on, left_of_light
+from .through_media import clear, going_on, left_of_light
 
 MAX_CHAIN = 16
 """Vertices of a chain of delta lobes, at most."""

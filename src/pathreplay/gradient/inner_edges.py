@@ -20,14 +20,16 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.passage import SHORT_OF
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
+from ..transport.traits import is_null
 from ..transport.velocity import held_direction, moved_direction
 from ..transport.vertex import Arrival, Flight, Walk, mis_weight
 from .adjoint import derivative_by_place
 from .counted import Counted, quasi_random
-from .crofton import PlaneLine, Sight, bisect, search
+from .crofton import ROUNDING, PlaneLine, Sight, bisect, search
 from .edges import Edges, Places
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
@@ -110,6 +112,7 @@ class Shaded:
 
     line: SquareLine
     u: mi.Point2f  # at the side in the shadow
+    u_lit: mi.Point2f
     hit: mi.PreliminaryIntersection3f  # of what casts it
     ray: mi.Ray3f
     n: mi.Vector3f
@@ -156,10 +159,11 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, lines: int, l: float, key: 
     active &= hidden
     f, pdf = seer.towards(light.d, active)
     density = light.pdf / line.share
-    Le *= seer.share_of_lamps(light, key, active)
+    Le *= seer.past(light, hit.t, key, active)
     F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density, pdf))
     K = 0.5 * dr.pi * dr.square(1 + l) / (l * lines) * found.weight * F * dr.select(a_hidden, -1, 1)
-    return Shaded(line, line.at(t), hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
+    u, u_lit = line.at(t), line.at(dr.select(a_hidden, found.b, found.a))
+    return Shaded(line, u, u_lit, hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
 
 
 def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
@@ -170,9 +174,18 @@ def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
 
 
 def shadow_weight(seer: Seer, c: Shaded) -> mi.Spectrum:
-    """K in full: with the derivative of B along the line."""
-    slope = derivative_by_place(c.u, lambda u: shadow_gap(seer, c, seer.at.ray, u))
-    return c.line.passed(c.K, slope, c.active)
+    """K in full: with the derivative of B along the line.
+
+    Lamps with a texture are sampled by texels, between which the sample jumps: what it jumps over is no edge.
+    """
+
+    def gap(u: mi.Point2f) -> mi.Float:
+        return shadow_gap(seer, c, seer.at.ray, u)
+
+    slope = derivative_by_place(c.u, gap)
+    passed, expected = dr.detach(gap(c.u_lit) - gap(c.u)), dr.dot(slope, c.u_lit - c.u)
+    jumps = dr.abs(passed - expected) > dr.abs(expected) + ROUNDING * c.hit.t
+    return c.line.passed(c.K, slope, c.active & ~jumps)
 
 
 @dataclass
@@ -214,11 +227,12 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, lines: int, l: float, key: mi.U
     line, active = found.line, found.weight > 0
     rays = [seer.origin.spawn_ray(line.at(t)) for t in (found.a, found.b)]
     firsts = [seer.hit(ray, active) for ray in rays]
-    edges = firsts
+    edges, through = firsts, mi.Bool(False)
     if walk.media is not None:  # the edge of what was met first or, where that is one null boundary, of what is behind
         behind = [seer.behind(ray, first, active) for ray, first in zip(rays, firsts, strict=True)]
         places = [place_met(walk, first, active, facets=False) for first in firsts]
-        edges = [dr.select(places[0] == places[1], seen, first) for seen, first in zip(behind, firsts, strict=True)]
+        through = (places[0] == places[1]) & firsts[0].is_valid() & is_null(firsts[0].shape.bsdf())
+        edges = [dr.select(through, seen, first) for seen, first in zip(behind, firsts, strict=True)]
     near_a = edges[0].t <= edges[1].t
     edge = dr.select(near_a, *edges)
     near, far = dr.select(near_a, *firsts), dr.select(near_a, *firsts[::-1])
@@ -230,12 +244,13 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, lines: int, l: float, key: mi.U
     f, pdf = seer.towards(ray_far.d, active)
     common = x.β * f * (0.5 * dr.pi / (l * lines) * found.weight / line.pdf)
     active &= dr.any(common != 0)
+    arrivals, depth = [seer.arrival(ray_near, near, pdf), seer.arrival(ray_far, far, pdf)], x.depth + 1
+    T, arrivals = seer.onward(arrivals, SHORT_OF * edge.t, key, active & through)
     K = []
-    for ray, seen in ((ray_near, near), (ray_far, far)):
-        arrival, depth = seer.arrival(ray, seen, pdf), x.depth + 1
+    for arrival in arrivals:
         path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < walk.max_depth))
         L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
-        K.append(dr.select(active, common * L, 0))
+        K.append(dr.select(active, common * T * L, 0))
     return Hiding(edge, near, far, ray_near.d, ray_far.d, n, K[0], K[1], active)
 
 

@@ -9,10 +9,10 @@ import mitsuba as mi
 
 from ..transport import arrive, scatter
 from ..transport.media import carried, span
-from ..transport.passage import beyond_null
-from ..transport.shadow import shadow
+from ..transport.passage import beyond_null, passage, past
 from ..transport.vertex import Arrival, Chosen, Flight, Walk, is_smooth
 from .counted import Counted
+from .through_media import going_on
 
 
 def may_see(walk: Walk, at: Arrival, step: Chosen) -> tuple[mi.Bool, mi.Spectrum]:
@@ -101,11 +101,22 @@ class Seer:
         alone = self.event & ~self.at.medium.use_emitter_sampling()
         return replace(at, delta=alone, medium=self.medium(ray.d), behind=mi.Float(0))
 
-    def share_of_lamps(self, light: mi.DirectionSample3f, key: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
-        """What media leave of the light of an emitter sample; particles may not ask for any."""
+    def past(self, light: mi.DirectionSample3f, t: mi.Float, key: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+        """What media leave of an emitter sample's light past an edge at ``t``; not all particles ask for any."""
         if self.walk.media is None:
             return mi.Spectrum(1)
         asks = active & (~self.event | self.at.medium.use_emitter_sampling())
         ray = self.origin.spawn_ray_to(light.p)
-        T = shadow(self.walk, ray, self.medium(light.d), Counted(key, mi.UInt32(0x60000)), asks).T
+        T = past(self.walk, ray, t, self.medium(light.d), Counted(key, mi.UInt32(0x60000)), asks)
         return dr.select(asks, T, 0)
+
+    def onward(
+        self, arrivals: list[Arrival], t: mi.Float, key: mi.UInt32, active: mi.Bool
+    ) -> tuple[mi.Spectrum, list[Arrival]]:
+        """Where ``active``, the arrivals as seen from ``t`` on their ray, and the transmittance up to there."""
+        if self.walk.media is None:
+            return mi.Spectrum(1), arrivals
+        others = Counted(key, mi.UInt32(0x70000))
+        T, medium = passage(self.walk, arrivals[0].ray, t, arrivals[0].medium, others, active)
+        T = dr.select(active, T, 1)
+        return T, [dr.select(active, going_on(self.walk, at, t, medium, active), at) for at in arrivals]

@@ -15,14 +15,11 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.passage import passage
+from ..transport.passage import SHORT_OF, further, passage
 from ..transport.path import PathState
 from ..transport.start import CameraStart, behind_emitters
 from ..transport.vertex import Arrival, Walk
 from .counted import Counted
-
-SHORT_OF = 1 - 1e-3
-"""Of the way to an edge, the part that its sides share: a little less than all, so that both still meet something."""
 
 
 def clear(walk: Walk) -> Walk:
@@ -58,8 +55,7 @@ def left_of_light(
 
 def going_on(walk: Walk, at: Arrival, t: mi.Float, medium: mi.MediumPtr, active: mi.Bool) -> Arrival:
     """The same arrival, as it is seen from distance ``t`` on its ray, where there is ``medium``."""
-    ray = mi.Ray3f(at.ray)
-    ray.o = at.ray.o + t * at.ray.d
+    ray = further(at.ray, t)
     hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, reorder=False, active=active)
     if walk.hide_emitters:
         hit = behind_emitters(walk, ray, hit, active & at.camera)

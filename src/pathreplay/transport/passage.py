@@ -8,9 +8,14 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .shadow import Stretch, transmittance
+from .shadow import Stretch, shadow, transmittance
 from .traits import is_null
 from .vertex import Walk
+
+SHORT_OF = 1 - 1e-3
+"""Of the way to an edge, the part that its sides share: a little less than all, so that both still meet something."""
+STEP = 1e-5
+"""Share of distance and coordinates that lie between a boundary and what is looked for behind it."""
 
 
 @dr.syntax
@@ -18,16 +23,16 @@ def beyond_null(
     scene: mi.Scene, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
     """The hit, or the first one behind null boundaries; distances are told along ``ray``."""
-    here, onward, gone = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(0)
+    here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
     passing = active & _is_boundary(here)
     while dr.hint(passing, exclude=[scene, ray], label="pathreplay: beyond null boundaries"):
-        si = here.compute_surface_interaction(onward, mi.RayFlags.Minimal, passing)
-        o = si.spawn_ray(ray.d).o
-        gone += dr.norm(o - onward.o)
-        onward.o, onward.maxt = o, ray.maxt - gone
+        # On the same line, from which `spawn_ray` would depart.
+        gone = t + STEP * (1 + dr.max(dr.abs(ray.o)) + t)
+        onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
         here = scene.ray_intersect_preliminary(onward, coherent=False, reorder=False, active=passing)
+        t = gone + here.t
         passing &= _is_boundary(here)
-    here.t += gone
+    here.t = t
     return here
 
 
@@ -49,3 +54,22 @@ def passage(
         T = dr.select(inside, T * transmittance(walk, stretch.medium, stretch.ray, a, b, sampler, inside), T)
         stretch, T = stretch.beyond(hit, T)
     return T, stretch.medium
+
+
+def past(
+    walk: Walk, ray: mi.Ray3f, t: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
+) -> mi.Spectrum:
+    """The transmittance of a shadow ray that passes an edge at distance ``t``. Detached.
+
+    In two parts, so that it passes on its side: null boundaries push rays aside by more than they are off the edge.
+    """
+    t = SHORT_OF * t
+    T, medium = passage(walk, ray, t, medium, sampler, active)
+    return T * shadow(walk, further(ray, t), medium, sampler, active & dr.any(T != 0)).T
+
+
+def further(ray: mi.Ray3f, t: mi.Float) -> mi.Ray3f:
+    """The rest of a ray, from distance ``t`` on."""
+    rest = mi.Ray3f(ray)
+    rest.o, rest.maxt = ray.o + t * ray.d, ray.maxt - t
+    return rest
