@@ -143,7 +143,7 @@ def _boundary(walk: Walk, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int
     probe.maxt = still.maxt - y if sign > 0 else y
     hit = walk.scene.ray_intersect_preliminary(probe, coherent=False, reorder=False, active=active)
     met = active & hit.is_valid()
-    # The same surface, as the attached ray itself meets it.
-    hit.t = y + sign * hit.t
-    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, met)
-    return dr.select(met, dr.replace_grad(hit.t, si.t), ray.maxt if sign > 0 else 0)
+    # The same surface, as the attached ray meets it from y on: a sphere answers for what a ray meets first.
+    probe.o, probe.d = ray.o + y * ray.d, sign * ray.d
+    si = hit.compute_surface_interaction(probe, mi.RayFlags.All, met)
+    return dr.select(met, dr.replace_grad(y + sign * hit.t, y + sign * si.t), ray.maxt if sign > 0 else 0)
