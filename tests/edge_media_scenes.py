@@ -51,12 +51,12 @@ def card_in_clouds(plugin: str) -> Callable[[], dict]:
     return lambda: in_a_box(clouds(plugin), wall=lamp(BEHIND, picture()), object=shape(T().translate([0.2, 0.1, 0.3]).scale(0.4), BLACK))
 
 
-BEAM = T().translate([1.0, 0.8, 1.4]).scale([0.4, 0.35, 1])
+BEAM = T().translate([1.05, 0.75, 1.5]).rotate([0, 0, 1], 20).scale([0.45, 0.25, 1])
 """Where a card casts a shadow into the fog that the camera looks at, and is itself beside the picture."""
 
 
 def shadow_in_fog(light: Callable[[], dict]) -> Callable[[], dict]:
-    return lambda: in_fog(thin(), 30, wall=shape(BACK, WALL), lamp=light(), object=shape(BEAM, BLACK))
+    return lambda: in_fog(thin(), 30, wall=shape(BACK, BLACK), lamp=light(), object=shape(BEAM, BLACK))
 
 
 def point() -> dict:
@@ -100,8 +100,8 @@ CELLS = [
     media_cell("fog_card", card_before_a_glow, OBJECT, translate(*ASIDE)),
     media_cell("cloud_card", card_in_clouds("heterogeneous"), OBJECT, translate(*ASIDE)),
     media_cell("grid_card", card_in_clouds("gridmedium"), OBJECT, translate(*ASIDE)),
-    media_cell("fog_shadow", shadow_in_fog(lambda: lamp(OVERHEAD)), OBJECT, translate(*ASIDE), 2),
-    media_cell("fog_beam", shadow_in_fog(point), OBJECT, translate(*ASIDE), 2),
+    media_cell("fog_shadow", shadow_in_fog(lambda: lamp(OVERHEAD)), OBJECT, translate(0.5, -1, 0), 2),
+    media_cell("fog_beam", shadow_in_fog(point), OBJECT, translate(0.5, -1, 0), 2),
     media_cell("fog_lamp", lamp_in_fog, "lamp.to_world", translate(*ASIDE)),
     media_cell("fog_light_moves", shadow_in_fog(point), "lamp.position", add([1.0, 0.3, 0.0]), 2),
     media_cell("ball_moves", ball_of_fog, OBJECT, translate(*ASIDE)),
