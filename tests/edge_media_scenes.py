@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import mitsuba as mi
+
 from edge_scenes import ASIDE, BACK, BLACK, CARD, OVERHEAD, T, cell, glow, lamp, paint, patterned, picture, shape
 from media_scenes import FORWARD, NULL, heterogeneous, homogeneous, smooth
 from truth import Case, Move, add, camera, rgb, translate
@@ -29,6 +31,7 @@ def in_a_box(medium: dict, **parts: Any) -> dict:
 
 BEHIND = T().translate([0, 0, -1.5]).scale([7, 7, 1])
 """A wall that does not touch the box."""
+INSIDE = T().translate([0.2, 0.1, 0.3]).scale(0.4)
 
 
 def thin(**more: Any) -> dict:
@@ -37,6 +40,11 @@ def thin(**more: Any) -> dict:
 
 def clouds(plugin: str = "heterogeneous") -> dict:
     return heterogeneous(smooth(0.1, 1.2), smooth(0.5, 0.9), plugin=plugin)
+
+
+def grow(value: Any, t: Any) -> mi.Transform4f:
+    """Of a card, so that its shadow does."""
+    return mi.Transform4f(value) @ mi.Transform4f().scale([1 + t, 1 + t, 1])
 
 
 def card() -> dict:
@@ -48,7 +56,9 @@ def card_before_a_glow() -> dict:
 
 
 def card_in_clouds(plugin: str) -> Callable[[], dict]:
-    return lambda: in_a_box(clouds(plugin), wall=lamp(BEHIND, picture()), object=shape(T().translate([0.2, 0.1, 0.3]).scale(0.4), BLACK))
+    return lambda: in_a_box(
+        clouds(plugin), wall=lamp(BEHIND, picture()), object=shape(T().translate([0.2, 0.1, 0.3]).scale(0.4), BLACK)
+    )
 
 
 BEAM = T().translate([1.05, 0.75, 1.5]).rotate([0, 0, 1], 20).scale([0.45, 0.25, 1])
@@ -85,6 +95,14 @@ def lamp_behind_a_ball() -> dict:
             "ball": ball}  # fmt: skip
 
 
+def lamp_by_a_ball() -> dict:
+    """A large lamp close to a ball of fog, beside the picture: particles often see it by chance."""
+    ball = {"type": "sphere", "to_world": T().scale(0.7), "bsdf": NULL, "interior": homogeneous(1.5, 0.9)}
+    light = T().translate([1.4, 0.1, 0.2]).rotate([0, 1, 0], -90).scale([0.6, 0.7, 1])
+    return {"type": "scene", "camera": camera((0, 0, 4), 20), "wall": shape(BACK, BLACK), "lamp": lamp(light, 4),
+            "ball": ball}  # fmt: skip
+
+
 def mirror_in_fog() -> dict:
     glass = T().rotate([0, 1, 0], -25).scale([1.5, 1.5, 1])
     light = T().translate([-2, 0.2, 2.0]).rotate([0, 1, 0], 120).scale([0.6, 0.5, 1])
@@ -100,12 +118,13 @@ CELLS = [
     media_cell("fog_card", card_before_a_glow, OBJECT, translate(*ASIDE)),
     media_cell("cloud_card", card_in_clouds("heterogeneous"), OBJECT, translate(*ASIDE)),
     media_cell("grid_card", card_in_clouds("gridmedium"), OBJECT, translate(*ASIDE)),
-    media_cell("fog_shadow", shadow_in_fog(lambda: lamp(OVERHEAD)), OBJECT, translate(0.5, -1, 0), 2),
+    media_cell("fog_shadow", shadow_in_fog(lambda: lamp(OVERHEAD)), OBJECT, grow, 2),
     media_cell("fog_beam", shadow_in_fog(point), OBJECT, translate(0.5, -1, 0), 2),
     media_cell("fog_lamp", lamp_in_fog, "lamp.to_world", translate(*ASIDE)),
     media_cell("fog_light_moves", shadow_in_fog(point), "lamp.position", add([1.0, 0.3, 0.0]), 2),
     media_cell("ball_moves", ball_of_fog, OBJECT, translate(*ASIDE)),
     media_cell("behind_ball", lamp_behind_a_ball, "lamp.to_world", translate(*ASIDE)),
+    media_cell("by_ball", lamp_by_a_ball, "lamp.to_world", translate(-1, 0, 0), 2),
     media_cell("fog_mirror", mirror_in_fog, "mirror.to_world", translate(0, 0, 1)),
 ]
 BY_NAME = {each.name: each for each in CELLS}
