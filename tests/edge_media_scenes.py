@@ -65,8 +65,14 @@ BEAM = T().translate([1.05, 0.75, 1.5]).rotate([0, 0, 1], 20).scale([0.45, 0.25,
 """Where a card casts a shadow into the fog that the camera looks at, and is itself beside the picture."""
 
 
-def shadow_in_fog(light: Callable[[], dict]) -> Callable[[], dict]:
-    return lambda: in_fog(thin(), 30, wall=shape(BACK, BLACK), lamp=light(), object=shape(BEAM, BLACK))
+NEAR = T().translate([2.2, 1.6, 1.5]).look_at([0, 0, 0], [-2.2, -1.6, -1.5], [0, 1, 0]).scale([1.2, 1.2, 1])
+"""A lamp large enough to be found by chance."""
+BY_CHANCE = {"sample_emitters": False}
+"""Of a medium: only directions that particles scatter find lamps."""
+
+
+def shadow_in_fog(light: Callable[[], dict], **more: Any) -> Callable[[], dict]:
+    return lambda: in_fog(thin(**more), 30, wall=shape(BACK, BLACK), lamp=light(), object=shape(BEAM, BLACK))
 
 
 def point() -> dict:
@@ -95,9 +101,9 @@ def lamp_behind_a_ball() -> dict:
             "ball": ball}  # fmt: skip
 
 
-def lamp_by_a_ball() -> dict:
+def lamp_by_a_ball(**more: Any) -> dict:
     """A large lamp close to a ball of fog, beside the picture: particles often see it by chance."""
-    ball = {"type": "sphere", "to_world": T().scale(0.7), "bsdf": NULL, "interior": homogeneous(1.5, 0.9)}
+    ball = {"type": "sphere", "to_world": T().scale(0.7), "bsdf": NULL, "interior": homogeneous(1.5, 0.9, **more)}
     light = T().translate([1.4, 0.1, 0.2]).rotate([0, 1, 0], -90).scale([0.6, 0.7, 1])
     return {"type": "scene", "camera": camera((0, 0, 4), 20), "wall": shape(BACK, BLACK), "lamp": lamp(light, 4),
             "ball": ball}  # fmt: skip
@@ -124,6 +130,8 @@ CELLS = [
     media_cell("fog_light_moves", shadow_in_fog(point), "lamp.position", add([1.0, 0.3, 0.0]), 2),
     media_cell("ball_moves", ball_of_fog, OBJECT, translate(*ASIDE)),
     media_cell("behind_ball", lamp_behind_a_ball, "lamp.to_world", translate(*ASIDE)),
+    media_cell("by_ball_chance", lambda: lamp_by_a_ball(**BY_CHANCE), "lamp.to_world", translate(-1, 0, 0), 2),
+    media_cell("shadow_chance", lambda: shadow_in_fog(lambda: lamp(NEAR, 4), **BY_CHANCE)(), OBJECT, grow, 2),
     media_cell("by_ball", lamp_by_a_ball, "lamp.to_world", translate(-1, 0, 0), 2),
     media_cell("fog_mirror", mirror_in_fog, "mirror.to_world", translate(0, 0, 1)),
 ]
