@@ -11,7 +11,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from edge_scenes import ASIDE, BACK, BLACK, CARD, OVERHEAD, T, cell, glow, lamp, paint, patterned, picture, shape
+from edge_scenes import ASIDE, BACK, BLACK, CARD, OVERHEAD, T, cell, glow, lamp, paint, patterned, picture, shape, sky
 from media_scenes import FORWARD, NULL, heterogeneous, homogeneous, smooth
 from truth import Case, Move, add, camera, rgb, translate
 
@@ -93,6 +93,14 @@ def ball_of_fog() -> dict:
             "object": ball}  # fmt: skip
 
 
+def ball_under_a_sky() -> dict:
+    """Dark fog above a wall, beside the picture. What the wall holds of its directions jumps at the ball's outline."""
+    ball = {"type": "sphere", "to_world": T().translate([0.9, 0.9, 0.2]).scale(0.7), "bsdf": NULL,
+            "interior": homogeneous(1.0, 0.0)}  # fmt: skip
+    return {"type": "scene", "camera": camera((0, 0, 4), 30), "wall": shape(BACK, patterned()), "sky": sky(),
+            "object": ball}  # fmt: skip
+
+
 def lamp_behind_a_ball() -> dict:
     """Its edge is seen by particles through the boundary of the ball, and by the camera through all of it."""
     ball = {"type": "sphere", "to_world": T().scale(0.7), "bsdf": NULL, "interior": homogeneous(1.0, 0.8, FORWARD)}
@@ -129,6 +137,7 @@ CELLS = [
     media_cell("fog_lamp", lamp_in_fog, "lamp.to_world", translate(*ASIDE)),
     media_cell("fog_light_moves", shadow_in_fog(point), "lamp.position", add([1.0, 0.3, 0.0]), 2),
     media_cell("ball_moves", ball_of_fog, OBJECT, translate(*ASIDE)),
+    media_cell("ball_sky", ball_under_a_sky, OBJECT, translate(*ASIDE), 2),
     media_cell("behind_ball", lamp_behind_a_ball, "lamp.to_world", translate(*ASIDE)),
     media_cell("by_ball_chance", lambda: lamp_by_a_ball(**BY_CHANCE), "lamp.to_world", translate(-1, 0, 0), 2),
     media_cell("shadow_chance", lambda: shadow_in_fog(lambda: lamp(NEAR, 4), **BY_CHANCE)(), OBJECT, grow, 2),
