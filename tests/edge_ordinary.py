@@ -19,7 +19,7 @@ import ordinary_scenes
 from ordinary_files import Patch, write_obj, write_ply
 from pathreplay.check.objective import Move, Objective
 from pathreplay.check.stencil import WIDE
-from truth import bitmap, noise, rgb, rotate, translate, translate_vertices, turn_vertices
+from truth import add, bitmap, noise, rgb, rotate, translate, translate_vertices, turn_vertices
 
 T = mi.ScalarTransform4f
 SIZE = 16
@@ -296,6 +296,17 @@ def hard(kind: str) -> Write:
     return lit_by({"type": kind, **AT[kind], name: rgb(9, 8, 7)}, depth=2)
 
 
+def moved_light(kind: str, move: Move, key: str = "lamp.to_world") -> Write:
+    """A light without extent that moves, and its shadows with it."""
+    name = "irradiance" if kind == "directional" else "intensity"
+    return lit_by({"type": kind, **AT[kind], name: rgb(9, 8, 7)}, key, move, depth=2)
+
+
+def projector(folder: Path) -> Moving:
+    light = {"type": "projector", "to_world": OVERHEAD, "fov": 50, "irradiance": bitmap(noise(8, 3, 2, 9))}
+    return Moving(room(light=light), BOX, ASIDE, depth=2)
+
+
 def hidden(folder: Path) -> Moving:
     lamp = panel(to_world=T().translate([-0.5, 0.5, 0.8]).scale(0.3))
     back = {"type": "rectangle", "to_world": T().translate([0.3, 1.2, 2.5]).rotate([1, 0, 0], 160).scale(0.4),
@@ -321,12 +332,54 @@ def made_of(name: str, depth: int = 3, **more: Any) -> Write:
     return lambda folder: Moving(room(box=box({"type": name, **more})), BOX, TURN, depth)
 
 
+def painted_lamp(folder: Path) -> Moving:
+    """A lamp with a texture, in the view, that turns."""
+    glow = {"type": "area", "radiance": bitmap(noise(8, 3, 1, 20))}
+    lamp = panel(to_world=T().translate([-0.7, 0.6, 0.5]).rotate([0, 1, 0], 25).scale(0.4), emitter=glow)
+    return Moving(room(light=lamp), "lamp.to_world", rotate(0.3, 1, 0))
+
+
+def seen_through(opacity: Any) -> Write:
+    """A sheet that lets a part of the light through, without an outline of its own inside."""
+
+    def write(folder: Path) -> Moving:
+        veil = {"type": "mask", "opacity": opacity(), "bsdf": PAINT}
+        sheet = {"type": "rectangle", "to_world": T().translate([0.2, 0.1, 0.4]).rotate([0, 1, 0], 20).scale(0.6)}
+        return Moving(room(box={**sheet, "bsdf": veil}), "box.to_world", translate(1, 0.3, 0))
+
+    return write
+
+
+def shaped(**shape: Any) -> Write:
+    """Another shape than a mesh in place of the box."""
+    return lambda folder: Moving(room(box={"bsdf": PAINT, **shape}), "box.to_world", translate(1, 0.3, 0))
+
+
+def curve(folder: Path) -> Moving:
+    """A bent tube, before which the camera moves."""
+    points = np.array([[-0.9, -0.6, 0.1], [-0.5, 0.3, 0.3], [0, -0.2, 0.5], [0.5, 0.5, 0.2], [0.9, -0.4, 0]])
+    (folder / "tube.txt").write_text("\n".join(f"{x} {y} {z} 0.15" for x, y, z in points))
+    tube = {"type": "bsplinecurve", "filename": str(folder / "tube.txt"), "bsdf": PAINT}
+    return Moving(room(box=tube), "camera.to_world", translate(1, 0.3, 0))
+
+
 def deep(folder: Path) -> Moving:
     return Moving(room(), BOX, TURN, depth=6)
 
 
 def by_roulette(folder: Path) -> Moving:
     return Moving(room(), BOX, TURN, depth=6, options={"rr_depth": 2})
+
+
+def mono(folder: Path) -> Moving:
+    """A grey world, written into a film of one channel."""
+    return Moving(room(sensor(film=film(pixel_format="luminance"))), BOX, ASIDE)
+
+
+def spectral(folder: Path) -> Moving:
+    """Spectra by wavelength; the film has three colours."""
+    glow = {"type": "area", "radiance": {"type": "spectrum", "value": [(400, 4), (550, 12), (700, 8)]}}
+    return Moving(room(light=panel(emitter=glow)), BOX, ASIDE)
 
 
 SCENES: dict[str, Write] = {
@@ -353,6 +406,7 @@ SCENES: dict[str, Write] = {
     "orthographic": seen_by(sensor("orthographic", UPRIGHT)),
     "orthographic_moves": moved_camera(sensor("orthographic", UPRIGHT)),
     "camera_turns": lambda folder: Moving(room(), "camera.to_world", rotate(0.3, 1, 0)),
+    "fov": lambda folder: Moving(room(), "camera.x_fov", add(10.0)),
     "second_sensor": second_sensor,
     "sky": lambda folder: Moving(room(light=sky()), BOX, ASIDE),
     "constant": lit_by({"type": "constant", "radiance": rgb(0.8, 0.9, 1)}),
@@ -365,6 +419,12 @@ SCENES: dict[str, Write] = {
     "point": hard("point"),
     "spot": hard("spot"),
     "directional": hard("directional"),
+    "point_moves": moved_light("point", add([1.0, 0.3, 0.0]), "lamp.position"),
+    "spot_moves": moved_light("spot", translate(1, 0.3, 0)),
+    "directional_turns": moved_light("directional", rotate(0.3, 1, 0)),
+    "sky_turns": lambda folder: Moving(room(light=sky()), "lamp.to_world", rotate(0.3, 1, 0)),
+    "projector": projector,
+    "painted_lamp": painted_lamp,
     "hidden": hidden,
     "hidden_sky": hidden_sky,
     "normal_map": normal_map,
@@ -375,6 +435,18 @@ SCENES: dict[str, Write] = {
     "dielectric": made_of("dielectric", 6),
     "roughdielectric": made_of("roughdielectric", 6, alpha=0.3),
     "thindielectric": made_of("thindielectric", 6),
+    "veil": seen_through(lambda: 0.5),
+    "painted_veil": seen_through(lambda: {**bitmap(noise(8, 1, 0.2, 0.9)), "filter_type": "bilinear"}),
+    "sphere": shaped(type="sphere", radius=0.5),
+    "disk": shaped(type="disk", to_world=T().rotate([1, 1, 0], 40).scale(0.6)),
+    "cylinder": shaped(type="cylinder", p0=[-0.5, -0.2, 0.1], p1=[0.5, 0.3, 0.3], radius=0.3),
+    "curve": curve,
     "deep": deep,
     "by_roulette": by_roulette,
 }
+
+VARIANTS: dict[str, tuple[str, Write]] = {
+    "mono": ("llvm_ad_mono", mono),
+    "spectral": ("llvm_ad_spectral", spectral),
+}
+"""Those that need another variant, set before they are written."""

@@ -315,6 +315,7 @@ def test_wrong_usage_says_what_would_be_right(arguments: dict, told: str) -> Non
         main(**arguments)
 
 
+@pytest.mark.slow
 def test_two_records_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By the command, which is run where the user is: exit status, table, and a mistake as one line."""
     for name, slowness in (("old", 0.7), ("new", 1.4)):

@@ -46,17 +46,10 @@ def adam(folder: Path) -> dict[str, bytes]:
     return {key: value.tobytes() for key, value in state.items()}
 
 
+@SLOW
 @pytest.mark.parametrize(
     ("job", "number"),
-    [
-        ("medium", signal.SIGKILL),
-        *(
-            pytest.param(job, number, marks=SLOW)
-            for job in JOBS
-            for number in (signal.SIGKILL, signal.SIGTERM)
-            if (job, number) != ("medium", signal.SIGKILL)
-        ),
-    ],
+    [(job, number) for job in JOBS for number in (signal.SIGKILL, signal.SIGTERM)],
 )
 def test_killed_and_resumed_is_undisturbed_to_the_bit(job: str, number: signal.Signals, tmp_path: Path) -> None:
     config = {**JOBS[job], "iterations": 8, "checkpoint_every": 1, "deterministic": True}

@@ -83,6 +83,7 @@ def test_a_driver_differentiates_still_fog(name: str) -> None:
         np.testing.assert_allclose(gradient, expected, rtol=TOLERANCE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORWARD)
 def test_a_forward_driver_differentiates_still_fog(name: str) -> None:
     """Its tangents add up to the gradient of the sweep, by parameters that grow by their own size."""

@@ -11,9 +11,10 @@ import pytest
 
 from pathreplay.gradient.centres import Centres
 from pathreplay.gradient.counted import quasi_random
-from pathreplay.gradient.crofton import PlaneLine, Sight, bisect, search
+from pathreplay.gradient.crofton import Picked, PlaneLine, Sight, bisect, glance
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.places import FilmPlaces
+from pathreplay.transport.pieces import smooth_pieces
 
 
 def world(**film: Any) -> mi.Scene:
@@ -44,7 +45,7 @@ FILMS = {
 
 def some_places(view: Pass, n: int = 100000) -> tuple[FilmPlaces, mi.Point2f]:
     places = FilmPlaces.of(view)
-    return places, quasi_random(dr.arange(mi.UInt32, n), mi.UInt32(1)) * places.size
+    return places, quasi_random(dr.arange(mi.UInt32, n), n, mi.UInt32(1)) * places.size
 
 
 @pytest.mark.parametrize("film", FILMS.values(), ids=FILMS)
@@ -106,31 +107,63 @@ def test_a_shape_that_hides_itself_is_seen() -> None:
     assert not Sight.nothing().differs(Sight.nothing())[0]
 
 
+def test_a_mesh_falls_into_pieces_where_vertices_are_written_twice() -> None:
+    """Where a piece meets itself, the triangles at the tear are pieces of their own."""
+    square = np.array([[0, 1, 2], [0, 2, 3]])
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    assert not smooth_pieces(square, corners).any()
+    assert not smooth_pieces(np.zeros((0, 3), int), np.zeros((0, 3))).any()
+    folded = np.concatenate([corners, corners[[0, 1]], [[1, 0, 1], [0, 0, 1]]])
+    assert list(smooth_pieces(np.concatenate([square, square + 4]), folded)) == [0, 0, 1, 1]
+    n = 8
+    turns = 2 * np.pi * np.append(np.arange(n), 0) / n  # closed by places, open by vertices
+    ring = np.stack([np.cos(turns), np.sin(turns), 0 * turns], 1)
+    i = np.arange(n)
+    faces = np.concatenate([np.stack([i, i + 1, i + n + 2], 1), np.stack([i, i + n + 2, i + n + 1], 1)])
+    pieces = smooth_pieces(faces, np.concatenate([ring, ring + np.array([0, 0, 1])]))
+    apart = np.bincount(pieces)[pieces] == 1
+    assert list(np.flatnonzero(apart)) == [n - 1, n]  # the triangles at the tear
+
+
 def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
     """Crofton: four sides and four corners, at which two crossings of one line go unseen by its ends."""
 
-    @dr.syntax
     def count(n: int, l: float, seed: int) -> mi.Float:
-        pick = mi.PCG32(n, initstate=seed)
+        number = dr.opaque(mi.UInt32, seed)
 
-        def draw(j: mi.UInt32) -> tuple[PlaneLine, mi.Bool]:
-            turn = dr.two_pi * pick.next_float32()
-            c = mi.Point2f(pick.next_float32(), pick.next_float32()) * (1 + 2 * l) - l
-            w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
-            return PlaneLine(c, w, mi.Float(-l / 2), mi.Float(l / 2)), mi.Bool(True)
+        def line(i: mi.UInt32) -> PlaneLine:
+            c = quasi_random(i, n, number) * (1 + 2 * l) - l
+            turn = dr.two_pi * mi.sample_tea_float32(i, number)
+            return PlaneLine(c, mi.Vector2f(dr.cos(turn), dr.sin(turn)), mi.Float(-l / 2), mi.Float(l / 2))
 
         def look(line: PlaneLine, t: mi.Float, active: mi.Bool) -> Sight:
             p = line.at(t)
             inside = (p.x > 0.3) & (p.y > 0.4) & (p.x < 0.8) & (p.y < 0.7)
             return Sight(mi.UInt32(inside), mi.Point3f(0), mi.Normal3f(0))
 
-        found = bisect(look, search(draw, look, 2, pick), pick)
-        return 0.5 * dr.pi * dr.sum(found.weight) * (1 + 2 * l) ** 2 / (l * n * 2)
+        mass = glance(look, line(dr.arange(mi.UInt32, n)), mi.Bool(True))
+        picked = Picked.of(mass, n // 4, number)
+        found = bisect(look, line(picked.index), picked.weight, mi.PCG32(n // 4, initstate=number))
+        return 0.5 * dr.pi * dr.sum(found.weight) * (1 + 2 * l) ** 2 / (l * n)
 
     lengths = [count(1 << 18, 0.1, seed)[0] for seed in range(1, 9)]
     error = np.std(lengths, ddof=1) / len(lengths) ** 0.5
     assert error < 0.01
     assert abs(np.mean(lengths) - 1.6) < 4 * error
+
+
+def test_lines_are_picked_as_often_as_they_count() -> None:
+    """What picks stand for adds up to what there is, line by line; where nothing was found they stand for nothing."""
+    rng = np.random.default_rng(0)
+    mass = np.where(rng.random(1000) < 0.1, rng.choice([1, 4], 1000), 0).astype(np.float32)
+    found = np.zeros(1000)
+    for seed in range(200):
+        picked = Picked.of(mi.Float(mass), 50, dr.opaque(mi.UInt32, seed))
+        np.add.at(found, np.array(picked.index), np.array(picked.weight) / 200)
+    assert (found[mass == 0] == 0).all()
+    assert np.abs(found[mass > 0] - 1).max() < 5 * (mass.sum() / 50 / 200) ** 0.5
+    assert found.sum() == pytest.approx((mass > 0).sum(), rel=0.02)
+    assert dr.all(Picked.of(dr.zeros(mi.Float, 100), 50, mi.UInt32(1)).weight == 0)
 
 
 @pytest.mark.parametrize("attach", ["all", "none"])
@@ -150,6 +183,7 @@ def test_where_nothing_moves_nothing_is_added() -> None:
         dr.enable_grad(params[key])
         params.update()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.eval()  # what other tests have left
             dr.kernel_history_clear()
             integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (8, 12, 3)), spp=4)
             grad = np.array(dr.grad(params[key]))

@@ -73,7 +73,7 @@ WAYS = {
     "medium, replay": ("backward", DENSITY, {"driver": "replay"}),
 }
 ALL = ("loops", "calls", "conditionals")
-QUICK = ("sweep", "medium")
+QUICK = ("sweep",)
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,8 @@ def test_refined_grid_ends_in_its_last_resolution_with_the_truth_in_another() ->
     assert result.history[-1].errors[TEXTURE] == pytest.approx(result.errors[TEXTURE], rel=1e-5)
 
 
-@pytest.mark.parametrize("stops", [(2, 3), pytest.param((1, 4), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("stops", [(2, 3), (1, 4)])
 def test_a_stop_around_a_refinement_changes_nothing(stops: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     whole = run(parameters=FINER)
     for stop_after in stops:

@@ -57,6 +57,7 @@ def test_without_a_rival_nothing_is_judged() -> None:
     assert not (result.folder / "rival").exists() and "Next to" not in result.report.read_text()
 
 
+@pytest.mark.slow
 def test_a_stopped_rival_goes_on_with_its_job(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         interrupt_at(3, patch)

@@ -179,7 +179,10 @@ def full_disk_at(write: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # Writes of this job: 1-2 config and origin, 3-7 first pictures and checkpoint, 8-9 checkpoints, then the results.
-@pytest.mark.parametrize(("write", "resumable"), [(1, False), (5, False), (8, True), (12, True)])
+@pytest.mark.parametrize(
+    ("write", "resumable"),
+    [(1, False), (8, True), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((5, False), (12, True)))],
+)
 def test_full_disk_leaves_nothing_half_written(write: int, resumable: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     earlier = run(output="runs/a", iterations=1)
     before = {p: p.read_bytes() for p in Path("runs").rglob("*") if p.is_file()}

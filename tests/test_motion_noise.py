@@ -230,7 +230,7 @@ NO_EDGES = [
 EDGES = Case("lamp and seams close to the floor", room_corner, **{**MOVES, "depth": 3}, spp=1024, reference_spp=8192)
 
 
-@pytest.mark.parametrize("blend", [0.01, 1.0, *(pytest.param(blend, marks=pytest.mark.slow) for blend in (0.0, 0.1))])
+@pytest.mark.parametrize("blend", [1.0, *(pytest.param(blend, marks=pytest.mark.slow) for blend in (0.0, 0.01, 0.1))])
 @pytest.mark.parametrize("case", NO_EDGES, ids=lambda case: case.name)
 def test_where_there_is_no_edge_any_blend_is_right(case: Case, blend: float, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(velocity, "BLEND", blend)
@@ -284,7 +284,8 @@ def test_narrow_lobes_follow_their_samples(lobe: str) -> None:
     assert all(share < 1.5 for share in shares.values())
 
 
-@pytest.mark.parametrize("alpha", [0.05, pytest.param(0.2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("alpha", [0.05, 0.2])
 @pytest.mark.parametrize("lobe", LOBES)
 def test_narrow_lobes_are_right(lobe: str, alpha: float) -> None:
     make, key, move = LOBES[lobe]

@@ -55,6 +55,7 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_whole_job_and_its_resumption_end(room: Path, run_python) -> None:
     done = run_python(ON_ONE_CORE, args=("optimize", "job.toml", "--quiet"))
     assert done.returncode == 0, done.stderr

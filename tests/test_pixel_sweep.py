@@ -235,14 +235,14 @@ def test_two_swept_views_add_up(changes: dict, tmp_path) -> None:
     [
         pytest.param({}, False, id="gaussian filter"),
         pytest.param({"loss": "l1"}, False, id="l1", marks=SLOW),
-        pytest.param({"integrator": {"type": "pathreplay", "driver": "replay"}}, False, id="replay"),
+        pytest.param({"integrator": {"type": "pathreplay", "driver": "replay"}}, False, id="replay", marks=SLOW),
         pytest.param({"integrator": {"type": "prb", "max_depth": 3}}, False, id="prb", marks=SLOW),
         pytest.param({"integrator": {"type": "prb_basic", "max_depth": 3}}, False, id="prb_basic", marks=SLOW),
-        pytest.param(POSE, False, id="moving"),
+        pytest.param(POSE, False, id="moving", marks=SLOW),
         pytest.param(
             POSE | {"integrator": {"type": "pathreplay", "attach": "all"}}, False, id="moving, all attached", marks=SLOW
         ),
-        pytest.param(GLASS, True, id="index of a plugin in Python"),
+        pytest.param(GLASS, True, id="index of a plugin in Python", marks=SLOW),
         pytest.param(BOXED, True, id="box filter"),
         pytest.param(BOXED | {"loss": "log"}, False, id="box filter, log"),
         pytest.param(BOXED | {"integrator": {"type": "prb", "max_depth": 3}}, False, id="box filter, prb", marks=SLOW),

@@ -299,8 +299,7 @@ PICTURES = [
 
 QUICK = {
     "homogeneous chromatic", "heterogeneous", "boundary glass", "boundary rough glass", "two lights", "nested",
-    "overlapping", "sensor inside", "mask beside", "hidden emitters, glass", "depth 2", "early roulette",
-    "gridmedium sparse",
+    "overlapping", "sensor inside", "mask beside", "hidden emitters, glass", "gridmedium sparse",
 }  # fmt: skip
 
 

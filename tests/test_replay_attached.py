@@ -199,7 +199,7 @@ def test_a_chain_of_sixteen_delta_lobes_agrees_with_the_sweep() -> None:
 @pytest.mark.parametrize(
     ("scene", "depth", "recovery"),
     [
-        (lambda: panes(2), 6, OtherRecovery(noise=0.2, place="everywhere")),
+        pytest.param(lambda: panes(2), 6, OtherRecovery(noise=0.2, place="everywhere"), marks=pytest.mark.slow),
         pytest.param(lambda: valley(DIFFUSE), 3, OtherRecovery(noise=0.5, place="smooth"), marks=pytest.mark.slow),
         (lambda: valley(DIFFUSE), 4, Recovery(noise=0.5)),
         pytest.param(lambda: valley(ROUGH), 4, Recovery(noise=0.5), marks=pytest.mark.slow),
@@ -225,7 +225,7 @@ def test_noise_leaves_the_gradient_unbiased(scene: Any, depth: int, recovery: Re
     [
         (DIFFUSE, "delta", "obj.to_world"),
         pytest.param(DIFFUSE, "delta", "camera.to_world", marks=pytest.mark.slow),
-        (ROUGH, "delta", "light.to_world"),
+        pytest.param(ROUGH, "delta", "light.to_world", marks=pytest.mark.slow),
         (ROUGH, "all", "obj.to_world"),
     ],
     ids=["diffuse", "diffuse-camera", "rough-metal-light", "rough-metal-all"],
@@ -236,6 +236,7 @@ def test_density_and_distance_reach_the_mis_weight_of_the_next_emission(attach: 
     assert error(found, gradient(scene, "sweep", 4, key, attach=attach)) < 1e-3
 
 
+@pytest.mark.slow
 def test_float64_books_reach_further_than_float32() -> None:
     """What is left: rounding that the inverses magnify. With float32 it beats the gradient after a few bounces."""
     scene = valley(DIFFUSE)

@@ -76,9 +76,9 @@ SLOW = [
     Case("index of glass", glass_ball, "object.bsdf.eta", add(), depth=5),
     Case("chromatic density and lamp", colourful_fog_on_the_floor, DENSITY.key, random()),
 ]
-CASES = [TEXTURE, VERTICES, DENSITY, *(pytest.param(case, marks=pytest.mark.slow) for case in SLOW)]
+CASES = [TEXTURE, DENSITY, *(pytest.param(case, marks=pytest.mark.slow) for case in (VERTICES, *SLOW))]
 LISTED = [
-    replace(DENSITY, name="listed density"),
+    pytest.param(replace(DENSITY, name="listed density"), marks=pytest.mark.slow),
     pytest.param(
         replace(DENSITY, name="listed albedo", scene=coloured_fog, key="object.interior_medium.albedo.data", step=0.1),
         marks=pytest.mark.slow),

@@ -53,7 +53,9 @@ def load() -> Callable[[dict, str], tuple[mi.Scene, mi.SceneParameters]]:
         params.update()
 
 
-@pytest.mark.parametrize("plugin", PLUGINS)
+@pytest.mark.parametrize(
+    "plugin", ["pathreplay", *(pytest.param(p, marks=pytest.mark.slow) for p in PLUGINS if p != "pathreplay")]
+)
 def test_a_term_has_the_methods_of_the_protocol_and_gives_what_it_says(plugin: str, load) -> None:
     scene, params = load(foggy(), DENSITY)
     integrator = mi.load_dict({"type": plugin, "max_depth": 3})

@@ -69,12 +69,13 @@ for variant in sys.argv[1:]:
 """
 
 SEQUENCES = {
+    "over scalar": ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_rgb"),
     "there and back": ("llvm_ad_rgb", "llvm_ad_mono", "scalar_rgb", "llvm_ad_rgb"),
     "scalar first": ("scalar_rgb", "llvm_ad_mono", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_mono"),
     "spectral first": ("llvm_ad_spectral", "llvm_ad_rgb", "llvm_ad_spectral"),
     "all": ("llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_spectral"),
 }
-QUICK = "there and back"
+QUICK = "over scalar"
 
 
 @pytest.mark.parametrize("name", [n if n == QUICK else pytest.param(n, marks=pytest.mark.slow) for n in SEQUENCES])

@@ -29,6 +29,7 @@ def test_the_example_is_valid_and_uses_five_views_or_more() -> None:
     assert config.target.integrator.type == "volpath" and config.integrator.type == "pathreplay"
 
 
+@pytest.mark.slow
 @pytest.mark.drawn
 def test_a_small_cloud_is_recovered_shown_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -16,6 +16,7 @@ Kind = Literal[
     "truth",  # a derivative, to hold against finite differences
     "noise",  # the error of a replay
     "step",  # an optimisation step
+    "edges",  # a derivative by what moves, in parts
     "cold start",  # the start of a process, without cached kernels
     "warm start",  # and with them
     "flight",  # way to the first real collision in a grid

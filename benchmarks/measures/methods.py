@@ -15,6 +15,9 @@ METHODS: dict[str, dict[str, object]] = {
     "film edges": {"type": "pathreplay", "edges": "film"},
     "all edges": {"type": "pathreplay", "edges": "all"},
     "prb_projective": {"type": "prb_projective"},
+    "edge list": {"type": "prb_projective", "sppc": 0, "sppi": 0},
+    "projective inner": {"type": "prb_projective", "sppc": 0, "sppp": 0},
+    "unguided inner": {"type": "prb_projective", "sppc": 0, "sppp": 0, "guiding": "none"},
     "volpath": {"type": "volpath"},
     "prbvolpath": {"type": "prbvolpath"},
     "score": {"type": "pathreplay"},
@@ -23,10 +26,22 @@ METHODS: dict[str, dict[str, object]] = {
 }
 
 #: Mitsuba's own: what ours is compared with, and not held to anything when two records are compared.
-STOCK = ("prb", "prb_basic", "prb_projective", "prbvolpath", "volpath", "finite differences", "half steps")
+STOCK = (
+    "prb",
+    "prb_basic",
+    "prb_projective",
+    "edge list",
+    "projective inner",
+    "unguided inner",
+    "prbvolpath",
+    "volpath",
+    "finite differences",
+    "half steps",
+)
 
-#: Ways: the loop of an optimisation step, and what a new process does first.
+#: Ways: the loop of an optimisation step, whether a step was recorded, and what a new process does first.
 USUAL, OWN = "usual loop", "own loop"
+TRACED, RECORDED = "traced", "recorded"
 STAGES = ("import", "first gradient", "second gradient")
 
 

@@ -31,6 +31,7 @@ MEASURES: dict[Kind, tuple[str, str]] = {
     "truth": ("derivative", "Derivative"),
     "noise": ("replay_error", "ReplayError"),
     "step": ("step", "Step"),
+    "edges": ("edges", "EdgePass"),
     "cold start": ("start", "Start"),
     "warm start": ("start", "Start"),
     "flight": ("grids", "Flight"),

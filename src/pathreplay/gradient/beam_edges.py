@@ -28,7 +28,7 @@ from ..transport.vertex import Arrival, Flight, Numbers, Walk
 from .adjoint import derivative_by_place
 from .centres import Centres
 from .counted import Counted, quasi_random
-from .crofton import PlaneLine, Sight, bisect, search
+from .crofton import Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places
 from .record import Layout, deepest, record, record_type, room_for
 from .seer import Seer
@@ -55,32 +55,35 @@ class Lighting:
     lit: mi.Bool  # there is such a light
 
 
-def beam_edges(walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lines: int, l: float) -> Edges:
-    """Find the border of a hard shadow in each lane, by ``lines`` lines of length ``l`` (pixels). Detached."""
+def beam_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UInt32, l: float) -> Edges:
+    """Find borders of hard shadows by lines of length ``l`` (pixels), and look ``closer`` at as many. Detached."""
     walk = replace(walk, max_depth=min(walk.max_depth, deepest(walk)))
-    pick = mi.PCG32(dr.width(lane), initstate=seed + 2, initseq=lane)
     centres = Centres.even(places.size, l)
 
-    def draw(j: mi.UInt32) -> tuple[BeamLine, mi.Bool]:
-        i = lane * lines + j
+    def draw(i: mi.UInt32) -> tuple[BeamLine, mi.Bool]:
         key = mixed(mixed(i, seed), mi.UInt32(0x3C6EF372))
         numbers = Counted(key, mi.UInt32(0x30000))
         turn = dr.two_pi * numbers.next_1d()
         w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
-        c, density = centres.draw(quasi_random(i, seed ^ 0x1F83D9AB))
-        reach = _reach(walk, dr.detach(places.ray(c - l, key)[0]))
+        c, density = centres.draw(quasi_random(i, lines, seed ^ 0x1F83D9AB))
+        reach = _reach(walk, dr.detach(places.ray(c - centres.margin, key)[0]))
         τ = numbers.next_1d() * reach
         ok = dr.isfinite(reach) & (reach > 0)
         density *= dr.select(ok, dr.rcp(reach), 1)
-        return BeamLine(c - l, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key, dr.select(ok, τ, 0)), ok
+        begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)
+        return BeamLine(c - centres.margin, w, begin, end, density, key, dr.select(ok, τ, 0)), ok
 
     def look(line: BeamLine, t: mi.Float, active: mi.Bool) -> Sight:
         x = _lighting(walk, places, line, line.at(t), active)
         word = dr.select(x.there, mi.UInt32(1), 0) | dr.select(x.hidden, mi.UInt32(2), 0)
         return Sight(word, mi.Point3f(0), mi.Normal3f(0))
 
-    found = bisect(look, search(draw, look, lines, pick), pick)
-    line, active = found.line, found.weight > 0
+    every, ok = draw(dr.arange(mi.UInt32, lines))
+    chosen = Picked.of(glance(look, every, ok) / every.density, closer, seed)
+    pick = mi.PCG32(closer, initstate=seed + 2, initseq=dr.arange(mi.UInt32, closer))
+    line, ok = draw(chosen.index)
+    found = bisect(look, line, dr.select(ok, chosen.weight, 0), pick)
+    active = found.weight > 0
     a, b = (_lighting(walk, places, line, line.at(t), active) for t in (found.a, found.b))
     active &= a.there & b.there & (a.hidden != b.hidden)
     s = line.at(dr.select(a.hidden, found.a, found.b))
@@ -94,13 +97,14 @@ def beam_edges(walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lin
     seer = Seer(walk, at, flight, active)
     n = edge_normal(dark.hit, dark.ray, active)
 
+    per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * lines))
     others = Counted(line.key, mi.UInt32(0x70000))
     around = walk.media.around
     medium = dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)
     T = passage(walk, camera_ray, line.τ, medium, others, active)[0]
     T *= past(walk, bright.ray, dark.hit.t, at.medium, others, active)
     f = weight * T * flight.σ_s * seer.towards(bright.ray.d, active)[0] * bright.Le
-    jump = f * (found.weight * 0.5 * dr.pi / (l * lines * dr.width(lane)) / line.density)
+    jump = f * (found.weight * per_line / line.density)
     jump *= dr.select(a.hidden, -1, 1)  # from begin to end of the line
 
     def gap(origin: mi.Interaction3f) -> mi.Float:

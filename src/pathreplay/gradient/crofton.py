@@ -6,6 +6,9 @@ of their centres and directions that are uniform, the expected sum of g / p(c) o
 
 Two crossings of one line go unseen, as at a corner. So lines whose ends agree are looked at in the middle, too; what
 only the middle finds counts twice in each half, which takes out the error of first order in l.
+
+Most lines find nothing. So all of them are glanced at first, which is one kernel; of those that found something a fixed
+number is looked at closer, in another, which thus wastes no lane, and has the same width each time.
 """
 
 from __future__ import annotations
@@ -83,42 +86,49 @@ Look = Callable[..., Sight]
 """(line, place on it, active) -> what is seen there."""
 
 
-@dr.syntax
-def search(draw: Callable[[mi.UInt32], tuple[Any, mi.Bool]], look: Look, lines: int, pick: mi.PCG32) -> Crossed:
-    """Look at ``lines`` lines in each lane; gives a piece of one with an edge, in proportion to what it counts.
+def glance(look: Look, line: Any, active: mi.Bool) -> mi.Float:
+    """How much a line counts, whose places are from ``line.begin`` to ``line.end``: 0 where it finds nothing."""
+    ends = (look(line, t, active) for t in (line.begin, line.end))
+    at_a, at_b = ends
+    at_c = look(line, 0.5 * (line.begin + line.end), active)
+    # Of two crossings, which count twice, one is chosen in time, for both: see `bisect`.
+    found = dr.select(at_a.differs(at_b), 1.0, dr.select(at_c.differs(at_a), 4.0, 0.0))
+    return dr.select(active, found, 0)
 
-    ``draw`` (number of the line) gives a line, whose places are from ``line.begin`` to ``line.end``, and whether there
-    is one. ``pick`` are random numbers of the search.
+
+@dataclass
+class Picked:
+    """A line for each lane, by its index among many, and what the lane stands for."""
+
+    index: mi.UInt32
+    weight: mi.Float  # 1 / expected number of lanes with that line; 0: no line finds anything
+
+    @staticmethod
+    def of(mass: mi.Float, lanes: int, seed: mi.UInt32) -> Picked:
+        """As often as ``mass`` says, which is that of each line."""
+        dr.eval(mass)  # before it is used twice
+        n = dr.width(mass)
+        until = dr.cumsum(mi.Float64(mass))
+        total = dr.gather(mi.Float64, until, n - 1)
+        lane = dr.arange(mi.UInt32, lanes)
+        x = (mi.Float64(lane) + mi.Float64(mi.sample_tea_float32(seed, lane))) * (total / lanes)
+        index = dr.minimum(dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float64, until, i) <= x), n - 1)
+        own = dr.gather(mi.Float, mass, index)
+        return Picked(index, dr.select(own > 0, mi.Float(total / lanes) / own, 0))
+
+
+@dr.syntax
+def bisect(look: Look, line: Any, weight: mi.Float, pick: mi.PCG32) -> Crossed:
+    """A piece of each line with an edge, 2^-14 as long as the line, where ``weight`` is not zero.
+
+    Of several crossings one is chosen; what only the middle found counts twice in each half. None, where a surface was
+    merely bent, weighs 0.
     """
-    line, _ = draw(mi.UInt32(0))
-    kept = Crossed(line, mi.Float(0), mi.Float(0), mi.Float(0))
-    mass = mi.Float(0)
-    j = mi.UInt32(0)
-    while dr.hint(j < lines, exclude=[draw, look], label="pathreplay: search"):
-        line, active = draw(j)
-        a, b = mi.Float(line.begin), mi.Float(line.end)
-        c = 0.5 * (a + b)
-        at_a, at_b, at_c = look(line, a, active), look(line, b, active), look(line, c, active)
-        odd = active & at_a.differs(at_b)
-        even = active & ~odd & at_c.differs(at_a)
-        first = pick.next_float32() < 0.5
-        a, b = dr.select(even & ~first, c, a), dr.select(even & first, c, b)
-        weight = dr.select(odd, 1, dr.select(even, 4.0, 0))  # one half of two, each of which counts twice
-        mass += weight
-        take = pick.next_float32() * mass < weight
-        kept = dr.select(take, Crossed(line, a, b, weight), kept)
-        j += 1
-    kept.weight = mass
-    return kept
-
-
-@dr.syntax
-def bisect(look: Look, found: Crossed, pick: mi.PCG32) -> Crossed:
-    """The same, 2^-14 as long. Of several crossings one is chosen; none, where a surface was merely bent, weighs 0."""
-    a, b, weight, line = mi.Float(found.a), mi.Float(found.b), mi.Float(found.weight), found.line
+    a, b, weight = mi.Float(line.begin), mi.Float(line.end), mi.Float(weight)
     at_a, at_b = look(line, a, weight > 0), look(line, b, weight > 0)
+    weight = dr.select(at_a.differs(at_b), weight, 2 * weight)
     n = mi.UInt32(0)
-    while dr.hint((weight > 0) & (n < BISECTIONS), exclude=[look], label="pathreplay: bisection"):
+    while dr.hint((weight > 0) & (n < BISECTIONS), exclude=[look, line], label="pathreplay: bisection"):
         c = 0.5 * (a + b)
         at_c = look(line, c, mi.Bool(True))
         left, right = at_c.differs(at_a), at_c.differs(at_b)

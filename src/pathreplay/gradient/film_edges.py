@@ -28,15 +28,17 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.emitters import draw_emitter
+from ..transport.motion import may_move
 from ..transport.passage import SHORT_OF, beyond_null
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
 from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
+from .bends import Bend
 from .centres import Centres
 from .counted import Counted, quasi_random
-from .crofton import Crossed, PlaneLine, Sight, bisect, hides_itself, search
+from .crofton import Crossed, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places, ray_to_camera
 from .primal import walk_on
 from .record import Layout, record, record_type
@@ -45,9 +47,7 @@ from .through_media import clear, going_on, left_of_light
 MAX_CHAIN = 16
 """Vertices of a chain of delta lobes, at most."""
 LOOKS = 8
-"""For so many lanes one takes a first look."""
-MEETS = 1e-3
-"""Relative difference of two distances, and angle, from which on surfaces meet at an edge."""
+"""For so many lines one takes a first look."""
 
 
 @dataclass
@@ -89,9 +89,7 @@ class FilmCrossing:
     s: mi.Point2f  # on its near side
     k: mi.UInt32  # vertices before
     near: Arrival
-    far: mi.PreliminaryIntersection3f
-    meets: mi.Bool  # two surfaces meet there
-    turns: mi.Bool  # a surface turns away there, by its shading normal
+    bend: Bend
     n: mi.Vector3f
     shadow: mi.Bool  # it is the border of a hard shadow
     shade: Shade | None
@@ -99,19 +97,33 @@ class FilmCrossing:
     active: mi.Bool
 
 
-def film_edges(walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lines: int, l: float) -> Edges:
-    """Find an edge on the film in each lane, by ``lines`` lines of length ``l`` (pixels). Detached.
+def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UInt32, l: float) -> Edges:
+    """Find edges on the film by so many lines of length ``l`` (pixels), and look ``closer`` at as many. Detached.
 
-    A first look with a line for every `LOOKS`-th lane decides where lines are thrown.
+    A first look, with one line for `LOOKS`, decides where lines are thrown.
     """
     full, walk = walk, clear(without_roulette(walk))
-    even = Centres.even(places.size, l)
-    few = dr.arange(mi.UInt32, max(dr.width(lane) // LOOKS, 1))
-    look = _find(walk, places, even, few, seed ^ 0x7F4A7C15, lines, 2 * l, bisected=False)
-    centres = even.refined(look.line.c + l, look.weight)
-    found = _find(walk, places, centres, lane, seed, lines, l)
-    per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * dr.width(lane) * lines))  # one kernel for all numbers of samples
-    c = _weighed(walk, full, places, found, per_line)
+
+    def line(centres: Centres, i: mi.UInt32, n: int, seed: mi.UInt32, l: float) -> FilmLine:
+        key = mixed(mixed(i, seed), mi.UInt32(0x51ED270B))
+        turn = dr.two_pi * mi.sample_tea_float32(key, mi.UInt32(0x30000))
+        c, density = centres.draw(quasi_random(i, n, seed))
+        w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
+        return FilmLine(c - centres.margin, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key)
+
+    def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:
+        return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)
+
+    centres = Centres.even(places.size, l)
+    few = max(lines // LOOKS, 1)
+    first = line(centres, dr.arange(mi.UInt32, few), few, seed ^ 0x7F4A7C15, 2 * l)
+    centres = centres.refined(first.c + centres.margin, glance(look, first, mi.Bool(True)))
+    every = line(centres, dr.arange(mi.UInt32, lines), lines, seed, l)
+    chosen = Picked.of(glance(look, every, mi.Bool(True)) / every.density, closer, seed)
+    pick = mi.PCG32(closer, initstate=seed, initseq=dr.arange(mi.UInt32, closer))
+    crossed = bisect(look, line(centres, chosen.index, lines, seed, l), chosen.weight, pick)
+    per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * lines))  # one kernel for all numbers of samples
+    c = _weighed(walk, full, places, crossed, per_line)
     layout = Layout.of(walk, True)
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)
     records, reached = _record_chain(walk, places.ray(c.s, c.line.key)[0], c, layout, records)
@@ -122,47 +134,27 @@ def film_edges(walk: Walk, places: Places, lane: mi.UInt32, seed: mi.UInt32, lin
     return replace(edges, motion=lambda ray: -K * _gap(walk, c, ray))
 
 
-def _find(
-    walk: Walk,
-    places: Places,
-    centres: Centres,
-    lane: mi.UInt32,
-    seed: mi.UInt32,
-    lines: int,
-    l: float,
-    bisected: bool = True,
-) -> Crossed:
-    """A piece of a line with an edge for each lane, or at first the whole line."""
-    pick = mi.PCG32(dr.width(lane), initstate=seed, initseq=lane)
-
-    def draw(j: mi.UInt32) -> tuple[FilmLine, mi.Bool]:
-        i = lane * lines + j
-        key = mixed(mixed(i, seed), mi.UInt32(0x51ED270B))
-        turn = dr.two_pi * mi.sample_tea_float32(key, mi.UInt32(0x30000))
-        w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
-        c, density = centres.draw(quasi_random(i, seed))
-        return FilmLine(c - l, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key), mi.Bool(True)
-
-    def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:
-        return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)
-
-    found = search(draw, look, lines, pick)
-    return bisect(look, found, pick) if bisected else found
-
-
 def without_roulette(walk: Walk) -> Walk:
     """The walk as chains take it: roulette would end paths beside an edge in different places."""
     return replace(walk, rr_depth=0xFFFFFFFF, max_depth=min(walk.max_depth, MAX_CHAIN))
 
 
-@dr.syntax
 def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> Sight:
-    """What a path meets from the camera to the first vertex where it is scattered."""
+    """What a path meets from the camera to the first vertex where it is scattered; until something moves, nothing."""
+    if walk.traits.mirrors or walk.traits.hard_lights or walk.media is not None:
+        return _chain_sight(walk, ray, key, active)
+    at = PathState.begin(walk, CameraStart(ray, Counted.of(key), active)).at
+    return dr.select(may_move(walk, at.hit), _sight(walk, at, active), Sight.nothing())
+
+
+@dr.syntax
+def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> Sight:
     numbers = Counted.of(key)
     path = PathState.begin(walk, CameraStart(ray, numbers, active))
-    sight = Sight.nothing()
+    sight, moves = Sight.nothing(), mi.Bool(False)
     while dr.hint(path.active, exclude=[walk], label="pathreplay: chain"):
-        here = _sight(walk, path.at, path.active)
+        moves |= may_move(walk, path.at.hit)
+        here = dr.select(moves, _sight(walk, path.at, path.active), Sight.nothing())
         if dr.hint(walk.traits.hard_lights, mode="scalar"):
             hidden = _shade(walk, path.at, key, path.depth, path.active).hidden
             here.signature = mixed(here.signature, dr.select(hidden, mi.UInt32(1), 0))
@@ -246,46 +238,25 @@ def _weighed(walk: Walk, full: Walk, places: Places, found: Crossed, per_line: m
         f.append(walk_on(onward, Counted.at_vertex(line.key, fork.k), path)[0])
     jump = weight * fork.β * (f[0] - f[1]) * (per_line * found.weight / line.density)
 
-    near_a, meet, turns, shadow = fork.a.hit.t <= fork.b.hit.t, _meet(fork), _turns(walk, fork), mi.Bool(False)
+    near_a, shadow = fork.a.hit.t <= fork.b.hit.t, mi.Bool(False)
     if fork.shade_a is not None:
         shadow = fork.shade_a.hidden != fork.shade_b.hidden
-        meet, turns = meet & ~shadow, turns & ~shadow
         near_a = dr.select(shadow, fork.shade_a.hidden, near_a)
-    near, far = dr.select(near_a, fork.a, fork.b), dr.select(near_a, fork.b.hit, fork.a.hit)
+    near = dr.select(near_a, fork.a, fork.b)
     shade = None if fork.shade_a is None else dr.select(near_a, fork.shade_a, fork.shade_b)
     active &= near.hit.is_valid()
+    bend = Bend.of(walk, ((fork.a.hit, fork.a.ray), (fork.b.hit, fork.b.ray)), active & ~shadow)
     n = edge_normal(near.hit, near.ray, active)
     if shade is not None:
         n = dr.select(shadow, edge_normal(shade.hit, shade.ray, active & shadow), n)
     s = dr.select(near_a, *ends)
-    return FilmCrossing(line, s, fork.k, near, far, meet, turns, n, shadow, shade, jump, active)
-
-
-def _meet(fork: Fork) -> mi.Bool:
-    """Whether two surfaces meet where paths part, at an angle."""
-    a, b = fork.a, fork.b
-    both = a.hit.is_valid() & b.hit.is_valid()
-    n_a, n_b = (x.hit.compute_surface_interaction(x.ray, mi.RayFlags.Minimal, both).n for x in (a, b))
-    angle = dr.squared_norm(dr.cross(n_a, n_b)) > dr.square(MEETS)
-    return both & angle & (dr.abs(a.hit.t - b.hit.t) < MEETS * dr.minimum(a.hit.t, b.hit.t))
-
-
-def _turns(walk: Walk, fork: Fork) -> mi.Bool:
-    """Whether it is one sheet of one surface, the shading normal of which is at right angles to the path there."""
-    a, b = fork.a, fork.b
-    both = fork.found & a.hit.is_valid() & (place_met(walk, a.hit, fork.found) == place_met(walk, b.hit, fork.found))
-    si_a, si_b = (x.hit.compute_surface_interaction(x.ray, mi.RayFlags.Minimal, both) for x in (a, b))
-    return both & ~hides_itself(si_a.p, si_a.n, si_b.p, si_b.n)
+    return FilmCrossing(line, s, fork.k, near, bend, n, shadow, shade, jump, active)
 
 
 def _gap(walk: Walk, c: FilmCrossing, ray: mi.Ray3f) -> mi.Float:
     """B: zero on the edge; differentiable in the ray that arrives, and in the shapes."""
     outline = outline_gap(c.n, ray.o, ray.d, c.near.hit, ray, c.active)
-    both = c.active & c.meets
-    t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, both).t for hit in (c.near.hit, c.far)]
-    turns = c.active & c.turns
-    si = c.near.hit.compute_surface_interaction(ray, mi.RayFlags.All, turns)
-    B = dr.select(both, t[0] - t[1], dr.select(turns, dr.dot(si.sh_frame.n, ray.d), outline))
+    B = dr.select(c.bend.meets | c.bend.turns, c.bend.gap(ray, c.active), outline)
     return B if c.shade is None else dr.select(c.shadow, _shadow_gap(walk, c, c.shade, ray), B)
 
 
@@ -304,6 +275,7 @@ def _record_chain(walk: Walk, ray: mi.Ray3f, c: FilmCrossing, layout: Layout, re
     path = PathState.begin(walk, CameraStart(ray, numbers, c.active))
     count = mi.UInt32(0)
     while dr.hint(path.active & (count <= c.k), exclude=[walk, layout], label="pathreplay: record chain"):
+        path.active &= count < c.k  # of the last one only the arrival will be read
         u, step = path.choose(walk, numbers)
         onward, v = path.advance(walk, u, step)
         records[count] = record(layout, v)

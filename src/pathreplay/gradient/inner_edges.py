@@ -2,34 +2,37 @@
 
 At a vertex x that scatters, light arrives from a direction ω, which the interior lets move with a velocity V when
 parameters move: it follows the number u that drew it (emitter samples), or the point that it hit (other samples, with
-the share φ, see `velocity`). At an edge the integrand jumps from f_near to f_far, and what V does not follow is
+the share φ, see `velocity`; in narrow lobes it stays, see `keeps_direction`). At an edge the integrand jumps from
+f_near to f_far, and what V does not follow is
 
     dJ/dπ = ∫ [f_near (V_edge - V_near) - f_far (V_edge - V_far)]·n dl,        n normal to the edge, from near to far.
 
 One vertex of each camera path is chosen. Edges are found by short lines (see `crofton`) in the unit square of emitter
 samples, where the visibility changes, and by short arcs around samples of the BSDF, where it is another surface that is
 seen. Multiple importance sampling belongs to both integrands, which thus add up. What moves x goes back along the path.
+Where x does not move, all that does not move looks alike, so that no line is spent on edges that stay where they are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.motion import may_move
 from ..transport.passage import SHORT_OF
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
-from ..transport.traits import is_null
+from ..transport.traits import Tables
 from ..transport.velocity import held_direction, moved_direction
 from ..transport.vertex import Arrival, Flight, Walk, mis_weight
-from .adjoint import derivative_by_place
+from .adjoint import derivative_by_place, derivative_by_ray
+from .bends import Bend
 from .counted import Counted, quasi_random
-from .crofton import ROUNDING, PlaneLine, Sight, bisect, search
+from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
@@ -37,9 +40,10 @@ from .seer import Seer, may_see
 
 BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
-
-
-Importance = Callable[..., "mi.Spectrum"]
+JUMP = 4.0
+"""So many times as far from an edge as its slope says is the other end of a line where a sample of an emitter jumps."""
+EVENLY = 0.25
+"""Share of the arcs that are thrown evenly: those that begin below the horizon, or where lobes are weak, count, too."""
 
 
 @dataclass
@@ -51,16 +55,27 @@ class Chosen:
     depth: mi.UInt32  # vertices before: as many, but null boundaries are none
     β: mi.Spectrum  # throughput before, over the probability of the choice
     mass: mi.Float  # by which it was chosen
+    moves: mi.Bool  # it, or a vertex before, may move
     active: mi.Bool
     flight: Flight | None = None  # before it, with media
 
 
 @dataclass
 class SquareLine(PlaneLine):
-    """A line in the unit square of samples of one emitter."""
+    """A line in a strip of the unit square of samples of one emitter: of a mesh, that of a triangle.
+
+    Its own coordinates are from 0 to 1 in the strip, since samples jump from strip to strip.
+    """
 
     emitter: mi.EmitterPtr
     share: mi.Float  # 1 / probability of the emitter
+    strip: mi.Float  # where it begins
+    width: mi.Float
+
+    def sample(self, t: mi.Float) -> mi.Point2f:
+        """A place of the line in the unit square."""
+        at = self.at(t)
+        return mi.Point2f(at.x, dr.fma(at.y, self.width, self.strip))
 
 
 @dataclass
@@ -78,32 +93,50 @@ class Arc:
 
 
 @dr.syntax
-def choose_vertex(
-    walk: Walk, numbers: Counted, ray: mi.Ray3f, W: mi.Spectrum, layout: Layout, records: Any
-) -> tuple[Any, Chosen]:
-    """Record a camera path, and choose one of the vertices that scatter smoothly, by what they count."""
+def choose_vertex(walk: Walk, numbers: Counted, ray: mi.Ray3f, layout: Layout, records: Any) -> tuple[Any, Chosen]:
+    """Walk along a camera path, and choose one of the vertices that scatter smoothly, by what they count.
+
+    Vertices up to the chosen one are recorded, if there are ``records``. The last vertex that ``walk`` allows scatters
+    nothing: the walk ends before.
+    """
+    walk = replace(walk, max_depth=max(walk.max_depth - 1, 0))
     path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))
-    none, flight = mi.UInt32(0), None if walk.media is None else Flight.none(walk.media)
-    chosen = Chosen(path.at, none, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), mi.Bool(False), flight)
+    none, no = mi.UInt32(0), mi.Bool(False)
+    flight = None if walk.media is None else Flight.none(walk.media)
+    chosen = Chosen(path.at, none, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), no, mi.Bool(False), flight)
     mass = mi.Float(0)
     count = mi.UInt32(0)
-    while dr.hint(path.active, exclude=[walk, layout, W], label="pathreplay: choose a vertex"):
-        pick = numbers.next_1d()
+    moves = mi.Bool(False)
+    while dr.hint(path.active, exclude=[walk, layout], label="pathreplay: choose a vertex"):
+        choice = numbers.next_1d()
         u, step = path.choose(walk, numbers)
         here, w = may_see(walk, path.at, step)
-        here &= path.active & (path.depth + 1 < walk.max_depth)
-        m = dr.select(here, dr.mean(dr.abs(path.β * w * W)), 0)
+        m = dr.select(path.active & here, dr.mean(dr.abs(path.β * w)), 0)
         mass += m
-        take = (m > 0) & (pick * mass < m)
+        moves |= may_move(walk, path.at.hit)
+        take = (m > 0) & (choice * mass < m)
         flight = None if walk.media is None else step.kept.media.flight
-        seer = Chosen(path.at, count, path.depth, path.β * w, m, mi.Bool(True), flight)
-        chosen = dr.select(take, seer, chosen)
+        chosen = dr.select(
+            take, Chosen(path.at, count, path.depth, path.β * w, m, moves, mi.Bool(True), flight), chosen
+        )
         onward, v = path.advance(walk, u, step)
-        records[count] = record(layout, v)
+        if dr.hint(records is not None, mode="scalar"):
+            records[count] = record(layout, v)
         path = onward
         count += 1
     chosen.β *= mass / dr.maximum(chosen.mass, dr.smallest(mi.Float))
     return records, chosen
+
+
+@dataclass
+class Search:
+    """How a search looks at its lines: it glances at all, or looks closer at some."""
+
+    chosen: mi.Float | None = None  # what the line of each lane stands for, or None: glance
+    pick: mi.PCG32 | None = None
+
+    def closer(self, look: Look, line: Any, active: mi.Bool) -> Crossed:
+        return bisect(look, line, dr.select(active, self.chosen, 0), self.pick)
 
 
 @dataclass
@@ -112,7 +145,7 @@ class Shaded:
 
     line: SquareLine
     u: mi.Point2f  # at the side in the shadow
-    u_lit: mi.Point2f
+    u_lit: mi.Point2f  # and at the other
     hit: mi.PreliminaryIntersection3f  # of what casts it
     ray: mi.Ray3f
     n: mi.Vector3f
@@ -120,27 +153,45 @@ class Shaded:
     active: mi.Bool
 
 
-def emitter_edges(walk: Walk, x: Chosen, seer: Seer, lines: int, l: float, key: mi.UInt32, pick: mi.PCG32) -> Shaded:
-    """Find the edge of a shadow among the samples of an emitter, and weigh it. Detached."""
-    scene, origin = walk.scene, seer.origin
+def emitter_line(walk: Walk, x: Chosen, l: float, key: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
+    """A line among the samples of an emitter, and whether there is one."""
+    numbers, scene = Counted(key, mi.UInt32(0)), walk.scene
+    index, share, _ = scene.sample_emitter(numbers.next_1d())
+    turn = dr.two_pi * numbers.next_1d()
+    c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(dr.cos(turn), dr.sin(turn))
+    begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)
+    for axis in range(2):  # the part that is inside
+        cuts = (BORDER - c[axis]) / w[axis], (1 - BORDER - c[axis]) / w[axis]
+        begin, end = dr.maximum(begin, dr.minimum(*cuts)), dr.minimum(end, dr.maximum(*cuts))
+    inside = x.active & (begin < end)
+    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, x.active)
+    begin, end = dr.select(inside, begin, 0), dr.select(inside, end, 0)
+    strip, width = _strip(walk.traits.tables, index, numbers.next_1d(), x.active)
+    return SquareLine(c, w, begin, end, emitter, share, strip, width), inside
 
-    def draw(j: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
-        numbers = Counted(key, 8 * j)
-        index, share, _ = scene.sample_emitter(numbers.next_1d())
-        turn = dr.two_pi * numbers.next_1d()
-        c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(dr.cos(turn), dr.sin(turn))
-        begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)
-        for axis in range(2):  # the part that is inside
-            cuts = (BORDER - c[axis]) / w[axis], (1 - BORDER - c[axis]) / w[axis]
-            begin, end = dr.maximum(begin, dr.minimum(*cuts)), dr.minimum(end, dr.maximum(*cuts))
-        inside = x.active & (begin < end)
-        emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, x.active)
-        begin, end = dr.select(inside, begin, 0), dr.select(inside, end, 0)
-        return SquareLine(c, w, begin, end, emitter, share), inside
+
+def _strip(tables: Tables, emitter: mi.UInt32, u: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    """Where a strip of the square begins in which u is, and how wide it is."""
+    lamps, until = tables.strips_of, tables.strips
+    n = dr.width(until)
+
+    def before(i: mi.UInt32) -> mi.Bool:
+        lamp = dr.gather(mi.UInt32, lamps, i, active)
+        return (lamp < emitter) | ((lamp == emitter) & (dr.gather(mi.Float, until, i, active) <= u))
+
+    i = dr.minimum(dr.binary_search(0, n - 1, before), n - 1)
+    first = (i == 0) | (dr.gather(mi.UInt32, lamps, dr.maximum(i, 1) - 1, active) != emitter)
+    begin = dr.select(first, 0, dr.gather(mi.Float, until, dr.maximum(i, 1) - 1, active))
+    return begin, dr.gather(mi.Float, until, i, active) - begin
+
+
+def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
+    """Find the edge of a shadow among the samples of an emitter, and weigh it: see `Search`. Detached."""
+    line, inside = emitter_line(walk, x, l, key)
 
     def shadowed(line: SquareLine, t: mi.Float, active: mi.Bool) -> tuple[Any, ...]:
-        light, Le = line.emitter.sample_direction(origin, line.at(t), active)
-        ray = origin.spawn_ray_to(light.p)
+        light, Le = line.emitter.sample_direction(seer.origin, line.sample(t), active)
+        ray = seer.origin.spawn_ray_to(light.p)
         lit = active & (light.pdf != 0)
         hit = seer.behind(ray, seer.hit(ray, lit), lit)
         # A lamp's own limb hides it by rounding only.
@@ -148,22 +199,36 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, lines: int, l: float, key: 
         return light, Le, ray, hit, hidden
 
     def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
-        return Sight(mi.UInt32(shadowed(line, t, active)[-1]), mi.Point3f(0), mi.Normal3f(0))
+        *_, hit, hidden = shadowed(line, t, active)
+        moves = x.moves | _lamp_moves(walk, line.emitter) | may_move(walk, hit)
+        return Sight(mi.UInt32(hidden & moves), mi.Point3f(0), mi.Normal3f(0))
 
-    found = bisect(look, search(draw, look, lines, pick), pick)
-    line, active = found.line, found.weight > 0
-    a_hidden = shadowed(line, found.a, active)[-1]
+    if search.chosen is None:
+        return glance(look, line, inside)
+    found = search.closer(look, line, inside)
+    active = found.weight > 0
+    a_hidden, b_hidden = (shadowed(line, t, active)[-1] for t in (found.a, found.b))
+    active &= a_hidden != b_hidden
     light, Le, *_ = shadowed(line, dr.select(a_hidden, found.b, found.a), active)
     t = dr.select(a_hidden, found.a, found.b)
     _, _, ray, hit, hidden = shadowed(line, t, active)
     active &= hidden
     f, pdf = seer.towards(light.d, active)
-    density = light.pdf / line.share
     Le *= seer.past(light, hit.t, key, active)
+    density = light.pdf / line.share
     F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density, pdf))
-    K = 0.5 * dr.pi * dr.square(1 + l) / (l * lines) * found.weight * F * dr.select(a_hidden, -1, 1)
-    u, u_lit = line.at(t), line.at(dr.select(a_hidden, found.b, found.a))
-    return Shaded(line, u, u_lit, hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
+    K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a_hidden, -1, 1)
+    ends = line.sample(t), line.sample(dr.select(a_hidden, found.b, found.a))
+    return Shaded(line, *ends, hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
+
+
+def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
+    moving = walk.traits.moving
+    moves = mi.Bool(moving is None)
+    for shape in moving or ():
+        if shape.is_emitter():
+            moves |= emitter == mi.EmitterPtr(shape.emitter())
+    return moves
 
 
 def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
@@ -174,23 +239,17 @@ def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
 
 
 def shadow_weight(seer: Seer, c: Shaded) -> mi.Spectrum:
-    """K in full: with the derivative of B along the line.
-
-    Lamps with a texture are sampled by texels, between which the sample jumps: what it jumps over is no edge.
-    """
-
-    def gap(u: mi.Point2f) -> mi.Float:
-        return shadow_gap(seer, c, seer.at.ray, u)
-
-    slope = derivative_by_place(c.u, gap)
-    passed, expected = dr.detach(gap(c.u_lit) - gap(c.u)), dr.dot(slope, c.u_lit - c.u)
-    jumps = dr.abs(passed - expected) > dr.abs(expected) + ROUNDING * c.hit.t
-    return c.line.passed(c.K, slope, c.active & ~jumps)
+    """K in full: with the derivative of B along the line."""
+    slope = derivative_by_place(c.u, lambda u: shadow_gap(seer, c, seer.at.ray, u))
+    # Where a sample of the emitter jumps there is no edge: its other side is far off.
+    off = dr.abs(shadow_gap(seer, c, seer.at.ray, c.u_lit) - shadow_gap(seer, c, seer.at.ray, c.u))
+    jumps = off > JUMP * dr.norm(slope) * dr.norm(c.u_lit - c.u) + ROUNDING * (dr.norm(c.ray.o) + c.hit.t)
+    return c.line.passed(c.K, mi.Vector2f(slope.x, slope.y * c.line.width), c.active & ~jumps)
 
 
 @dataclass
 class Hiding:
-    """A crossing on an arc: one surface hides another."""
+    """A crossing on an arc: one surface hides another, or bends."""
 
     edge: mi.PreliminaryIntersection3f  # of the one that hides
     near: mi.PreliminaryIntersection3f  # what the direction at its side hits: it, or a null boundary before it
@@ -198,51 +257,67 @@ class Hiding:
     d_near: mi.Vector3f
     d_far: mi.Vector3f
     n: mi.Vector3f  # from near to far
+    bend: Bend
+    slope: mi.Float  # of its B, along n
     K_near: mi.Spectrum
     K_far: mi.Spectrum
     active: mi.Bool
 
 
-def arc_edges(walk: Walk, x: Chosen, seer: Seer, lines: int, l: float, key: mi.UInt32, pick: mi.PCG32) -> Hiding:
-    """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides. Detached."""
+def arc(seer: Seer, l: float, key: mi.UInt32, active: mi.Bool) -> tuple[Arc, mi.Bool]:
+    """An arc around a direction in which a vertex scatters, and whether there is one."""
+    numbers = Counted(key, mi.UInt32(0x100))
+    d, smooth = seer.sample(numbers.next_1d(), numbers.next_2d())
+    evenly = numbers.next_1d() < EVENLY
+    d = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), d)
+    ok = active & (evenly | smooth)
+    pdf = dr.lerp(seer.towards(d, ok)[1], dr.inv_four_pi, EVENLY)
+    c = dr.select(ok, d, mi.Vector3f(0, 0, 1))
+    turn = dr.two_pi * numbers.next_1d()
+    w = mi.Frame3f(c).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
+    return Arc(c, w, dr.select(ok, pdf, 1), mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
 
-    def draw(j: mi.UInt32) -> tuple[Arc, mi.Bool]:
-        numbers = Counted(key, 0x100 + 8 * j)
-        c, pdf, ok = seer.sample(numbers.next_1d(), numbers.next_2d())
-        turn = dr.two_pi * numbers.next_1d()
-        w = mi.Frame3f(c).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
-        return Arc(c, w, pdf, mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
+
+def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
+    """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides: see `Search`.
+
+    Detached.
+    """
+    line, ok = arc(seer, l, key, x.active)
 
     def look(line: Arc, t: mi.Float, active: mi.Bool) -> Sight:
         ray = seer.origin.spawn_ray(line.at(t))
-        first = seer.hit(ray, active)
+        first = seer.hit(ray, active & seer.may_scatter(ray.d))
         seen = seer.behind(ray, first, active)
-        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
-        place = place_met(walk, seen, active, facets=False)
+        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
+        turned = dr.select(dr.dot(at.sh_frame.n, ray.d) > 0, mi.UInt32(1), 0)
+        place = dr.select(seer.keeps, place_met(walk, seen, active), place_met(walk, seen, active, facets=False))
+        moves = x.moves | may_move(walk, seen)
         if walk.media is not None:  # directions follow null boundaries, too
-            place = mixed(place, place_met(walk, first, active, facets=False))
-        return Sight(place, at.p, at.n)
+            place, moves = mixed(place, place_met(walk, first, active, facets=False)), moves | may_move(walk, first)
+        return dr.select(moves, Sight(mixed(place, turned), at.p, at.n), Sight.nothing())
 
-    found = bisect(look, search(draw, look, lines, pick), pick)
-    line, active = found.line, found.weight > 0
+    if search.chosen is None:
+        return glance(look, line, ok)
+    found = search.closer(look, line, ok)
+    active = found.weight > 0
     rays = [seer.origin.spawn_ray(line.at(t)) for t in (found.a, found.b)]
     firsts = [seer.hit(ray, active) for ray in rays]
-    edges, through = firsts, mi.Bool(False)
-    if walk.media is not None:  # the edge of what was met first or, where that is one null boundary, of what is behind
-        behind = [seer.behind(ray, first, active) for ray, first in zip(rays, firsts, strict=True)]
-        places = [place_met(walk, first, active, facets=False) for first in firsts]
-        through = (places[0] == places[1]) & firsts[0].is_valid() & is_null(firsts[0].shape.bsdf())
-        edges = [dr.select(through, seen, first) for seen, first in zip(behind, firsts, strict=True)]
+    edges, through = seer.edges(rays, firsts, active)
     near_a = edges[0].t <= edges[1].t
-    edge = dr.select(near_a, *edges)
-    near, far = dr.select(near_a, *firsts), dr.select(near_a, *firsts[::-1])
+    edge, near, far = dr.select(near_a, *edges), dr.select(near_a, *firsts), dr.select(near_a, *firsts[::-1])
     ray_near, ray_far = dr.select(near_a, *rays), dr.select(near_a, *rays[::-1])
     active &= edge.is_valid()
 
-    n = edge_normal(edge, ray_near, active)
+    bend = Bend.of(walk, ((edge, ray_near), (dr.select(near_a, *edges[::-1]), ray_far)), active)
+    slope = derivative_by_ray(ray_near, lambda ray: bend.gap(ray, active)).d
+    slope -= dr.dot(slope, ray_near.d) * ray_near.d
+    bent = (bend.meets | bend.turns) & (dr.squared_norm(slope) > 0)
+    n = dr.select(bent, dr.normalize(slope), edge_normal(edge, ray_near, active))
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
+    steep = dr.select(bent, dr.dot(slope, n), 1)
     f, pdf = seer.towards(ray_far.d, active)
-    common = x.β * f * (0.5 * dr.pi / (l * lines) * found.weight / line.pdf)
+    common = x.β * f * (0.5 * dr.pi / l * found.weight / line.pdf)
     active &= dr.any(common != 0)
     arrivals, depth = [seer.arrival(ray_near, near, pdf), seer.arrival(ray_far, far, pdf)], x.depth + 1
     T, arrivals = seer.onward(arrivals, SHORT_OF * edge.t, key, active & through)
@@ -251,7 +326,7 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, lines: int, l: float, key: mi.U
         path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < walk.max_depth))
         L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
         K.append(dr.select(active, common * T * L, 0))
-    return Hiding(edge, near, far, ray_near.d, ray_far.d, n, K[0], K[1], active)
+    return Hiding(edge, near, far, ray_near.d, ray_far.d, n, bend, steep, K[0], K[1], active)
 
 
 def hiding_motion(walk: Walk, seer: Seer, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
@@ -261,40 +336,61 @@ def hiding_motion(walk: Walk, seer: Seer, c: Hiding, at: mi.Ray3f) -> mi.Spectru
     edge = held_direction(origin, c.d_near, c.edge, c.active)
     d_near, _ = moved_direction(lengths, origin, c.d_near, c.near, seer.holds(c.near, c.active))
     d_far, _ = moved_direction(lengths, origin, c.d_far, c.far, seer.holds(c.far, c.active))
-    swept = c.K_near * dr.dot(c.n, edge - d_near) - c.K_far * dr.dot(c.n, edge - d_far)
+    bends = c.bend.meets | c.bend.turns
+
+    def gap(d: mi.Vector3f) -> mi.Float:
+        """How far a direction is from the edge, along n."""
+        ray = mi.Ray3f(origin.spawn_ray(dr.detach(d)).o, d)
+        return dr.select(bends, -c.bend.gap(ray, c.active) / c.slope, dr.dot(c.n, edge - d))
+
+    swept = c.K_near * gap(d_near) - c.K_far * gap(d_far)
     return dr.select(c.active, swept, 0)
 
 
 def inner_edges(
     walk: Walk,
     places: Places,
-    lane: mi.UInt32,
-    seed: mi.UInt32,
     lines: int,
+    closer: int,
+    seed: mi.UInt32,
     lengths: tuple[float, float],
-    W: Importance,
 ) -> Edges:
-    """Find an edge that a vertex sees in each lane, by ``lines`` lines of each kind. Detached.
+    """Find edges that vertices see by so many lines of each kind, and look ``closer`` at as many. Detached.
 
-    ``lengths`` are those in the square and on the sphere (radians). ``W`` (place, ray) -> Spectrum is what light counts
-    that arrives at a place of the film: it decides which paths are worth looking at.
+    ``lengths`` are those in the square and on the sphere (radians). What light counts that arrives at the film decides
+    nothing here, since forward mode would not know it and choose otherwise.
     """
     walk = replace(walk, max_depth=min(walk.max_depth, deepest(walk)))
-    key = mixed(mixed(lane, seed), mi.UInt32(0x2545F491))
-    pick = mi.PCG32(dr.width(lane), initstate=seed + 1, initseq=lane)
-    s = quasi_random(lane, seed) * places.size
-    ray0, weight = dr.detach(places.ray(s, key))
     layout = Layout.of(walk, True)
-    records = dr.alloc_local(record_type(layout), room_for(walk))
-    β = weight * dr.opaque(mi.Float, places.size.x * places.size.y / dr.width(lane))
-    records, x = choose_vertex(walk, Counted.of(key), ray0, W(s, ray0), layout, records)
-    x.β *= β
-
     square, arc = lengths
+    per_line = dr.opaque(mi.Float, places.size.x * places.size.y / lines)
+
+    def path(i: mi.UInt32, records: Any) -> tuple[Any, ...]:
+        key = mixed(mixed(i, seed), mi.UInt32(0x2545F491))
+        s = quasi_random(i, lines, seed) * places.size
+        ray, weight = dr.detach(places.ray(s, key))
+        records, x = choose_vertex(walk, Counted.of(key), ray, layout, records)
+        x.β *= weight * per_line
+        return s, key, records, x
+
+    i = dr.arange(mi.UInt32, lines)
+    _, key, _, x = path(i, None)
     seer = Seer(walk, x.at, x.flight, x.active)
-    shaded = emitter_edges(walk, x, seer, lines, square, key ^ 0x1B873593, pick)
+    in_squares = emitter_edges(walk, x, seer, square, key ^ 0x1B873593, Search()) + dr.zeros(mi.Float, lines)
+    on_arcs = arc_edges(walk, x, seer, arc, key ^ 0x38B34AE5, Search()) + dr.zeros(mi.Float, lines)
+    dr.eval(in_squares, on_arcs)
+    chosen = Picked.of(dr.concat((in_squares, on_arcs)), closer, seed)
+
+    on_arc = chosen.index >= lines
+    i = dr.select(on_arc, chosen.index - lines, chosen.index)
+    pick = mi.PCG32(closer, initstate=seed + 1, initseq=dr.arange(mi.UInt32, closer))
+    s, key, records, x = path(i, dr.alloc_local(record_type(layout), room_for(walk)))
+    x.active &= chosen.weight > 0
+    of_square, of_arc = dr.select(on_arc, 0, chosen.weight), dr.select(on_arc, chosen.weight, 0)
+    seer = Seer(walk, x.at, x.flight, x.active)
+    shaded = emitter_edges(walk, x, seer, square, key ^ 0x1B873593, Search(of_square, pick))
     K = shadow_weight(seer, shaded)
-    hiding = arc_edges(walk, x, seer, lines, arc, key ^ 0x38B34AE5, pick)
+    hiding = arc_edges(walk, x, seer, arc, key ^ 0x38B34AE5, Search(of_arc, pick))
 
     def motion(ray: mi.Ray3f) -> mi.Spectrum:
         return hiding_motion(walk, seer, hiding, ray) - K * shadow_gap(seer, shaded, ray, shaded.u)

@@ -10,6 +10,8 @@ import mitsuba as mi
 from ..transport import arrive, scatter
 from ..transport.media import carried, span
 from ..transport.passage import beyond_null, passage, past
+from ..transport.signature import place_met
+from ..transport.traits import is_null
 from ..transport.vertex import Arrival, Chosen, Flight, Walk, is_smooth
 from .counted import Counted
 from .through_media import going_on
@@ -36,6 +38,7 @@ class Seer:
         else:
             self.vertex = arrive.choose(walk, at, None, mi.Spectrum(1), active, flight)
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
+        self.keeps = scatter.keeps_direction(walk, self.si, active)  # and slides over facets, too
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
         """The vertex, differentiable in the ``ray`` that arrives and in what moves it: see `fly_again`."""
@@ -55,8 +58,8 @@ class Seer:
             return si.bsdf().eval_pdf(ctx, si, si.to_local(d), active)
         return scatter.towards(self.vertex, ctx, d, active)
 
-    def sample(self, lobe: mi.Float, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
-        """A direction in which it scatters, its density, and whether there is one that is not of a delta lobe."""
+    def sample(self, lobe: mi.Float, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Bool]:
+        """A direction in which it scatters, and whether there is one that is not of a delta lobe."""
         si, active = self.si, self.active
         surface = active if self.walk.media is None else active & self.vertex.surface
         sample, _ = si.bsdf().sample(mi.BSDFContext(), si, lobe, u, surface)
@@ -64,13 +67,18 @@ class Seer:
         if self.walk.media is not None:
             inside, phase = self.vertex.inside, mi.PhaseFunctionContext(None)
             wo, _, pdf_wo = inside.phase.sample(phase, inside.mei, lobe, u, active & self.event)
-            d, pdf = dr.select(self.event, wo, d), dr.select(self.event, pdf_wo, pdf)
-            delta &= ~self.event
-        ok = active & (pdf > 0) & ~delta
-        return dr.select(ok, d, mi.Vector3f(0, 0, 1)), dr.select(ok, pdf, 1), ok
+            d, pdf, delta = dr.select(self.event, wo, d), dr.select(self.event, pdf_wo, pdf), delta & ~self.event
+        return d, active & (pdf > 0) & ~delta
+
+    def may_scatter(self, d: mi.Vector3f) -> mi.Bool:
+        """Whether it may scatter light from a direction: it is on the side that is looked at, or lets light through."""
+        above = mi.Frame3f.cos_theta(self.si.to_local(d)) * mi.Frame3f.cos_theta(self.si.wi) > 0
+        both = above | mi.has_flag(self.si.bsdf().flags(), mi.BSDFFlags.Transmission)
+        return both if self.walk.media is None else both | self.event
 
     def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
         """Whether a direction follows what it hits: from particles only what scatters or emits, see `scatter`."""
+        active = active & ~self.keeps
         if self.walk.media is None:
             return active
         seen = is_smooth(hit.shape.bsdf()) | (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
@@ -84,6 +92,20 @@ class Seer:
         """The same without null boundaries."""
         return hit if self.walk.media is None else beyond_null(self.walk.scene, ray, hit, active)
 
+    def edges(
+        self, rays: list[mi.Ray3f], firsts: list[mi.PreliminaryIntersection3f], active: mi.Bool
+    ) -> tuple[list[mi.PreliminaryIntersection3f], mi.Bool]:
+        """What has an edge between two rays: what they met first or, where that is one null boundary, what is behind.
+
+        Also, where that is.
+        """
+        if self.walk.media is None:
+            return firsts, mi.Bool(False)
+        places = [place_met(self.walk, first, active, facets=False) for first in firsts]
+        through = (places[0] == places[1]) & firsts[0].is_valid() & is_null(firsts[0].shape.bsdf())
+        pairs = zip(rays, firsts, strict=True)
+        return [dr.select(through, self.behind(ray, first, active), first) for ray, first in pairs], through
+
     def medium(self, d: mi.Vector3f) -> mi.MediumPtr | None:
         """What there is in a direction."""
         if self.walk.media is None:
@@ -91,9 +113,7 @@ class Seer:
         turns = self.vertex.surface & self.si.is_medium_transition()
         return dr.select(turns, self.si.target_medium(d), self.at.medium)
 
-    def arrival(
-        self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, pdf: mi.Float, delta: mi.Bool | None = None
-    ) -> Arrival:
+    def arrival(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, pdf: mi.Float) -> Arrival:
         """What a path comes to along a ray from here."""
         at = Arrival(ray, hit, pdf, mi.Bool(False), mi.Bool(False))
         if self.walk.media is None:

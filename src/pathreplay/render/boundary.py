@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import PathreplayError
 from ..gradient.adjoint import LostPaths
 from ..gradient.baseline import Baseline
 from ..gradient.beam_edges import beam_edges
@@ -15,7 +16,7 @@ from ..gradient.counted import Counted
 from ..gradient.edges import Edges, edges_backward, edges_forward
 from ..gradient.film_edges import film_edges
 from ..gradient.inner_edges import inner_edges
-from ..transport.motion import path_moves
+from ..transport.motion import moving_shapes, path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
@@ -23,8 +24,10 @@ from .camera_pass import Pass
 from .places import FilmPlaces
 from .term import Found
 
-LINES = 4
-"""Lines that a lane looks at, of each kind: it keeps one with an edge."""
+FILM_CLOSER, INNER_CLOSER = 4, 8
+"""For so many lines one is looked at closer, of those with an edge."""
+BATCH = "BatchSensor"
+"""By class: Dr.Jit ends the process where its rays are differentiated by their place."""
 FILM_LENGTH = 0.5  # pixels
 INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
 
@@ -33,11 +36,13 @@ INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
 class Boundary:
     """A term: edges that the camera sees, directly or by mirrors and glass, and those that surfaces and particles see.
 
-    Not differentiated: hard shadows beyond the first vertex that scatters; edges of textures and of masks; alpha.
+    Not differentiated: hard shadows beyond the first vertex that scatters; edges of
+    textures and of masks; alpha.
     """
 
-    inner: bool  # also those that surfaces see
-    spp: int  # lines per pixel, of each kind; 0: samples of the pass
+    film: bool = True  # edges that the camera sees
+    inner: bool = True  # those that surfaces see
+    spp: int = 0  # lines per pixel, of each kind; 0: samples of the pass
 
     def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
         """Tangent of the image: see `Term`."""
@@ -45,7 +50,7 @@ class Boundary:
         if not _moves(walk, places):
             return Found()
         image = None
-        for edges in self._searches(view, walk, places, lambda s, ray: mi.Spectrum(1)):
+        for edges in self._searches(view, walk, places):
             δL = edges_forward(walk, places, edges)
             part = places.image(edges.s, δL, edges.ray.wavelengths)
             image = part if image is None else image + part
@@ -58,28 +63,30 @@ class Boundary:
             return Found()
         wanted = places.undeveloped(grad_in)
 
-        def importance(s: mi.Point2f, ray: mi.Ray3f) -> mi.Spectrum:
-            return places.importance(wanted, s, ray.wavelengths)
-
         lost, paths = LostPaths(), 0
-        for edges in self._searches(view, walk, places, importance):
-            edges_backward(walk, places, edges, importance(edges.s, edges.ray), lost)
+        for edges in self._searches(view, walk, places):
+            W = places.importance(wanted, edges.s, edges.ray.wavelengths)
+            edges_backward(walk, places, edges, W, lost)
             paths += dr.width(edges.s)
         dr.eval()
         return Found(lost=lost.count, paths=paths, moves=True)
 
-    def _searches(
-        self, view: Pass, walk: Walk, places: FilmPlaces, importance: Callable[..., mi.Spectrum]
-    ) -> Iterator[Edges]:
+    def _searches(self, view: Pass, walk: Walk, places: FilmPlaces) -> Iterator[Edges]:
         """The edges of each search."""
-        size = int(places.size.x) * int(places.size.y)
-        lane = dr.arange(mi.UInt32, max(size * (self.spp or view.spp) // LINES, 1))
+        if view.sensor.class_name() == BATCH:
+            raise PathreplayError(
+                f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
+                "put its sensors into the scene one by one, or use edges = 'none'"
+            )
+        walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
+        lines = max(int(places.size.x) * int(places.size.y) * (self.spp or view.spp), 1)
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
-        yield film_edges(walk, places, lane, seed ^ 0x5EED, LINES, FILM_LENGTH)
-        if walk.media is not None and walk.traits.hard_lights:
-            yield beam_edges(walk, places, lane, seed ^ 0x5EED, LINES, FILM_LENGTH)
+        if self.film:
+            yield film_edges(walk, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
+            if walk.media is not None and walk.traits.hard_lights:
+                yield beam_edges(walk, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
         if self.inner:
-            yield inner_edges(walk, places, lane, seed ^ 0x5EED, LINES, INNER_LENGTHS, importance)
+            yield inner_edges(walk, places, lines, max(lines // INNER_CLOSER, 1), seed ^ 0x5EED, INNER_LENGTHS)
 
 
 def _moves(walk: Walk, places: FilmPlaces) -> bool:

@@ -7,7 +7,18 @@ from dataclasses import replace
 import mitsuba as mi
 
 from ..transport.media import Media, scene_media
-from ..transport.traits import INSTANCE, MASK, Traits, blend_lengths, fixed_traits, is_null, nodes_of, with_gradients
+from ..transport.traits import (
+    INSTANCE,
+    MASK,
+    Traits,
+    blend_lengths,
+    fixed_traits,
+    is_null,
+    nodes_of,
+    pieces_of,
+    strips_of,
+    with_gradients,
+)
 from ..transport.traits import Tables as Tables
 
 
@@ -24,6 +35,8 @@ class SceneFacts:
         self._traits = fixed_traits(nodes, scene)
         self._shapes = [node for node in nodes if isinstance(node, mi.Shape)]
         self._boxes = [shape.bbox() for shape in self._shapes]
+        self._sizes = _sizes(self._shapes)
+        self._lights = scene.emitters()
         self._emitters = [*scene.emitters(), *(shape for shape in self._shapes if shape.is_emitter())]
         self._lamps = [shape for shape in self._shapes if shape.is_mesh() and shape.is_emitter()]
         self._instances = [shape for shape in self._shapes if shape.class_name() == INSTANCE]
@@ -57,12 +70,23 @@ class SceneFacts:
         )
 
     def _tables(self) -> Tables:
-        """Made anew when shapes have changed their sizes."""
+        """Made anew when shapes have changed their sizes, or meshes the number of their triangles."""
         boxes = [shape.bbox() for shape in self._shapes]
         if boxes != self._boxes:
-            tables = replace(self._traits.tables, blend_lengths=blend_lengths(self._shapes))
+            lamps, strips = strips_of(self._lights, self._shapes)
+            tables = replace(
+                self._traits.tables, blend_lengths=blend_lengths(self._shapes), strips_of=lamps, strips=strips
+            )
             self._traits, self._boxes = replace(self._traits, tables=tables), boxes
+        if (sizes := _sizes(self._shapes)) != self._sizes:
+            begins, pieces = pieces_of(self._shapes)
+            tables = replace(self._traits.tables, pieces_at=begins, pieces=pieces)
+            self._traits, self._sizes = replace(self._traits, tables=tables), sizes
         return self._traits.tables
+
+
+def _sizes(shapes: list[mi.Shape]) -> list[tuple[int, int]]:
+    return [(shape.vertex_count(), shape.face_count()) for shape in shapes if shape.is_mesh()]
 
 
 def _parts(scene: mi.Scene) -> list[mi.Object]:

@@ -45,7 +45,7 @@ def splat(view: Pass, rays: Rays, L: mi.Spectrum, valid: mi.Bool) -> mi.TensorXf
 def adjoint(view: Pass, rays: Rays, grad_in: mi.TensorXf) -> mi.Spectrum:
     """δL of each ray: ``grad_in`` (the adjoint of the image), taken back through filter, weights and their division."""
     with dr.resume_grad():
-        L = dr.full(mi.Spectrum, 1.0, dr.width(rays.ray))
+        L = dr.full(mi.Spectrum, 1.0, dr.width(rays.position))  # rays may all be the same
         dr.enable_grad(L)
         image = splat(view, rays, L, mi.Bool(True))
         dr.set_grad(image, grad_in)

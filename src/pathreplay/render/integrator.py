@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -84,7 +85,7 @@ class PathReplayIntegrator(PathIntegrator):
         self.interior = _interior(self.name, props, self.max_depth)
         self.driver, self.branch = self.interior.driver, self.interior.branch
         self.edges = choice(props, self.name, "edges", "none", EDGE_TERMS)
-        self.edge_spp = whole_number(props, self.name, "edge_spp", 0, lowest=0)
+        self.edge_spp = whole_number(props, self.name, "edge_spp", 0, lowest=0, kind="number of lines per pixel")
         if self.edges != "none" and self.attach != "delta":
             raise PathreplayError(
                 f"{self.name}: edges = '{self.edges}' with attach = '{self.attach}': edges know what moves with "
@@ -101,9 +102,13 @@ class PathReplayIntegrator(PathIntegrator):
             return (self.interior,)
         return self.interior, self._boundary
 
+    def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> Walk:
+        walk = PathIntegrator._walk(self, scene, sensor)
+        return replace(walk, edges=self.edges == "all" and walk.media is None)
+
     @property
     def _boundary(self) -> Boundary:
-        return Boundary(self.edges == "all", self.edge_spp)
+        return Boundary(inner=self.edges == "all", spp=self.edge_spp)
 
     def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0) -> bool:
         """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
@@ -172,7 +177,7 @@ class PathReplayIntegrator(PathIntegrator):
     def _tell_edges(self, walk: Walk, sensor: mi.Sensor) -> None:
         if EDGES in self.told or self.edges == "all":
             return
-        note, named = missing_edges(walk, sensor)
+        note, named = missing_edges(walk, sensor, self.edges)
         if named:
             self.told.add(EDGES)
         if note:

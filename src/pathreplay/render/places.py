@@ -36,7 +36,8 @@ class FilmPlaces:
         place = (self.corner + s - mi.ScalarPoint2f(film.crop_offset())) / mi.ScalarVector2f(film.crop_size())
         time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
         wavelength, aperture = numbers.next_1d(), numbers.next_2d()
-        ray, weight = sensor.sample_ray(time, wavelength, place, aperture)
+        # Not `sample_ray`, which irradiance meters do not have.
+        ray, weight = sensor.sample_ray_differential(time, wavelength, place, aperture)
         return mi.Ray3f(ray), dr.detach(weight)
 
     def undeveloped(self, grad_in: mi.TensorXf) -> mi.TensorXf:

@@ -23,15 +23,24 @@ def choice(props: mi.Properties, plugin: str, name: str, default: Any, choices: 
 
 
 def whole_number(
-    props: mi.Properties, plugin: str, name: str, default: int, lowest: int, unbounded: bool = False
+    props: mi.Properties,
+    plugin: str,
+    name: str,
+    default: int,
+    lowest: int,
+    unbounded: bool = False,
+    kind: str = "depth",
 ) -> int:
-    """A whole number from ``lowest`` to `LARGEST`, or -1 where it may be unbounded. Raises PathreplayError else."""
+    """A whole number from ``lowest`` to `LARGEST`, or -1 where it may be unbounded; ``kind`` says of what.
+
+    Raises PathreplayError else.
+    """
     value = props.get(name, default)
     if type(value) is int and (lowest <= value <= LARGEST or (unbounded and value == -1)):
         return value
     besides = "-1 (unbounded) or " if unbounded else ""
     raise PathreplayError(
-        f"{plugin}: {name} = {shown(value)}: use {besides}a depth >= {lowest}, a whole number of at most {LARGEST}"
+        f"{plugin}: {name} = {shown(value)}: use {besides}a {kind} >= {lowest}, a whole number of at most {LARGEST}"
     )
 
 

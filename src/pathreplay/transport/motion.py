@@ -6,7 +6,35 @@ import drjit as dr
 import mitsuba as mi
 
 from .start import CameraStart
+from .traits import nodes_of
 from .vertex import Arrival, Walk
+
+FEW = 8
+"""Of more moving shapes than these nobody asks which they are."""
+COPIES = frozenset({"Instance", "ShapeGroup"})
+
+
+def moving_shapes(scene: mi.Scene) -> tuple[mi.Shape, ...] | None:
+    """Those that have gradients, in whatever belongs to them; None where other things have gradients, or too many."""
+    params = mi.traverse(scene)
+    with dr.resume_grad():
+        attached = {params.properties[key][2] for key in params.keys() if dr.grad_enabled(params[key])}
+    shapes = {shape: nodes_of(shape) | {shape} for shape in scene.shapes()}
+    moving = tuple(shape for shape, nodes in shapes.items() if not attached.isdisjoint(nodes))
+    rest = attached.difference(*(shapes[shape] for shape in moving))
+    copies = any(shape.class_name() in COPIES for shape in moving)
+    return None if rest or copies or len(moving) > FEW else moving
+
+
+def may_move(walk: Walk, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+    """Whether what was hit may be moved by a parameter; what a ray misses is not."""
+    moving = walk.traits.moving
+    if moving is None:
+        return mi.Bool(True)
+    moves = mi.Bool(False)
+    for shape in moving:
+        moves |= hit.shape == mi.ShapePtr(shape)
+    return moves & hit.is_valid()
 
 
 def path_moves(walk: Walk, start: CameraStart, at: Arrival) -> bool:

@@ -113,7 +113,8 @@ def _at_surface(
     smooth = active & ~kept.delta
     d, J = kept.d, mi.Float(1)
     if attached:
-        d, J = moved_direction(walk.traits.tables.blend_lengths, si, kept.d, again.hit_next, smooth)
+        holds = smooth & ~keeps_direction(walk, si, smooth)
+        d, J = moved_direction(walk.traits.tables.blend_lengths, si, kept.d, again.hit_next, holds)
 
     if walk.resamples:
         sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
@@ -140,6 +141,18 @@ def _at_surface(
         delta = active & kept.delta
         w = dr.select(delta, _delta_weight(walk, v, u, ctx, kept, w_sample, delta), w)
     return w, d, pdf
+
+
+def keeps_direction(walk: Walk, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+    """Where smooth continuations keep their direction rather than the point that they hit: where lobes are narrow.
+
+    Those would turn the motion of what they hit into noise. Only where edges are looked for, which they slide over.
+    Decided by the vertex and the ray that arrives there, so that all its directions move alike.
+    """
+    if not (walk.edges and walk.traits.glossy):
+        return mi.Bool(False)
+    centre, _ = si.bsdf().sample(mi.BSDFContext(), dr.detach(si), 0.5, mi.Point2f(0.5), active)
+    return active & ~mi.has_flag(centre.sampled_type, mi.BSDFFlags.Delta) & (dr.detach(centre.pdf) > NARROW)
 
 
 def _followed(walk: Walk, v: Vertex, u: Numbers, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:

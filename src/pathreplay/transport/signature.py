@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .surface import held_point
+from .traits import FACETS, WHOLE, Tables
 from .vertex import Walk
 
 # Cosine between ray and normal of a cylinder below which an edge is its limb rather than its rim.
@@ -13,17 +14,23 @@ GRAZING = 0.05
 
 
 def place_met(walk: Walk, hit: mi.PreliminaryIntersection3f, active: mi.Bool, facets: bool = True) -> mi.UInt32:
-    """What a ray met, as a number: 0 for nothing, else one for each shape, copy of a shape, and facet of a flat mesh.
+    """What a ray met, as a number: 0 for nothing, else one for each shape, copy of a shape, and piece of a mesh.
 
-    A mesh with vertex normals shades as if it were smooth: it has no facets.
+    Pieces are shaded as if they were smooth; of a flat mesh they are its triangles. Only if ``facets``.
     """
     met = active & hit.is_valid()
     shape = dr.reinterpret_array(mi.UInt32, hit.shape)
     place = mixed(shape, dr.reinterpret_array(mi.UInt32, hit.instance))
     if facets:
-        faceted = dr.gather(mi.Bool, walk.traits.tables.faceted, shape, met)
-        place = mixed(place, dr.select(faceted, hit.prim_index + 1, 0))
+        place = mixed(place, _piece(walk.traits.tables, shape, hit.prim_index, met))
     return dr.select(met, place | 1, 0)
+
+
+def _piece(tables: Tables, shape: mi.UInt32, triangle: mi.UInt32, met: mi.Bool) -> mi.UInt32:
+    begin = dr.gather(mi.UInt32, tables.pieces_at, shape, met)
+    flat = begin == FACETS
+    piece = dr.gather(mi.UInt32, tables.pieces, begin + triangle, met & ~flat & (begin != WHOLE))
+    return dr.select(flat, triangle + 1, piece)
 
 
 def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:

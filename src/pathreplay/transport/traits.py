@@ -8,7 +8,9 @@ from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from .pieces import mesh_areas, mesh_pieces
 from .velocity import blend_length
 
 # Classes by name: Mitsuba's objects do not tell these things of themselves.
@@ -16,7 +18,11 @@ from .velocity import blend_length
 ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
 MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
 FRAMES = frozenset({"NormalMap", "BumpMap", TWO_SIDED})
+# Those without a narrow lobe of their own, and a texture that jumps within itself.
+DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
 INSTANCE = "Instance"
+WHOLE, FACETS = 0, 0xFFFFFFFF
+"""Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
 
 T = TypeVar("T")
 V = TypeVar("V")
@@ -31,7 +37,10 @@ class Tables:
 
     attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: nowhere)
     blend_lengths: mi.Float  # those of `velocity`, by shape
-    faceted: mi.Bool  # this shape is a mesh that is shaded flat
+    pieces_at: mi.UInt32  # by shape: where the pieces of its triangles begin, if not `WHOLE` or `FACETS`
+    pieces: mi.UInt32  # of all such meshes (see `pieces`), in a row; the first is no triangle's
+    strips_of: mi.UInt32  # emitters, for each strip of their unit squares of samples (see `strips_of`)
+    strips: mi.Float  # and where it ends
 
 
 @dataclass(frozen=True)
@@ -46,6 +55,7 @@ class Traits:
     hard_lights: bool  # there are emitters whose shadows are hard
     two_sides: bool  # a surface may have another BSDF on its back
     masks_mirrors: bool  # a mask lies over delta lobes
+    glossy: bool  # a surface may have a narrow smooth lobe, and no texture has seams
     outlines: bool  # a point of a surface may see where a shape, a lamp or a texture ends
     tables: Tables  # of single BSDFs and shapes
     # What has gradients:
@@ -53,6 +63,7 @@ class Traits:
     instances_move: bool = False  # the to_world of an instance
     opacity_moves: bool = False  # the opacity of a mask
     lights_vary: bool = False  # something about an emitter, or about a shape that emits
+    moving: tuple[mi.Shape, ...] | None = None  # the shapes that may move, or None: all, and the camera, too
 
 
 def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
@@ -75,11 +86,13 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
+        glossy=_is_glossy(bsdfs, nodes),
         outlines=not _seamless(shapes, nodes),
         tables=Tables(
             mi.Bool(_by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)) if attachables else None,
             blend_lengths(shapes),
-            mi.Bool(_by_index(mi.ShapePtr, shapes, _is_faceted, False)),
+            *pieces_of(shapes),
+            *strips_of(scene.emitters(), shapes),
         ),
     )
 
@@ -89,15 +102,34 @@ def blend_lengths(shapes: list[mi.Shape]) -> mi.Float:
     return mi.Float(_by_index(mi.ShapePtr, shapes, blend_length, 0.0))
 
 
-def _is_faceted(shape: mi.Shape) -> bool:
-    """Whether it is a mesh that is shaded flat.
+def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
+    """The tables of pieces: where those of each shape begin, and what they are."""
+    found: list[np.ndarray] = [np.zeros(1, np.uint32)]
 
-    It has no vertex normals, or hardly any vertices that triangles share: a welded mesh has half as many vertices as
-    triangles, one that was split at every edge has twice as many or more.
-    """
-    return shape.is_mesh() and (
-        shape.has_face_normals() or not shape.has_vertex_normals() or shape.vertex_count() >= 2 * shape.face_count()
-    )
+    def begin(shape: mi.Shape) -> int:
+        if not shape.is_mesh():
+            return WHOLE
+        if shape.has_face_normals() or not shape.has_vertex_normals():
+            return FACETS
+        pieces = mesh_pieces(shape)
+        if not pieces.any():
+            return WHOLE
+        found.append(pieces)
+        return sum(map(len, found[:-1]))
+
+    begins = _by_index(mi.ShapePtr, shapes, begin, WHOLE)
+    return mi.UInt32(begins), mi.UInt32(np.concatenate(found).astype(np.uint32))
+
+
+def strips_of(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.Float]:
+    """The strips of the unit squares of emitter samples, by emitter: of mesh lamps, which triangle a number chooses."""
+    areas = {shape.emitter(): mesh_areas(shape) for shape in shapes if shape.is_emitter() and shape.is_mesh()}
+    ends = []
+    for emitter in emitters:
+        painted = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+        ends.append(np.cumsum(areas[emitter]) if emitter in areas and not painted else np.ones(1))
+    lamps = np.repeat(np.arange(len(ends)), [len(x) for x in ends])
+    return mi.UInt32(lamps.astype(np.uint32)), mi.Float(np.concatenate([x / x[-1] for x in ends] or [np.ones(1)]))
 
 
 def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], otherwise: V) -> list[V]:
@@ -132,6 +164,12 @@ def nodes_of(root: mi.Object) -> set[mi.Object]:
 
     root.traverse(Collector())
     return seen
+
+
+def _is_glossy(bsdfs: list[mi.BSDF], nodes: set[mi.Object]) -> bool:
+    """Whether a surface may have a narrow smooth lobe, and no texture has a seam that such lobes would slide over."""
+    narrow = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) and b.class_name() not in DULL for b in bsdfs)
+    return narrow and not any(node.class_name() == CHECKERED for node in nodes)
 
 
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:

@@ -22,7 +22,8 @@ class Walk:
     is 2^32 - 1. ``media`` is None in a scene without them, which then walks as Mitsuba's `path` does; with media all
     conventions are those of `volpath`: null boundaries are no vertices. ``baseline`` (MediumInteraction3f, extinction,
     majorant, Bool) -> Spectrum guesses the radiance that arrives at a point of a medium from beyond (None: zero); a
-    better guess makes gradients less noisy, and none makes them wrong.
+    better guess makes gradients less noisy, and none makes them wrong. ``edges`` says that what vertices slide over is
+    looked for.
     """
 
     scene: mi.Scene
@@ -37,6 +38,7 @@ class Walk:
     # To keep a null collision of each path, for derivatives where collisions are never real: how much it counts (Float,
     # see `branch_weight`); else None.
     branching: mi.Float = None
+    edges: bool = False
     # Null boundaries are passed as if they were not there, and ``media`` is None: what edges are looked for with.
     clear: bool = False
 

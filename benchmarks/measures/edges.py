@@ -1,0 +1,110 @@
+"""One derivative by what moves in a scene, in parts: what task `edges` measures.
+
+Seconds are those of kernels, as Dr.Jit keeps them, for a method by itself; of the clock, for one that is `recorded`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.check.objective import Objective, smooth_weights
+from pathreplay.inverse.losses import l2
+from pathreplay.inverse.recorded import Recordings, differentiate
+from pathreplay.render.boundary import Boundary
+from pathreplay.render.facts import SceneFacts
+
+from ..scenes import SCENES
+from .job import Job
+from .methods import METHODS, RECORDED, TRACED, parts
+from .scene import stopwatch
+from .spread import spreads
+
+#: Parts of our boundary alone, by method.
+PARTS = {"film edges alone": {"inner": False}, "inner edges alone": {"film": False}, "edges alone": {}}
+#: Around which axis vertices turn, by scene.
+AXES = {"shadow": (0, 0, 1)}
+UPRIGHT = (0, 1, 0)
+
+
+class EdgePass:
+    """Each call runs one gradient pass by an angle, of the image weighted by a wave: see `job.Measure`."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.scene = mi.load_dict(SCENES[job.scene](job.resolution), optimize=False)
+        self.params = mi.traverse(self.scene)
+        (key,) = job.parameters
+        self.params.keep([key])
+        axis = mi.Vector3f(AXES.get(job.scene, UPRIGHT))
+
+        def turned(value: Any, t: mi.Float) -> Any:
+            return dr.ravel(mi.Transform4f().rotate(axis, dr.rad2deg(t)) @ dr.unravel(mi.Point3f, value))
+
+        self.objective = Objective(self.scene, self.params, key, turned)
+        shape = (job.resolution, job.resolution, 3)
+        self.objective.weigh(smooth_weights(shape, alpha=False))
+        self.target = dr.full(mi.TensorXf, 0.2, shape)
+        self.tables = SceneFacts(self.scene).traits().tables
+        self.forget()
+
+    def forget(self) -> None:
+        """Make all integrators anew, and record anew."""
+        self.integrators: dict[str, Any] = {}
+        self.recordings = {name: Recordings() for name in self.job.methods}
+        self.passes = dict.fromkeys(self.job.methods, 0)
+
+    def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
+        """Seconds, and the derivative."""
+        name, way = parts(method)
+        integrator = self._integrator(name)
+        t = dr.opaque(mi.Float, 0)
+        dr.enable_grad(t)
+        self.objective.put(t)
+        if way == RECORDED:
+            seconds, _ = stopwatch(lambda: self._step(method, integrator, seed))
+        else:
+            run = self._step if way == TRACED else self._gradient
+            seconds = kernel_seconds(lambda: run(method, integrator, seed))
+        return seconds, np.array([self.objective.collect(t)])
+
+    def _gradient(self, method: str, integrator: Any, seed: int) -> None:
+        adjoint = self.objective.adjoint
+        integrator.render_backward(self.scene, self.params, adjoint, seed=seed, spp=self.job.spp)
+
+    def _step(self, method: str, integrator: Any, seed: int) -> Any:
+        """Image, loss and gradient, as an optimiser wants them. Recorded in the second pass, launched in the others."""
+        records = parts(method)[1] == RECORDED and self.passes[method] > 0
+        self.passes[method] += 1
+        run = self.recordings[method].differentiate if records else differentiate
+        number = dr.opaque(mi.UInt32, seed)
+        return run(
+            self.params, self.scene, 0, integrator, self.target, number, self.job.spp, l2, 1.0, False, self.tables
+        )
+
+    def _integrator(self, name: str) -> Any:
+        if name not in self.integrators:
+            plugin = {"type": "pathreplay"} if name in PARTS else METHODS[name]
+            self.integrators[name] = mi.load_dict(plugin | self.job.limits)
+            if name in PARTS:
+                self.integrators[name].interior = Boundary(**PARTS[name])
+        return self.integrators[name]
+
+    def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
+        """What the derivatives of all seeds say: see `spread`."""
+        return spreads(kept, None, ())
+
+
+def kernel_seconds(run: Callable[[], Any]) -> float:
+    """Seconds of all kernels that it launches."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.sync_thread()
+        dr.kernel_history_clear()
+        result = run()
+        dr.eval(result)
+        dr.sync_thread()
+        return sum(entry["execution_time"] for entry in dr.kernel_history()) / 1000

@@ -1,0 +1,92 @@
+"""Rooms of one wall, one lamp and one mesh that moves: its shadow, its outline, both. The mesh is called ``object``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mitsuba as mi
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from .parts import SceneDict, sensor
+
+LUMPS = 600
+"""Vertices of the mesh with many triangles."""
+
+
+def _room(resolution: int, fov: float, glows: bool = False, **parts: mi.Mesh) -> SceneDict:
+    """A wall with a picture, lit by a lamp, or a picture that glows."""
+    T = mi.ScalarTransform4f
+    texels = np.random.default_rng(3).uniform(0.1, 1, (8, 8, 3)).astype(np.float32)
+    picture = {"type": "bitmap", "raw": True, "data": mi.TensorXf(texels)}
+    wall = {"type": "rectangle", "to_world": T().translate([0, 0, -1]).scale([6, 6, 1])}
+    dark = {"bsdf": _paint(0, 0, 0)}
+    over = T().translate([1.6, 1.2, 2.5]).look_at([0, 0, 0], [-1.6, -1.2, -3.5], [0, 1, 0]).scale([0.5, 0.5, 1])
+    lamp = {"type": "rectangle", "to_world": over, **dark, "emitter": {"type": "area", "radiance": 10.0}}
+    if glows:
+        lit = {"wall": {**wall, **dark, "emitter": {"type": "area", "radiance": picture}}}
+    else:
+        lit = {"wall": {**wall, "bsdf": {"type": "diffuse", "reflectance": picture}}, "lamp": lamp}
+    camera = sensor(resolution, [0, 0, 4], [0, 0, 0], fov, up=(0, 1, 0))
+    return {"type": "scene", "camera": camera, **lit, **parts}
+
+
+def _paint(*value: float) -> SceneDict:
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(value)}}
+
+
+def _box(bsdf: SceneDict) -> mi.Mesh:
+    return _mesh(*_cube(), [0.1, 0.1, 0], 0.4, bsdf, flat=True)
+
+
+def _ears(bsdf: SceneDict) -> mi.Mesh:
+    return _mesh(*_ball_with_ears(LUMPS), [0.1, 0, 0], 0.4, bsdf, flat=False)
+
+
+def _cube() -> tuple[np.ndarray, np.ndarray]:
+    """Eight vertices, so that faces share their edges."""
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    return corners, np.array([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))])
+
+
+def _ball_with_ears(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a spiral on the sphere, their hull, and then bumps and two ears: closed, and it hides itself."""
+    z = 1 - (2 * np.arange(n) + 1) / n
+    turn = np.pi * (1 + np.sqrt(5)) * np.arange(n)
+    points = np.stack([*(np.sqrt(1 - z * z) * f(turn) for f in (np.cos, np.sin)), z], -1)
+    faces = ConvexHull(points).simplices
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    radius = 1 + 0.1 * np.sin(5 * points[:, 0]) * np.cos(4 * points[:, 1])
+    for side in (-0.5, 0.5):
+        ear = np.array([side, 0.8, 0.2]) / np.linalg.norm([side, 0.8, 0.2])
+        radius += 0.9 * np.exp(-np.sum((points - ear) ** 2, -1) / 0.06)
+    return points * radius[:, None], faces
+
+
+def _mesh(
+    vertices: np.ndarray, faces: np.ndarray, at: list[float], size: float, bsdf: SceneDict, flat: bool
+) -> mi.Mesh:
+    props = mi.Properties()
+    props["mesh_bsdf"] = mi.load_dict({"type": "twosided", "inner": bsdf})
+    props["face_normals"] = flat
+    mesh = mi.Mesh("object", len(vertices), len(faces), has_vertex_normals=not flat, props=props)
+    place = mi.ScalarTransform4f().translate(at).rotate([1, 0.4, 0], 30).scale(size)
+    matrix = np.array(place.matrix, float)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.ravel(vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
+    params["faces"] = np.ravel(faces).astype(np.uint32)
+    params.update()
+    return mesh
+
+
+EDGE_SCENES: dict[str, Callable[[int], SceneDict]] = {
+    "shadow": lambda n: _room(n, 30, object=_mesh(*_cube(), [1.3, 0.9, 1.2], 0.25, _paint(0, 0, 0), flat=True)),
+    "silhouette": lambda n: _room(n, 45, object=_box(_paint(0.5, 0.5, 0.2))),
+    "ears": lambda n: _room(n, 45, object=_ears(_paint(0.5, 0.5, 0.2))),
+    "black silhouette": lambda n: _room(n, 45, glows=True, object=_box(_paint(0, 0, 0))),
+    "black ears": lambda n: _room(n, 45, glows=True, object=_ears(_paint(0, 0, 0))),
+}
+"""Key of what moves: ``object.vertex_positions``."""

@@ -1,0 +1,52 @@
+"""Smooth pieces of meshes: which triangles are shaded as one surface, so that an edge is where two pieces meet.
+
+Triangles share a normal at a vertex that they share. At an edge that is to be seen, as at a seam of texture
+coordinates, programs write vertices twice: then triangles have two places in common, and no vertex.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+
+def mesh_areas(mesh: mi.Mesh) -> np.ndarray:
+    """Twice the areas of its triangles; Mitsuba's rectangle, which hides its mesh, is one."""
+    params = mi.traverse(mesh)
+    if "faces" not in params:
+        return np.ones(1)
+    positions = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
+    a, b, c = (positions[corner] for corner in np.array(params["faces"]).reshape(-1, 3).T)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def mesh_pieces(mesh: mi.Mesh) -> np.ndarray:
+    """The `smooth_pieces` of a mesh that has vertex normals; Mitsuba's rectangle, which hides its mesh, is one."""
+    params = mi.traverse(mesh)
+    if "faces" not in params:
+        return np.zeros(mesh.face_count(), int)
+    faces, positions = (np.array(params[key]).reshape(-1, 3) for key in ("faces", "vertex_positions"))
+    return smooth_pieces(faces, positions)
+
+
+def smooth_pieces(faces: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """A number for each triangle, other ones on both sides of an edge; all zero where there is none.
+
+    What hangs together by vertices is one piece. Where a piece meets itself without sharing vertices, as where an edge
+    runs out, each triangle there is a piece of its own.
+    """
+    count = len(positions)
+    links = coo_matrix((np.ones(faces.size, bool), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), (count, count))
+    pieces = connected_components(links, directed=False)[1][faces[:, 0]]
+    sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2).astype(np.int64), axis=1)
+    _, side, shared = np.unique(sides[:, 0] * count + sides[:, 1], return_inverse=True, return_counts=True)
+    alone = np.flatnonzero(shared[side] == 1)
+    _, places = np.unique(positions[sides[alone]].reshape(-1, 3), axis=0, return_inverse=True)
+    of = alone // 3  # triangles
+    meeting = np.column_stack([np.sort(places.reshape(-1, 2), axis=1), pieces[of]])
+    _, where, together = np.unique(meeting, axis=0, return_inverse=True, return_counts=True)
+    torn = of[together[where.ravel()] > 1]
+    pieces[torn] = count + torn
+    return np.unique(pieces, return_inverse=True)[1].reshape(-1)
