@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -27,13 +27,20 @@ _STYLES = {"pass": "green", "zero": "green", "fail": "bold red", "inconclusive":
 
 
 def check_all(
-    scene: mi.Scene, patterns: Sequence[str], *, integrator: Spec = None, max_depth: int | None = None, **options: Any
+    scene: mi.Scene,
+    patterns: Sequence[str],
+    *,
+    integrator: Spec = None,
+    max_depth: int | None = None,
+    edges: Mapping[str, Any] | None = None,
+    **options: Any,
 ) -> list[GradientCheck]:
     """``check_gradient(scene, key, **options)`` for every key that the patterns name, with a bar on standard error.
 
-    Raises what :func:`check_gradient` and :func:`resolve_differentiable` do.
+    ``edges`` are further properties of `pathreplay`. Raises what :func:`check_gradient` and
+    :func:`resolve_differentiable` do.
     """
-    tested = integrator_under_test(integrator, scene, max_depth)
+    tested = integrator_under_test(integrator, scene, max_depth, edges)
     keys = resolve_differentiable(mi.traverse(scene), patterns, tested)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     results = []

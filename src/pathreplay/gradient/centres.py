@@ -1,12 +1,17 @@
-"""Where on the film lines are worth throwing: at random by pixel, more often where a first look has found edges."""
+"""Where on the film edges are worth looking for: at random by pixel, more often where a first look has found some."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import drjit as dr
 import mitsuba as mi
 
+LOOKS = 8
+"""For so many lines one takes a first look."""
+AROUND = 1.0
+"""Lines that are thrown at the pixels around what was found, for one at its own."""
 EVENLY = 0.25
 """Share of the lines that are thrown evenly, so that what the first look missed is found, too."""
 
@@ -26,11 +31,14 @@ class Centres:
         return Centres(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
 
     def refined(self, c: mi.Point2f, found: mi.Float) -> Centres:
-        """More often where there was something: at places ``c`` so much."""
-        index = mi.UInt32(c.y) * self.width + mi.UInt32(c.x)
+        """More often where there was something, at places ``c`` so much, and around: edges go on."""
         n = self.width * self.height
         counts = dr.zeros(mi.Float, n)
-        dr.scatter_add(counts, dr.minimum(found, 1), index)
+        for dy, dx in product((-1, 0, 1), repeat=2):
+            x, y = mi.Int32(c.x) + dx, mi.Int32(c.y) + dy
+            inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+            part = 1.0 if dx == dy == 0 else AROUND / 8
+            dr.scatter_add(counts, part * dr.minimum(found, 1), mi.UInt32(y * self.width + x), inside)
         share = dr.fma(counts, (1 - EVENLY) / dr.maximum(dr.sum(counts), 1), EVENLY / n)
         until = dr.cumsum(share)
         return Centres(self.width, self.height, self.margin, until / dr.gather(mi.Float, until, n - 1))

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
+
+GOLDEN = 2654435769
+"""2^32 over the golden ratio."""
 
 
 @dataclass
@@ -33,8 +37,8 @@ class Counted:
         return mi.Point2f(x, self.next_1d())
 
 
-def quasi_random(i: mi.UInt32, seed: mi.UInt32) -> mi.Point2f:
-    """The i-th point of the R2 sequence in the unit square (Roberts, 2018), shifted by the seed."""
-    x = i * mi.UInt32(3242174889) + mi.sample_tea_32(seed, mi.UInt32(1))[0]
-    y = i * mi.UInt32(2447445413) + mi.sample_tea_32(seed, mi.UInt32(2))[0]
+def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32) -> mi.Point2f:
+    """The i-th of n points that fill the unit square evenly, from left to right (Fibonacci's lattice), shifted."""
+    x = i * dr.opaque(mi.UInt32, 2**32 // n) + mi.sample_tea_32(seed, mi.UInt32(1))[0]
+    y = i * mi.UInt32(GOLDEN) + mi.sample_tea_32(seed, mi.UInt32(2))[0]
     return mi.Point2f(mi.Float(x >> 8), mi.Float(y >> 8)) * 2**-24

@@ -91,8 +91,8 @@ def glance(look: Look, line: Any, active: mi.Bool) -> mi.Float:
     ends = (look(line, t, active) for t in (line.begin, line.end))
     at_a, at_b = ends
     at_c = look(line, 0.5 * (line.begin + line.end), active)
-    # Of two crossings one is chosen in time, and counts for both: see `bisect`.
-    found = dr.select(at_a.differs(at_b), 1.0, dr.select(at_c.differs(at_a), 2.0, 0.0))
+    # Of two crossings, which count twice, one is chosen in time, for both: see `bisect`.
+    found = dr.select(at_a.differs(at_b), 1.0, dr.select(at_c.differs(at_a), 4.0, 0.0))
     return dr.select(active, found, 0)
 
 

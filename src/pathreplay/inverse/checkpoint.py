@@ -25,9 +25,9 @@ class Entry:
     """One iteration of the history: loss before the step, wall-clock seconds, L2 norm of each variable's gradient.
 
     ``dropped`` counts gradient entries that were NaN or infinite and were taken as zero in this step. ``errors`` are
-    the root mean square errors, after the step, of the variables whose truth is known; ``picture_error`` is that of the
-    pictures without their noise, in the iterations in which it was measured (jobs with a rival). Neither costs
-    ``seconds``.
+    the root mean square errors, after the step, of the variables whose truth is known, and how far poses are from
+    theirs (see `PoseError.of`); ``picture_error`` is that of the pictures without their noise, in the iterations in
+    which it was measured (jobs with a rival). Neither costs ``seconds``.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")

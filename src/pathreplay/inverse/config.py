@@ -94,6 +94,7 @@ class Parameter(_Table):
     pivot: Vector | None = None
     distance: Positive | None = None
     rotation_learning_rate: Positive | None = None
+    smooth: Positive | None = None
 
     @model_validator(mode="after")
     def _of_one_kind(self) -> Parameter:
@@ -102,7 +103,7 @@ class Parameter(_Table):
             if posed:
                 self._refuse(f"'{min(posed)}' belongs to a pose; add pose = 'translation', 'rotation' or 'rigid'")
             return self
-        if plain := {"lower", "upper", "initial", "resolutions", "refine_at"} & self.model_fields_set:
+        if plain := {"lower", "upper", "initial", "resolutions", "refine_at", "smooth"} & self.model_fields_set:
             self._refuse(f"'{min(plain)}' does not go with a pose; displace its start with 'start'")
         parts = PARTS[self.pose]
         given = [] if self.start is None else sorted(self.start.model_fields_set)
@@ -115,6 +116,8 @@ class Parameter(_Table):
 
     @model_validator(mode="after")
     def _in_order(self) -> Parameter:
+        if self.smooth is not None and not (self.lower is None and self.upper is None):
+            self._refuse("'smooth' does not go with 'lower' and 'upper', which would tear the mesh; leave them out")
         sizes, begins = self.resolutions or [], self.refine_at or []
         if len(begins) != max(0, len(sizes) - 1):
             self._refuse(
@@ -138,6 +141,15 @@ class Plugin(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True)
 
     type: str
+
+    @model_validator(mode="after")
+    def _has_edges(self) -> Plugin:
+        if self.type != "pathreplay" and (asked := {"edges", "edge_spp"} & set(self.model_extra or {})):
+            raise ValueError(
+                f"'{min(asked)}' is an option of the integrator 'pathreplay', which '{self.type}' does not have; "
+                "leave it out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _of_32_bits(self) -> Plugin:

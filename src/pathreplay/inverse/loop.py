@@ -18,8 +18,8 @@ from pathreplay.inverse.evaluate import Evaluator, Local, Shard, total
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.optimiser import Adam
-from pathreplay.inverse.problem import Problem, put_values
-from pathreplay.inverse.values import Arrays
+from pathreplay.inverse.problem import Problem, pose_errors, put_values
+from pathreplay.inverse.values import Array, Arrays
 from pathreplay.scenes.parameters import get_array, to_value
 
 # How often the pictures are judged in a job with a rival: enough for a curve, at some per cent of its time.
@@ -62,7 +62,11 @@ Event = Started | Refined | Stepped | Stopped
 def new_run(problem: Problem, integrator: mi.Integrator, record: bool = True) -> Run:
     """A run at the problem's start values, in this process."""
     values = {v.key: get_array(to_value(v.like, v.start)) for v in problem.variables}
-    return Run(Local(Evaluator(problem, integrator, record)), Adam(values), values)
+    return Run(
+        Local(Evaluator(problem, integrator, record)),
+        Adam(values, [v.key for v in problem.variables if v.surface]),
+        values,
+    )
 
 
 def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
@@ -117,14 +121,24 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
         )
     decay = config.learning_rate_decay ** (position / config.iterations)
     rates = {v.key: v.learning_rate * decay for v in problem.variables}
-    stepped = run.optimiser.step(run.values, found.gradients, rates)
+    stepped = _stepped(problem, run, found.gradients, rates)
     run.values = {v.key: np.clip(stepped[v.key], *v.bounds) for v in problem.variables}
     run.learned = found.learned
     seconds = time.perf_counter() - begin
     norms = {key: float(np.linalg.norm(gradient)) for key, gradient in found.gradients.items()}
     errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
+    errors |= pose_errors(problem, run.values)
     run.history.append(Entry(i, found.loss, seconds, norms, found.dropped, errors))
     return refined
+
+
+def _stepped(problem: Problem, run: Run, gradients: Arrays, rates: dict[str, float]) -> dict[str, Array]:
+    """The values after a step of the optimiser; on a `Surface` it is taken where that wants it."""
+    surfaces = {v.key: v.surface for v in problem.variables if v.surface}
+    latent = {key: surface.latent(run.values[key]) for key, surface in surfaces.items()}
+    slopes = {key: surface.gradient(gradients[key]) for key, surface in surfaces.items()}
+    stepped = run.optimiser.step({**run.values, **latent}, {**gradients, **slopes}, rates)
+    return stepped | {key: surface.positions(stepped[key]) for key, surface in surfaces.items()}
 
 
 def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:

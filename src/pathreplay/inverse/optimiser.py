@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -39,29 +39,49 @@ class Optimiser(Protocol):
 
 
 class Adam:
-    """Dr.Jit's Adam, of variables that begin at ``values``."""
+    """Dr.Jit's Adam, of variables that begin at ``values``.
 
-    def __init__(self, values: Arrays) -> None:
-        self._adam = drjit.opt.Adam(1.0, {k: mi.TensorXf(v) for k, v in values.items()}, beta_1=BETA_1, beta_2=BETA_2)
+    Of those that are ``uniform`` all entries are measured by the largest mean of squares, so that entries with little
+    gradient stay where they are (UniformAdam).
+    """
+
+    def __init__(self, values: Arrays, uniform: Collection[str] = ()) -> None:
+        self._adams = {
+            even: drjit.opt.Adam(
+                1.0,
+                {k: mi.TensorXf(v) for k, v in values.items() if (k in uniform) == even},
+                beta_1=BETA_1,
+                beta_2=BETA_2,
+                uniform=even,
+            )
+            for even in (False, True)
+        }
+        self._uniform = frozenset(uniform)
+
+    def _of(self, key: str) -> drjit.opt.Adam:
+        return self._adams[key in self._uniform]
 
     def step(self, values: Arrays, gradients: Arrays, rates: Mapping[str, float]) -> dict[str, Array]:
         """See `Optimiser`."""
-        adam = self._adam
         for key, value in values.items():
+            adam = self._of(key)
             adam[key] = mi.TensorXf(value)
             dr.set_grad(adam[key], mi.TensorXf(gradients[key]))
-        # Opaque: as a literal the changing rate would be compiled into the kernel anew in every iteration.
-        adam.set_learning_rate({key: dr.opaque(mi.Float, rate) for key, rate in rates.items()})
-        adam.step()
-        return {key: np.array(dr.detach(adam[key])) for key in values}
+        for even, adam in self._adams.items():
+            # Opaque: as a literal the changing rate would be compiled into the kernel anew in every iteration.
+            mine = {key: dr.opaque(mi.Float, rate) for key, rate in rates.items() if (key in self._uniform) == even}
+            adam.set_learning_rate(mine)
+            adam.step()
+        return {key: np.array(dr.detach(self._of(key)[key])) for key in values}
 
     def state(self) -> State:
         """See `Optimiser`; the arrays are ``first`` and ``second``, the means of gradients and of their squares."""
         steps: dict[str, int] = {}
         arrays: dict[str, Array] = {}
-        for key, (_, _, _, (step, first, second, _)) in self._adam.state.items():
-            steps[key] = int(step[0])
-            arrays |= {f"first:{key}": np.array(first), f"second:{key}": np.array(second)}
+        for adam in self._adams.values():
+            for key, (_, _, _, (step, first, second, _)) in adam.state.items():
+                steps[key] = int(step[0])
+                arrays |= {f"first:{key}": np.array(first), f"second:{key}": np.array(second)}
         return State(steps, arrays)
 
     def restore(self, state: State, values: Arrays) -> None:
@@ -73,7 +93,8 @@ class Adam:
                 raise ValueError(f"the means of '{key}' are not like its value, {value.dtype} of shape {value.shape}")
             if (moments[1] < 0).any():
                 raise ValueError(f"'second:{key}', a mean of squares, is negative")
-            self._adam[key] = mi.TensorXf(value)
-            stored, promoted, rate, (count, first, _, greatest) = self._adam.state[key]
+            adam = self._of(key)
+            adam[key] = mi.TensorXf(value)
+            stored, promoted, rate, (count, first, _, greatest) = adam.state[key]
             m, v = (type(first)(moment.ravel()) for moment in moments)
-            self._adam.state[key] = (stored, promoted, rate, (type(count)(state.steps[key]), m, v, greatest))
+            adam.state[key] = (stored, promoted, rate, (type(count)(state.steps[key]), m, v, greatest))

@@ -13,7 +13,7 @@ from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.grids import matched, rmse, slices
 from pathreplay.inverse.images import Image, difference
-from pathreplay.inverse.pose import Pose, PoseError
+from pathreplay.inverse.pose import Pose, PoseError, error_names
 from pathreplay.inverse.values import Array
 
 # Differences are shown brighter than the pictures: a converged one would be black otherwise.
@@ -152,7 +152,7 @@ class RecoveredPose:
 
 @dataclass(frozen=True)
 class Contestant:
-    """One of two integrators that had the same time, and the errors of the parameters that it ended with."""
+    """One of two integrators that had the same time, and the errors of the parameters and poses that it ended with."""
 
     name: str
     run: Run
@@ -204,4 +204,10 @@ class Outcome:
             return []
         runs = zip(self.names(), (self.run, self.run.rival), ("result", "rival"), strict=True)
         known = [item for item in self.recovered if item.truth is not None]
-        return [Contestant(name, run, {i.key: i.error(kind) or 0.0 for i in known}) for name, run, kind in runs]
+        found = []
+        for name, run, kind in runs:
+            last = run.history[-1].errors if run.history else {}
+            errors = {item.key: item.error(kind) or 0.0 for item in known}
+            places = {name: last[name] for pose in self.poses for name in error_names(pose.pose.key) if name in last}
+            found.append(Contestant(name, run, errors | places))
+        return found

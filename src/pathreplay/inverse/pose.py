@@ -92,9 +92,18 @@ class PoseError:
     relative: float | None
     degrees: float
 
+    def of(self, key: str) -> dict[str, float]:
+        """By names that say of which pose: 'KEY:position' (scene units) and 'KEY:degrees'."""
+        return dict(zip(error_names(key), (self.position, self.degrees), strict=True))
+
     def __str__(self) -> str:
         share = "" if self.relative is None else f" ({100 * self.relative:.3g} % of its distance)"
         return f"{self.position:.3g}{share} and {self.degrees:.3g}° off"
+
+
+def error_names(key: str) -> tuple[str, str]:
+    """What the two errors of a pose are called."""
+    return f"{key}:position", f"{key}:degrees"
 
 
 def make_pose(key: str, value: Any, kind: PoseKind, pivot: list[float] | None, distance: float | None) -> Pose:

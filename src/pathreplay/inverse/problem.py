@@ -21,6 +21,7 @@ from pathreplay.inverse.grids import Levels, make_levels, resampled
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
+from pathreplay.inverse.surface import Surface
 from pathreplay.inverse.targets import read_targets, rendered_targets, target_scene, truth_of
 from pathreplay.inverse.values import Array, Arrays, make_value, seen
 from pathreplay.render.edge_notes import edges_note, moves_edges
@@ -50,6 +51,8 @@ class Variable:
     """In the shape of ``start``, or for a grid in another resolution."""
     levels: Levels | None = None
     """Of a grid that is refined on the way."""
+    surface: Surface | None = None
+    """Of a mesh whose steps are spread over it."""
     form: Form = AS_STORED
     """How Mitsuba stores it; everything here is what people see."""
 
@@ -105,6 +108,17 @@ def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, An
 def put_values(problem: Problem, values: Arrays) -> None:
     """Give the scene these values of the variables, without derivatives."""
     problem.params.update(scene_values(problem, variables_of(problem, values)))
+
+
+def pose_errors(problem: Problem, values: Arrays) -> dict[str, float]:
+    """How far the poses whose truth is known are from it, by name: see `PoseError.of`."""
+    known = [pose for pose in problem.poses if pose.truth is not None]
+    placed = scene_values(problem, variables_of(problem, values)) if known else {}
+    found: dict[str, float] = {}
+    for pose in known:
+        if error := pose.error(parameters.get_array(placed[pose.key])):
+            found |= error.of(pose.key)
+    return found
 
 
 def build_problem(config: Config, base: Path, targets: dict[str, Image] | None = None) -> Problem:
@@ -184,12 +198,13 @@ def _keys(params: mi.SceneParameters, entries: list[Parameter], integrator: mi.I
 def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
     """What is to be said of edges that move. An integrator of ours need not say it once more."""
     moving = [key for key in keys if moves_edges(params, key)]
+    edges = getattr(integrator, "edges", "none")
     # By name: Mitsuba's projective integrators sample edges. Ours tells itself what it leaves out.
-    if not moving or "Projective" in type(integrator).__name__ or getattr(integrator, "edges", "none") == "all":
+    if not moving or "Projective" in type(integrator).__name__ or edges == "all":
         return ()
     if hasattr(integrator, "told"):
         integrator.told.add(EDGES)
-    return (edges_note(moving),)
+    return (edges_note(moving, edges),)
 
 
 def _variables(
@@ -209,7 +224,8 @@ def _variables(
                 start = resampled(start, levels.shapes[0])
                 like = type(like)(start)
             bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
-            variables.append(Variable(key, like, bounds, rate, start, None, levels, form))
+            surface = _surface(params, key, entry)
+            variables.append(Variable(key, like, bounds, rate, start, None, levels, surface, form))
             continue
         limits.require_near(scene, key, parameters.get_array(params[key]), entry)
         pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
@@ -224,6 +240,15 @@ def _variables(
             limits.require_learning_rate(name, rate, start)
             variables.append(Variable(name, mi.Vector3f(0), (-np.inf, np.inf), rate, start, None))
     return variables, poses
+
+
+def _surface(params: mi.SceneParameters, key: str, entry: Parameter) -> Surface | None:
+    if entry.smooth is None:
+        return None
+    owner, _, name = key.rpartition(".")
+    if name != "vertex_positions" or (faces := f"{owner}.faces") not in params:
+        raise PathreplayError(f"Parameter '{key}' is no mesh's vertex_positions; leave 'smooth' out")
+    return Surface(parameters.get_array(params[key]), np.array(params[faces]), entry.smooth)
 
 
 def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:

@@ -20,6 +20,7 @@ from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.grids import rmse
 from pathreplay.inverse.images import Image, png_bytes
 from pathreplay.inverse.outcome import Contestant, Outcome
+from pathreplay.inverse.pose import error_names
 
 # Colours that read on light and dark ground alike.
 OURS, RIVAL, GREY = "#3b82f6", "#e07b39", "#808080"
@@ -67,19 +68,22 @@ def loss_figure(history: Sequence[Entry]) -> Figure:
 
 
 def comparison_figure(contestants: Sequence[Contestant]) -> Figure:
-    """Errors against seconds of two runs: of the pictures, and of the first keys."""
+    """Errors against seconds of two runs: of the pictures, and of the first keys; of poses on a logarithmic scale."""
     panels = [None, *list(contestants[0].errors)[:PANELS]]
     figure = Figure(figsize=(4.4 * len(panels), 3.0), layout="constrained")
     for axes, key in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         for contestant, colour in zip(contestants, (OURS, RIVAL), strict=True):
             history = contestant.run.history
             seconds = np.cumsum([entry.seconds for entry in history])
-            errors = [entry.picture_error if key is None else entry.errors[key] for entry in history]
-            found = [(s, error) for s, error in zip(seconds, errors, strict=True) if key or error]
+            errors = [entry.picture_error if key is None else entry.errors.get(key) for entry in history]
+            found = [(s, error) for s, error in zip(seconds, errors, strict=True) if error is not None]
             marker = "o" if key is None else None
             points = zip(*found, strict=True)
             axes.plot(*points, color=colour, linewidth=1.5, marker=marker, markersize=3, label=contestant.name)
-        axes.set_ylim(bottom=0)
+        if key is not None and key.endswith(error_names("")):
+            axes.set_yscale("log")
+        else:
+            axes.set_ylim(bottom=0)
         axes.set_title("error of the pictures" if key is None else f"error of {key}", fontsize=9, color=GREY)
         _plain(axes, "seconds")
     axes.legend(frameon=False, labelcolor=GREY)

@@ -57,12 +57,17 @@ def doubts(walk: Walk) -> Iterator[str]:
         yield f"attach = 'all' keeps the directions of {', '.join(traits.detached_names)} fixed"
 
 
-def missing_edges(walk: Walk, sensor: mi.Sensor) -> tuple[str, bool]:
-    """One line that tells of the motion of edges where something moves (empty: none), and whether it names what."""
+def missing_edges(walk: Walk, sensor: mi.Sensor, edges: str) -> tuple[str, bool]:
+    """One line that tells of the motion of edges where something moves (empty: none), and whether it names what.
+
+    ``edges`` are looked at, but not in media.
+    """
+    if walk.media is not None:
+        edges = "none"
     moving = keys_that_move_edges(mi.traverse(walk.scene)) or keys_that_move_edges(mi.traverse(sensor))
     if moving:
-        return edges_note(moving), True
-    if walk.traits.lobes and walk.traits.area_lights:
+        return edges_note(moving, edges), True
+    if edges == "none" and walk.traits.lobes and walk.traits.area_lights:
         return (
             "something moves in a scene with delta lobes and area lights: where the edge of a light or a "
             "silhouette is seen through glass or mirrors, its motion is missing from the gradient"

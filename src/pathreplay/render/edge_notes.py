@@ -33,10 +33,15 @@ def keys_that_move_edges(params: mi.SceneParameters) -> list[str]:
         return [key for key in params.keys() if moves_edges(params, key) and dr.grad_enabled(params[key])]
 
 
-def edges_note(keys: Iterable[str]) -> str:
-    """One line that tells of parameters with which edges move, and what can be done."""
+def edges_note(keys: Iterable[str], edges: str = "none") -> str:
+    """One line that tells of parameters with which edges move, and what can be done; ``edges`` are looked at."""
     first, *others = keys
     more = f" (and {len(others)} more)" if others else ""
+    if edges == "film":
+        return (
+            f"'{first}'{more} moves, and edges = 'film' leaves out what surfaces see of moving edges (soft shadows, "
+            "indirect light): use edges = 'all' where that matters; see docs/edges.md"
+        )
     return (
         f"'{first}'{more} moves, and the gradient leaves out what moving edges do (silhouettes, shadows, borders of "
         "lights): use edges = 'all' of the integrator 'pathreplay', or let paint or shading show the motion rather "

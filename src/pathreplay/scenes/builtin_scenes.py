@@ -8,12 +8,15 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from pathreplay.scenes.bodies import ball, knobs, mesh
+
 SceneDict = dict[str, Any]
 
 COSTS: dict[str, Callable[[int], int]] = {
     "texture": lambda n: 64 * n**2,  # three numbers a texel, and copies in double precision
     "grid": lambda n: 256 * n**3,  # a voxel: its noise is summed from 12 waves, all at once
     "views": lambda n: 100_000 * n,  # a sensor with its film
+    "ball_splits": lambda n: 2000 * 4 ** min(n, 40),  # eight faces, each split into four so often
 }
 """Arguments of which a scene may get too large -> bytes that making it takes, roughly."""
 
@@ -192,6 +195,119 @@ def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
     return scene
 
 
+def silhouettes(resolution: int = 32, views: int = 2) -> SceneDict:
+    """A black body with four knobs, 1 long, before a white sky: there is nothing to see of it but its outline.
+
+    Key of its vertices: ``body.vertex_positions``. The cameras stand around it at equal angles (two: 90 degrees).
+    """
+    black = {"type": "diffuse", "reflectance": 0.0}
+    vertices, faces = ball(4)
+    scene: SceneDict = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "sky": {"type": "constant", "radiance": 1.0},
+        "body": mesh(knobs(vertices), faces, black),
+    }
+    for view in range(views):
+        angle = np.pi * view / max(views, 1) if views <= 2 else 2 * np.pi * view / views
+        origin = [float(4 * np.sin(angle)), 0.8 * (-1) ** view, float(4 * np.cos(angle))]
+        scene[f"view{view + 1}"] = _camera(origin, [0, 0, 0], 28, resolution)
+    return scene
+
+
+def shadows(resolution: int = 32, views: int = 4, ball_splits: int = 0) -> SceneDict:
+    """The body of `silhouettes`, black, over a white floor on which a lamp casts its shadow.
+
+    Cameras look down on it from around. With ``ball_splits`` (4) there is a ball in its place, with as many vertices:
+    what one starts from.
+    """
+    T = mi.ScalarTransform4f
+    vertices, faces = ball(ball_splits or 4)
+    points = 0.3 * vertices if ball_splits else knobs(vertices)
+    scene: SceneDict = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "body": mesh(points, faces, {"type": "diffuse", "reflectance": 0.0}),
+        "floor": {
+            "type": "rectangle",
+            "to_world": T().translate([0, -0.8, 0]).rotate([1, 0, 0], -90).scale(8),
+            "bsdf": {"type": "diffuse", "reflectance": 0.8},
+        },
+        "lamp": {
+            "type": "rectangle",
+            "to_world": T().look_at(origin=[1.5, 4, 1], target=[0, 0, 0], up=[0, 0, 1]).scale(0.3),
+            "emitter": {"type": "area", "radiance": 60.0},
+        },
+    }
+    for view in range(views):
+        angle = 2 * np.pi * (view + 0.25) / views
+        origin = [float(3.6 * np.sin(angle)), 2.0, float(3.6 * np.cos(angle))]
+        scene[f"view{view + 1}"] = _camera(origin, [0, -0.25, 0], 32, resolution)
+    return scene
+
+
+def silhouette_in_mirror(resolution: int = 32) -> SceneDict:
+    """The body of `silhouettes`, seen by one camera, directly and from its other side in a mirror.
+
+    The picture is twice as wide as high. The rim of the mirror is not seen: it reflects what is beside it.
+    """
+    scene = silhouettes(resolution, views=1)
+    camera = _camera([0.5, 0, 4], [0.5, 0, 0], 36, resolution)
+    camera["film"]["width"] *= 2
+    place = mi.ScalarTransform4f().look_at(origin=[1.3, 0, -0.6], target=[0.69, 0, 0.193], up=[0, 1, 0])
+    mirror = {"type": "rectangle", "to_world": place.scale([0.8, 0.8, 1]), "bsdf": {"type": "conductor"}}
+    return {**scene, "integrator": {"type": "path", "max_depth": 3}, "view1": camera, "mirror": mirror}
+
+
+def _panel(place: Any, *colour: float) -> SceneDict:
+    """A rectangle that glows in one colour and reflects nothing."""
+    black = {"type": "diffuse", "reflectance": 0.0}
+    glow = {"type": "area", "radiance": {"type": "rgb", "value": list(colour)}}
+    return {"type": "rectangle", "to_world": place, "bsdf": black, "emitter": glow}
+
+
+def flat_colours(resolution: int = 32) -> SceneDict:
+    """Panels that glow, each in one colour, at different distances before the dark: all there is to see are edges.
+
+    The camera, key ``camera.to_world``, looks at them from three units away.
+    """
+
+    def at(x: float, y: float, z: float, turn: float, width: float, height: float) -> Any:
+        return mi.ScalarTransform4f().translate([x, y, z]).rotate([0, 0, 1], turn).scale([width, height, 1])
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 1},
+        "camera": _camera([0.2, 0.1, 3], [0, 0, 0], 40, resolution),
+        "red": _panel(at(-0.5, 0.3, 0.4, 20, 0.3, 0.25), 0.9, 0.2, 0.1),
+        "green": _panel(at(0.5, 0.35, -0.4, -35, 0.4, 0.3), 0.2, 0.8, 0.3),
+        "blue": _panel(at(-0.35, -0.5, -0.8, 50, 0.4, 0.3), 0.2, 0.3, 1.0),
+        "white": _panel(at(0.35, -0.4, 0.6, 10, 0.2, 0.25), 0.9, 0.9, 0.9),
+    }
+
+
+def glass_ball(resolution: int = 32) -> SceneDict:
+    """A ball of glass (index 1.5, radius 0.5) before panels of one colour each: it is seen by what it bends.
+
+    Keys: ``glass.eta`` and ``ball.to_world``.
+    """
+
+    def at(x: float, y: float, z: float, width: float, height: float) -> Any:
+        return mi.ScalarTransform4f().translate([x, y, z]).scale([width, height, 1])
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 5},
+        "camera": _camera([0, 0, 3], [0, 0, 0], 24, resolution),
+        "glass": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
+        "ball": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "ref", "id": "glass"}},
+        "back": _panel(at(0, 0, -3, 6, 6), 0.3, 0.4, 0.6),
+        "red": _panel(at(-0.35, 0.2, -1.6, 0.25, 0.35), 0.9, 0.2, 0.1),
+        "green": _panel(at(0.3, 0.3, -1.2, 0.25, 0.2), 0.2, 0.8, 0.3),
+        "white": _panel(at(0.15, -0.3, -1.4, 0.35, 0.2), 0.9, 0.9, 0.9),
+    }
+
+
 def _cumulus(size: int) -> np.ndarray:
     """Extinction max(0, 8 b(y) Σ_i exp(-|x - c_i|² / r_i²) (0.75 + n(x)) - 1.5) at the voxel centres of [-1, 1]³.
 
@@ -229,7 +345,9 @@ def _sky(rows: int) -> np.ndarray:
     return (sky + 30 * glow * np.array([1.0, 0.9, 0.75])).astype(np.float32)
 
 
-BUILTINS: dict[str, Callable[..., SceneDict]] = {
-    make.__name__.replace("_", "-"): make for make in (cornell_box, cornell_box_photo, glass_pane, mirror_camera, cloud)
-}
+_SCENES = (
+    cornell_box, cornell_box_photo, glass_pane, mirror_camera, cloud, silhouettes, silhouette_in_mirror, shadows,
+    flat_colours, glass_ball,
+)  # fmt: skip
+BUILTINS: dict[str, Callable[..., SceneDict]] = {make.__name__.replace("_", "-"): make for make in _SCENES}
 """Built-in scenes: name -> function that returns a Mitsuba scene dictionary."""

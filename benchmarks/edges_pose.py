@@ -1,0 +1,70 @@
+"""Poses from outlines: what `pathreplay optimize` makes of the examples, beside Mitsuba's `prb_projective`.
+
+    python -m benchmarks.edges_pose [EXAMPLE ...]
+
+runs the jobs in examples/, each with two seeds, prints a table, and leaves reports in runs/edges-pose. Both integrators
+have the same start, targets, samples and seconds, in turns. The overlap is the dark that target and start share, over
+the dark of the target, in each view.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from pathreplay.inverse import load_config, optimize
+from pathreplay.inverse.config import Config
+from pathreplay.inverse.images import read_image
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+RUNS = Path("runs/edges-pose")
+JOBS = ("silhouettes", "silhouette-in-mirror")
+SEEDS = (0, 1)
+DARK = 0.5
+
+
+def overlap(folder: Path) -> str:
+    """Of each view."""
+    shares = []
+    for path in sorted((folder / "images").glob("target-*.exr")):
+        target, start = (
+            read_image(path.with_name(path.name.replace("target", kind))).mean(axis=2) < DARK
+            for kind in ("target", "start")
+        )
+        shares.append((target & start).sum() / target.sum())
+    return ", ".join(f"{share:.2f}" for share in shares)
+
+
+def ended(path: Path) -> tuple[str, str, str, str]:
+    """Iterations, seconds, distance and angle from the truth of a run, by its history."""
+    entries = [json.loads(line) for line in path.read_text().splitlines()]
+    (position, degrees), seconds = entries[-1]["errors"].values(), sum(entry["seconds"] for entry in entries)
+    return str(len(entries)), f"{seconds:.0f}", f"{position:.5f}", f"{degrees:.4f}"
+
+
+def rows(name: str, config: Config) -> None:
+    """Run the job; print a row for each of the two."""
+    result = optimize(config, output=RUNS / f"{name}-seed-{config.seed}", progress=False)
+    if result.stopped:
+        raise SystemExit(f"stopped by {result.stopped_by}")
+    runs = {config.integrator.type: "history.jsonl"}
+    if config.rival is not None:
+        runs[config.rival.type] = "rival/history.jsonl"
+    for integrator, history in runs.items():
+        cells = name, overlap(result.folder), str(config.seed), integrator, *ended(result.folder / history)
+        print(f"| {' | '.join(cells)} |", flush=True)
+
+
+def main(names: list[str]) -> None:
+    """Print the table, row by row."""
+    titles = "job", "overlap", "seed", "integrator", "iterations", "seconds", "position / size", "degrees"
+    print(f"| {' | '.join(titles)} |\n|{' --- |' * len(titles)}")
+    for name in names or JOBS:
+        config = load_config(EXAMPLES / name / "config.toml")
+        for seed in SEEDS:
+            rows(name, config.model_copy(update={"seed": seed}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

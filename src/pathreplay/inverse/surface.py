@@ -1,0 +1,55 @@
+"""Steps that are spread over a mesh, so that it stays one: "Large Steps in Inverse Rendering of Geometry" (2021).
+
+A gradient by vertices is noisy, and only those near an outline have one. So not the vertices v are stepped but
+
+    u = (I + λ L) v,        with L the Laplacian of the mesh that counts neighbours,
+
+which makes of a step δu the smooth change (I + λ L)⁻¹ δu. It is what Mitsuba's `mi.ad.LargeSteps` does, with a sparse
+solver that SciPy has.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+
+class Surface:
+    """Of a mesh by its vertices (3 n numbers) and faces (3 m). Vertices in one place are one, so that no seam opens."""
+
+    def __init__(self, positions: Array, faces: NDArray[np.integer], smooth: float) -> None:
+        points, copies = np.unique(positions.reshape(-1, 3), axis=0, return_inverse=True)
+        self._copies, n = copies.ravel(), len(points)
+        corners = self._copies[faces.reshape(-1, 3)]
+        ends = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+        i, j = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0).T
+        i, j = i[i != j], j[i != j]  # faces without area have such sides
+        neighbours = scipy.sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)).tocsc()
+        laplacian = scipy.sparse.diags(np.asarray(neighbours.sum(axis=1)).ravel()) - neighbours
+        self._matrix = (scipy.sparse.identity(n) + smooth * laplacian).tocsc()
+        self._solver = scipy.sparse.linalg.splu(self._matrix)
+
+    def latent(self, positions: Array) -> Array:
+        """u of v."""
+        points = np.zeros((self._matrix.shape[0], 3))
+        points[self._copies] = positions.reshape(-1, 3)
+        return self._spread(self._matrix @ points)
+
+    def positions(self, latent: Array) -> Array:
+        """v of u."""
+        points = np.zeros((self._matrix.shape[0], 3))
+        points[self._copies] = latent.reshape(-1, 3)
+        return self._spread(self._solver.solve(points))
+
+    def gradient(self, by_positions: Array) -> Array:
+        """The derivative by u, of that by v; all copies of a vertex have the same, which is that of their common u."""
+        total = np.zeros((self._matrix.shape[0], 3))
+        np.add.at(total, self._copies, by_positions.reshape(-1, 3))
+        return self._spread(self._solver.solve(total))
+
+    def _spread(self, points: NDArray[np.float64]) -> Array:
+        return points[self._copies].ravel().astype(np.float32)

@@ -1,0 +1,51 @@
+"""Meshes that are computed: a ball of triangles, and a body with knobs that looks like itself from nowhere else."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+_KNOBS = (  # direction, height, sharpness
+    ((1.0, 0.1, 0.2), 0.55, 7.0),
+    ((-0.5, 0.8, 0.3), 0.4, 9.0),
+    ((-0.4, -0.7, 0.6), 0.25, 6.0),
+    ((0.1, -0.3, -1.0), 0.35, 8.0),
+)
+
+
+def ball(splits: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) and faces (m, 3) of an octahedron whose faces are split into four, so often, on the unit sphere.
+
+    Faces share their vertices and are seen counter-clockwise from outside.
+    """
+    v = np.concatenate([np.eye(3), -np.eye(3)])
+    f = np.array([(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)])
+    for _ in range(splits):
+        sides = np.sort(f[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        edges, at = np.unique(sides, axis=0, return_inverse=True)
+        a, b, c = (len(v) + at.reshape(-1, 3)).T
+        v = np.concatenate([v, v[edges].mean(axis=1)])
+        x, y, z = f.T
+        f = np.concatenate([np.stack(corner, axis=1) for corner in ((x, a, c), (a, y, b), (c, b, z), (a, b, c))])
+    return v / np.linalg.norm(v, axis=1, keepdims=True), f
+
+
+def knobs(directions: np.ndarray) -> np.ndarray:
+    """A body on four knobs of different size, as points in these directions (n, 3); it is 1 long."""
+    radius = np.full(len(directions), 0.4)
+    for at, height, sharpness in _KNOBS:
+        radius += height * np.exp(sharpness * (directions @ (np.array(at) / np.linalg.norm(at)) - 1))
+    points = directions * radius[:, None]
+    return points / np.ptp(points, axis=0).max()
+
+
+def mesh(vertices: np.ndarray, faces: np.ndarray, bsdf: dict[str, object], flat: bool = False) -> mi.Mesh:
+    """A mesh of Mitsuba's, with normals at its vertices unless it is to look ``flat``."""
+    props = mi.Properties()
+    props["bsdf"], props["face_normals"] = mi.load_dict(bsdf), flat
+    made = mi.Mesh("mesh", len(vertices), len(faces), props, has_vertex_normals=not flat)
+    params = mi.traverse(made)
+    params["vertex_positions"] = np.ravel(vertices).astype(np.float32)
+    params["faces"] = np.ravel(faces).astype(np.uint32)
+    params.update()
+    return made
