@@ -22,15 +22,6 @@ TAIL = 0.9
 """Largest share of one pass in the variance of eight; of normal deviates it is more once in some thousand tests."""
 
 
-REFUSED = {"edges": "yes", "edge_spp": -1}
-
-
-@pytest.mark.parametrize("option", REFUSED)
-def test_bad_options_are_told_by_name(option: str) -> None:
-    with pytest.raises(RuntimeError, match=f"pathreplay: {option} = .* use "):
-        mi.load_dict({"type": "pathreplay", option: REFUSED[option]})
-
-
 def one_film(sensor: dict) -> dict:
     """A square before a sky, seen by a sensor."""
     film = {"type": "hdrfilm", "width": 2, "height": 1, "pixel_format": "rgb", "rfilter": {"type": "box"}}
