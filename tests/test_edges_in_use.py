@@ -58,8 +58,14 @@ def run(**changes: Any) -> Any:
 BAD = {
     "of another integrator": ({"type": "prb", "edges": "all"}, "'edges' is an option of the integrator 'pathreplay'"),
     "unknown": ({"type": "pathreplay", "edges": "outline"}, "edges = 'outline' is unknown: use one of 'none', 'film'"),
-    "below zero": ({"type": "pathreplay", "edges": "all", "edge_spp": -1}, "edge_spp = -1: use a number of lines per pixel >= 0"),
-    "half a line": ({"type": "pathreplay", "edges": "all", "edge_spp": 1.5}, "edge_spp = 1.5: use a number of lines per pixel >= 0"),
+    "below zero": (
+        {"type": "pathreplay", "edges": "all", "edge_spp": -1},
+        "edge_spp = -1: use a number of lines per pixel >= 0",
+    ),
+    "half a line": (
+        {"type": "pathreplay", "edges": "all", "edge_spp": 1.5},
+        "edge_spp = 1.5: use a number of lines per pixel >= 0",
+    ),
     "attached": (
         {"type": "pathreplay", "edges": "all", "attach": "all"},
         "edges know what moves with attach = 'delta'",
