@@ -124,7 +124,7 @@ def mirror_in_fog() -> dict:
 
 
 def media_cell(name: str, make: Callable[[], dict], key: str, move: Move, depth: int = 3, **more: Any) -> Case:
-    return cell(name, make, key, move, depth, **{"reference": "volpath", **more})
+    return cell(name, make, key, move, depth, **{"reference": "volpath", "spp": 128, **more})
 
 
 OBJECT = "object.to_world"
@@ -132,8 +132,8 @@ CELLS = [
     media_cell("fog_card", card_before_a_glow, OBJECT, translate(*ASIDE)),
     media_cell("cloud_card", card_in_clouds("heterogeneous"), OBJECT, translate(*ASIDE)),
     media_cell("grid_card", card_in_clouds("gridmedium"), OBJECT, translate(*ASIDE)),
-    media_cell("fog_shadow", shadow_in_fog(lambda: lamp(OVERHEAD)), OBJECT, grow, 2),
-    media_cell("fog_beam", shadow_in_fog(point), OBJECT, translate(0.5, -1, 0), 2),
+    media_cell("fog_shadow", shadow_in_fog(lambda: lamp(OVERHEAD)), OBJECT, grow, 2, spp=64),
+    media_cell("fog_beam", shadow_in_fog(point), OBJECT, translate(0.5, -1, 0), 2, spp=192),
     media_cell("fog_lamp", lamp_in_fog, "lamp.to_world", translate(*ASIDE)),
     media_cell("fog_light_moves", shadow_in_fog(point), "lamp.position", add([1.0, 0.3, 0.0]), 2),
     media_cell("ball_moves", ball_of_fog, OBJECT, translate(*ASIDE)),

@@ -16,8 +16,8 @@ from pathreplay.check.statistics import gap
 from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
 from truth import ROWS, TRANSPOSE_MAX, Bench, Row
 
-FEW = ("fog_shadow", "fog_beam", "behind_ball", "by_ball_chance")
-"""Cells that say most in a minute: shadows, beams, what is seen through fog, and by particles behind a boundary."""
+FEW = ("fog_shadow", "by_ball_chance")
+"""Cells that say most in a minute: shadows, and lamps that are found by chance behind a boundary."""
 
 
 @contextmanager

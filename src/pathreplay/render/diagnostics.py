@@ -60,10 +60,8 @@ def doubts(walk: Walk) -> Iterator[str]:
 def missing_edges(walk: Walk, sensor: mi.Sensor, edges: str) -> tuple[str, bool]:
     """One line that tells of the motion of edges where something moves (empty: none), and whether it names what.
 
-    ``edges`` are looked at, but not in media.
+    ``edges`` are looked at.
     """
-    if walk.media is not None:
-        edges = "none"
     moving = keys_that_move_edges(mi.traverse(walk.scene)) or keys_that_move_edges(mi.traverse(sensor))
     if moving:
         return edges_note(moving, edges), True
