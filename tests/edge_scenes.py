@@ -267,7 +267,7 @@ CELLS = [
     cell("cube24_turns", before_a_glow(lambda: cube24(BOX, BLACK)), VERTICES, TURN),
     cell("cube8_lit", lit_box(cube8), VERTICES, TURN),
     cell("cube24_lit", lit_box(cube24), VERTICES, TURN),
-    cell("can_turns", lit_box(can), VERTICES, turn_vertices(1, 0, 0.3)),
+    cell("can_moves", lit_box(can), VERTICES, translate_vertices(*ASIDE), seeds=16),
     cell("camera_moves", before_a_glow(lambda: shape(CARD, BLACK)), "camera.to_world", translate(*ASIDE)),
     cell("lamp_seen", lamp_seen, "lamp.to_world", translate(*ASIDE)),
     # Shadows.
@@ -283,14 +283,16 @@ CELLS = [
     cell("shadow_env", shadow_of_sky, OBJECT, translate(*ASIDE)),
     cell("lamp_lights", lamp_lights, "lamp.to_world", translate(*ASIDE)),
     # One bounce more.
-    cell("indirect", by_a_side_wall(patterned, lambda: paint(0.8, 0.7, 0.3)), OBJECT, translate(1, 0.3, 0.4), 3),
+    cell("indirect", by_a_side_wall(patterned, lambda: paint(0.8, 0.7, 0.3)), OBJECT, translate(1, 0.3, 0.4), 3,
+         seeds=16),
     cell("indirect_rough", by_a_side_wall(
         lambda: {"type": "twosided", "inner": {"type": "roughconductor", "alpha": 0.3}}, patterned),
         OBJECT, translate(1, 0.3, 0.4), 3),
-    cell("cube_in_wall", stands_in_the_wall, VERTICES, translate_vertices(*ASIDE), 3),
+    cell("cube_in_wall", stands_in_the_wall, VERTICES, translate_vertices(0, 0, 1), 3, seeds=16),
     cell("indirect_contact", on_a_side_wall(lambda: cube24(IN_THE_WALL, paint(0.9))), VERTICES,
          translate_vertices(0.3, 1, 0.2), 3),
-    cell("indirect_can", on_a_side_wall(lambda: can(BESIDE, paint(0.9), 5)), VERTICES, turn_vertices(0, 1, 0.3), 3),
+    cell("indirect_can", on_a_side_wall(lambda: can(BESIDE, paint(0.9), 5)), VERTICES, turn_vertices(0, 1, 0.3), 3,
+         seeds=16),
     # Through delta lobes.
     cell("mirror_z", mirror, "mirror.to_world", UP, 3),
     cell("mirror_x", mirror, "mirror.to_world", translate(1, 0, 0), 3),
