@@ -8,6 +8,7 @@ they leave creases out, and shade the wrong faces (see docs/edges_peers.md).
 from __future__ import annotations
 
 import statistics as st
+from dataclasses import replace
 
 from ..measures.job import Job, Point, Record
 from ..measures.methods import RECORDED, TRACED
@@ -61,7 +62,7 @@ def table(record: Record) -> str:
             p.scene,
             method_cell(p),
             *comparison(p, methods.get("prb"))[:2],
-            *(comparison(p, methods.get(rival))[3] if p.method == ours else "" for ours, rival in VERSUS),
+            *(_cost(p, methods.get(rival)) if p.method == ours else "" for ours, rival in VERSUS),
         ]
         for methods in groups(parts).values()
         for p in methods.values()
@@ -70,6 +71,15 @@ def table(record: Record) -> str:
     header = ["scene", "method", "seconds of kernels (median)", "time / prb", *columns_told]
     steps = {point.method: point for point in record.points if ", " in point.method}
     return markdown(header, rows) + "\n\n" + _steps(steps)
+
+
+def _cost(point: Point, rival: Point | None) -> str:
+    """Time x variance next to a rival that may have run in fewer rounds."""
+    if rival is None or rival.error:
+        return ""
+    n = min(len(point.seeds), len(rival.seeds))
+    first = [replace(p, seconds=p.seconds[:n], squared_errors=p.squared_errors[:n]) for p in (point, rival)]
+    return comparison(*first)[3]
 
 
 def _steps(steps: dict[str, Point]) -> str:
