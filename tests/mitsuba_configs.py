@@ -311,7 +311,6 @@ MOVING = {
     "plane under a sky": Config(under_sky, PLANE, along_z, Limits(0.03, 0.2), res=64),
     "plane under a projector": Config(projected, PLANE, along_z, Limits(0.03, 0.2), res=64),
     "pane of rough glass": Config(
-        # Behind clear glass points that are held cost much more noise than directions that follow their samples.
         panes,
         ("shape.vertex_positions",),
         along_z,
@@ -319,7 +318,6 @@ MOVING = {
         depth=4,
         res=32,
         spp=8192,
-        options={"attach": "all", "edges": "none"},
     ),
     "textured lamp": Config(tilted_lamp, PLANE, along_z, Limits(0.003, 0.4, 0.25), res=64),
     "plane under a textured lamp": Config(lit_from_below, PLANE, along_z, Limits(0.025, 0.4, 0.25), res=64),

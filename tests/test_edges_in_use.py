@@ -17,6 +17,7 @@ from pathreplay.check.reference import integrator_under_test
 from pathreplay.cli import app
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import load_config, make_config, optimize
+from pathreplay.inverse.problem import build_problem
 from pathreplay.inverse.surface import Surface
 from pathreplay.scenes.bodies import ball, knobs, mesh
 from pathreplay.scenes.loading import load_scene
@@ -57,8 +58,14 @@ def run(**changes: Any) -> Any:
 BAD = {
     "of another integrator": ({"type": "prb", "edges": "all"}, "'edges' is an option of the integrator 'pathreplay'"),
     "unknown": ({"type": "pathreplay", "edges": "outline"}, "edges = 'outline' is unknown: use one of 'none', 'film'"),
-    "below zero": ({"type": "pathreplay", "edges": "all", "edge_spp": -1}, "edge_spp = -1: use a number >= 0"),
-    "half a line": ({"type": "pathreplay", "edges": "all", "edge_spp": 1.5}, "edge_spp = 1.5: use a number >= 0"),
+    "below zero": (
+        {"type": "pathreplay", "edges": "all", "edge_spp": -1},
+        "edge_spp = -1: use a number of lines per pixel >= 0",
+    ),
+    "half a line": (
+        {"type": "pathreplay", "edges": "all", "edge_spp": 1.5},
+        "edge_spp = 1.5: use a number of lines per pixel >= 0",
+    ),
     "attached": (
         {"type": "pathreplay", "edges": "all", "attach": "all"},
         "edges know what moves with attach = 'delta'",
@@ -106,11 +113,11 @@ def test_a_check_of_an_outline_passes_with_edges_and_fails_without() -> None:
 # ------------------------------ What is told ------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("edges", "told"), [("none", "silhouettes, shadows"), ("film", "soft shadows"), ("all", "")])
 def test_a_job_says_what_its_edges_leave_out(edges: str, told: str) -> None:
-    html = run(integrator={**JOB["integrator"], "edges": edges}).report.read_text()
-    assert html.count("moving edges") == bool(told) and told in html
+    job = {**JOB, "integrator": {**JOB["integrator"], "edges": edges}}
+    notes = " ".join(build_problem(make_config(job), Path.cwd()).notes)
+    assert notes.count("moving edges") == bool(told) and told in notes
 
 
 @pytest.mark.slow
@@ -181,38 +188,54 @@ def test_a_body_is_closed_and_turned_outwards() -> None:
     assert set(np.unique(sides, axis=0, return_counts=True)[1]) == {2}
 
 
+@pytest.mark.slow
+def test_a_mesh_goes_on_where_it_was_stopped() -> None:
+    smooth = {"parameters": [{"key": KEY, "smooth": 20.0, "learning_rate": 0.1}], "learning_rate_decay": 1.0}
+    smooth["scene_parameters"] = {"resolution": 8, "views": 1}
+    start = np.ravel(knobs(ball(4)[0]))
+    smooth["target"] = {**JOB["target"], "values": {"sky.radiance.value": 0.5}}
+    whole, half = run(**smooth, iterations=4), run(**smooth, iterations=2)
+    config = half.folder / "config.json"
+    config.write_text(config.read_text().replace('"iterations": 2', '"iterations": 4'))
+    resumed = optimize(resume=half.folder, progress=False)
+    assert np.abs(whole.parameters[KEY] - start).max() > 0.01
+    assert resumed.parameters[KEY] == pytest.approx(whole.parameters[KEY], abs=1e-3)
+
+
 # ------------------------------ The examples, shorter ------------------------------
 
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
-def example(name: str, **changes: Any) -> Any:
-    config = load_config(EXAMPLES / name / "config.toml")
-    return optimize(config.model_copy(update={"rival": None, "picture_spp": 16, **changes}), progress=False)
+def example(name: str, iterations: int, **changes: Any) -> Any:
+    """What comes of an example's first part; it would take several times as many steps to end."""
+    changes = {"rival": None, "picture_spp": 16, "iterations": iterations, "learning_rate_decay": 0.1, **changes}
+    return optimize(load_config(EXAMPLES / name / "config.toml").model_copy(update=changes), progress=False)
 
 
 @pytest.mark.slow
 def test_an_outline_tells_where_a_body_is() -> None:
-    result = example("silhouettes", iterations=120, spp=16)
+    result = example("silhouettes", 110, spp=16)
     error = result.poses[KEY]
     assert result.history[0].errors[f"{KEY}:position"] > 0.35 and result.history[0].errors[f"{KEY}:degrees"] > 40
-    assert error.position < 0.01 and error.degrees < 1
+    assert error.position < 0.02 and error.degrees < 2
 
 
 @pytest.mark.slow
 def test_borders_of_colours_tell_where_a_camera_stands() -> None:
-    result = example("camera-by-edges", iterations=100)
-    assert result.poses["camera.to_world"].relative < 0.005  # from 14 %
+    result = example("camera-by-edges", 80)
+    error = result.poses["camera.to_world"]
+    assert error.position < 0.05 and error.degrees < 0.5  # from 0.43 and 9 degrees
 
 
 @pytest.mark.slow
 def test_borders_seen_in_glass_tell_its_index_and_its_place() -> None:
-    result = example("glass-ball", iterations=60)
-    assert result.errors["glass.eta"] < 0.01 and result.poses["ball.to_world"].position < 0.01
+    result = example("glass-ball", 60)
+    assert result.errors["glass.eta"] < 0.01 and result.poses["ball.to_world"].position < 0.01  # from 0.08 and 0.1
 
 
 @pytest.mark.slow
 def test_outlines_and_shadows_make_a_body_of_a_ball() -> None:
-    result = example("mesh-by-shadows", iterations=25)
-    assert result.history[-1].loss < 0.25 * result.history[0].loss
+    result = example("mesh-by-shadows", 30)
+    assert result.history[-1].loss < 0.3 * result.history[0].loss

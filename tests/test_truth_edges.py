@@ -16,7 +16,7 @@ import pytest
 from edge_scenes import ALL_MOVE, BY_NAME, weights
 from pathreplay.check.statistics import gap
 from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
-from pathreplay.gradient import inner_edges
+from pathreplay.gradient import inner_edges, seer
 from pathreplay.render import boundary
 from pathreplay.transport import velocity
 from truth import ROWS, TRANSPOSE_MAX, Bench, Row
@@ -118,9 +118,9 @@ def test_nor_do_they_where_edges_ignore_what_the_interior_follows(name: str, mon
 
     So emitters are looked for by arcs alone, with all of their light, and directions at both sides stand still.
     """
-    arrival, kept = inner_edges.Arrival, (mi.Bool(True), mi.Bool(False))
+    arrival, kept = seer.Arrival, (mi.Bool(True), mi.Bool(False))
     monkeypatch.setattr(inner_edges, "moved_direction", lambda lengths, origin, d, hit, active: (d, mi.Float(1)))
-    monkeypatch.setattr(inner_edges, "Arrival", lambda ray, hit, pdf, *_: arrival(ray, hit, pdf, *kept))
+    monkeypatch.setattr(seer, "Arrival", lambda ray, hit, pdf, *_: arrival(ray, hit, pdf, *kept))
     monkeypatch.setattr(inner_edges, "shadow_weight", lambda x, shaded: mi.Spectrum(0))
     with loaded(name) as case:
         found = gap(backwards(case.bench, MANY), case.reference)

@@ -30,7 +30,7 @@ GUIDED = 120
 
 def jobs(quick: bool) -> list[Job]:
     """Inner edges, edges on the film, and steps that are recorded; the guided rival in jobs of its own."""
-    inner = ("prb", "inner edges alone", "film edges alone", "unguided inner")
+    inner = ("prb", "inner edges alone", "film edges alone", "edges alone", "unguided inner")
     film = ("prb", "film edges alone", "edge list")
     wanted = [(scene, inner, 0.0) for scene in INNER] + [(scene, film, 0.0) for scene in FILM]
     wanted += [(scene, ("prb", "projective inner"), GUIDED) for scene in INNER]
@@ -44,8 +44,8 @@ def jobs(quick: bool) -> list[Job]:
             rr_depth=100,
             resolution=32,
             spp=16 if quick else 64,
-            rounds=4 if quick or patience else 24,
-            warm_up=1 if patience else 3,
+            rounds=4 if quick else 6 if patience else 16,
+            warm_up=0 if patience else 2,
             patience=patience,
             measure="edges",
         )

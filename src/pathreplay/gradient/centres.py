@@ -1,4 +1,4 @@
-"""Where on the film lines are worth throwing: at random by pixel, more often where a first look has found edges."""
+"""Where on the film edges are worth looking for: at random by pixel, more often where a first look has found some."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from itertools import product
 import drjit as dr
 import mitsuba as mi
 
+LOOKS = 8
+"""For so many lines one takes a first look."""
 AROUND = 1.0
 """Lines that are thrown at the pixels around what was found, for one at its own."""
 EVENLY = 0.25

@@ -29,23 +29,23 @@ import mitsuba as mi
 
 from ..transport.emitters import draw_emitter
 from ..transport.motion import may_move
+from ..transport.passage import SHORT_OF, beyond_null
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
 from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
 from .bends import Bend
-from .centres import Centres
+from .centres import LOOKS, Centres
 from .counted import Counted, quasi_random
 from .crofton import Crossed, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places, ray_to_camera
 from .primal import walk_on
 from .record import Layout, record, record_type
+from .through_media import clear, going_on, left_of_light
 
 MAX_CHAIN = 16
 """Vertices of a chain of delta lobes, at most."""
-LOOKS = 8
-"""For so many lines one takes a first look."""
 
 
 @dataclass
@@ -100,7 +100,7 @@ def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
 
     A first look, with one line for `LOOKS`, decides where lines are thrown.
     """
-    walk = without_roulette(walk)
+    full, walk = walk, clear(without_roulette(walk))
 
     def line(centres: Centres, i: mi.UInt32, n: int, seed: mi.UInt32, l: float) -> FilmLine:
         key = mixed(mixed(i, seed), mi.UInt32(0x51ED270B))
@@ -121,7 +121,7 @@ def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
     pick = mi.PCG32(closer, initstate=seed, initseq=dr.arange(mi.UInt32, closer))
     crossed = bisect(look, line(centres, chosen.index, lines, seed, l), chosen.weight, pick)
     per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * lines))  # one kernel for all numbers of samples
-    c = _weighed(walk, places, crossed, per_line)
+    c = _weighed(walk, full, places, crossed, per_line)
     layout = Layout.of(walk, True)
     records = dr.alloc_local(record_type(layout), MAX_CHAIN + 1)
     records, reached = _record_chain(walk, places.ray(c.s, c.line.key)[0], c, layout, records)
@@ -184,6 +184,8 @@ def _shade(walk: Walk, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Boo
     light, _ = draw_emitter(walk.scene, si, u, lit, visible=False)
     ray = si.spawn_ray_to(light.p)
     hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, active=lit & light.delta & (light.pdf != 0))
+    if walk.clear:
+        hit = beyond_null(walk.scene, ray, hit, lit)
     return Shade(u, ray, hit, hit.is_valid())
 
 
@@ -215,17 +217,23 @@ def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: m
     return fork
 
 
-def _weighed(walk: Walk, places: Places, found: Crossed, per_line: mi.Float) -> FilmCrossing:
-    """What the jump of radiance is, with the same random numbers on both sides."""
+def _weighed(walk: Walk, full: Walk, places: Places, found: Crossed, per_line: mi.Float) -> FilmCrossing:
+    """What the jump of radiance is, with the same random numbers on both sides. ``full`` is the walk with media."""
     line, active = found.line, found.weight > 0
     ends = line.at(found.a), line.at(found.b)
     (ray_a, weight), (ray_b, _) = (places.ray(s, line.key) for s in ends)
     fork = _fork(walk, (ray_a, ray_b), line.key, active)
     active &= fork.found
+    sides, onward = [fork.a, fork.b], walk
+    if full.media is not None:
+        onward, t = full, SHORT_OF * dr.minimum(fork.a.hit.t, fork.b.hit.t)
+        T, medium = left_of_light(full, ray_a, line.key, fork.k, t, active)
+        active &= dr.any(T != 0)
+        sides, weight = [going_on(full, side, t, medium, active) for side in sides], weight * T
     f = []
-    for side in (fork.a, fork.b):
+    for side in sides:
         path = PathState(side, mi.Spectrum(1), None, mi.Float(1), mi.UInt32(fork.k), mi.Bool(active))
-        f.append(walk_on(walk, Counted.at_vertex(line.key, fork.k), path)[0])
+        f.append(walk_on(onward, Counted.at_vertex(line.key, fork.k), path)[0])
     jump = weight * fork.β * (f[0] - f[1]) * (per_line * found.weight / line.density)
 
     near_a, shadow = fork.a.hit.t <= fork.b.hit.t, mi.Bool(False)

@@ -1,4 +1,4 @@
-"""Edges that points of surfaces see: shadows, and what moves in and out of indirect light.
+"""Edges that points of surfaces see, and particles of media: shadows, and what moves in and out of indirect light.
 
 At a vertex x that scatters, light arrives from a direction ω, which the interior lets move with a velocity V when
 parameters move: it follows the number u that drew it (emitter samples), or the point that it hit (other samples, with
@@ -22,20 +22,22 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.motion import may_move
+from ..transport.passage import SHORT_OF
 from ..transport.path import PathState
-from ..transport.scatter import keeps_direction
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
 from ..transport.traits import Tables
 from ..transport.velocity import held_direction, moved_direction
-from ..transport.vertex import Arrival, Walk, is_smooth, mis_weight
+from ..transport.vertex import Arrival, Flight, Walk, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
 from .bends import Bend
+from .centres import LOOKS, Centres
 from .counted import Counted, quasi_random
 from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
+from .seer import Seer, may_see
 
 BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
@@ -50,11 +52,13 @@ class Chosen:
     """The vertex of a camera path that looks for edges."""
 
     at: Arrival
-    k: mi.UInt32  # vertices before
+    k: mi.UInt32  # records before
+    depth: mi.UInt32  # vertices before: as many, but null boundaries are none
     β: mi.Spectrum  # throughput before, over the probability of the choice
     mass: mi.Float  # by which it was chosen
     moves: mi.Bool  # it, or a vertex before, may move
     active: mi.Bool
+    flight: Flight | None = None  # before it, with media
 
 
 @dataclass
@@ -98,18 +102,24 @@ def choose_vertex(walk: Walk, numbers: Counted, ray: mi.Ray3f, layout: Layout, r
     """
     walk = replace(walk, max_depth=max(walk.max_depth - 1, 0))
     path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))
-    chosen = Chosen(path.at, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), mi.Bool(False), mi.Bool(False))
+    none, no = mi.UInt32(0), mi.Bool(False)
+    flight = None if walk.media is None else Flight.none(walk.media)
+    chosen = Chosen(path.at, none, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), no, mi.Bool(False), flight)
     mass = mi.Float(0)
     count = mi.UInt32(0)
     moves = mi.Bool(False)
     while dr.hint(path.active, exclude=[walk, layout], label="pathreplay: choose a vertex"):
-        here = path.at.hit.is_valid() & is_smooth(path.at.hit.shape.bsdf())
-        m = dr.select(path.active & here, dr.mean(dr.abs(path.β)), 0)
+        choice = numbers.next_1d()
+        u, step = path.choose(walk, numbers)
+        here, w = may_see(walk, path.at, step)
+        m = dr.select(path.active & here, dr.mean(dr.abs(path.β * w)), 0)
         mass += m
         moves |= may_move(walk, path.at.hit)
-        take = (m > 0) & (numbers.next_1d() * mass < m)
-        chosen = dr.select(take, Chosen(path.at, count, path.β, m, moves, mi.Bool(True)), chosen)
-        u, step = path.choose(walk, numbers)
+        take = (m > 0) & (choice * mass < m)
+        flight = None if walk.media is None else step.kept.media.flight
+        chosen = dr.select(
+            take, Chosen(path.at, count, path.depth, path.β * w, m, moves, mi.Bool(True), flight), chosen
+        )
         onward, v = path.advance(walk, u, step)
         if dr.hint(records is not None, mode="scalar"):
             records[count] = record(layout, v)
@@ -176,17 +186,15 @@ def _strip(tables: Tables, emitter: mi.UInt32, u: mi.Float, active: mi.Bool) -> 
     return begin, dr.gather(mi.Float, until, i, active) - begin
 
 
-def emitter_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -> Any:
+def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
     """Find the edge of a shadow among the samples of an emitter, and weigh it: see `Search`. Detached."""
-    scene = walk.scene
-    si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
     line, inside = emitter_line(walk, x, l, key)
 
     def shadowed(line: SquareLine, t: mi.Float, active: mi.Bool) -> tuple[Any, ...]:
-        light, Le = line.emitter.sample_direction(si, line.sample(t), active)
-        ray = si.spawn_ray_to(light.p)
+        light, Le = line.emitter.sample_direction(seer.origin, line.sample(t), active)
+        ray = seer.origin.spawn_ray_to(light.p)
         lit = active & (light.pdf != 0)
-        hit = scene.ray_intersect_preliminary(ray, coherent=False, active=lit)
+        hit = seer.behind(ray, seer.hit(ray, lit), lit)
         # A lamp's own limb hides it by rounding only.
         hidden = lit & hit.is_valid() & (hit.shape.emitter() != light.emitter)
         return light, Le, ray, hit, hidden
@@ -206,7 +214,8 @@ def emitter_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Searc
     t = dr.select(a_hidden, found.a, found.b)
     _, _, ray, hit, hidden = shadowed(line, t, active)
     active &= hidden
-    f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
+    f, pdf = seer.towards(light.d, active)
+    Le *= seer.past(light, hit.t, key, active)
     density = light.pdf / line.share
     F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density, pdf))
     K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a_hidden, -1, 1)
@@ -223,18 +232,18 @@ def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
     return moves
 
 
-def shadow_gap(x: Chosen, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
+def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
     """B: distance of the line to the emitter sample from the edge; differentiable in all that moves."""
-    si = x.at.hit.compute_surface_interaction(at, mi.RayFlags.All, c.active)
-    light, _ = c.line.emitter.sample_direction(si, u, c.active)
-    return outline_gap(c.n, si.p, light.d, c.hit, c.ray, c.active)
+    origin = seer.moved(at)
+    light, _ = c.line.emitter.sample_direction(origin, u, c.active)
+    return outline_gap(c.n, origin.p, light.d, c.hit, c.ray, c.active)
 
 
-def shadow_weight(x: Chosen, c: Shaded) -> mi.Spectrum:
+def shadow_weight(seer: Seer, c: Shaded) -> mi.Spectrum:
     """K in full: with the derivative of B along the line."""
-    slope = derivative_by_place(c.u, lambda u: shadow_gap(x, c, x.at.ray, u))
+    slope = derivative_by_place(c.u, lambda u: shadow_gap(seer, c, seer.at.ray, u))
     # Where a sample of the emitter jumps there is no edge: its other side is far off.
-    off = dr.abs(shadow_gap(x, c, x.at.ray, c.u_lit) - shadow_gap(x, c, x.at.ray, c.u))
+    off = dr.abs(shadow_gap(seer, c, seer.at.ray, c.u_lit) - shadow_gap(seer, c, seer.at.ray, c.u))
     jumps = off > JUMP * dr.norm(slope) * dr.norm(c.u_lit - c.u) + ROUNDING * (dr.norm(c.ray.o) + c.hit.t)
     return c.line.passed(c.K, mi.Vector2f(slope.x, slope.y * c.line.width), c.active & ~jumps)
 
@@ -243,7 +252,8 @@ def shadow_weight(x: Chosen, c: Shaded) -> mi.Spectrum:
 class Hiding:
     """A crossing on an arc: one surface hides another, or bends."""
 
-    near: mi.PreliminaryIntersection3f
+    edge: mi.PreliminaryIntersection3f  # of the one that hides
+    near: mi.PreliminaryIntersection3f  # what the direction at its side hits: it, or a null boundary before it
     far: mi.PreliminaryIntersection3f  # may be none
     d_near: mi.Vector3f
     d_far: mi.Vector3f
@@ -253,92 +263,85 @@ class Hiding:
     K_near: mi.Spectrum
     K_far: mi.Spectrum
     active: mi.Bool
-    keeps: mi.Bool  # directions are kept rather than what they hit
 
 
-def arc(si: mi.SurfaceInteraction3f, l: float, key: mi.UInt32, active: mi.Bool) -> tuple[Arc, mi.Bool]:
-    """An arc around a direction in which a point scatters, and whether there is one."""
-    numbers, ctx = Counted(key, mi.UInt32(0x100)), mi.BSDFContext()
-    sample, _ = si.bsdf().sample(ctx, si, numbers.next_1d(), numbers.next_2d(), active)
+def arc(seer: Seer, l: float, key: mi.UInt32, active: mi.Bool) -> tuple[Arc, mi.Bool]:
+    """An arc around a direction in which a vertex scatters, and whether there is one."""
+    numbers = Counted(key, mi.UInt32(0x100))
+    d, smooth = seer.sample(numbers.next_1d(), numbers.next_2d())
     evenly = numbers.next_1d() < EVENLY
-    wo = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), sample.wo)
-    smooth = (sample.pdf > 0) & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    d = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), d)
     ok = active & (evenly | smooth)
-    pdf = dr.lerp(si.bsdf().pdf(ctx, si, wo, ok), dr.inv_four_pi, EVENLY)
-    c = dr.select(ok, si.to_world(wo), mi.Vector3f(0, 0, 1))
+    pdf = dr.lerp(seer.towards(d, ok)[1], dr.inv_four_pi, EVENLY)
+    c = dr.select(ok, d, mi.Vector3f(0, 0, 1))
     turn = dr.two_pi * numbers.next_1d()
     w = mi.Frame3f(c).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
     return Arc(c, w, dr.select(ok, pdf, 1), mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
 
 
-def arc_edges(walk: Walk, x: Chosen, l: float, key: mi.UInt32, search: Search) -> Any:
+def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
     """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides: see `Search`.
 
     Detached.
     """
-    scene = walk.scene
-    si = x.at.hit.compute_surface_interaction(x.at.ray, mi.RayFlags.All, x.active)
-    keeps = keeps_direction(walk, si, x.active)  # and slides over facets, too
-    line, ok = arc(si, l, key, x.active)
-
-    def hit(d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
-        ray = si.spawn_ray(d)
-        return ray, scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-
-    through = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
+    line, ok = arc(seer, l, key, x.active)
 
     def look(line: Arc, t: mi.Float, active: mi.Bool) -> Sight:
-        above = mi.Frame3f.cos_theta(si.to_local(line.at(t))) * mi.Frame3f.cos_theta(si.wi) > 0
-        ray, seen = hit(line.at(t), active & (above | through))
+        ray = seer.origin.spawn_ray(line.at(t))
+        first = seer.hit(ray, active & seer.may_scatter(ray.d))
+        seen = seer.behind(ray, first, active)
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
         turned = dr.select(dr.dot(at.sh_frame.n, ray.d) > 0, mi.UInt32(1), 0)
-        place = dr.select(keeps, place_met(walk, seen, active), place_met(walk, seen, active, facets=False))
-        sight = Sight(mixed(place, turned), at.p, at.n)
-        return dr.select(x.moves | may_move(walk, seen), sight, Sight.nothing())
+        place = dr.select(seer.keeps, place_met(walk, seen, active), place_met(walk, seen, active, facets=False))
+        moves = x.moves | may_move(walk, seen)
+        if walk.media is not None:  # directions follow null boundaries, too
+            place, moves = mixed(place, place_met(walk, first, active, facets=False)), moves | may_move(walk, first)
+        return dr.select(moves, Sight(mixed(place, turned), at.p, at.n), Sight.nothing())
 
     if search.chosen is None:
         return glance(look, line, ok)
     found = search.closer(look, line, ok)
     active = found.weight > 0
-    ray_a, a = hit(line.at(found.a), active)
-    ray_b, b = hit(line.at(found.b), active)
-    near_a = a.t <= b.t
-    near, far = dr.select(near_a, a, b), dr.select(near_a, b, a)
-    ray_near, ray_far = dr.select(near_a, ray_a, ray_b), dr.select(near_a, ray_b, ray_a)
-    active &= near.is_valid()
+    rays = [seer.origin.spawn_ray(line.at(t)) for t in (found.a, found.b)]
+    firsts = [seer.hit(ray, active) for ray in rays]
+    edges, through = seer.edges(rays, firsts, active)
+    near_a = edges[0].t <= edges[1].t
+    edge, near, far = dr.select(near_a, *edges), dr.select(near_a, *firsts), dr.select(near_a, *firsts[::-1])
+    ray_near, ray_far = dr.select(near_a, *rays), dr.select(near_a, *rays[::-1])
+    active &= edge.is_valid()
 
-    bend = Bend.of(walk, ((near, ray_near), (far, ray_far)), active)
+    bend = Bend.of(walk, ((edge, ray_near), (dr.select(near_a, *edges[::-1]), ray_far)), active)
     slope = derivative_by_ray(ray_near, lambda ray: bend.gap(ray, active)).d
     slope -= dr.dot(slope, ray_near.d) * ray_near.d
     bent = (bend.meets | bend.turns) & (dr.squared_norm(slope) > 0)
-    n = dr.select(bent, dr.normalize(slope), edge_normal(near, ray_near, active))
+    n = dr.select(bent, dr.normalize(slope), edge_normal(edge, ray_near, active))
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
     steep = dr.select(bent, dr.dot(slope, n), 1)
-    f, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(ray_far.d), active)
+    f, pdf = seer.towards(ray_far.d, active)
     common = x.β * f * (0.5 * dr.pi / l * found.weight / line.pdf)
     active &= dr.any(common != 0)
+    arrivals, depth = [seer.arrival(ray_near, near, pdf), seer.arrival(ray_far, far, pdf)], x.depth + 1
+    T, arrivals = seer.onward(arrivals, SHORT_OF * edge.t, key, active & through)
     K = []
-    for ray, seen in ((ray_near, near), (ray_far, far)):
-        arrival = Arrival(ray, seen, pdf, mi.Bool(False), mi.Bool(False))
-        path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), x.k + 1, active & (x.k + 1 < walk.max_depth))
+    for arrival in arrivals:
+        path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < walk.max_depth))
         L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
-        K.append(dr.select(active, common * L, 0))
-    return Hiding(near, far, ray_near.d, ray_far.d, n, bend, steep, K[0], K[1], active, keeps)
+        K.append(dr.select(active, common * T * L, 0))
+    return Hiding(edge, near, far, ray_near.d, ray_far.d, n, bend, steep, K[0], K[1], active)
 
 
-def hiding_motion(walk: Walk, x: Chosen, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
+def hiding_motion(walk: Walk, seer: Seer, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
     """What the edge sweeps that the directions at its sides do not follow; differentiable in all that moves."""
-    si = x.at.hit.compute_surface_interaction(at, mi.RayFlags.All, c.active)
+    origin = seer.moved(at)
     lengths = walk.traits.tables.blend_lengths
-    edge = held_direction(si, c.d_near, c.near, c.active)
-    holds = c.active & ~c.keeps
-    d_near, _ = moved_direction(lengths, si, c.d_near, c.near, holds)
-    d_far, _ = moved_direction(lengths, si, c.d_far, c.far, holds)
+    edge = held_direction(origin, c.d_near, c.edge, c.active)
+    d_near, _ = moved_direction(lengths, origin, c.d_near, c.near, seer.holds(c.near, c.active))
+    d_far, _ = moved_direction(lengths, origin, c.d_far, c.far, seer.holds(c.far, c.active))
     bends = c.bend.meets | c.bend.turns
 
     def gap(d: mi.Vector3f) -> mi.Float:
         """How far a direction is from the edge, along n."""
-        ray = mi.Ray3f(si.spawn_ray(dr.detach(d)).o, d)
+        ray = mi.Ray3f(origin.spawn_ray(dr.detach(d)).o, d)
         return dr.select(bends, -c.bend.gap(ray, c.active) / c.slope, dr.dot(c.n, edge - d))
 
     swept = c.K_near * gap(d_near) - c.K_far * gap(d_far)
@@ -361,35 +364,42 @@ def inner_edges(
     walk = replace(walk, max_depth=min(walk.max_depth, deepest(walk)))
     layout = Layout.of(walk, True)
     square, arc = lengths
-    per_line = dr.opaque(mi.Float, places.size.x * places.size.y / lines)
 
-    def path(i: mi.UInt32, records: Any) -> tuple[Any, ...]:
+    def path(centres: Centres, i: mi.UInt32, n: int, seed: mi.UInt32, records: Any) -> tuple[Any, ...]:
         key = mixed(mixed(i, seed), mi.UInt32(0x2545F491))
-        s = quasi_random(i, lines, seed) * places.size
+        s, density = centres.draw(quasi_random(i, n, seed))
         ray, weight = dr.detach(places.ray(s, key))
         records, x = choose_vertex(walk, Counted.of(key), ray, layout, records)
-        x.β *= weight * per_line
-        return s, key, records, x
+        x.β *= weight / (density * dr.opaque(mi.Float, n))
+        return s, density, key, records, x
 
-    i = dr.arange(mi.UInt32, lines)
-    _, key, _, x = path(i, None)
-    in_squares = emitter_edges(walk, x, square, key ^ 0x1B873593, Search()) + dr.zeros(mi.Float, lines)
-    on_arcs = arc_edges(walk, x, arc, key ^ 0x38B34AE5, Search()) + dr.zeros(mi.Float, lines)
-    dr.eval(in_squares, on_arcs)
-    chosen = Picked.of(dr.concat((in_squares, on_arcs)), closer, seed)
+    def glances(centres: Centres, n: int, seed: mi.UInt32) -> tuple[mi.Point2f, mi.Float, mi.Float]:
+        s, density, key, _, x = path(centres, dr.arange(mi.UInt32, n), n, seed, None)
+        seer = Seer(walk, x.at, x.flight, x.active)
+        in_squares = emitter_edges(walk, x, seer, square, key ^ 0x1B873593, Search()) / density
+        on_arcs = arc_edges(walk, x, seer, arc, key ^ 0x38B34AE5, Search()) / density
+        return s, in_squares + dr.zeros(mi.Float, n), on_arcs + dr.zeros(mi.Float, n)
+
+    centres = Centres(int(places.size.x), int(places.size.y), 0.0)
+    s, *found = glances(centres, max(lines // LOOKS, 1), seed ^ 0x7F4A7C15)
+    centres = centres.refined(s, found[0] + found[1])
+    _, *found = glances(centres, lines, seed)
+    dr.eval(found)
+    chosen = Picked.of(dr.concat(found), closer, seed)
 
     on_arc = chosen.index >= lines
     i = dr.select(on_arc, chosen.index - lines, chosen.index)
     pick = mi.PCG32(closer, initstate=seed + 1, initseq=dr.arange(mi.UInt32, closer))
-    s, key, records, x = path(i, dr.alloc_local(record_type(layout), room_for(walk)))
+    s, _, key, records, x = path(centres, i, lines, seed, dr.alloc_local(record_type(layout), room_for(walk)))
     x.active &= chosen.weight > 0
     of_square, of_arc = dr.select(on_arc, 0, chosen.weight), dr.select(on_arc, chosen.weight, 0)
-    shaded = emitter_edges(walk, x, square, key ^ 0x1B873593, Search(of_square, pick))
-    K = shadow_weight(x, shaded)
-    hiding = arc_edges(walk, x, arc, key ^ 0x38B34AE5, Search(of_arc, pick))
+    seer = Seer(walk, x.at, x.flight, x.active)
+    shaded = emitter_edges(walk, x, seer, square, key ^ 0x1B873593, Search(of_square, pick))
+    K = shadow_weight(seer, shaded)
+    hiding = arc_edges(walk, x, seer, arc, key ^ 0x38B34AE5, Search(of_arc, pick))
 
     def motion(ray: mi.Ray3f) -> mi.Spectrum:
-        return hiding_motion(walk, x, hiding, ray) - K * shadow_gap(x, shaded, ray, shaded.u)
+        return hiding_motion(walk, seer, hiding, ray) - K * shadow_gap(seer, shaded, ray, shaded.u)
 
     k = dr.select(x.active, x.k, 0)
     return Edges(s, key, k, x.at.ray, layout, records, motion)

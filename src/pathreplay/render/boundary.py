@@ -11,6 +11,7 @@ import mitsuba as mi
 from ..errors import PathreplayError
 from ..gradient.adjoint import LostPaths
 from ..gradient.baseline import Baseline
+from ..gradient.beam_edges import beam_edges
 from ..gradient.counted import Counted
 from ..gradient.edges import Edges, edges_backward, edges_forward
 from ..gradient.film_edges import film_edges
@@ -33,9 +34,9 @@ INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
 
 @dataclass(frozen=True)
 class Boundary:
-    """A term: edges that the camera sees, directly or by mirrors and glass, and those that surfaces see.
+    """A term: edges that the camera sees, directly or by mirrors and glass, and those that surfaces and particles see.
 
-    Not differentiated: edges in scenes with media; hard shadows beyond the first vertex that scatters; edges of
+    Not differentiated: hard shadows beyond the first vertex that scatters; edges of
     textures and of masks; alpha.
     """
 
@@ -82,14 +83,14 @@ class Boundary:
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
         if self.film:
             yield film_edges(walk, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
+            if walk.media is not None and walk.traits.hard_lights:
+                yield beam_edges(walk, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
         if self.inner:
             yield inner_edges(walk, places, lines, max(lines // INNER_CLOSER, 1), seed ^ 0x5EED, INNER_LENGTHS)
 
 
 def _moves(walk: Walk, places: FilmPlaces) -> bool:
-    """Whether paths move with the parameters: if not, edges do not either. With media they are left out."""
-    if walk.media is not None:
-        return False
+    """Whether paths move with the parameters: if not, edges do not either."""
     key = mi.UInt32(0)
     with dr.resume_grad():
         ray, _ = places.ray(mi.Point2f(0.5), key)

@@ -175,7 +175,7 @@ class PathReplayIntegrator(PathIntegrator):
             self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
 
     def _tell_edges(self, walk: Walk, sensor: mi.Sensor) -> None:
-        if EDGES in self.told or (self.edges == "all" and walk.media is None):
+        if EDGES in self.told or self.edges == "all":
             return
         note, named = missing_edges(walk, sensor, self.edges)
         if named:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .passage import beyond_null
 from .start import CameraStart, behind_emitters
 from .step import choose_step
 from .vertex import Arrival, Chosen, Numbers, Replayed, Walk, reciprocal
@@ -98,6 +99,8 @@ def next_arrival(walk: Walk, at: Arrival, step: Chosen, active: mi.Bool) -> Arri
     """
     kept, null, ray = step.kept, step.null, step.ray_next
     hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, reorder=False, active=active)
+    if walk.clear:
+        hit = beyond_null(walk.scene, ray, hit, active)
     if walk.media is None:
         return Arrival(ray=ray, hit=hit, pdf=kept.pdf, delta=kept.delta, camera=mi.Bool(False))
     camera = null & at.camera

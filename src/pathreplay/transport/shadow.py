@@ -60,7 +60,7 @@ def shadow(walk: Walk, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler,
 
     while dr.hint(stretch.active, exclude=[walk], label="pathreplay: shadow"):
         hit, a, b, inside = stretch.part(walk.scene)
-        T = dr.select(inside, T * _transmittance(walk, stretch.medium, stretch.ray, a, b, sampler, inside), T)
+        T = dr.select(inside, T * transmittance(walk, stretch.medium, stretch.ray, a, b, sampler, inside), T)
         length += b - a
         u = sampler.next_1d(inside) * length
         picked = inside & (u < b - a)
@@ -71,7 +71,7 @@ def shadow(walk: Walk, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler,
     return Shadow(T=T, y=y, medium=y_medium, length=length)
 
 
-def _transmittance(
+def transmittance(
     walk: Walk, medium: mi.MediumPtr, ray: mi.Ray3f, a: mi.Float, b: mi.Float, sampler: mi.Sampler, active: mi.Bool
 ) -> mi.Spectrum:
     """An unbiased estimate of the transmittance of one medium between the distances a and b."""
@@ -143,7 +143,7 @@ def _boundary(walk: Walk, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int
     probe.maxt = still.maxt - y if sign > 0 else y
     hit = walk.scene.ray_intersect_preliminary(probe, coherent=False, reorder=False, active=active)
     met = active & hit.is_valid()
-    # The same surface, as the attached ray itself meets it.
-    hit.t = y + sign * hit.t
-    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, met)
-    return dr.select(met, dr.replace_grad(hit.t, si.t), ray.maxt if sign > 0 else 0)
+    # The same surface, as the attached ray meets it from y on: a sphere answers for what a ray meets first.
+    probe.o, probe.d = ray.o + y * ray.d, sign * ray.d
+    si = hit.compute_surface_interaction(probe, mi.RayFlags.All, met)
+    return dr.select(met, dr.replace_grad(y + sign * hit.t, y + sign * si.t), ray.maxt if sign > 0 else 0)

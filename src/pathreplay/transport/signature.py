@@ -51,12 +51,15 @@ def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Boo
         on_mesh = active & si.shape.is_mesh()
         square, disk = kind == int(mi.ShapeType.Rectangle), kind == int(mi.ShapeType.Disk)
         limb = dr.abs(dr.dot(si.n, ray.d)) < GRAZING
-        rim = disk | ((kind == int(mi.ShapeType.Cylinder)) & ~limb)
+        cylinder = kind == int(mi.ShapeType.Cylinder)
+        rim = disk | (cylinder & ~limb)
         # Distance to the sides u = 0, 1 and v = 0, 1.
         to_u = dr.minimum(si.uv.x, 1 - si.uv.x) * dr.norm(si.dp_du)
         to_v = dr.minimum(si.uv.y, 1 - si.uv.y) * dr.norm(si.dp_dv)
         side = dr.select(to_u < to_v, si.dp_dv, si.dp_du)
-        side = dr.select(on_mesh, _nearest_side(hit, ray, on_mesh), dr.select(square, side, si.dp_dv))
+        side = dr.select(
+            on_mesh, _nearest_side(hit, ray, on_mesh), dr.select(square, side, dr.select(cylinder, si.dp_du, si.dp_dv))
+        )
         straight = on_mesh | square | rim
         return dr.normalize(dr.select(straight, dr.cross(side, ray.d), si.n - dr.dot(si.n, ray.d) * ray.d))
 

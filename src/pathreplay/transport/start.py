@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .passage import beyond_null
 from .vertex import Arrival, Walk
 
 
@@ -22,6 +23,8 @@ class CameraStart:
         """The first arrival along the rays, detached; ``hide_emitters`` makes area emitters transparent."""
         ray = mi.Ray3f(dr.detach(self.ray))
         hit = walk.scene.ray_intersect_preliminary(ray, coherent=True, reorder=False, active=active)
+        if walk.clear:
+            hit = beyond_null(walk.scene, ray, hit, active)
         if walk.hide_emitters:
             hit = behind_emitters(walk, ray, hit, active)
         at = Arrival(ray=ray, hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))

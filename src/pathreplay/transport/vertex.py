@@ -39,6 +39,8 @@ class Walk:
     # see `branch_weight`); else None.
     branching: mi.Float = None
     edges: bool = False
+    # Null boundaries are passed as if they were not there, and ``media`` is None: what edges are looked for with.
+    clear: bool = False
 
     @property
     def resamples(self) -> bool:
@@ -132,6 +134,20 @@ class Flight:
     # Only the first walk needs these; they are None in a record that is read back.
     σ_s: mi.Spectrum = None  # scattering coefficient at the collision
     null: NullCollision = None  # type: ignore[assignment]  # one of those on the way, if the walk branches
+
+    @staticmethod
+    def none(media: Media) -> Flight:
+        """One that met nothing, as a first walk has it."""
+        zero, nothing = mi.Float(0), mi.Spectrum(0)
+        flight = Flight(mi.Bool(False), zero, mi.Float(1), mi.Spectrum(1), mi.Float(0), σ_s=nothing)
+        if media.emissive:
+            flight.t_emit, flight.c_emit, flight.E = mi.Float(0), mi.Spectrum(0), mi.Spectrum(0)
+        return flight
+
+    @property
+    def weight(self) -> mi.Spectrum:
+        """Of what comes from its end: scattering coefficient over density at a collision, times that of null ones."""
+        return dr.select(self.event, self.σ_s * dr.rcp(self.density), 1) * self.W
 
 
 @dataclass

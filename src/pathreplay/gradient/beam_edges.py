@@ -1,0 +1,186 @@
+"""Beams: borders of the hard shadows that lights without extent cast into media.
+
+The camera sees particles x = o + τ d at all distances τ, and x is lit or not. So there are edges on the film for each
+τ, found by short lines on which τ stays the same (see `crofton`), as for hard shadows on surfaces (see `film_edges`):
+
+    dI/dπ = - Σ K dB/dπ,    K = π/2 · f / (l p(c) p(τ) N) · sgn(w·∂B/∂s) / |∂B/∂s|,    B = n·(x + r d - z),
+
+f is what the lit side sends to the camera, with the transmittance of both ways. dB/dπ is taken with x as the interior
+moves it, ∂B/∂s with τ held, since places and distances together are the domain of the integral.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.emitters import draw_emitter
+from ..transport.media import interaction
+from ..transport.passage import beyond_null, passage, past
+from ..transport.path import PathState
+from ..transport.signature import edge_normal, mixed, outline_gap
+from ..transport.start import CameraStart
+from ..transport.step import choose_step
+from ..transport.vertex import Arrival, Flight, Numbers, Walk
+from .adjoint import derivative_by_place
+from .centres import Centres
+from .counted import Counted, quasi_random
+from .crofton import Picked, PlaneLine, Sight, bisect, glance
+from .edges import Edges, Places
+from .record import Layout, deepest, record, record_type, room_for
+from .seer import Seer
+
+
+@dataclass
+class BeamLine(PlaneLine):
+    """A line on the film, and of particles that are seen there at one distance."""
+
+    density: mi.Float  # of its centre, per pixel, and of the distance
+    key: mi.UInt32
+    τ: mi.Float
+
+
+@dataclass
+class Lighting:
+    """A particle, and what is between it and the light that is sampled there."""
+
+    there: mi.Bool  # nothing hides it from the camera
+    ray: mi.Ray3f  # towards the light, if that has no extent
+    hit: mi.PreliminaryIntersection3f
+    hidden: mi.Bool
+    Le: mi.Spectrum  # over the probability of the light
+    lit: mi.Bool  # there is such a light
+
+
+def beam_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UInt32, l: float) -> Edges:
+    """Find borders of hard shadows by lines of length ``l`` (pixels), and look ``closer`` at as many. Detached."""
+    walk = replace(walk, max_depth=min(walk.max_depth, deepest(walk)))
+    centres = Centres.even(places.size, l)
+
+    def draw(i: mi.UInt32) -> tuple[BeamLine, mi.Bool]:
+        key = mixed(mixed(i, seed), mi.UInt32(0x3C6EF372))
+        numbers = Counted(key, mi.UInt32(0x30000))
+        turn = dr.two_pi * numbers.next_1d()
+        w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
+        c, density = centres.draw(quasi_random(i, lines, seed ^ 0x1F83D9AB))
+        reach = _reach(walk, dr.detach(places.ray(c - centres.margin, key)[0]))
+        τ = numbers.next_1d() * reach
+        ok = dr.isfinite(reach) & (reach > 0)
+        density *= dr.select(ok, dr.rcp(reach), 1)
+        begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)
+        return BeamLine(c - centres.margin, w, begin, end, density, key, dr.select(ok, τ, 0)), ok
+
+    def look(line: BeamLine, t: mi.Float, active: mi.Bool) -> Sight:
+        x = _lighting(walk, places, line, line.at(t), active)
+        word = dr.select(x.there, mi.UInt32(1), 0) | dr.select(x.hidden, mi.UInt32(2), 0)
+        return Sight(word, mi.Point3f(0), mi.Normal3f(0))
+
+    every, ok = draw(dr.arange(mi.UInt32, lines))
+    chosen = Picked.of(glance(look, every, ok) / every.density, closer, seed)
+    pick = mi.PCG32(closer, initstate=seed + 2, initseq=dr.arange(mi.UInt32, closer))
+    line, ok = draw(chosen.index)
+    found = bisect(look, line, dr.select(ok, chosen.weight, 0), pick)
+    active = found.weight > 0
+    a, b = (_lighting(walk, places, line, line.at(t), active) for t in (found.a, found.b))
+    active &= a.there & b.there & (a.hidden != b.hidden)
+    s = line.at(dr.select(a.hidden, found.a, found.b))
+    dark, bright = dr.select(a.hidden, a, b), dr.select(a.hidden, b, a)
+    active &= bright.lit
+    camera_ray, weight = dr.detach(places.ray(s, line.key))
+    layout = Layout.of(walk, True)
+    records = dr.alloc_local(record_type(layout), room_for(walk))
+    records, k, at, flight = _to_particle(walk, camera_ray, line, active, layout, records)
+    active &= flight.event
+    seer = Seer(walk, at, flight, active)
+    n = edge_normal(dark.hit, dark.ray, active)
+
+    per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * lines))
+    others = Counted(line.key, mi.UInt32(0x70000))
+    around = walk.media.around
+    medium = dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)
+    T = passage(walk, camera_ray, line.τ, medium, others, active)[0]
+    T *= past(walk, bright.ray, dark.hit.t, at.medium, others, active)
+    f = weight * T * flight.σ_s * seer.towards(bright.ray.d, active)[0] * bright.Le
+    jump = f * (found.weight * per_line / line.density)
+    jump *= dr.select(a.hidden, -1, 1)  # from begin to end of the line
+
+    def gap(origin: mi.Interaction3f) -> mi.Float:
+        light, _ = walk.scene.sample_emitter_direction(origin, _which(line), False, active)
+        return outline_gap(n, origin.p, light.d, dark.hit, dark.ray, active)
+
+    def along(s: mi.Point2f) -> mi.Float:
+        return gap(_particle(places.ray(s, line.key)[0], line.τ))
+
+    K = line.passed(jump, derivative_by_place(s, along), active)
+    return Edges(s, line.key, dr.select(active, k, 0), at.ray, layout, records, lambda ray: -K * gap(seer.moved(ray)))
+
+
+def _which(line: BeamLine) -> mi.Point2f:
+    """The random numbers that say which light."""
+    return Counted(line.key, mi.UInt32(0x30010)).next_2d()
+
+
+def _particle(ray: mi.Ray3f, τ: mi.Float) -> mi.Interaction3f:
+    x = dr.zeros(mi.Interaction3f)
+    x.p, x.t, x.time, x.wavelengths = ray.o + τ * ray.d, mi.Float(0), ray.time, ray.wavelengths
+    return x
+
+
+def _hit(walk: Walk, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
+    """What a ray meets behind null boundaries."""
+    hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, reorder=False, active=active)
+    return beyond_null(walk.scene, ray, hit, active)
+
+
+def _reach(walk: Walk, ray: mi.Ray3f) -> mi.Float:
+    """How far particles are looked for: up to what the ray meets or, if that is nothing, the end of the scene."""
+    hit = _hit(walk, ray, mi.Bool(True))
+    box = walk.scene.bbox()
+    far = dr.norm(ray.o - box.center()) + 0.5 * dr.norm(box.extents())
+    return dr.select(hit.is_valid(), hit.t, far)
+
+
+def _lighting(walk: Walk, places: Places, line: BeamLine, s: mi.Point2f, active: mi.Bool) -> Lighting:
+    ray = dr.detach(places.ray(s, line.key)[0])
+    before = _hit(walk, ray, active)
+    there = active & ~(before.is_valid() & (before.t < line.τ))
+    x = _particle(ray, line.τ)
+    light, Le = draw_emitter(walk.scene, x, _which(line), there, visible=False)
+    lit = there & light.delta & (light.pdf != 0)
+    towards = x.spawn_ray_to(light.p)
+    hit = _hit(walk, towards, lit)
+    return Lighting(there, towards, hit, lit & hit.is_valid(), Le, lit)
+
+
+@dr.syntax
+def _to_particle(
+    walk: Walk, ray: mi.Ray3f, line: BeamLine, active: mi.Bool, layout: Layout, records: Any
+) -> tuple[Any, mi.UInt32, Arrival, Flight]:
+    """Record the way to the particle, through null boundaries; the arrival there, and its flight."""
+    numbers = Counted.of(line.key)
+    path = PathState.begin(walk, CameraStart(ray, numbers, active))
+    at, flight = path.at, Flight.none(walk.media)
+    gone, k, count = mi.Float(0), mi.UInt32(0), mi.UInt32(0)
+    go_on = path.active & (count < room_for(walk))
+    while dr.hint(go_on, exclude=[walk, layout], label="pathreplay: to a particle"):
+        length = dr.select(path.at.hit.is_valid(), path.at.hit.t, dr.inf)
+        event = (gone + length > line.τ) & (path.at.medium != None)  # noqa: E711 (an array of pointers)
+        here = Flight.none(walk.media)
+        here.event, here.t = event, dr.select(event, line.τ - gone, 0)
+        u = Numbers.draw(numbers)
+        step = choose_step(walk, path.at, u, numbers, path.β, mi.Bool(False), path.active, here)
+        onward, v = path.advance(walk, u, step)
+        records[count] = record(layout, v)
+        at, k = dr.select(event, path.at, at), dr.select(event, count, k)
+        flight = dr.select(event, here, flight)
+        gone += dr.norm(onward.at.ray.o - path.at.ray.o)
+        go_on = onward.active & step.null & ~event & (gone < line.τ)
+        path = onward
+        count += 1
+    active &= flight.event
+    σ_s, _, _ = at.medium.get_scattering_coefficients(interaction(at.medium, at.ray, flight.t), active)
+    flight.σ_s = dr.detach(σ_s)
+    return records, k, at, flight

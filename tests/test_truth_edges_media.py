@@ -1,0 +1,49 @@
+"""Interior and edges together in scenes with media, against finite differences of `volpath`, and forward by reverse."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from edge_media_scenes import BY_NAME
+from edge_scenes import weights
+from pathreplay.check.statistics import gap
+from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
+from truth import ROWS, TRANSPOSE_MAX, Bench, Row
+
+FEW = ("fog_shadow", "fog_beam", "behind_ball", "by_ball_chance")
+"""Cells that say most in a minute: shadows, beams, what is seen through fog, and by particles behind a boundary."""
+
+
+@contextmanager
+def loaded(name: str) -> Iterator[Bench]:
+    """The case, detached at the end, since Dr.Jit trips over what is attached in other scenes."""
+    bench = Bench(BY_NAME[name])
+    bench.weigh(weights())
+    try:
+        yield bench
+    finally:
+        bench.release()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FEW)
+def test_gradients_with_edges_agree(name: str) -> None:
+    with loaded(name) as bench:
+        case = bench.case
+        reference = bench.reference(case.seeds)
+        bench.put(dr.opaque(mi.Float, 0))
+        integrator = bench.integrator(rr_depth=case.rr_depth, **case.options)
+        g = bench.backwards(integrator)
+        transpose = bench.transpose_error(integrator, integrator, 1, case.spp)
+    found = gap(g, reference)
+    row = Row(f"edges: {name}", "sweep", g.mean(), reference.mean(), found.error, found.z, np.nan, transpose)
+    ROWS.append(row)
+    assert abs(row.z) < Z_LIMIT, row
+    assert row.error < RESOLUTION * max(abs(row.gradient), abs(row.reference)), row
+    assert row.transpose < TRANSPOSE_MAX, row
