@@ -297,7 +297,7 @@ CELLS = [
     cell("mirror_z", mirror, "mirror.to_world", UP, 3),
     cell("mirror_x", mirror, "mirror.to_world", translate(1, 0, 0), 3),
     cell("glass_index", ball_of_glass, "ball.bsdf.eta", add(1.0), 5),
-    cell("glass_moves", ball_of_glass, "ball.to_world", translate(1, 0, 0), 5, step=0.02,
+    cell("glass_moves", ball_of_glass, "ball.to_world", translate(1, 0, 0), 5, step=0.01,
          reference_spp=4096),
     cell("emit_eta", glowing_behind_glass, "ball.bsdf.eta", add(1.0), 6),
     cell("emit_blocker", glowing_behind_glass, OBJECT, translate(1, 0, 0), 6, step=0.02),
