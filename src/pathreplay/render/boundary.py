@@ -78,7 +78,8 @@ class Boundary:
                 f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
                 "put its sensors into the scene one by one, or use edges = 'none'"
             )
-        walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
+        if walk.media is None:  # there boundaries that move are no vertices, and paths pass them unseen
+            walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
         lines = max(int(places.size.x) * int(places.size.y) * (self.spp or view.spp), 1)
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
         if self.film:

@@ -47,8 +47,8 @@ def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Boo
     """
     with dr.suspend_grad():
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        kind = hit.shape.shape_type()
-        on_mesh = active & hit.shape.is_mesh()
+        kind = si.shape.shape_type()  # not that of the hit, which has none where a copy was met
+        on_mesh = active & si.shape.is_mesh()
         square, disk = kind == int(mi.ShapeType.Rectangle), kind == int(mi.ShapeType.Disk)
         limb = dr.abs(dr.dot(si.n, ray.d)) < GRAZING
         cylinder = kind == int(mi.ShapeType.Cylinder)
