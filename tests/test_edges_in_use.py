@@ -58,8 +58,14 @@ def run(**changes: Any) -> Any:
 BAD = {
     "of another integrator": ({"type": "prb", "edges": "all"}, "'edges' is an option of the integrator 'pathreplay'"),
     "unknown": ({"type": "pathreplay", "edges": "outline"}, "edges = 'outline' is unknown: use one of 'none', 'film'"),
-    "below zero": ({"type": "pathreplay", "edges": "all", "edge_spp": -1}, "edge_spp = -1: use a number of lines per pixel >= 0"),
-    "half a line": ({"type": "pathreplay", "edges": "all", "edge_spp": 1.5}, "edge_spp = 1.5: use a number of lines per pixel >= 0"),
+    "below zero": (
+        {"type": "pathreplay", "edges": "all", "edge_spp": -1},
+        "edge_spp = -1: use a number of lines per pixel >= 0",
+    ),
+    "half a line": (
+        {"type": "pathreplay", "edges": "all", "edge_spp": 1.5},
+        "edge_spp = 1.5: use a number of lines per pixel >= 0",
+    ),
     "attached": (
         {"type": "pathreplay", "edges": "all", "attach": "all"},
         "edges know what moves with attach = 'delta'",
@@ -180,6 +186,20 @@ def test_a_body_is_closed_and_turned_outwards() -> None:
     assert np.ptp(points, axis=0).max() == pytest.approx(1)
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     assert set(np.unique(sides, axis=0, return_counts=True)[1]) == {2}
+
+
+@pytest.mark.slow
+def test_a_mesh_goes_on_where_it_was_stopped() -> None:
+    smooth = {"parameters": [{"key": KEY, "smooth": 20.0, "learning_rate": 0.1}], "learning_rate_decay": 1.0}
+    smooth["scene_parameters"] = {"resolution": 8, "views": 1}
+    start = np.ravel(knobs(ball(4)[0]))
+    smooth["target"] = {**JOB["target"], "values": {"sky.radiance.value": 0.5}}
+    whole, half = run(**smooth, iterations=4), run(**smooth, iterations=2)
+    config = half.folder / "config.json"
+    config.write_text(config.read_text().replace('"iterations": 2', '"iterations": 4'))
+    resumed = optimize(resume=half.folder, progress=False)
+    assert np.abs(whole.parameters[KEY] - start).max() > 0.01
+    assert resumed.parameters[KEY] == pytest.approx(whole.parameters[KEY], abs=1e-3)
 
 
 # ------------------------------ The examples, shorter ------------------------------

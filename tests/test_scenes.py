@@ -33,6 +33,11 @@ KEYS = {
     "glass-pane": {"glass.eta", "front_face.bsdf.normalmap.data"},
     "cloud": {"cloud.interior_medium.sigma_t.data"},
     "mirror-camera": {"camera.to_world", "mirror.to_world"},
+    "silhouettes": {"body.vertex_positions"},
+    "silhouette-in-mirror": {"body.vertex_positions"},
+    "shadows": {"body.vertex_positions"},
+    "flat-colours": {"camera.to_world"},
+    "glass-ball": {"glass.eta", "ball.to_world"},
 }
 
 
@@ -42,7 +47,8 @@ def test_builtins_render_with_their_names(name: str) -> None:
     params = mi.traverse(scene)
     assert KEYS[name] <= set(params.keys())
     for sensor in range(len(scene.sensors())):
-        assert mi.render(scene, sensor=sensor, spp=4, integrator=mi.load_dict({"type": "volpath"})).shape == (8, 8, 3)
+        size = (8, 16, 3) if name == "silhouette-in-mirror" else (8, 8, 3)
+        assert mi.render(scene, sensor=sensor, spp=4, integrator=mi.load_dict({"type": "volpath"})).shape == size
 
 
 def test_closeup_sees_every_texel() -> None:
