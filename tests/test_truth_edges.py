@@ -23,7 +23,7 @@ from truth import ROWS, TRANSPOSE_MAX, Bench, Row
 
 QUICK = ("shadow_all",)
 """The cell that says most in a few seconds."""
-COUNTED_TWICE = ("shadow_lamp", "shadow_all", "lamp_lights", "lamp_seen", "cube8_lit", "sphere_lamp")
+COUNTED_TWICE = ("shadow_lamp", "shadow_all", "lamp_lights", "cube8_lit", "sphere_lamp")
 """Cells in which something moves that the interior follows, and that edges could add again."""
 MANY = 32
 """Passes of an estimator that looks for small lamps by chance."""
