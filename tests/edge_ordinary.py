@@ -6,6 +6,7 @@ finite differences.
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -65,6 +66,7 @@ def weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
 
 
 def loaded(moving: Moving, folder: Path) -> Objective:
+    gc.collect()  # of scenes that go while a kernel is traced, Dr.Jit loses count, and ends the process
     if isinstance(moving.scene, str):
         (folder / "scene.xml").write_text(moving.scene, encoding="utf-8")
         scene = mi.load_file(str(folder / "scene.xml"), optimize=moving.optimize)
