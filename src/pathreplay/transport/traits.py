@@ -124,12 +124,12 @@ def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
 def strips_of(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.Float]:
     """The strips of the unit squares of emitter samples, by emitter: of mesh lamps, which triangle a number chooses."""
     areas = {shape.emitter(): mesh_areas(shape) for shape in shapes if shape.is_emitter() and shape.is_mesh()}
-    ends = []
+    ends = [] if emitters else [np.ones(1)]  # an empty array in a walk would end the process
     for emitter in emitters:
         painted = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
         ends.append(np.cumsum(areas[emitter]) if emitter in areas and not painted else np.ones(1))
     lamps = np.repeat(np.arange(len(ends)), [len(x) for x in ends])
-    return mi.UInt32(lamps.astype(np.uint32)), mi.Float(np.concatenate([x / x[-1] for x in ends] or [np.ones(1)]))
+    return mi.UInt32(lamps.astype(np.uint32)), mi.Float(np.concatenate([x / x[-1] for x in ends]))
 
 
 def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], otherwise: V) -> list[V]:
