@@ -145,7 +145,7 @@ def test_delta_tracking_as_listed_is_right_where_collisions_are_drawn(case: Case
     found = gap(b.backwards(listing), reference)
     assert found.error < RESOLUTION * abs(reference.mean())
     assert abs(found.z) < Z_LIMIT
-    if case is not LISTED[0]:
+    if case.name != "listed density":
         steady = {"rr_depth": 1000}
         tangent = b.dot(b.forward(b.integrator(**steady), 1, 16))
         again = b.backward(b.integrator("pathreplay_listing", **steady), 1, 16)
