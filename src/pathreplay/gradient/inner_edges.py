@@ -208,18 +208,17 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
         return glance(look, line, inside)
     found = search.closer(look, line, inside)
     active = found.weight > 0
-    a_hidden, b_hidden = (shadowed(line, t, active)[-1] for t in (found.a, found.b))
+    a, b = (shadowed(line, t, active) for t in (found.a, found.b))
+    a_hidden, b_hidden = a[-1], b[-1]
     active &= a_hidden != b_hidden
-    light, Le, *_ = shadowed(line, dr.select(a_hidden, found.b, found.a), active)
-    t = dr.select(a_hidden, found.a, found.b)
-    _, _, ray, hit, hidden = shadowed(line, t, active)
-    active &= hidden
+    light, Le = dr.select(a_hidden, b[0], a[0]), dr.select(a_hidden, b[1], a[1])
+    ray, hit = dr.select(a_hidden, a[2], b[2]), dr.select(a_hidden, a[3], b[3])
     f, pdf = seer.towards(light.d, active)
     Le *= seer.past(light, hit.t, key, active)
     density = light.pdf / line.share
     F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density, pdf))
     K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a_hidden, -1, 1)
-    ends = line.sample(t), line.sample(dr.select(a_hidden, found.b, found.a))
+    ends = line.sample(dr.select(a_hidden, found.a, found.b)), line.sample(dr.select(a_hidden, found.b, found.a))
     return Shaded(line, *ends, hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
 
 
