@@ -137,17 +137,17 @@ def test_steps_on_a_surface_are_smooth_and_exact() -> None:
     vertices, faces = ball(2)
     positions = np.ravel(knobs(vertices)).astype(np.float32)
     surface = Surface(positions, np.ravel(faces), 20.0)
-    assert surface.positions(surface.latent(positions)) == pytest.approx(positions, abs=1e-5)
+    assert surface.values(surface.latent(positions)) == pytest.approx(positions, abs=1e-5)
     # By the chain rule: <gradient by u, δu> = <gradient by v, δv>.
     random = np.random.default_rng(1)
     g, δu = (random.normal(size=positions.size).astype(np.float32) for _ in range(2))
-    assert surface.gradient(g) @ δu == pytest.approx(g @ surface.positions(δu), rel=1e-4)
+    assert surface.gradient(positions, g) @ δu == pytest.approx(g @ surface.values(δu), rel=1e-4)
     # A shift of all vertices is not slowed down, and one of a single vertex is.
     shift = np.tile([1, 2, 3], len(vertices)).astype(np.float32)
-    assert surface.positions(shift) == pytest.approx(shift, abs=1e-4)
+    assert surface.values(shift) == pytest.approx(shift, abs=1e-4)
     alone = np.zeros_like(positions)
     alone[0] = 1
-    assert 0 < surface.positions(alone)[0] < 0.1
+    assert 0 < surface.values(alone)[0] < 0.1
 
 
 def test_copies_of_a_vertex_stay_together() -> None:
@@ -155,7 +155,7 @@ def test_copies_of_a_vertex_stay_together() -> None:
     positions, faces = np.array(cube["vertex_positions"]), np.array(cube["faces"])
     surface = Surface(positions, faces, 5.0)
     g = np.random.default_rng(2).normal(size=positions.size).astype(np.float32)
-    moved = (positions + surface.positions(surface.gradient(g))).reshape(-1, 3)
+    moved = (positions + surface.values(surface.gradient(positions, g))).reshape(-1, 3)
     assert len(np.unique(positions.reshape(-1, 3), axis=0)) == 8
     assert len(np.unique(np.round(moved, 5), axis=0)) == 8
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,29 @@ import pytest
 
 from pathreplay import backend
 from pathreplay.inverse.evaluate import Evaluate, Evaluation, Executor, Local, Shard
-from pathreplay.inverse.optimiser import Adam, Optimiser
+from pathreplay.inverse.optimiser import DrJitOptimiser, Optimiser
+from pathreplay.inverse.optimizer_options import Optimizer
 
-OPTIMISERS = [Adam]
+Make = Callable[..., Optimiser]
+OPTIMISERS = {
+    "adam": {},
+    "amsgrad": {"type": "adam", "amsgrad": True},
+    "uniform": {"type": "adam", "uniform": True},
+    "adamw": {"type": "adamw", "weight_decay": 1e-3},
+    "sgd": {"type": "sgd"},
+    "nesterov": {"type": "sgd", "momentum": 0.5, "nesterov": True},
+    "rmsprop": {"type": "rmsprop", "alpha": 0.9},
+}
 EXECUTORS = [Local]
 
 GOAL = {"colour": np.float32([0.2, -0.4, 0.9]), "grid": np.linspace(-1, 1, 24, dtype=np.float32).reshape(2, 3, 4, 1)}
 RATES = {"colour": 0.05, "grid": 0.1}
 Arrays = dict[str, np.ndarray]
+
+
+@pytest.fixture(params=OPTIMISERS)
+def make(request: pytest.FixtureRequest) -> Make:
+    return partial(DrJitOptimiser, options=Optimizer(**OPTIMISERS[request.param]))
 
 
 @pytest.fixture(autouse=True)
@@ -40,24 +56,21 @@ def bits(values: Mapping[str, np.ndarray]) -> dict[str, Any]:
     return {key: (value.dtype, value.shape, value.tobytes()) for key, value in values.items()}
 
 
-@pytest.mark.parametrize("make", OPTIMISERS)
-def test_an_optimiser_gets_there(make: type[Adam]) -> None:
+def test_an_optimiser_gets_there(make: Make) -> None:
     values = go_on(make(start()), start(), 200)
     for key, goal in GOAL.items():
         assert values[key].shape == goal.shape and values[key].dtype == np.float32
-        np.testing.assert_allclose(values[key], goal, atol=0.02)
+        np.testing.assert_allclose(values[key], goal, atol=0.06)
 
 
-@pytest.mark.parametrize("make", OPTIMISERS)
-def test_an_optimiser_leaves_what_it_was_given(make: type[Adam]) -> None:
+def test_an_optimiser_leaves_what_it_was_given(make: Make) -> None:
     values = start()
     go_on(make(values), values, 1)
     assert bits(values) == bits(start())
 
 
-@pytest.mark.parametrize("make", OPTIMISERS)
 @pytest.mark.parametrize("done", [0, 3])
-def test_a_restored_optimiser_goes_on_bit_for_bit(make: type[Adam], done: int) -> None:
+def test_a_restored_optimiser_goes_on_bit_for_bit(make: Make, done: int) -> None:
     optimiser = make(start())
     values = go_on(optimiser, start(), done)
     state = optimiser.state()
@@ -68,8 +81,7 @@ def test_a_restored_optimiser_goes_on_bit_for_bit(make: type[Adam], done: int) -
     assert bits(go_on(other, values, 3)) == bits(go_on(optimiser, values, 3))
 
 
-@pytest.mark.parametrize("make", OPTIMISERS)
-def test_an_optimiser_begins_anew_on_another_shape_only_there(make: type[Adam]) -> None:
+def test_an_optimiser_begins_anew_on_another_shape_only_there(make: Make) -> None:
     optimiser = make({"grid": np.zeros(2, np.float32), "colour": start()["colour"]})
     old = {"grid": np.zeros(2, np.float32), "colour": start()["colour"]}
     optimiser.step(old, {"grid": np.ones(2, np.float32), "colour": -GOAL["colour"]}, RATES)
@@ -78,13 +90,22 @@ def test_an_optimiser_begins_anew_on_another_shape_only_there(make: type[Adam]) 
     assert bits({"grid": values["grid"]}) == bits({"grid": go_on(make(start()), start(), 1)["grid"]})
 
 
-@pytest.mark.parametrize("make", OPTIMISERS)
-def test_a_state_of_other_variables_is_refused(make: type[Adam]) -> None:
+def test_a_state_of_other_variables_is_refused(make: Make) -> None:
     optimiser = make(start())
     go_on(optimiser, start(), 1)
-    for values in ({"grid": np.zeros(5, np.float32)}, {"other": np.zeros(3, np.float32)}):
+    other = [{"other": np.zeros(3, np.float32)}]
+    if optimiser.state().arrays:  # plain gradient descent remembers nothing that had a shape
+        other.append({"grid": np.zeros(5, np.float32)})
+    for values in other:
         with pytest.raises((KeyError, ValueError)):
             make(values).restore(optimiser.state(), values)
+
+
+def test_a_state_of_another_optimiser_is_refused() -> None:
+    optimiser = DrJitOptimiser(start())
+    go_on(optimiser, start(), 1)
+    with pytest.raises(ValueError, match="nothing that this optimizer keeps"):
+        DrJitOptimiser(start(), Optimizer(type="sgd")).restore(optimiser.state(), start())
 
 
 def counting(values: Mapping[str, np.ndarray], shard: Shard, learned: Mapping[str, np.ndarray], /) -> Evaluation:

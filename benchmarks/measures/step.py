@@ -15,7 +15,7 @@ from pathreplay.inverse.config import make_config
 from pathreplay.inverse.evaluate import Evaluator, Local
 from pathreplay.inverse.loop import take_step
 from pathreplay.inverse.losses import l2
-from pathreplay.inverse.optimiser import Adam
+from pathreplay.inverse.optimiser import DrJitOptimiser
 from pathreplay.inverse.problem import Problem, Variable, View
 from pathreplay.scenes.parameters import get_array
 
@@ -33,7 +33,7 @@ RATE = 0.02
 TARGET_SPP = 256
 
 
-class Watched(Adam):
+class Watched(DrJitOptimiser):
     """Adam that remembers the gradients of its last step."""
 
     seen: Mapping[str, np.ndarray]

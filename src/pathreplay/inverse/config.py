@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import difflib
-import math
 import sys
 from collections.abc import Callable
-from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import MISSING, file_problem
 from pathreplay.inverse.config_errors import first_error
+from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.pose import PARTS, PoseKind
+from pathreplay.inverse.schedules import Schedule
+from pathreplay.inverse.tables import Count, Finite, Positive, Switch, Table, Whole
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -24,37 +25,7 @@ else:
     import tomli as tomllib
 
 
-def _whole(value: Any) -> Any:
-    return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else value
-
-
-def _single(value: Any) -> Any:
-    """A number as a float; Mitsuba computes in single precision, so what that cannot hold is no number to it."""
-    if isinstance(value, bool) or not isinstance(value, Real):
-        return value
-    try:
-        number = float(value)
-    except OverflowError:  # a whole number that not even double precision holds
-        number = 2 * LARGEST
-    if math.isfinite(number) and abs(number) > LARGEST:
-        raise ValueError(f"{shown(value)} is beyond single precision; give a number up to {LARGEST:.3g}")
-    return number
-
-
-LARGEST = float(np.finfo(np.float32).max)
-# Strict: true is not 1, and "16" is not 16. NumPy's numbers are numbers.
-Whole = Annotated[int, Field(strict=True), BeforeValidator(_whole)]
-Finite = Annotated[float, Field(strict=True, allow_inf_nan=False), BeforeValidator(_single)]
-Positive = Annotated[Finite, Field(gt=0)]
-Switch = Annotated[bool, Field(strict=True)]
-Count = Annotated[Whole, Field(ge=1, le=2**31 - 1)]
-
-
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Picture(_Table):
+class Picture(Table):
     """An image as the value of a texture: file, how it meets the texture's shape, and its colour space."""
 
     image: str
@@ -72,14 +43,17 @@ Argument = Switch | Whole | Finite | str
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 
-class Displacement(_Table):
+TransformKind = Literal["log", "softplus", "logit"]
+
+
+class Displacement(Table):
     """Where a pose starts, from where the scene has it: scene units, and a rotation vector in degrees."""
 
     translation: Vector | None = None
     rotation: Vector | None = None
 
 
-class Parameter(_Table):
+class Parameter(Table):
     """One scene parameter to recover, or several by a glob."""
 
     key: str
@@ -95,6 +69,7 @@ class Parameter(_Table):
     distance: Positive | None = None
     rotation_learning_rate: Positive | None = None
     smooth: Positive | None = None
+    transform: TransformKind | None = None
 
     @model_validator(mode="after")
     def _of_one_kind(self) -> Parameter:
@@ -103,7 +78,10 @@ class Parameter(_Table):
             if posed:
                 self._refuse(f"'{min(posed)}' belongs to a pose; add pose = 'translation', 'rotation' or 'rigid'")
             return self
-        if plain := {"lower", "upper", "initial", "resolutions", "refine_at", "smooth"} & self.model_fields_set:
+        if (
+            plain := {"lower", "upper", "initial", "resolutions", "refine_at", "smooth", "transform"}
+            & self.model_fields_set
+        ):
             self._refuse(f"'{min(plain)}' does not go with a pose; displace its start with 'start'")
         parts = PARTS[self.pose]
         given = [] if self.start is None else sorted(self.start.model_fields_set)
@@ -118,6 +96,8 @@ class Parameter(_Table):
     def _in_order(self) -> Parameter:
         if self.smooth is not None and not (self.lower is None and self.upper is None):
             self._refuse("'smooth' does not go with 'lower' and 'upper', which would tear the mesh; leave them out")
+        if self.smooth is not None and self.transform is not None:
+            self._refuse("'smooth' does not go with 'transform': both say where steps are taken; leave one out")
         sizes, begins = self.resolutions or [], self.refine_at or []
         if len(begins) != max(0, len(sizes) - 1):
             self._refuse(
@@ -159,7 +139,7 @@ class Plugin(BaseModel):
         return self
 
 
-class Target(_Table):
+class Target(Table):
     """What the pictures should look like: image files, one per sensor, or a scene to render."""
 
     images: list[str] | None = None
@@ -190,7 +170,7 @@ class Target(_Table):
 ITERATION, TARGET, PICTURE, JUDGEMENT = 0, 1, 2, 3
 
 
-class Config(_Table):
+class Config(Table):
     """One optimisation job. Every key is explained in docs/optimize.md."""
 
     scene: str
@@ -208,9 +188,23 @@ class Config(_Table):
     seed: Annotated[Whole, Field(ge=0, le=10**18)] = 0
     learning_rate: Positive = 0.02
     learning_rate_decay: Annotated[Positive, Field(le=1)] = 0.1
+    learning_rate_schedule: Schedule = "exponential"
+    warm_up: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 0
+    optimizer: Optimizer = Optimizer()
     checkpoint_every: Count = 25
     deterministic: Switch = False
     output: str | None = None
+
+    @model_validator(mode="after")
+    def _scheduled(self) -> Config:
+        if self.learning_rate_schedule == "constant" and "learning_rate_decay" in self.model_fields_set:
+            raise ValueError("learning_rate_decay does not go with learning_rate_schedule = 'constant'; leave one out")
+        if self.warm_up >= self.iterations:
+            raise ValueError(
+                f"warm_up {self.warm_up} is not before the end of the {self.iterations} iterations; shorten it, or "
+                "raise 'iterations'"
+            )
+        return self
 
     @model_validator(mode="after")
     def _refined_in_time(self) -> Config:
@@ -234,6 +228,7 @@ _TABLES: dict[str, type[BaseModel]] = {
     "target": Target,
     "Picture": Picture,
     "start": Displacement,
+    "optimizer": Optimizer,
 }
 
 

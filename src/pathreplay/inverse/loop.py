@@ -17,8 +17,9 @@ from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
 from pathreplay.inverse.evaluate import Evaluator, Local, Shard, total
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
-from pathreplay.inverse.optimiser import Adam
+from pathreplay.inverse.optimiser import DrJitOptimiser
 from pathreplay.inverse.problem import Problem, pose_errors, put_values
+from pathreplay.inverse.schedules import rate
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.scenes.parameters import get_array, to_value
 
@@ -59,12 +60,14 @@ class Stopped:
 Event = Started | Refined | Stepped | Stopped
 
 
-def new_run(problem: Problem, integrator: mi.Integrator, record: bool = True) -> Run:
+def new_run(problem: Problem, config: Config, integrator: mi.Integrator) -> Run:
     """A run at the problem's start values, in this process."""
     values = {v.key: get_array(to_value(v.like, v.start)) for v in problem.variables}
     return Run(
-        Local(Evaluator(problem, integrator, record)),
-        Adam(values, [v.key for v in problem.variables if v.surface]),
+        Local(Evaluator(problem, integrator, record=not config.deterministic)),
+        DrJitOptimiser(
+            values, config.optimizer, [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
+        ),
         values,
     )
 
@@ -96,7 +99,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     """One step, with the learning rates and resolutions of iteration ``position``; adds an entry to the history.
 
     Evaluate every view, a shard with a seed of its own, and sum in their order; step with the learning rate
-    lr·decay^(position / iterations), project every variable into its bounds. A grid whose next resolution is due is
+    of that iteration (see `schedules`), project every variable into its bounds. A grid whose next resolution is due is
     interpolated before that, and returned; the optimiser starts anew on it. What is differentiated is decided by the
     integrator; targets, bounds and the seeds' choice of paths are not.
 
@@ -119,8 +122,9 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
             f"The loss is {found.loss} at iteration {i}; lower the learning rates, or bound the parameters that ran "
             "away"
         )
-    decay = config.learning_rate_decay ** (position / config.iterations)
-    rates = {v.key: v.learning_rate * decay for v in problem.variables}
+    schedule, decay = config.learning_rate_schedule, config.learning_rate_decay
+    factor = rate(schedule, position, config.iterations, decay, config.warm_up)
+    rates = {v.key: v.learning_rate * factor for v in problem.variables}
     stepped = _stepped(problem, run, found.gradients, rates)
     run.values = {v.key: np.clip(stepped[v.key], *v.bounds) for v in problem.variables}
     run.learned = found.learned
@@ -133,12 +137,12 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
 
 
 def _stepped(problem: Problem, run: Run, gradients: Arrays, rates: dict[str, float]) -> dict[str, Array]:
-    """The values after a step of the optimiser; on a `Surface` it is taken where that wants it."""
-    surfaces = {v.key: v.surface for v in problem.variables if v.surface}
-    latent = {key: surface.latent(run.values[key]) for key, surface in surfaces.items()}
-    slopes = {key: surface.gradient(gradients[key]) for key, surface in surfaces.items()}
+    """The values after a step of the optimiser, which is taken in the coordinates of each variable."""
+    others = {v.key: v.coordinates for v in problem.variables if v.coordinates}
+    latent = {key: other.latent(run.values[key]) for key, other in others.items()}
+    slopes = {key: other.gradient(run.values[key], gradients[key]) for key, other in others.items()}
     stepped = run.optimiser.step({**run.values, **latent}, {**gradients, **slopes}, rates)
-    return stepped | {key: surface.positions(stepped[key]) for key, surface in surfaces.items()}
+    return stepped | {key: other.values(stepped[key]) for key, other in others.items()}
 
 
 def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:

@@ -23,6 +23,7 @@ from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.surface import Surface
 from pathreplay.inverse.targets import read_targets, rendered_targets, target_scene, truth_of
+from pathreplay.inverse.transforms import Coordinates, Transform
 from pathreplay.inverse.values import Array, Arrays, make_value, seen
 from pathreplay.render.edge_notes import edges_note, moves_edges
 from pathreplay.render.integrator import EDGES
@@ -51,8 +52,8 @@ class Variable:
     """In the shape of ``start``, or for a grid in another resolution."""
     levels: Levels | None = None
     """Of a grid that is refined on the way."""
-    surface: Surface | None = None
-    """Of a mesh whose steps are spread over it."""
+    coordinates: Coordinates | None = None
+    """Where steps are taken, if not in the values themselves."""
     form: Form = AS_STORED
     """How Mitsuba stores it; everything here is what people see."""
 
@@ -218,14 +219,17 @@ def _variables(
             form = form_of(params, key)
             like = seen(params, key)
             start = _start(key, like, form, entry, base)
-            limits.require_learning_rate(key, rate, start, (entry.lower, entry.upper))
+            bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
+            coordinates = _coordinates(params, key, entry, start)
+            if isinstance(coordinates, Transform):
+                limits.require_learning_rate(key, rate, coordinates.latent(start))
+            else:
+                limits.require_learning_rate(key, rate, start, (entry.lower, entry.upper))
             levels = _levels(key, entry, start)
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
                 like = type(like)(start)
-            bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
-            surface = _surface(params, key, entry)
-            variables.append(Variable(key, like, bounds, rate, start, None, levels, surface, form))
+            variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, form))
             continue
         limits.require_near(scene, key, parameters.get_array(params[key]), entry)
         pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
@@ -242,7 +246,11 @@ def _variables(
     return variables, poses
 
 
-def _surface(params: mi.SceneParameters, key: str, entry: Parameter) -> Surface | None:
+def _coordinates(params: mi.SceneParameters, key: str, entry: Parameter, start: Array) -> Coordinates | None:
+    if entry.transform is not None:
+        transform = Transform(entry.transform, *(-np.inf if x is None else x for x in (entry.lower, entry.upper)))
+        transform.require_inside(key, start)
+        return transform
     if entry.smooth is None:
         return None
     owner, _, name = key.rpartition(".")

@@ -19,7 +19,12 @@ Array = NDArray[np.float32]
 
 
 class Surface:
-    """Of a mesh by its vertices (3 n numbers) and faces (3 m). Vertices in one place are one, so that no seam opens."""
+    """Of a mesh by its vertices (3 n numbers) and faces (3 m): `Coordinates`.
+
+    Vertices in one place are one, so that no seam opens.
+    """
+
+    uniform = True
 
     def __init__(self, positions: Array, faces: NDArray[np.integer], smooth: float) -> None:
         points, copies = np.unique(positions.reshape(-1, 3), axis=0, return_inverse=True)
@@ -33,22 +38,22 @@ class Surface:
         self._matrix = (scipy.sparse.identity(n) + smooth * laplacian).tocsc()
         self._solver = scipy.sparse.linalg.splu(self._matrix)
 
-    def latent(self, positions: Array) -> Array:
+    def latent(self, values: Array) -> Array:
         """u of v."""
         points = np.zeros((self._matrix.shape[0], 3))
-        points[self._copies] = positions.reshape(-1, 3)
+        points[self._copies] = values.reshape(-1, 3)
         return self._spread(self._matrix @ points)
 
-    def positions(self, latent: Array) -> Array:
+    def values(self, latent: Array) -> Array:
         """v of u."""
         points = np.zeros((self._matrix.shape[0], 3))
         points[self._copies] = latent.reshape(-1, 3)
         return self._spread(self._solver.solve(points))
 
-    def gradient(self, by_positions: Array) -> Array:
+    def gradient(self, values: Array, by_values: Array) -> Array:
         """The derivative by u, of that by v; all copies of a vertex have the same, which is that of their common u."""
         total = np.zeros((self._matrix.shape[0], 3))
-        np.add.at(total, self._copies, by_positions.reshape(-1, 3))
+        np.add.at(total, self._copies, by_values.reshape(-1, 3))
         return self._spread(self._solver.solve(total))
 
     def _spread(self, points: NDArray[np.float64]) -> Array:
