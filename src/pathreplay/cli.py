@@ -146,14 +146,28 @@ def optimize(
         Path | None, typer.Option(metavar="RUN_FOLDER", help="Go on with an unfinished run instead.")
     ] = None,
     output: Annotated[Path | None, typer.Option(help="Run folder to make; default: runs/<name of the config>.")] = None,
+    define: Annotated[
+        list[str] | None,
+        typer.Option("--define", "-D", metavar="KEY=VALUE", help="Change the job, as in -D spp=32; may be repeated."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on the screen.")] = False,
 ) -> None:
     """Recover scene parameters from pictures; Ctrl-C or SIGTERM ends early with everything written."""
     with interrupts.undisturbed():  # what is half imported can bring the process down at its end
         from pathreplay.inverse import optimize as run_job
 
-    result = run_job(config, resume=resume, output=output, progress=not quiet)
+    result = run_job(config, resume=resume, output=output, progress=not quiet, define=define or ())
     typer.echo(result.describe())
+
+
+@app.command(short_help="Print the JSON schema of a job.")
+def schema() -> None:
+    """Print the JSON schema of a job: editors complete and check configs with it."""
+    import json
+
+    from pathreplay.inverse.config import Config
+
+    typer.echo(json.dumps(Config.model_json_schema(), indent=2))
 
 
 _CHECKOUT = Path(__file__).resolve().parents[2]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import MISSING, file_problem
 from pathreplay.inverse.config_errors import first_error
+from pathreplay.inverse.definitions import defined
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.pose import PARTS, PoseKind
 from pathreplay.inverse.schedules import Schedule
@@ -232,8 +234,8 @@ _TABLES: dict[str, type[BaseModel]] = {
 }
 
 
-def load_config(path: Path) -> Config:
-    """Read a job from a TOML file (or from the JSON that a run folder may hold).
+def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
+    """Read a job from a TOML file (or from the JSON that a run folder may hold); for ``changes`` see `defined`.
 
     Raises PathreplayError for an unreadable file, an unknown key (names the nearest), a value out of its range.
     """
@@ -249,9 +251,11 @@ def load_config(path: Path) -> Config:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise PathreplayError(f"Config {path} cannot be read ({error}); give a TOML file in UTF-8") from None
-    if path.suffix == ".json":
+    if path.suffix != ".json":
+        return _checked(str(path), Config.model_validate, defined(_toml(path, text), changes))
+    if not changes:
         return _checked(str(path), Config.model_validate_json, text)
-    return _checked(str(path), Config.model_validate, _toml(path, text))
+    return _checked(str(path), Config.model_validate, defined(_json(path, text), changes))
 
 
 def _toml(path: Path, text: str) -> dict[str, Any]:
@@ -263,6 +267,13 @@ def _toml(path: Path, text: str) -> dict[str, Any]:
         raise PathreplayError(f"Config {path} is not valid TOML: {error}; mend it there") from None
     except ValueError:
         raise PathreplayError(f"Config {path} has a number of more digits than Python reads; shorten it") from None
+
+
+def _json(path: Path, text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise PathreplayError(f"Config {path} is not valid JSON: {error}; mend it there") from None
 
 
 def make_config(values: dict[str, Any]) -> Config:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -31,6 +31,7 @@ def optimize(
     resume: str | Path | None = None,
     output: str | Path | None = None,
     progress: bool = True,
+    define: Sequence[str] = (),
 ) -> RunResult:
     """Recover the parameters that a job names, and write its run folder.
 
@@ -40,6 +41,7 @@ def optimize(
         output: run folder to make; the default is the config's ``output``, else ``runs/<name of the config>``. Where it
             exists, a number is appended: an earlier run is never touched.
         progress: draw a progress bar on stderr (lines, now and then, where that is no terminal).
+        define: changes of what the file says, each ``KEY=VALUE`` (see docs/optimize.md).
 
     The first Ctrl-C, SIGTERM or SIGHUP ends the run after the current iteration with everything written; a Ctrl-C after
     that aborts (KeyboardInterrupt). Until the run folder is there, signals do what they did before. With
@@ -50,7 +52,7 @@ def optimize(
             folder that is in use, damaged, or vanishes.
     """
     try:
-        return _run(*_started(config, resume, output), progress)
+        return _run(*_started(config, resume, output, tuple(define)), progress)
     finally:
         # Python finds the scene only by its collector, and Dr.Jit traces calls through every scene that is alive.
         gc.collect()
@@ -131,12 +133,14 @@ def _went_on(folder: RunFolder, config: Config, problem: Problem, run: Run) -> d
 
 
 def _started(
-    config: str | Path | Config | None, resume: str | Path | None, output: str | Path | None
+    config: str | Path | Config | None, resume: str | Path | None, output: str | Path | None, changes: tuple[str, ...]
 ) -> tuple[Job, Path, RunFolder | None]:
     """The job, where its run folder shall be, and the one that is gone on with."""
     if resume is not None:
-        if config is not None or output is not None:
-            raise PathreplayError("--resume takes config and output from the run folder; leave CONFIG and --output out")
+        if config is not None or output is not None or changes:
+            raise PathreplayError(
+                "--resume takes config and output from the run folder; leave CONFIG, --output and -D out"
+            )
         job, folder = open_run_folder(Path(resume))
         return job, folder.path, folder
     if config is None:
@@ -146,7 +150,9 @@ def _started(
             f"config is a {type(config).__name__}; give the path of a TOML file, or make_config of a dictionary"
         )
     if isinstance(config, Config):
+        if changes:
+            raise PathreplayError("define changes what a file says; give make_config the values that you want")
         job = Job(config, None, Path.cwd())
     else:
-        job = Job(load_config(Path(config)), Path(config), Path(config).parent)
+        job = Job(load_config(Path(config), changes), Path(config), Path(config).parent, changes)
     return job, new_output(job.config.output if output is None else output, job.source), None

@@ -165,6 +165,7 @@ class Outcome:
 
     config: Config
     source: Path | None
+    changes: tuple[str, ...]
     folder: Path
     views: tuple[ViewPictures, ...]
     recovered: tuple[Recovered, ...]
@@ -179,7 +180,8 @@ class Outcome:
         if len(self.run.history) < self.config.iterations:
             return resume_command(self.folder)
         job = self.folder / "config.json" if self.source is None else self.source
-        return f"pathreplay optimize {shlex.quote(str(job))}"
+        changes = "".join(f" -D {shlex.quote(change)}" for change in self.changes)
+        return f"pathreplay optimize {shlex.quote(str(job))}{changes if self.source else ''}"
 
     def names(self) -> tuple[str, str]:
         """What the job and its rival are called: their integrators; a run against itself has one name twice."""

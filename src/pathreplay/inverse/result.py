@@ -93,7 +93,7 @@ def outcome_of(
         for v in problem.variables
         if v.key in problem.params
     )
-    return Outcome(job.config, job.source, folder, views, recovered, poses, run, values, problem.notes)
+    return Outcome(job.config, job.source, job.changes, folder, views, recovered, poses, run, values, problem.notes)
 
 
 def result_files(outcome: Outcome) -> dict[str, bytes]:

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -26,11 +27,15 @@ RIVAL_CHECKPOINT = "rival/checkpoint.safetensors"
 
 @dataclass(frozen=True)
 class Job:
-    """What a run does, the file that says so (None where Python does), and the folder where its paths start."""
+    """What a run does, the file that says so (None where Python does), and the folder where its paths start.
+
+    ``changes`` are those that the command line made to the file.
+    """
 
     config: Config
     source: Path | None
     base: Path
+    changes: tuple[str, ...] = ()
 
 
 class RunFolder:
@@ -108,14 +113,19 @@ class RunFolder:
 def create_run_folder(output: Path, job: Job, files: Mapping[str, bytes]) -> RunFolder:
     """Make ``output``, or ``output-2``, ``-3``, … where that exists, and put the job and its first files into it.
 
-    The config is copied as it was written (``config.toml``), or as JSON where it came from Python. What fails leaves no
+    The config is copied as it was written (``config.toml``), or as JSON where it came from Python, or was changed. What fails leaves no
     folder behind. Raises PathreplayError where the folder cannot be made or written.
     """
-    if job.source is not None and job.source.suffix != ".json":
+    if job.source is not None and job.source.suffix != ".json" and not job.changes:
         copy = {"config.toml": job.source.read_bytes()}
     else:
         copy = {"config.json": job.config.model_dump_json(indent=2, exclude_unset=True).encode()}
-    origin = {"base": str(job.base.resolve()), "config": None if job.source is None else str(job.source)}
+    origin: dict[str, Any] = {
+        "base": str(job.base.resolve()),
+        "config": None if job.source is None else str(job.source),
+    }
+    if job.changes:
+        origin["changes"] = list(job.changes)
     with undisturbed(), contextlib.ExitStack() as undo:
         path = _make_new(output)
         undo.callback(shutil.rmtree, path, ignore_errors=True)
@@ -127,12 +137,13 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, bytes]) -> Run
 
 
 class _Origin(BaseModel):
-    """run.json: where relative paths of the config start, and the config that the run was started with."""
+    """run.json: where relative paths of the config start, the config that the run was started with, and `changes`."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
     base: str
     config: str | None
+    changes: list[str] = []
 
 
 def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
@@ -155,7 +166,8 @@ def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
     except (OSError, ValueError) as error:
         what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
         raise PathreplayError(f"{path / 'run.json'} cannot be used ({what}); start the job from its config") from None
-    job = Job(load_config(copy), None if origin.config is None else Path(origin.config), Path(origin.base))
+    source = None if origin.config is None else Path(origin.config)
+    job = Job(load_config(copy), source, Path(origin.base), tuple(origin.changes))
     return job, RunFolder(path)
 
 

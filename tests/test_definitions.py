@@ -1,0 +1,96 @@
+"""What `-D KEY=VALUE` does to a job, and the schema by which editors know one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from pathreplay.cli import app
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse import load_config, optimize
+from pathreplay.inverse.definitions import defined
+from test_steps import JOB, SCENE
+
+TABLE: dict[str, Any] = {"scene": "a.xml", "spp": 16, "parameters": [{"key": "a"}, {"key": "b", "lower": 0.0}]}
+GIVEN = {
+    "spp=32": {"spp": 32},
+    "scene=rooms/b c.xml": {"scene": "rooms/b c.xml"},
+    'scene="16"': {"scene": "16"},
+    "integrator.max_depth=3": {"integrator": {"max_depth": 3}},
+    "parameters.1.lower=0.5": {"parameters": [{"key": "a"}, {"key": "b", "lower": 0.5}]},
+    "parameters=[]": {"parameters": []},
+    'target.values."wall.bsdf.reflectance.value"=[0.1, 0.2, 0.3]': {
+        "target": {"values": {"wall.bsdf.reflectance.value": [0.1, 0.2, 0.3]}}
+    },
+    "deterministic=true": {"deterministic": True},
+    "output=": {"output": ""},
+    "loss=a=b": {"loss": "a=b"},
+    "scene=1979-05-27": {"scene": "1979-05-27"},
+}
+
+
+@pytest.mark.parametrize("change", GIVEN)
+def test_a_change_goes_where_it_says(change: str) -> None:
+    before = json.dumps(TABLE)
+    assert defined(TABLE, [change]) == {**TABLE, **GIVEN[change]}
+    assert json.dumps(TABLE) == before
+
+
+def test_the_last_change_counts() -> None:
+    assert defined(TABLE, ["spp=1", "spp=2"])["spp"] == 2
+
+
+REFUSED = {
+    "spp": "has no '='",
+    "=3": "names no key",
+    "a b=3": "names no key",
+    "a\nb=2": "names no key",
+    "parameters.2.key=c": "no place in a list of 2",
+    "parameters.first.key=c": "no place in a list of 2",
+    "spp.x=1": "no table",
+}
+
+
+@pytest.mark.parametrize("change", REFUSED)
+def test_what_leads_nowhere_is_refused_in_one_line(change: str) -> None:
+    with pytest.raises(PathreplayError) as told:
+        defined(TABLE, [change])
+    assert REFUSED[change] in str(told.value) and "\n" not in str(told.value)
+
+
+@pytest.fixture
+def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "room.xml").write_text(SCENE)
+    path = tmp_path / "job.json"
+    path.write_text(json.dumps(JOB))
+    return path
+
+
+def test_changes_are_checked_like_the_file(job: Path) -> None:
+    assert load_config(job, ["spp=2"]).spp == 2
+    with pytest.raises(PathreplayError, match="unknown key 'sppp'; did you mean 'spp'"):
+        load_config(job, ["sppp=2"])
+
+
+def test_a_run_remembers_its_changes(job: Path) -> None:
+    result = optimize(job, output="run", progress=False, define=["iterations=2", "loss=l1"])
+    assert result.iterations == 2
+    assert load_config(result.folder / "config.json").loss == "l1"
+    assert "job.json -D iterations=2 -D loss=l1" in result.report.read_text()
+    with pytest.raises(PathreplayError, match="leave CONFIG, --output and -D out"):
+        optimize(resume=result.folder, progress=False, define=["iterations=4"])
+
+
+def test_the_schema_says_what_a_job_may_be() -> None:
+    told = CliRunner().invoke(app, ["schema"])
+    schema = json.loads(told.stdout)
+    assert told.exit_code == 0
+    assert set(schema["required"]) == {"scene", "parameters", "target"}
+    optimizer = schema["$defs"]["Optimizer"]["properties"]
+    assert optimizer["type"]["enum"] == ["adam", "adamw", "sgd", "rmsprop"]
+    assert schema["additionalProperties"] is False
