@@ -65,6 +65,6 @@ def _put(table: Any, path: list[str], value: Any, option: str) -> Any:
         return [_put(each, rest, value, option) if i == int(name) else each for i, each in enumerate(table)]
     if not isinstance(table, dict):
         raise PathreplayError(
-            f"{option}: '{shown(name)}' is asked of {shown(table)}, which is no table; see the config"
+            f"{option}: '{shown(name)}' is asked of {shown(table)}, which is no table; correct the key"
         )
     return {**table, name: _put(table.get(name, {}), rest, value, option)}

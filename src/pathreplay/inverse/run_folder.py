@@ -113,8 +113,8 @@ class RunFolder:
 def create_run_folder(output: Path, job: Job, files: Mapping[str, bytes]) -> RunFolder:
     """Make ``output``, or ``output-2``, ``-3``, … where that exists, and put the job and its first files into it.
 
-    The config is copied as it was written (``config.toml``), or as JSON where it came from Python, or was changed. What fails leaves no
-    folder behind. Raises PathreplayError where the folder cannot be made or written.
+    The config is copied as it was written (``config.toml``), or as JSON where it came from Python or was changed. What
+    fails leaves no folder behind. Raises PathreplayError where the folder cannot be made or written.
     """
     if job.source is not None and job.source.suffix != ".json" and not job.changes:
         copy = {"config.toml": job.source.read_bytes()}
