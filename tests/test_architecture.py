@@ -300,7 +300,7 @@ def test_an_executor_gives_what_the_local_one_gives(skeleton: Load) -> None:
     def evaluator() -> tuple[Evaluator, dict[str, np.ndarray]]:
         config = make_config({**JOB, "integrator": {"type": "pathreplay", "max_depth": 3}})
         problem = build_problem(config, Path.cwd())
-        return Evaluator(problem, problem.integrator, record=False), new_run(problem, config, problem.integrator).values
+        return Evaluator(problem, problem.integrator, record=False), new_run(problem, problem.integrator).values
 
     shards = [Shard((0,), 4, (1,)), Shard((1,), 4, (2,)), Shard((0, 1), 4, (3, 4))]
     evaluators, values = zip(*(evaluator() for _ in range(2)), strict=True)

@@ -75,9 +75,9 @@ def _run(job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> R
         problem = build_problem(config, job.base, None if resumed is None else saved_targets(resumed.path))
         for note in problem.notes:
             bar.note(note)
-        run = new_run(problem, config, problem.integrator)
+        run = new_run(problem, problem.integrator, not config.deterministic, config.optimizer)
         if problem.rival is not None:
-            run.rival = new_run(problem, config, problem.rival)
+            run.rival = new_run(problem, problem.rival, not config.deterministic, config.optimizer)
         if resumed is None:
             folder, before = _begun(output, job, problem, run)
             stack.callback(folder.lock.close)

@@ -18,6 +18,7 @@ from pathreplay.inverse.evaluate import Evaluator, Local, Shard, total
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.optimiser import DrJitOptimiser
+from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.problem import Problem, pose_errors, put_values
 from pathreplay.inverse.schedules import rate
 from pathreplay.inverse.values import Array, Arrays
@@ -60,13 +61,15 @@ class Stopped:
 Event = Started | Refined | Stepped | Stopped
 
 
-def new_run(problem: Problem, config: Config, integrator: mi.Integrator) -> Run:
+def new_run(
+    problem: Problem, integrator: mi.Integrator, record: bool = True, optimizer: Optimizer | None = None
+) -> Run:
     """A run at the problem's start values, in this process."""
     values = {v.key: get_array(to_value(v.like, v.start)) for v in problem.variables}
     return Run(
-        Local(Evaluator(problem, integrator, record=not config.deterministic)),
+        Local(Evaluator(problem, integrator, record)),
         DrJitOptimiser(
-            values, config.optimizer, [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
+            values, optimizer, [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
         ),
         values,
     )
