@@ -13,7 +13,7 @@ from pathreplay import backend
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import images, load_config, make_config
 from pathreplay.inverse.grids import resampled
-from pathreplay.inverse.losses import LOSSES, RELATIVE_FLOOR, find_loss
+from pathreplay.inverse.losses import LOSSES, RELATIVE_FLOOR, find_loss, mean_loss
 from pathreplay.inverse.values import make_value
 from pathreplay.media.volume_files import save_vol
 from pathreplay.threads import spare_thread
@@ -40,7 +40,7 @@ def test_loss_and_its_gradient_follow_the_formula(name: str) -> None:
     image = target + rng.choice([-1, 1], target.shape) * rng.uniform(0.02, 0.09, target.shape)  # away from l1's kink
     x = mi.TensorXf(image.astype(np.float32))
     dr.enable_grad(x)
-    loss = find_loss(name)(x, mi.TensorXf(target.astype(np.float32)))
+    loss = mean_loss(find_loss(name), x, mi.TensorXf(target.astype(np.float32)))
     dr.backward(loss)
     assert loss.array[0] == pytest.approx(FORMULAS[name](image, target), rel=1e-4)
     step = np.zeros_like(image)

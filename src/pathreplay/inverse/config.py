@@ -145,6 +145,8 @@ class Target(Table):
     """What the pictures should look like: image files, one per sensor, or a scene to render."""
 
     images: list[str] | None = None
+    masks: list[str] | None = None
+    alpha: Literal["black", "mask"] = "black"
     scene: str | None = None
     scene_parameters: dict[str, Argument] | None = None
     values: dict[str, Value] = Field(default_factory=dict)
@@ -154,11 +156,15 @@ class Target(Table):
     @model_validator(mode="after")
     def _one_source(self) -> Target:
         if self.images is not None:
-            extra = sorted(self.model_fields_set - {"images"})
+            extra = sorted(self.model_fields_set - {"images", "masks", "alpha"})
             if extra:
                 raise ValueError(f"target: 'images' excludes '{extra[0]}'; give image files or a scene to render")
             if not self.images:
                 raise ValueError("target: 'images' is empty; name one image file per sensor")
+            if self.masks is not None and self.alpha == "mask":
+                raise ValueError("target: 'masks' and alpha = 'mask' are two masks; leave one out")
+        elif self.alpha == "mask":
+            raise ValueError("target: alpha = 'mask' is about 'images'; leave it out, or name them")
         elif not self.values and self.scene is None:
             raise ValueError("target: nothing to match; give 'images', or 'values' and/or 'scene' to render")
         if self.integrator.type == "pathreplay":
@@ -178,6 +184,7 @@ class Config(Table):
     scene: str
     scene_parameters: dict[str, Argument] = Field(default_factory=dict)
     sensors: list[Whole | str] | None = None
+    held_out: list[Whole | str] = Field(default_factory=list)
     variant: str | None = None
     integrator: Plugin = Plugin(type="pathreplay")
     rival: Plugin | None = None

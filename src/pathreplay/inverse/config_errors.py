@@ -28,6 +28,7 @@ _KINDS = {
     "values": "a number, a list of numbers, the name of an image or volume file, or { image = ... }",
     "scene_parameters": "a number, true, false or a text in quotes",
     "sensors": "the names or numbers of sensors: [0, ...]",
+    "held_out": "the names or numbers of sensors: [0, ...]",
 }
 
 

@@ -32,9 +32,10 @@ class Shard:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a shard adds to the loss (the mean over all views) and to its gradient, by key; and what is known after it.
+    """What a shard adds to the loss (the mean over views that are learned from) and to its gradient, by key.
 
-    Unbiased for the losses in `QUADRATIC`; the loss itself carries the variance of the pictures on top.
+    And what is known after it. Unbiased for the losses in `QUADRATIC`; the loss itself carries the variance of the
+    pictures on top.
     """
 
     loss: float
@@ -95,6 +96,7 @@ class Evaluator:
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
         self.freezes = record and is_recordable(integrator, facts.has_media)
         self._targets = [mi.TensorXf(view.target) for view in problem.views]
+        self._weights = [None if view.weight is None else mi.TensorXf(view.weight) for view in problem.views]
         self._tables = facts.traits().tables
         self._recordings = Recordings()
         self._sweeps: dict[int, bool] = {}  # of each view that was seen: whether its pixels can be swept
@@ -149,11 +151,11 @@ class Evaluator:
             self._sweeps[view] = may and bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
-        share = 1 / len(problem.views)
+        share = 1 / len(problem.trained())
         with plain_errors():
             value, lost = (self._recordings.differentiate if records else differentiate)(
-                problem.params, problem.scene, sensor, self.integrator, target, number, spp, problem.loss, share,
-                self._sweeps[view], self._tables,
+                problem.params, problem.scene, sensor, self.integrator, target, self._weights[view], number, spp,
+                problem.loss, share, self._sweeps[view], self._tables,
             )  # fmt: skip
         if lost is not None:
             self.integrator.tell_lost(lost, target.shape[0] * target.shape[1] * spp)

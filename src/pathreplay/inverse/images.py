@@ -81,6 +81,15 @@ def over_black(image: Image, path: Path) -> Image:
     return np.concatenate([image[:, :, :-1] * image[:, :, -1:], image[:, :, -1:]], axis=2)
 
 
+def unpremultiplied(image: Image, path: Path) -> Image:
+    """The colours of an image with alpha as if it were opaque; EXR files hold them times alpha. Alpha stays."""
+    if image.shape[2] not in (2, 4) or path.suffix.lower() != ".exr":
+        return image
+    alpha = image[:, :, -1:]
+    colours = np.divide(image[:, :, :-1], alpha, out=np.zeros_like(image[:, :, :-1]), where=alpha > 0)
+    return np.concatenate([colours, alpha], axis=2)
+
+
 def transparent_share(image: Image) -> float:
     """The share of pixels through which a background would be seen; 0 without alpha."""
     return float((image[:, :, -1] < 1).mean()) if image.shape[2] in (2, 4) else 0.0
@@ -130,6 +139,11 @@ def png_bytes(image: Image, exposure: float = 1.0) -> bytes:
     stream = mi.MemoryStream()
     bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(stream, mi.Bitmap.FileFormat.PNG)
     return bytes(stream.raw_buffer())
+
+
+def encoded(linear: NDArray[np.floating]) -> NDArray[np.floating]:
+    """sRGB of linear radiance, both from 0 to 1."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
 
 
 def exposure_for(image: Image) -> float:

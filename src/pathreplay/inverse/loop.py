@@ -117,7 +117,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     # The last view first: what is learned of media depends on the order, and earlier versions had this one.
     shards = [
         Shard((n,), config.spp, config.seeds(ITERATION, view.sensor, i)[:1])
-        for n, view in reversed(list(enumerate(problem.views)))
+        for n, view in reversed(problem.trained().items())
     ]
     found = total(run.executor.run(run.values, shards, run.learned))
     if not np.isfinite(found.loss):
@@ -162,17 +162,17 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
     """Root mean square error of the pictures with these values in the scene, without the noise of rendering them.
 
     With two independent renderings A and B of a view, E[(A - T)(B - T)] = (I - T)², where a square would add the
-    variance; the mean over pixels and views is taken before the root (negative ones count as zero). The noise of the
-    targets stays in.
+    variance; the mean over pixels and views that are learned from is taken before the
+    root (negative ones count as zero). The noise of the targets stays in.
     """
     put_values(problem, values)
-    total = 0.0
-    for view in problem.views:
+    total, views = 0.0, problem.trained().values()
+    for view in views:
         a, b = (
             _picture(problem, view.sensor, problem.judge, config.spp, seed).astype(np.float64) - view.target
             for seed in config.seeds(JUDGEMENT, view.sensor, iteration)
         )
-        total += float(np.mean(a * b)) / len(problem.views)
+        total += float(np.mean(a * b if view.weight is None else a * b * view.weight)) / len(views)
     return float(np.sqrt(max(total, 0.0)))
 
 

@@ -1,48 +1,52 @@
-"""Loss functions: how far a rendered picture is from its target, as one number with a derivative.
+"""Loss functions: how far a rendered picture is from its target, with a derivative.
 
-Every loss is the mean over pixels and channels of f(I, T), with I the rendered picture (noisy, differentiable) and T
-the target. No path is judged by itself (see `recorded`), hence a loss whose f' is linear in I has an unbiased gradient:
-``l2`` and ``relative-l2``. The gradients of ``l1`` and ``log`` are biased by the noise in I (less with more samples);
-they pay where outliers would rule ``l2``.
+A loss is f(I, T), entry by entry, with I the rendered picture (noisy, differentiable) and T the target; what counts is
+its mean over pixels and channels, or over those that a weight leaves. No path is judged by itself (see `recorded`),
+hence a loss whose f' is linear in I has an unbiased gradient: ``l2`` and ``relative-l2``. The gradients of ``l1`` and
+``log`` are biased by the noise in I (less with more samples); they pay where outliers would rule ``l2``.
 """
 
 from __future__ import annotations
 
 import difflib
+import importlib
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.errors import PathreplayError
+from pathreplay.errors import PathreplayError, shown
+from pathreplay.scenes.descriptions import one_line
 
 Loss = Callable[[Any, Any], Any]
-"""loss(image, target) on tensors of one shape (height, width, channels) -> tensor of one number."""
+"""loss(image, target) on tensors of one shape (height, width, channels) -> such a tensor (or one number)."""
 
 # Radiance below which relative-l2 stops amplifying: about 1 % of a display's white.
 RELATIVE_FLOOR = 1e-2
 
 
 def l1(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """mean |I - T|. Gradient biased by noise in I."""
-    return dr.mean(dr.abs(image - target), axis=None)
+    """|I - T|. Gradient biased by noise in I."""
+    return dr.abs(image - target)
 
 
 def l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """mean (I - T)^2. Gradient unbiased; the value carries the variance of I on top."""
-    return dr.mean(dr.square(image - target), axis=None)
+    """(I - T)^2. Gradient unbiased; the value carries the variance of I on top."""
+    return dr.square(image - target)
 
 
 def relative_l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """mean ((I - T) / (T + floor))^2, so that dark parts count. Divides by the target, hence unbiased like ``l2``."""
-    return dr.mean(dr.square((image - target) / (dr.abs(target) + RELATIVE_FLOOR)), axis=None)
+    """((I - T) / (T + floor))^2, so that dark parts count. Divides by the target, hence unbiased like ``l2``."""
+    return dr.square((image - target) / (dr.abs(target) + RELATIVE_FLOOR))
 
 
 def log(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """mean (log(1 + I) - log(1 + T))^2, for pictures with very bright spots. Gradient biased by noise in I."""
+    """(log(1 + I) - log(1 + T))^2, for pictures with very bright spots. Gradient biased by noise in I."""
     positive = dr.maximum(image, 0)
-    return dr.mean(dr.square(dr.log(1 + positive) - dr.log(1 + dr.maximum(target, 0))), axis=None)
+    return dr.square(dr.log(1 + positive) - dr.log(1 + dr.maximum(target, 0)))
 
 
 #: Losses whose derivative by a pixel is a linear function of that pixel alone.
@@ -51,10 +55,55 @@ QUADRATIC = frozenset({l2, relative_l2})
 LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "relative-l2": relative_l2, "log": log}
 
 
-def find_loss(name: str) -> Loss:
-    """The loss called ``name``; raises PathreplayError with the nearest name and the list."""
+def mean_loss(loss: Loss, image: Any, target: Any, weight: Any = None) -> mi.TensorXf:
+    """The mean of a loss over pixels and channels, as a tensor of one number.
+
+    ``weight`` (height x width x 1, with mean 1) says how much pixels count; None: all the same.
+    """
+    found = loss(image, target)
+    return dr.mean(found if weight is None else found * weight, axis=None)
+
+
+def find_loss(name: str, base: Path | None = None) -> Loss:
+    """The loss called ``name``, or ``module:function``, whose module may be in the folder ``base``.
+
+    Raises PathreplayError with the nearest name and the list, or why there is no such function.
+    """
     if name in LOSSES:
         return LOSSES[name]
+    module, colon, function = name.partition(":")
+    if colon:
+        return _imported(name, module, function, base)
     close = difflib.get_close_matches(name, LOSSES, n=1)
     hint = f"; did you mean '{close[0]}'?" if close else ""
-    raise PathreplayError(f"No loss '{name}'{hint} (losses: {', '.join(LOSSES)})")
+    raise PathreplayError(f"No loss '{name}'{hint} (losses: {', '.join(LOSSES)}, or module:function)")
+
+
+def _imported(name: str, module: str, function: str, base: Path | None) -> Loss:
+    before = list(sys.path)
+    if base is not None:
+        sys.path.insert(0, str(base.resolve()))
+    try:
+        found = getattr(importlib.import_module(module), function)
+    except Exception as error:  # whatever the module does when it is imported
+        why = one_line(error) or type(error).__name__
+        raise PathreplayError(f"Loss '{name}' cannot be imported ({why}); write module:function") from None
+    finally:
+        sys.path[:] = before
+    if not callable(found):
+        raise PathreplayError(f"Loss '{name}' is no function of image and target, but {shown(found)}; name another")
+
+    def loss(image: Any, target: Any) -> Any:
+        try:
+            value = mi.TensorXf(found(image, target))
+        except Exception as error:  # whatever the function does
+            why = one_line(error) or type(error).__name__
+            raise PathreplayError(f"Loss '{name}' cannot be computed ({why}); mend it, or name another") from error
+        if value.shape not in (image.shape, ()):
+            raise PathreplayError(
+                f"Loss '{name}' gives the shape {value.shape} for pictures of {image.shape}; return a tensor like the "
+                "image, or one number"
+            )
+        return value
+
+    return loss

@@ -13,6 +13,7 @@ from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.grids import matched, rmse, slices
 from pathreplay.inverse.images import Image, difference
+from pathreplay.inverse.likeness import Likeness
 from pathreplay.inverse.pose import Pose, PoseError, error_names
 from pathreplay.inverse.values import Array
 
@@ -35,14 +36,38 @@ class ViewPictures:
     result: Image
     exposure: float
     rival: Image | None = None
+    weight: Image | None = None
+    """How much pixels count, if not all the same."""
+    held_out: bool = False
+
+    def error(self, image: Image) -> float:
+        """Root mean square difference from the target, of what counts."""
+        squares = np.square(image.astype(np.float64) - self.target)
+        return float(np.sqrt(np.mean(squares if self.weight is None else squares * self.weight)))
+
+    def likeness(self, image: Image) -> Likeness:
+        """Of what counts, at the exposure of the view."""
+        return Likeness.of(image, self.target, self.exposure, self.weight)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For views.json."""
+        table: dict[str, Any] = {"held_out": self.held_out, "exposure": self.exposure}
+        for kind, image in (("result", self.result), ("start", self.start), ("rival", self.rival)):
+            if image is not None:
+                table[kind] = {"rmse": self.error(image), **asdict(self.likeness(image))}
+        return table
 
     def pictures(self) -> dict[str, Image]:
         """The pictures to show; a difference is result - target, red above and blue below, DIFFERENCE_GAIN times."""
-        gap = difference(self.result, self.target) * DIFFERENCE_GAIN
-        found = {"target": self.target, "start": self.start, "result": self.result, "difference": gap}
+        found = {"target": self.target, "start": self.start, "result": self.result}
+        found["difference"] = self._difference(self.result)
         if self.rival is None:
             return found
-        return {**found, "rival": self.rival, "rival-difference": difference(self.rival, self.target) * DIFFERENCE_GAIN}
+        return {**found, "rival": self.rival, "rival-difference": self._difference(self.rival)}
+
+    def _difference(self, image: Image) -> Image:
+        gap = difference(image, self.target) * DIFFERENCE_GAIN
+        return gap if self.weight is None else gap * (self.weight > 0)
 
 
 @dataclass(frozen=True)
@@ -174,6 +199,10 @@ class Outcome:
     values: dict[str, Array]
     """Variables as people see them, and what poses make of the scene, by key."""
     notes: tuple[str, ...]
+
+    def held_out(self) -> list[ViewPictures]:
+        """The views that were not learned from."""
+        return [view for view in self.views if view.held_out]
 
     def command(self) -> str:
         """The command line that makes this run again, or goes on with it where it was stopped."""

@@ -22,7 +22,7 @@ from pathreplay.inverse.images import Image
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.surface import Surface
-from pathreplay.inverse.targets import read_targets, rendered_targets, target_scene, truth_of
+from pathreplay.inverse.targets import Targets, read_masks, read_targets, rendered_targets, target_scene, truth_of
 from pathreplay.inverse.transforms import Coordinates, Transform
 from pathreplay.inverse.values import Array, Arrays, make_value, seen
 from pathreplay.render.edge_notes import edges_note, moves_edges
@@ -65,6 +65,10 @@ class View:
     name: str
     sensor: int
     target: Image
+    weight: Image | None = None
+    """How much pixels count (height x width x 1, with the mean 1); None: all the same."""
+    held_out: bool = False
+    """It is only looked at in the end, and never learned from."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,10 @@ class Problem:
     loss: Loss
     notes: tuple[str, ...]
     """What was done to the scene that the user should know of."""
+
+    def trained(self) -> dict[int, View]:
+        """The views that are learned from, by their place."""
+        return {n: view for n, view in enumerate(self.views) if not view.held_out}
 
 
 def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
@@ -122,13 +130,13 @@ def pose_errors(problem: Problem, values: Arrays) -> dict[str, float]:
     return found
 
 
-def build_problem(config: Config, base: Path, targets: dict[str, Image] | None = None) -> Problem:
+def build_problem(config: Config, base: Path, targets: Targets | None = None) -> Problem:
     """Load and check everything that the job names; relative paths start at ``base``.
 
-    ``targets`` (by view name) are the pictures of an earlier part of the same run; otherwise they are read or rendered.
+    ``targets`` are those of an earlier part of the same run; otherwise they are read or rendered.
     Raises PathreplayError for whatever in the job cannot work.
     """
-    loss = find_loss(config.loss)
+    loss = find_loss(config.loss, base)
     wanted = [entry.key for entry in config.parameters]
     scene, notes = load_scene_for(config.scene, wanted, base, **config.scene_parameters)
     params = mi.traverse(scene)
@@ -143,34 +151,41 @@ def build_problem(config: Config, base: Path, targets: dict[str, Image] | None =
     judge = integrator if config.target.images is not None else load_integrator(config.target.integrator.model_dump())
     # Before any target is rendered: the cheap mistakes first.
     sensors = _sensors(scene, config.sensors)
+    held_out = _held_out(scene, sensors, config)
     limits.require_visible(scene, params, keys)
     limits.require_films(scene, sensors, {"spp": config.spp, "picture_spp": config.picture_spp})
     unsolved, moved = _variables(scene, params, keys, config, base)
 
     truth: dict[str, Array] = {}
+    first = targets is None
     if config.target.images is None:
         other = target_scene(config, base)
         truth = truth_of(other, params, keys)
         if targets is None:
             with one_thread(config.deterministic):
-                targets = rendered_targets(config, other, sensors)
+                targets = Targets(rendered_targets(config, other, sensors), {})
         # Dr.Jit traces calls through every instance alive: the target scene would be in all our kernels.
         del other
         gc.collect()
     elif targets is None:
-        targets, transparent = read_targets(config.target.images, scene, sensors, base)
+        targets, transparent = read_targets(config.target, scene, sensors, base)
         notes += transparent
+    if first and config.target.masks is not None:
+        targets = replace(targets, weights=read_masks(config.target.masks, scene, sensors, base))
 
-    if missing := set(sensors) - set(targets):
+    if missing := set(sensors) - set(targets.images):
         raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
-    for name, target in targets.items():
-        limits.require_finite_loss(loss, name, target)
+    views = tuple(
+        View(name, index, targets.images[name], targets.weights.get(name), name in held_out)
+        for name, index in sensors.items()
+    )
+    for view in views:
+        limits.require_finite_loss(loss, view)
     variables = tuple(replace(variable, truth=truth.get(variable.key)) for variable in unsolved)
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in moved)
     # Traversed anew: an object from which values were read expects all its keys at the next update().
     params = mi.traverse(scene)
     parameters.keep_only(params, keys)
-    views = tuple(View(name, index, targets[name]) for name, index in sensors.items())
     return Problem(scene, params, integrator, rival, judge, variables, poses, views, loss, notes)
 
 
@@ -301,12 +316,29 @@ def _sensors(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int]:
     names = list(file_names(names).values())
     if wanted is None:
         return {name: i for i, name in enumerate(names)}
-    chosen: dict[str, int] = {}
-    for item in wanted:
-        index = next((each.index(item) for each in (ids, names) if item in each), item)
-        if not isinstance(index, int) or not 0 <= index < len(names):
-            raise PathreplayError(f"No sensor {item!r} in the scene; it has {', '.join(names)} (0 to {len(names) - 1})")
-        chosen[names[index]] = index
+    chosen = {names[index]: index for index in (_place(item, ids, names) for item in wanted)}
     if not chosen:
         raise PathreplayError("'sensors' is empty; name one, or leave the key out for all of them")
     return chosen
+
+
+def _place(item: int | str, ids: list[str], names: list[str]) -> int:
+    """The index of a sensor that is named, or given by its number."""
+    index = next((each.index(item) for each in (ids, names) if item in each), item)
+    if not isinstance(index, int) or not 0 <= index < len(names):
+        raise PathreplayError(f"No sensor {item!r} in the scene; it has {', '.join(names)} (0 to {len(names) - 1})")
+    return index
+
+
+def _held_out(scene: mi.Scene, sensors: dict[str, int], config: Config) -> set[str]:
+    """The names of the views that are not learned from."""
+    everywhere = _sensors(scene, None)
+    ids = [sensor.id() for sensor in scene.sensors()]
+    places = {_place(item, ids, list(everywhere)) for item in config.held_out}
+    found = {name for name, index in sensors.items() if index in places}
+    if len(found) < len(places):
+        other = next(name for name, index in everywhere.items() if index in places and name not in found)
+        raise PathreplayError(f"held_out: sensor '{other}' is not among 'sensors'; add it there, or leave it out here")
+    if len(found) == len(sensors):
+        raise PathreplayError("held_out names every sensor of the job; leave one to learn from")
+    return found

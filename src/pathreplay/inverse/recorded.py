@@ -15,7 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.inverse.losses import Loss
+from pathreplay.inverse.losses import Loss, mean_loss
 from pathreplay.render.facts import Tables
 from pathreplay.scenes.parameters import keep_only
 
@@ -80,6 +80,7 @@ def differentiate(
     sensor: int,
     integrator: mi.Integrator,
     target: mi.TensorXf,
+    weight: mi.TensorXf | None,
     seed: int | mi.UInt32,
     spp: int,
     loss: Loss,
@@ -93,12 +94,12 @@ def differentiate(
     """
     with _handed(integrator, tables):
         if sweeps:
-            offset, slope = (term * share for term in linear_derivative(loss, target))
+            offset, slope = (term * share for term in linear_derivative(loss, target, weight))
             image = integrator.render_and_backward(scene, offset, slope, scene.sensors()[sensor], seed, spp)
-            value = loss(image, target).array * share
+            value = mean_loss(loss, image, target, weight).array * share
         else:
             image = mi.render(scene, params, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
-            value = loss(image, target).array * share
+            value = mean_loss(loss, image, target, weight).array * share
             if dr.grad_enabled(value):
                 dr.backward(value)
     return dr.detach(value), integrator.take_lost() if hasattr(integrator, "take_lost") else None
@@ -117,15 +118,15 @@ def _handed(integrator: Any, tables: Tables) -> Iterator[None]:
         integrator.tables = None
 
 
-def linear_derivative(loss: Loss, target: Any) -> tuple[Any, Any]:
+def linear_derivative(loss: Loss, target: Any, weight: Any = None) -> tuple[Any, Any]:
     """Offset and slope of the derivative of a quadratic loss by the image, from two images far apart."""
     bright = 1 + dr.abs(target)
-    offset = _derivative(loss, dr.zeros(mi.TensorXf, target.shape), target)
-    return offset, (_derivative(loss, mi.TensorXf(bright), target) - offset) / bright
+    offset = _derivative(loss, dr.zeros(mi.TensorXf, target.shape), target, weight)
+    return offset, (_derivative(loss, mi.TensorXf(bright), target, weight) - offset) / bright
 
 
-def _derivative(loss: Loss, image: Any, target: Any) -> Any:
+def _derivative(loss: Loss, image: Any, target: Any, weight: Any) -> Any:
     """Derivative of a loss by the image, a tensor like it."""
     dr.enable_grad(image)
-    dr.backward(loss(image, target))
+    dr.backward(mean_loss(loss, image, target, weight))
     return dr.grad(image)

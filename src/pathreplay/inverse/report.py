@@ -17,8 +17,7 @@ import PIL.Image
 from matplotlib.figure import Figure
 
 from pathreplay.inverse.checkpoint import Entry
-from pathreplay.inverse.grids import rmse
-from pathreplay.inverse.images import Image, png_bytes
+from pathreplay.inverse.images import Image, encoded, png_bytes
 from pathreplay.inverse.outcome import Contestant, Outcome
 from pathreplay.inverse.pose import error_names
 
@@ -49,7 +48,6 @@ def report_files(outcome: Outcome) -> dict[str, bytes]:
         data_uri=lambda image, exposure=1.0: _uri("image/png", png_bytes(image, exposure)),
         curves={name: _uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves},
         contestants=contestants,
-        rmse=rmse,
         versions=versions(),
     )
     return {"report.html": html.encode(), **drawings, "summary.png": summary(outcome)}
@@ -155,17 +153,12 @@ def versions() -> dict[str, str]:
 def swatch(values: list[float]) -> str:
     """A CSS colour for linear RGB; brighter than white is scaled to full brightness, hue kept."""
     colour = np.array(values, dtype=np.float32).clip(min=0)
-    return "#" + "".join(f"{round(float(c) * 255):02x}" for c in _encoded(colour / max(1.0, float(colour.max()))))
+    return "#" + "".join(f"{round(float(c) * 255):02x}" for c in encoded(colour / max(1.0, float(colour.max()))))
 
 
 def _shown(image: Image, exposure: float) -> Image:
-    encoded = _encoded(np.clip(image[:, :, :3] * exposure, 0, 1))
-    return encoded[:, :, 0] if image.shape[2] < 3 else encoded
-
-
-def _encoded(linear: np.ndarray) -> np.ndarray:
-    """sRGB of linear radiance, both from 0 to 1."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
+    colours = encoded(np.clip(image[:, :, :3] * exposure, 0, 1))
+    return colours[:, :, 0] if image.shape[2] < 3 else colours
 
 
 def _uri(kind: str, data: bytes) -> str:

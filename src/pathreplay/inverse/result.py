@@ -13,6 +13,7 @@ import safetensors.numpy
 from pathreplay.files import file_names
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes
+from pathreplay.inverse.likeness import Likeness
 from pathreplay.inverse.outcome import Outcome, Recovered, RecoveredPose, ViewPictures, resume_command
 from pathreplay.inverse.pose import Pose, PoseError
 from pathreplay.inverse.problem import Problem, scene_values, variables_of
@@ -41,6 +42,10 @@ class RunResult:
     """Root mean square error of each parameter whose truth is known; poses are told apart."""
     poses: dict[str, PoseError]
     """How far each pose whose truth is known is from it."""
+    views: dict[str, Likeness]
+    """How alike each view is to its target."""
+    held_out: tuple[str, ...]
+    """The views that were not learned from."""
 
     def __repr__(self) -> str:
         """Short: a notebook prints it, and the history may have thousands of entries."""
@@ -60,6 +65,9 @@ class RunResult:
             found = f"{value.item():.5g}, " if value.size == 1 else ""
             lines.append(f"{key}: {found}root mean square error {error:.4g}")
         lines += [f"{key}: {error}" for key, error in self.poses.items()]
+        if self.held_out:
+            psnr, ssim = (np.mean([getattr(self.views[v], kind) for v in self.held_out]) for kind in ("psnr", "ssim"))
+            lines.append(f"held-out views ({len(self.held_out)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}")
         lines.append(f"report: {self.report}")
         if self.stopped:
             lines.append(f"stopped early by {self.stopped_by}; go on with: {resume_command(self.folder)}")
@@ -80,7 +88,16 @@ def outcome_of(
     starts = _with_scene(problem, {v.key: v.start for v in problem.variables})
     values = _with_scene(problem, run.values)
     views = tuple(
-        ViewPictures(v.name, v.target, before[v.name], after[v.name], exposure_for(v.target), rivals.get(v.name))
+        ViewPictures(
+            v.name,
+            v.target,
+            before[v.name],
+            after[v.name],
+            exposure_for(v.target),
+            rivals.get(v.name),
+            v.weight,
+            v.held_out,
+        )
         for v in problem.views
     )
     poses = tuple(
@@ -101,6 +118,8 @@ def result_files(outcome: Outcome) -> dict[str, bytes]:
     table = {item.key: item.as_dict() for item in outcome.recovered}
     table |= {item.pose.key: item.as_dict() for item in outcome.poses}
     files = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}
+    views = {view.name: view.as_dict() for view in outcome.views}
+    files["views.json"] = (json.dumps(views, indent=2) + "\n").encode()
     files |= _run_files("", outcome.run.history, outcome.values)
     if rival := outcome.run.rival:
         files |= _run_files("rival/", rival.history, rival.values)
@@ -131,6 +150,8 @@ def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
         parameters=outcome.values,
         errors={item.key: error for item in outcome.recovered if (error := item.error()) is not None},
         poses={item.pose.key: errors["error"] for item in outcome.poses if (errors := item.errors())},
+        views={view.name: view.likeness(view.result) for view in outcome.views},
+        held_out=tuple(view.name for view in outcome.held_out()),
     )
 
 

@@ -13,6 +13,7 @@ from pathreplay.inverse.images import Image, exr_bytes, read_image
 from pathreplay.inverse.loop import Event, Started, Stepped, Stopped
 from pathreplay.inverse.problem import Problem
 from pathreplay.inverse.run_folder import CHECKPOINT, RIVAL_CHECKPOINT, RunFolder
+from pathreplay.inverse.targets import Targets
 from pathreplay.inverse.values import require_finite_array
 from pathreplay.render.film import picture_shape
 
@@ -44,13 +45,18 @@ class Saving:
 def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict[str, bytes]:
     """What a run goes on from, by name: targets, pictures of its start (by view), checkpoints."""
     pictures = {_picture("target", view.name): view.target for view in problem.views}
+    pictures |= {_picture("weight", view.name): view.weight for view in problem.views if view.weight is not None}
     pictures |= {_picture("start", name): image for name, image in before.items()}
     return {name: exr_bytes(image) for name, image in pictures.items()} | _checkpoints(run)
 
 
-def saved_targets(folder: Path) -> dict[str, Image]:
-    """The targets in a run folder, by view."""
-    return {path.stem.removeprefix("target-"): _read(path) for path in sorted(folder.glob(_picture("target", "*")))}
+def saved_targets(folder: Path) -> Targets:
+    """The targets in a run folder."""
+    images, weights = (
+        {path.stem.removeprefix(f"{kind}-"): _read(path) for path in sorted(folder.glob(_picture(kind, "*")))}
+        for kind in ("target", "weight")
+    )
+    return Targets(images, weights)
 
 
 def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
@@ -61,6 +67,8 @@ def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
     before = {view.name: _read(folder / _picture("start", view.name)) for view in problem.views}
     for view in problem.views:
         wanted = picture_shape(problem.scene.sensors()[view.sensor])
+        if view.weight is not None and (view.weight.shape != (*wanted[:2], 1) or not view.weight.any()):
+            raise PathreplayError(f"{folder / _picture('weight', view.name)} is damaged; start the job from its config")
         for kind, found in (("target", view.target), ("start", before[view.name])):
             path = folder / _picture(kind, view.name)
             if found.shape != wanted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
@@ -10,15 +11,26 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import limits
-from pathreplay.inverse.config import TARGET, Config
+from pathreplay.inverse.config import TARGET, Config, Target
 from pathreplay.inverse.grids import comparable
-from pathreplay.inverse.images import Image, find_image, over_black, read_image, transparent_share
+from pathreplay.inverse.images import Image, find_image, over_black, read_image, transparent_share, unpremultiplied
 from pathreplay.inverse.values import Array, adapted_image, make_value, require_finite_array, seen
 from pathreplay.render.film import picture_shape
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator, told
 from pathreplay.scenes.loading import load_scene
 from pathreplay.scenes.stored import form_of
+
+
+@dataclass(frozen=True)
+class Targets:
+    """By view: what it should look like, and how much each pixel counts where that is not all the same.
+
+    Pictures are linear, height x width x channels; weights are height x width x 1, with the mean 1.
+    """
+
+    images: dict[str, Image]
+    weights: dict[str, Image]
 
 
 def target_scene(config: Config, base: Path) -> mi.Scene:
@@ -64,30 +76,66 @@ def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -
 
 
 def read_targets(
-    files: list[str], scene: mi.Scene, sensors: dict[str, int], base: Path
-) -> tuple[dict[str, Image], tuple[str, ...]]:
-    """The target pictures by view, and what is to be said about them."""
-    if len(files) != len(sensors):
-        raise PathreplayError(
-            f"{len(files)} target images for {len(sensors)} sensors ({', '.join(sensors)}); "
-            "name one per sensor, in this order"
-        )
+    target: Target, scene: mi.Scene, sensors: dict[str, int], base: Path
+) -> tuple[Targets, tuple[str, ...]]:
+    """The target pictures and weights from files, and what is to be said about them."""
     targets: dict[str, Image] = {}
+    weights: dict[str, Image] = {}
     notes: list[str] = []
-    for (name, index), file in zip(sensors.items(), files, strict=True):
+    for name, file in _by_view("target images", target.images or [], sensors).items():
         path = find_image(file, base)
-        image = over_black(read_image(path), path)
-        height, width, channels = picture_shape(scene.sensors()[index])
-        if image.shape[:2] != (height, width):
-            raise PathreplayError(
-                f"Target image '{file}' is {image.shape[1]} x {image.shape[0]}, "
-                f"sensor '{name}' renders {width} x {height}; resize the image or the film"
-            )
+        image = read_image(path)
+        height, width, channels = picture_shape(scene.sensors()[sensors[name]])
+        _require_size(f"Target image '{file}'", image, name, height, width)
+        if target.alpha == "mask":
+            if image.shape[2] not in (2, 4):
+                raise PathreplayError(
+                    f"Target image '{file}' has no alpha to be its mask; give 'masks', or leave alpha = 'mask' out"
+                )
+            weights[name] = _weight(f"the alpha of '{file}'", image[:, :, -1:], name)
+            image = unpremultiplied(image, path)
+        else:
+            image = over_black(image, path)
         targets[name] = adapted_image(f"Target image '{file}'", image, f"sensor '{name}' renders", channels)
         share = transparent_share(image)
-        if share and channels in (1, 3):
+        if share and channels in (1, 3) and target.alpha == "black":
             notes.append(
                 f"target image '{file}' is transparent in {share:.1%} of its pixels: black is fitted there; if "
-                "the background of your scene is not black, put it behind the picture first"
+                "the background of your scene is not black, put it behind the picture first, or take alpha = 'mask'"
             )
-    return targets, tuple(notes)
+    return Targets(targets, weights), tuple(notes)
+
+
+def read_masks(files: list[str], scene: mi.Scene, sensors: dict[str, int], base: Path) -> dict[str, Image]:
+    """The weights that masks give, by view: white counts, black does not."""
+    weights: dict[str, Image] = {}
+    for name, file in _by_view("masks", files, sensors).items():
+        mask = read_image(find_image(file, base), raw=True)
+        height, width, _ = picture_shape(scene.sensors()[sensors[name]])
+        _require_size(f"Mask '{file}'", mask, name, height, width)
+        weights[name] = _weight(f"mask '{file}'", adapted_image(f"Mask '{file}'", mask, "a mask has", 1), name)
+    return weights
+
+
+def _by_view(what: str, files: list[str], sensors: dict[str, int]) -> dict[str, str]:
+    if len(files) != len(sensors):
+        raise PathreplayError(
+            f"{len(files)} {what} for {len(sensors)} sensors ({', '.join(sensors)}); name one per sensor, in this order"
+        )
+    return dict(zip(sensors, files, strict=True))
+
+
+def _require_size(what: str, image: Image, name: str, height: int, width: int) -> None:
+    if image.shape[:2] != (height, width):
+        raise PathreplayError(
+            f"{what} is {image.shape[1]} x {image.shape[0]}, sensor '{name}' renders {width} x {height}; resize the "
+            "image or the film"
+        )
+
+
+def _weight(what: str, mask: Image, name: str) -> Image:
+    require_finite_array(what, mask)
+    if mask.min() < 0 or not mask.any():
+        wrong = "is black" if not mask.any() else f"has the value {mask.min():g}"
+        raise PathreplayError(f"Of sensor '{name}' {what} {wrong}; paint white what counts, or leave the sensor out")
+    return (mask / mask.mean(dtype=np.float64)).astype(np.float32)
