@@ -118,7 +118,7 @@ def _begun(output: Path, job: Job, problem: Problem, run: Run) -> tuple[RunFolde
     with _computing(job.config):
         before = render_views(problem, job.config, run.values)
     for view in problem.views:
-        require_finite_loss(problem.loss, view, before[view.name])
+        require_finite_loss(problem.loss, view.name, view.target, view.weight, before[view.name])
     return create_run_folder(output, job, first_files(problem, before, run)), before
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Iterable, Mapping, Sequence
 from math import prod
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -18,9 +18,6 @@ from pathreplay.inverse.images import Image
 from pathreplay.inverse.losses import Loss, mean_loss
 from pathreplay.inverse.values import Array
 from pathreplay.render.film import MOST_SAMPLES, film_size, require_film
-
-if TYPE_CHECKING:
-    from pathreplay.inverse.problem import View
 
 # Bytes for each pixel of each view: its target, start and result stay.
 _A_VIEW = 36
@@ -107,12 +104,13 @@ def require_near(scene: mi.Scene, key: str, value: Array, entry: Parameter) -> N
         raise PathreplayError(f"Parameter '{key}' starts turned by {turn} degrees; give angles between -360 and 360")
 
 
-def require_finite_loss(loss: Loss, view: View, picture: Image | None = None) -> None:
-    """Raise PathreplayError unless the view's loss and derivative by ``picture`` (default: black) are finite."""
-    target, name = view.target, view.name
+def require_finite_loss(
+    loss: Loss, name: str, target: Image, weight: Image | None, picture: Image | None = None
+) -> None:
+    """Raise PathreplayError unless loss and derivative of ``picture`` (default: black) by ``target`` are finite."""
     image: Any = mi.TensorXf(np.zeros_like(target) if picture is None else picture)
     dr.enable_grad(image)
-    value = mean_loss(loss, image, mi.TensorXf(target), None if view.weight is None else mi.TensorXf(view.weight))
+    value = mean_loss(loss, image, mi.TensorXf(target), None if weight is None else mi.TensorXf(weight))
     dr.backward(value)
     if np.isfinite(np.array(value)).all() and np.isfinite(np.array(dr.grad(image))).all():
         return

@@ -180,7 +180,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
         for name, index in sensors.items()
     )
     for view in views:
-        limits.require_finite_loss(loss, view)
+        limits.require_finite_loss(loss, view.name, view.target, view.weight)
     variables = tuple(replace(variable, truth=truth.get(variable.key)) for variable in unsolved)
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in moved)
     # Traversed anew: an object from which values were read expects all its keys at the next update().
