@@ -90,7 +90,7 @@ def test_the_schema_says_what_a_job_may_be() -> None:
     told = CliRunner().invoke(app, ["schema"])
     schema = json.loads(told.stdout)
     assert told.exit_code == 0
-    assert set(schema["required"]) == {"scene", "parameters", "target"}
+    assert set(schema["required"]) == {"scene", "parameters"}
     optimizer = schema["$defs"]["Optimizer"]["properties"]
     assert optimizer["type"]["enum"] == ["adam", "adamw", "sgd", "rmsprop"]
     assert schema["additionalProperties"] is False

@@ -141,6 +141,17 @@ class Plugin(BaseModel):
         return self
 
 
+NOTHING = "target: nothing to match; give 'images', or 'values' and/or 'scene' to render"
+
+
+class Capture(Table):
+    """Pictures and their cameras, by the file that lists them; ``width`` in pixels is that of renderings."""
+
+    transforms: str
+    width: Count | None = None
+    hold_out_every: Annotated[Whole, Field(ge=2, le=2**31 - 1)] | None = None
+
+
 class Target(Table):
     """What the pictures should look like: image files, one per sensor, or a scene to render."""
 
@@ -163,10 +174,12 @@ class Target(Table):
                 raise ValueError("target: 'images' is empty; name one image file per sensor")
             if self.masks is not None and self.alpha == "mask":
                 raise ValueError("target: 'masks' and alpha = 'mask' are two masks; leave one out")
+        elif self.model_fields_set <= {"alpha"}:
+            return self  # fit for a capture, which brings pictures
         elif self.alpha == "mask":
             raise ValueError("target: alpha = 'mask' is about 'images'; leave it out, or name them")
         elif not self.values and self.scene is None:
-            raise ValueError("target: nothing to match; give 'images', or 'values' and/or 'scene' to render")
+            raise ValueError(NOTHING)
         if self.integrator.type == "pathreplay":
             raise ValueError(
                 "target: integrator 'pathreplay' would grade itself; render targets with another, such as 'path'"
@@ -189,7 +202,8 @@ class Config(Table):
     integrator: Plugin = Plugin(type="pathreplay")
     rival: Plugin | None = None
     parameters: Annotated[list[Parameter], Field(min_length=1)]
-    target: Target
+    capture: Capture | None = None
+    target: Target = Target()
     loss: str = "l2"
     iterations: Count = 200
     spp: Count = 16
@@ -203,6 +217,20 @@ class Config(Table):
     checkpoint_every: Count = 25
     deterministic: Switch = False
     output: str | None = None
+
+    @property
+    def brings_pictures(self) -> bool:
+        """Whether targets are files, and not rendered."""
+        return self.capture is not None or self.target.images is not None
+
+    @model_validator(mode="after")
+    def _has_pictures(self) -> Config:
+        given = self.target.model_fields_set - {"alpha"}
+        if self.capture is None and not given:
+            raise ValueError(NOTHING if "target" in self.model_fields_set else "key 'target' is missing; add it")
+        if self.capture is not None and given:
+            raise ValueError(f"target: 'capture' brings the pictures; leave '{min(given)}' out, or the capture")
+        return self
 
     @model_validator(mode="after")
     def _scheduled(self) -> Config:
@@ -238,6 +266,7 @@ _TABLES: dict[str, type[BaseModel]] = {
     "Picture": Picture,
     "start": Displacement,
     "optimizer": Optimizer,
+    "capture": Capture,
 }
 
 

@@ -61,10 +61,8 @@ def _put(table: Any, path: list[str], value: Any, option: str) -> Any:
     name, *rest = path
     if isinstance(table, list):
         if not name.isdecimal() or int(name) >= len(table):
-            raise PathreplayError(f"{option}: '{shown(name)}' is no place in a list of {len(table)}; count from 0")
+            raise PathreplayError(f"{option}: {shown(name)} is no place in a list of {len(table)}; count from 0")
         return [_put(each, rest, value, option) if i == int(name) else each for i, each in enumerate(table)]
     if not isinstance(table, dict):
-        raise PathreplayError(
-            f"{option}: '{shown(name)}' is asked of {shown(table)}, which is no table; correct the key"
-        )
+        raise PathreplayError(f"{option}: {shown(name)} is asked of {shown(table)}, which is no table; correct the key")
     return {**table, name: _put(table.get(name, {}), rest, value, option)}

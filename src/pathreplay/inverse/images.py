@@ -57,6 +57,12 @@ def read_image(path: Path, *, raw: bool = False) -> Image:
     return pixels[:, :, None] if pixels.ndim == 2 else pixels
 
 
+def picture_size(path: Path) -> tuple[int, int]:
+    """Width and height of a picture. Raises as `read_image`."""
+    height, width, _ = read_image(path).shape
+    return width, height
+
+
 def with_channels(image: Image, channels: int) -> Image | None:
     """The image with that many channels: alpha is dropped, grey repeated, colour averaged by luminance; else None."""
     have = image.shape[2]

@@ -16,13 +16,22 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.files import file_names
 from pathreplay.inverse import limits
+from pathreplay.inverse.capture import Shot, read_capture
 from pathreplay.inverse.config import Config, Parameter, Plugin
 from pathreplay.inverse.grids import Levels, make_levels, resampled
-from pathreplay.inverse.images import Image
+from pathreplay.inverse.images import Image, picture_size
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.surface import Surface
-from pathreplay.inverse.targets import Targets, read_masks, read_targets, rendered_targets, target_scene, truth_of
+from pathreplay.inverse.targets import (
+    Targets,
+    by_view,
+    read_masks,
+    read_targets,
+    rendered_targets,
+    target_scene,
+    truth_of,
+)
 from pathreplay.inverse.transforms import Coordinates, Transform
 from pathreplay.inverse.values import Array, Arrays, make_value, seen
 from pathreplay.render.edge_notes import edges_note, moves_edges
@@ -138,7 +147,9 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     """
     loss = find_loss(config.loss, base)
     wanted = [entry.key for entry in config.parameters]
-    scene, notes = load_scene_for(config.scene, wanted, base, **config.scene_parameters)
+    shots = {} if config.capture is None else read_capture(config.capture, base, picture_size)
+    cameras = {name: shot.camera for name, shot in shots.items()}
+    scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
     params = mi.traverse(scene)
     parameters.require_finite(params)
     integrator = _gradient_integrator(config.integrator)
@@ -148,17 +159,17 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     if rival is not None:
         _keys(params, config.parameters, rival)
         _edges(params, keys, rival)  # for its log: one note is enough
-    judge = integrator if config.target.images is not None else load_integrator(config.target.integrator.model_dump())
+    judge = integrator if config.brings_pictures else load_integrator(config.target.integrator.model_dump())
     # Before any target is rendered: the cheap mistakes first.
-    sensors = _sensors(scene, config.sensors)
-    held_out = _held_out(scene, sensors, config)
+    sensors = _sensors(scene, config.sensors or list(shots) or None)
+    held_out = _held_out(scene, sensors, config, list(shots))
     limits.require_visible(scene, params, keys)
     limits.require_films(scene, sensors, {"spp": config.spp, "picture_spp": config.picture_spp})
     unsolved, moved = _variables(scene, params, keys, config, base)
 
     truth: dict[str, Array] = {}
     first = targets is None
-    if config.target.images is None:
+    if not config.brings_pictures:
         other = target_scene(config, base)
         truth = truth_of(other, params, keys)
         if targets is None:
@@ -168,10 +179,11 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
         del other
         gc.collect()
     elif targets is None:
-        targets, transparent = read_targets(config.target, scene, sensors, base)
-        notes += transparent
+        targets, said = _pictures(config, shots, scene, sensors, base)
+        notes += said
     if first and config.target.masks is not None:
-        targets = replace(targets, weights=read_masks(config.target.masks, scene, sensors, base))
+        masks = by_view("masks", config.target.masks, sensors)
+        targets = replace(targets, weights=read_masks(masks, scene, sensors, base))
 
     if missing := set(sensors) - set(targets.images):
         raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
@@ -187,6 +199,24 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     params = mi.traverse(scene)
     parameters.keep_only(params, keys)
     return Problem(scene, params, integrator, rival, judge, variables, poses, views, loss, notes)
+
+
+def _pictures(
+    config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path
+) -> tuple[Targets, tuple[str, ...]]:
+    """Targets from the files of a capture, or from those that the job names, and what is to be said about them."""
+    alpha = config.target.alpha
+    if not shots:
+        files = by_view("target images", config.target.images or [], sensors)
+        return read_targets(files, alpha, scene, sensors, base)
+    if other := set(sensors) - set(shots):
+        raise PathreplayError(f"sensors: '{min(other)}' is no camera of the capture, and has no picture; leave it out")
+    pictures = {name: str(shots[name].image.resolve()) for name in sensors}
+    masks = {name: str(mask.resolve()) for name in sensors if (mask := shots[name].mask) is not None}
+    if masks and alpha == "mask":
+        raise PathreplayError("target: the capture has masks, and alpha = 'mask' is another; leave alpha out")
+    targets, notes = read_targets(pictures, alpha, scene, sensors, base, resize=True)
+    return replace(targets, weights=targets.weights | read_masks(masks, scene, sensors, base, resize=True)), notes
 
 
 def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
@@ -330,15 +360,17 @@ def _place(item: int | str, ids: list[str], names: list[str]) -> int:
     return index
 
 
-def _held_out(scene: mi.Scene, sensors: dict[str, int], config: Config) -> set[str]:
-    """The names of the views that are not learned from."""
+def _held_out(scene: mi.Scene, sensors: dict[str, int], config: Config, shots: list[str]) -> set[str]:
+    """The names of the views that are not learned from: those that the job names, and every so many of ``shots``."""
     everywhere = _sensors(scene, None)
     ids = [sensor.id() for sensor in scene.sensors()]
     places = {_place(item, ids, list(everywhere)) for item in config.held_out}
     found = {name for name, index in sensors.items() if index in places}
+    every = None if config.capture is None else config.capture.hold_out_every
     if len(found) < len(places):
         other = next(name for name, index in everywhere.items() if index in places and name not in found)
         raise PathreplayError(f"held_out: sensor '{other}' is not among 'sensors'; add it there, or leave it out here")
+    found |= set(sensors) & set(shots[::every] if every else ())
     if len(found) == len(sensors):
         raise PathreplayError("held_out names every sensor of the job; leave one to learn from")
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +11,17 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import limits
-from pathreplay.inverse.config import TARGET, Config, Target
+from pathreplay.inverse.config import TARGET, Config
 from pathreplay.inverse.grids import comparable
-from pathreplay.inverse.images import Image, find_image, over_black, read_image, transparent_share, unpremultiplied
+from pathreplay.inverse.images import (
+    Image,
+    find_image,
+    over_black,
+    read_image,
+    resized,
+    transparent_share,
+    unpremultiplied,
+)
 from pathreplay.inverse.values import Array, adapted_image, make_value, require_finite_array, seen
 from pathreplay.render.film import picture_shape
 from pathreplay.scenes import parameters
@@ -76,29 +84,33 @@ def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -
 
 
 def read_targets(
-    target: Target, scene: mi.Scene, sensors: dict[str, int], base: Path
+    files: Mapping[str, str], alpha: str, scene: mi.Scene, sensors: dict[str, int], base: Path, *, resize: bool = False
 ) -> tuple[Targets, tuple[str, ...]]:
-    """The target pictures and weights from files, and what is to be said about them."""
+    """Pictures by view (and weights, with ``alpha`` = 'mask') from files by view, and what is to be said about them.
+
+    ``resize``: to the size of the film, if they have another.
+    """
     targets: dict[str, Image] = {}
     weights: dict[str, Image] = {}
     notes: list[str] = []
-    for name, file in _by_view("target images", target.images or [], sensors).items():
+    for name, file in files.items():
         path = find_image(file, base)
         image = read_image(path)
-        height, width, channels = picture_shape(scene.sensors()[sensors[name]])
-        _require_size(f"Target image '{file}'", image, name, height, width)
-        if target.alpha == "mask":
+        _, _, channels = shape = picture_shape(scene.sensors()[sensors[name]])
+        if alpha == "mask":
             if image.shape[2] not in (2, 4):
                 raise PathreplayError(
-                    f"Target image '{file}' has no alpha to be its mask; give 'masks', or leave alpha = 'mask' out"
+                    f"Target image '{file}' has no alpha to be its mask; give masks, or leave alpha = 'mask' out"
                 )
-            weights[name] = _weight(f"the alpha of '{file}'", image[:, :, -1:], name)
+            seen = _sized(f"Target image '{file}'", image[:, :, -1:], name, shape, resize)
+            weights[name] = _weight(f"the alpha of '{file}'", seen, name)
             image = unpremultiplied(image, path)
         else:
             image = over_black(image, path)
+        image = _sized(f"Target image '{file}'", image, name, shape, resize)
         targets[name] = adapted_image(f"Target image '{file}'", image, f"sensor '{name}' renders", channels)
         share = transparent_share(image)
-        if share and channels in (1, 3) and target.alpha == "black":
+        if share and channels in (1, 3) and alpha == "black":
             notes.append(
                 f"target image '{file}' is transparent in {share:.1%} of its pixels: black is fitted there; if "
                 "the background of your scene is not black, put it behind the picture first, or take alpha = 'mask'"
@@ -106,18 +118,20 @@ def read_targets(
     return Targets(targets, weights), tuple(notes)
 
 
-def read_masks(files: list[str], scene: mi.Scene, sensors: dict[str, int], base: Path) -> dict[str, Image]:
+def read_masks(
+    files: Mapping[str, str], scene: mi.Scene, sensors: dict[str, int], base: Path, *, resize: bool = False
+) -> dict[str, Image]:
     """The weights that masks give, by view: white counts, black does not."""
     weights: dict[str, Image] = {}
-    for name, file in _by_view("masks", files, sensors).items():
+    for name, file in files.items():
         mask = read_image(find_image(file, base), raw=True)
-        height, width, _ = picture_shape(scene.sensors()[sensors[name]])
-        _require_size(f"Mask '{file}'", mask, name, height, width)
+        mask = _sized(f"Mask '{file}'", mask, name, picture_shape(scene.sensors()[sensors[name]]), resize)
         weights[name] = _weight(f"mask '{file}'", adapted_image(f"Mask '{file}'", mask, "a mask has", 1), name)
     return weights
 
 
-def _by_view(what: str, files: list[str], sensors: dict[str, int]) -> dict[str, str]:
+def by_view(what: str, files: list[str], sensors: dict[str, int]) -> dict[str, str]:
+    """A file for each view. Raises PathreplayError unless there are as many."""
     if len(files) != len(sensors):
         raise PathreplayError(
             f"{len(files)} {what} for {len(sensors)} sensors ({', '.join(sensors)}); name one per sensor, in this order"
@@ -125,12 +139,17 @@ def _by_view(what: str, files: list[str], sensors: dict[str, int]) -> dict[str, 
     return dict(zip(sensors, files, strict=True))
 
 
-def _require_size(what: str, image: Image, name: str, height: int, width: int) -> None:
+def _sized(what: str, image: Image, name: str, shape: tuple[int, int, int], resize: bool) -> Image:
+    """The image, which must have the size of the film, or is brought to it."""
+    height, width, _ = shape
+    if resize:
+        return resized(image, height, width)
     if image.shape[:2] != (height, width):
         raise PathreplayError(
             f"{what} is {image.shape[1]} x {image.shape[0]}, sensor '{name}' renders {width} x {height}; resize the "
             "image or the film"
         )
+    return image
 
 
 def _weight(what: str, mask: Image, name: str) -> Image:

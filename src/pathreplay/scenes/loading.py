@@ -18,7 +18,7 @@ from pathreplay.files import MISSING, file_problem
 from pathreplay.scenes import parameters as scene_parameters
 from pathreplay.scenes.builtin_scenes import BUILTINS, COSTS, SceneDict
 from pathreplay.scenes.descriptions import told
-from pathreplay.scenes.substitute import load_dict_with, load_file_with
+from pathreplay.scenes.substitute import Cameras, load_dict_with, load_file_with
 
 
 def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any) -> mi.Scene:
@@ -34,14 +34,22 @@ def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any)
 
 
 def load_scene_with(
-    spec: str | Path, plugins: Mapping[str, str], base: Path | None = None, /, **parameters: Any
+    spec: str | Path,
+    plugins: Mapping[str, str],
+    base: Path | None = None,
+    cameras: Cameras | None = None,
+    /,
+    **parameters: Any,
 ) -> tuple[mi.Scene, list[str]]:
-    """`load_scene` with plugins exchanged (old type -> new type), and one line for each that was: id and place."""
+    """`load_scene` with plugins exchanged (old type -> new type), and one line for each that was: id and place.
+
+    ``cameras`` are added to those of the scene.
+    """
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
     if str(spec) in BUILTINS:
         with told(f"Built-in scene '{spec}' cannot be made of {parameters}"):
-            return load_dict_with(_builtin_dict(str(spec), parameters), plugins)
+            return load_dict_with(_builtin_dict(str(spec), parameters), plugins, cameras)
     path = Path(spec) if base is None else Path(base) / spec
     if (problem := file_problem(path)) == MISSING:
         raise PathreplayError(_unknown(str(spec), path))
@@ -50,22 +58,28 @@ def load_scene_with(
     # As XML has them: true and not True.
     arguments = {name: str(v).lower() if isinstance(v, bool) else str(v) for name, v in parameters.items()}
     with told(f"Scene {path} cannot be loaded", (RuntimeError, ValueError, TypeError)):
-        scene, exchanged = load_file_with(path, plugins, arguments)
+        scene, exchanged = load_file_with(path, plugins, arguments, cameras)
     if not isinstance(scene, mi.Scene):
         raise PathreplayError(f"{path} describes no <scene> but a {type(scene).__name__}; wrap it in <scene>")
     return scene, exchanged
 
 
 def load_scene_for(
-    spec: str | Path, wanted: Iterable[str], base: Path | None = None, /, **parameters: Any
+    spec: str | Path,
+    wanted: Iterable[str],
+    base: Path | None = None,
+    cameras: Cameras | None = None,
+    /,
+    **parameters: Any,
 ) -> tuple[mi.Scene, tuple[str, ...]]:
     """Load a scene in which the ``wanted`` keys and globs carry derivatives, as far as exchanging plugins brings it.
 
     Where a pattern that ends in ``eta`` matches the index of a ``dielectric``, the scene is loaded once more with
-    `smoothdielectric` in the place of every ``dielectric``. Returns the scene and what is to be said about it, one line
-    each. Patterns that match nothing are left for others to complain about. Raises what `load_scene` does.
+    `smoothdielectric` in the place of every ``dielectric``. ``cameras`` are added to those of the scene. Returns the
+    scene and what is to be said about it, one line each. Patterns that match nothing are left for others to complain
+    about. Raises what `load_scene` does.
     """
-    scene = load_scene(spec, base, **parameters)
+    scene, _ = load_scene_with(spec, {}, base, cameras, **parameters)
     params = mi.traverse(scene)
     patterns = [pattern for pattern in wanted if pattern.rsplit(".", 1)[-1] == "eta"]
     keys: list[str] = []
@@ -76,7 +90,7 @@ def load_scene_for(
     # Dr.Jit traces calls through every instance alive, so the first scene has to go before the second one comes.
     del scene, params
     gc.collect()
-    scene, exchanged = load_scene_with(spec, {"dielectric": "smoothdielectric"}, base, **parameters)
+    scene, exchanged = load_scene_with(spec, {"dielectric": "smoothdielectric"}, base, cameras, **parameters)
     count = "one" if len(exchanged) == 1 else f"all {len(exchanged)}"
     return scene, (f"replaced 'dielectric' by 'smoothdielectric' ({count} of them): its eta carries a derivative",)
 

@@ -14,15 +14,21 @@ from pathreplay.scenes.descriptions import require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
 from pathreplay.threads import spare_thread
 
+Cameras = Mapping[str, Mapping[str, Any]]
+"""Sensors by their ids, as dictionaries of Mitsuba's."""
+
 
 def load_file_with(
-    path: str | Path, plugins: Mapping[str, str], parameters: Mapping[str, str] | None = None
+    path: str | Path,
+    plugins: Mapping[str, str],
+    parameters: Mapping[str, str] | None = None,
+    cameras: Cameras | None = None,
 ) -> tuple[Any, list[str]]:
     """`mi.load_file(path, optimize=False, **parameters)` with plugins exchanged, included files' plugins too.
 
     `plugins` maps the type named in the scene to the type to load in its place, {"dielectric": "smoothdielectric"} for
     one. The new plugin has to be registered and is given the properties and the id of the old one, so that parameter
-    keys stay what they were.
+    keys stay what they were. ``cameras`` are added to what the scene has.
 
     Returns the scene (or object) and one line per exchanged plugin, its id and where it stands in the file.
     Raises RuntimeError (Mitsuba's) for a file that cannot be read or holds a property unknown to the new plugin, and
@@ -36,17 +42,19 @@ def load_file_with(
     with _parsing() as config:
         mi.file_resolver().prepend(mi.filesystem.path(str(path.parent)))
         state = mi.parser.parse_file(config, str(path), **parameters)
-        return _instantiate(config, state, plugins)
+        return _instantiate(config, state, plugins, cameras)
 
 
-def load_dict_with(scene: Mapping[str, Any], plugins: Mapping[str, str]) -> tuple[Any, list[str]]:
+def load_dict_with(
+    scene: Mapping[str, Any], plugins: Mapping[str, str], cameras: Cameras | None = None
+) -> tuple[Any, list[str]]:
     """`mi.load_dict(scene, optimize=False)` with plugins exchanged; otherwise as `load_file_with`.
 
     Objects that stand in the dictionary already loaded stay what they are. Raises PathreplayError for a None.
     """
     require_values(scene)
     with _parsing() as config:
-        return _instantiate(config, mi.parser.parse_dict(config, dict(scene)), plugins)
+        return _instantiate(config, mi.parser.parse_dict(config, dict(scene)), plugins, cameras)
 
 
 @contextmanager
@@ -63,8 +71,13 @@ def _parsing() -> Iterator[mi.parser.ParserConfig]:
         mi.set_file_resolver(outer)
 
 
-def _instantiate(config: Any, state: Any, plugins: Mapping[str, str]) -> tuple[Any, list[str]]:
+def _instantiate(config: Any, state: Any, plugins: Mapping[str, str], cameras: Cameras | None) -> tuple[Any, list[str]]:
     exchanged = []
+    taken = {node.props.id() for node in state.nodes}
+    for name, camera in (cameras or {}).items():
+        if name in taken:
+            raise PathreplayError(f"The scene has an object '{name}', as a camera is called that joins it; rename one")
+        state.root.props[name] = mi.load_dict(dict(camera))
     for node in state.nodes:
         if (new := plugins.get(node.props.plugin_name())) is not None:
             exchanged.append(f"{node.props.id() or 'unnamed'} ({mi.parser.file_location(state, node)})")

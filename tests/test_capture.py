@@ -1,0 +1,185 @@
+"""Captures: cameras of a transforms.json see what they should, and jobs learn from their pictures."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse import make_config, optimize
+from pathreplay.inverse.capture import read_capture
+from pathreplay.inverse.config import Capture
+from pathreplay.inverse.images import exr_bytes, picture_size, png_bytes
+from pathreplay.scenes.loading import load_scene_for
+
+WIDTH, HEIGHT = 12, 8
+KEY = "wall.bsdf.reflectance.value"
+SCENE = """<scene version="3.0.0">
+  <sensor type="perspective" id="other"><film type="hdrfilm"/></sensor>
+  <shape type="rectangle" id="wall"><transform name="to_world"><scale value="9"/></transform>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>
+  <emitter type="directional"><vector name="direction" value="0,0,-1"/>
+    <rgb name="irradiance" value="3.14159265"/></emitter>
+</scene>"""
+
+
+def placed(x: float, turn: float = 0.0) -> list[list[float]]:
+    """An OpenGL camera at (x, 0, 5) that looks along -z, turned about y by so many degrees."""
+    c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    return [[c, 0, s, x], [0, 1, 0, 0], [-s, 0, c, 5], [0, 0, 0, 1]]
+
+
+FRAMES = [{"file_path": f"./pictures/shot {k}", "transform_matrix": placed(0.3 * k, 5 * k)} for k in range(4)]
+PLAIN: dict[str, Any] = {"camera_angle_x": 0.6, "frames": FRAMES}
+JOB: dict[str, Any] = {
+    "scene": "room.xml",
+    "integrator": {"type": "pathreplay", "max_depth": 2},
+    "optimizer": {"type": "sgd"},
+    "learning_rate": 1.0,
+    "learning_rate_schedule": "constant",
+    "iterations": 10,
+    "spp": 1,
+    "picture_spp": 1,
+    "capture": {"transforms": "capture/transforms.json", "hold_out_every": 3},
+    "parameters": [{"key": KEY, "lower": 0.0}],
+}
+
+
+def write(table: Any) -> None:
+    Path("capture/transforms.json").write_text(table if isinstance(table, str) else json.dumps(table))
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "room.xml").write_text(SCENE)
+    pictures = tmp_path / "capture" / "pictures"
+    pictures.mkdir(parents=True)
+    for k in range(4):
+        grey = np.full((HEIGHT, WIDTH, 3), 0.8, np.float32)
+        (pictures / f"shot {k}.exr").write_bytes(exr_bytes(grey))
+    write(PLAIN)
+    return tmp_path
+
+
+def seen(camera: mi.Sensor, point: list[float]) -> np.ndarray:
+    """Where a point of the world is on the picture, in pixels from its upper left."""
+    si = mi.SurfaceInteraction3f()
+    si.p = mi.Point3f(point)
+    ds, _ = camera.sample_direction(si, mi.Point2f(0.5))
+    return np.array(ds.uv).ravel()
+
+
+@pytest.mark.parametrize("lens", [{}, {"cx": 4.5, "cy": 4.75}, {"fl_x": 15.0, "fl_y": 15.0, "cx": 7.0, "cy": 3.0}])
+@pytest.mark.parametrize("scale", [1, 4])
+def test_cameras_are_pinholes_as_the_file_says(lens: dict[str, float], scale: int) -> None:
+    """Against the projection that the formats define: x = cx + fl X / -Z, y = cy - fl Y / -Z, in the camera's axes.
+
+    ``scale``: intrinsics are those of a larger picture.
+    """
+    given = {key: value * scale for key, value in lens.items()}
+    write({**PLAIN, **given, "w": WIDTH * scale, "h": HEIGHT * scale})
+    shots = read_capture(Capture(transforms="capture/transforms.json"), Path(), picture_size)
+    assert list(shots) == ["shot_0", "shot_1", "shot_2", "shot_3"]
+    cameras = {name: shot.camera for name, shot in shots.items()}
+    scene, _ = load_scene_for("room.xml", [], None, cameras)
+    assert [sensor.id() for sensor in scene.sensors()] == ["other", *shots]
+    fl = lens.get("fl_x", 0.5 * WIDTH / math.tan(0.3))
+    for frame, camera in zip(FRAMES, scene.sensors()[1:], strict=True):
+        for point in ([0.4, 0.2, 0.0], [-0.7, -0.5, 1.0]):
+            X, Y, Z, _ = np.linalg.inv(frame["transform_matrix"]) @ [*point, 1]
+            expected = lens.get("cx", WIDTH / 2) - fl * X / Z, lens.get("cy", HEIGHT / 2) + fl * Y / Z
+            assert seen(camera, point) == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_job_learns_from_a_capture() -> None:
+    result = optimize(make_config(JOB), progress=False)
+    assert result.parameters[KEY] == pytest.approx([0.8] * 3, abs=1e-3)
+    assert result.held_out == ("shot_0", "shot_3")
+    assert set(result.views) == {"shot_0", "shot_1", "shot_2", "shot_3"}
+    assert min(each.psnr for each in result.views.values()) > 50
+    assert "capture/transforms.json" in result.report.read_text()
+
+
+def test_pictures_are_brought_to_the_width_of_renderings() -> None:
+    job = {**JOB, "capture": {"transforms": "capture/transforms.json", "width": 6}, "sensors": ["shot_1", "shot_2"]}
+    result = optimize(make_config(job), progress=False)
+    assert set(result.views) == {"shot_1", "shot_2"} and result.held_out == ()
+    assert picture_size(result.folder / "images" / "target-shot_1.exr") == (6, 4)
+    assert result.parameters[KEY] == pytest.approx([0.8] * 3, abs=1e-3)
+
+
+def test_masks_and_intrinsics_of_a_frame_are_its_own(folder: Path) -> None:
+    half = np.repeat([[1.0] * 6 + [0.0] * 6], HEIGHT, axis=0).astype(np.float32)[:, :, None]
+    spoiled = np.where(half > 0, 0.8, 0.1).repeat(3, axis=2).astype(np.float32)
+    (folder / "capture" / "pictures" / "shot 1.exr").write_bytes(exr_bytes(spoiled))
+    (folder / "capture" / "mask.png").write_bytes(png_bytes(half))
+    frame = {**FRAMES[1], "mask_path": "mask.png", "fl_x": 20.0}
+    write({**PLAIN, "frames": [FRAMES[0], frame]})
+    shots = read_capture(Capture(transforms="capture/transforms.json"), Path(), picture_size)
+    fovs = [shot.camera["fov"] for shot in shots.values()]
+    assert fovs == pytest.approx([math.degrees(0.6), 2 * math.degrees(math.atan(0.3))])
+    result = optimize(make_config({**JOB, "capture": {"transforms": "capture/transforms.json"}}), progress=False)
+    assert result.parameters[KEY] == pytest.approx([0.8] * 3, abs=1e-3)
+
+
+def with_frame(**changes: Any) -> dict[str, Any]:
+    return {**PLAIN, "frames": [{**FRAMES[0], **changes}]}
+
+
+REFUSED: dict[str, tuple[Any, str]] = {
+    "no JSON": ("{", "is no transforms.json as we know it"),
+    "a list": ([1], "is no transforms.json as we know it"),
+    "no frames": ({"frames": []}, "'frames'"),
+    "no lens": ({"frames": FRAMES}, "neither fl_x nor camera_angle_x"),
+    "fisheye": ({**PLAIN, "camera_model": "OPENCV_FISHEYE"}, "camera_model 'OPENCV_FISHEYE'; undistort"),
+    "distorted": ({**PLAIN, "k1": 0.1, "p2": -0.01}, "is distorted (k1 = 0.1, p2 = -0.01); undistort"),
+    "flat pixels": ({**PLAIN, "fl_x": 15, "fl_y": 19}, "no squares (fl_x = 15, fl_y = 19)"),
+    "other shape": ({**PLAIN, "w": 12, "h": 12}, "said to be 12 x 12, and its picture is 12 x 8"),
+    "no picture": (with_frame(file_path="gone"), "picture 'gone' does not exist"),
+    "a NUL": (with_frame(file_path="go\0ne"), "cannot be reached"),
+    "sheared": (with_frame(transform_matrix=np.diag([1, 2, 1, 1]).tolist()), "no rotation and translation"),
+    "a mirror": (with_frame(transform_matrix=np.diag([-1, 1, 1, 1]).tolist()), "no rotation and translation"),
+    "not finite": (json.dumps(PLAIN).replace("0.6", "NaN"), "is no transforms.json as we know it"),
+    "twice": ({**PLAIN, "frames": [FRAMES[0], FRAMES[0]]}, "would both be called 'pictures_shot_0'"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_captures_that_cannot_be_used_are_refused_in_one_line(case: str, folder: Path) -> None:
+    table, words = REFUSED[case]
+    write(table)
+    with pytest.raises(PathreplayError) as told:
+        optimize(make_config(JOB), progress=False)
+    assert words in str(told.value) and "\n" not in str(told.value)
+    assert not (folder / "runs").exists()
+
+
+JOBS_REFUSED = {
+    "no file": ({"capture": {"transforms": "gone.json"}}, "gone.json; give the path of a transforms.json"),
+    "pictures twice": ({"target": {"images": ["a.png"]}}, "'capture' brings the pictures; leave 'images' out"),
+    "another camera": ({"sensors": ["other", "shot_1"]}, "'other' is no camera of the capture"),
+    "no alpha": ({"target": {"alpha": "mask"}}, "has no alpha to be its mask"),
+    "every": ({"capture": {"transforms": "capture/transforms.json", "hold_out_every": 1}}, "capture.hold_out_every"),
+    "misspelt": ({"capture": {"transform": "capture/transforms.json"}}, "did you mean 'transforms'?"),
+}
+
+
+@pytest.mark.parametrize("case", JOBS_REFUSED)
+def test_jobs_that_do_not_go_with_a_capture_are_refused_in_one_line(case: str) -> None:
+    changes, words = JOBS_REFUSED[case]
+    with pytest.raises(PathreplayError) as told:
+        optimize(make_config({**JOB, **changes}), progress=False)
+    assert words in str(told.value) and "\n" not in str(told.value)
+
+
+def test_an_object_of_the_same_name_is_told(folder: Path) -> None:
+    (folder / "room.xml").write_text(SCENE.replace('id="wall"', 'id="shot_1"'))
+    with pytest.raises(PathreplayError, match="has an object 'shot_1'"):
+        optimize(make_config({**JOB, "parameters": [{"key": "shot_1.bsdf.reflectance.value"}]}), progress=False)
