@@ -11,6 +11,7 @@ import pytest
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
+from pathreplay.inverse.batches import batch
 from pathreplay.inverse.images import exr_bytes, read_image
 from pathreplay.inverse.likeness import MOST_DB, Likeness
 from pathreplay.threads import spare_thread
@@ -121,6 +122,44 @@ def test_a_job_may_bring_its_loss(room: Path) -> None:
     (room / "my_losses.py").write_text("def double(image, target):\n    return 2 * (image - target) ** 2\n")
     result = optimize(make_config({**JOB, "loss": "my_losses:double", "iterations": 2}), progress=False)
     assert result.history[0].loss == pytest.approx(0.18, rel=1e-3)
+
+
+class Views:
+    """As much of a problem as batches are made of."""
+
+    def __init__(self, *places: int) -> None:
+        self.places = places
+
+    def trained(self) -> dict[int, None]:
+        return dict.fromkeys(self.places)
+
+
+def test_batches_have_every_view_once_in_a_round() -> None:
+    views: Any = Views(0, 2, 3, 5, 7)
+    config = make_config({**JOB, "views_per_step": 2, "seed": 3})
+    seen = [batch(views, config, i) for i in range(10)]
+    assert all(len(each) == 2 for each in seen)
+    rounds = np.reshape(seen, (4, 5))
+    assert (np.sort(rounds, axis=1) == [0, 2, 3, 5, 7]).all()
+    assert len({tuple(each) for each in rounds.tolist()}) > 1
+    assert seen != [batch(views, make_config({**JOB, "views_per_step": 2, "seed": 4}), i) for i in range(10)]
+    assert (
+        batch(views, make_config({**JOB, "views_per_step": 5}), 3)
+        == [7, 5, 3, 2, 0]
+        == batch(views, make_config(JOB), 1)
+    )
+
+
+def test_a_batch_stands_for_all_views(room: Path) -> None:
+    """Of two views with the same target, one has the loss and the gradient of both."""
+    both = {**JOB, "sensors": None, "target": {"images": ["target.exr", "target.exr"]}}
+    all_of, one_of = (
+        optimize(make_config({**both, **more}), output=str(k), progress=False)
+        for k, more in enumerate(({}, {"views_per_step": 1}))
+    )
+    assert [e.loss for e in all_of.history] == pytest.approx([e.loss for e in one_of.history], rel=1e-3, abs=1e-8)
+    assert one_of.parameters[KEY] == pytest.approx(all_of.parameters[KEY], abs=1e-5)
+    assert one_of.parameters[KEY].mean() == pytest.approx(0.8, abs=1e-3)
 
 
 BROKEN = "def shapes(image, target):\n    return image[1:] * target\n\n\nnumber = 3\n"

@@ -188,7 +188,7 @@ class Target(Table):
 
 
 # Streams of random numbers: pictures never share a seed with iterations, nor targets with renderings.
-ITERATION, TARGET, PICTURE, JUDGEMENT = 0, 1, 2, 3
+ITERATION, TARGET, PICTURE, JUDGEMENT, BATCH = 0, 1, 2, 3, 4
 
 
 class Config(Table):
@@ -207,6 +207,7 @@ class Config(Table):
     loss: str = "l2"
     iterations: Count = 200
     spp: Count = 16
+    views_per_step: Count | None = None
     picture_spp: Count = 128
     seed: Annotated[Whole, Field(ge=0, le=10**18)] = 0
     learning_rate: Positive = 0.02

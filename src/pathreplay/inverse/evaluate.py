@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any, Protocol
 
@@ -43,6 +43,13 @@ class Evaluation:
     dropped: int
     """Gradient entries that were NaN or infinite in a view, and count as zero there."""
     learned: Arrays
+
+    def of(self, share: float) -> Evaluation:
+        """So many times the loss and the gradient, as if so many more views had been evaluated that are like these."""
+        if share == 1:
+            return self
+        gradients = {key: gradient * np.float32(share) for key, gradient in self.gradients.items()}
+        return replace(self, loss=self.loss * share, gradients=gradients)
 
 
 Evaluate = Callable[[Arrays, Shard, Arrays], Evaluation]

@@ -12,6 +12,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.interrupts import Stop
+from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
 from pathreplay.inverse.evaluate import Evaluator, Local, Shard, total
@@ -101,10 +102,10 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
 def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Refined]:
     """One step, with the learning rates and resolutions of iteration ``position``; adds an entry to the history.
 
-    Evaluate every view, a shard with a seed of its own, and sum in their order; step with the learning rate
-    of that iteration (see `schedules`), project every variable into its bounds. A grid whose next resolution is due is
-    interpolated before that, and returned; the optimiser starts anew on it. What is differentiated is decided by the
-    integrator; targets, bounds and the seeds' choice of paths are not.
+    Evaluate the views of its `batch`, a shard with a seed of its own for each, and sum in their order; step with the
+    learning rate of that iteration (see `schedules`), project every variable into its bounds. A grid whose next
+    resolution is due is interpolated before that, and returned; the optimiser starts anew on it. What is differentiated
+    is decided by the integrator; targets, bounds and the seeds' choice of paths are not.
 
     Raises PathreplayError where the loss is no longer finite.
     """
@@ -114,12 +115,11 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
         if v.levels and run.values[v.key].shape != (shape := v.levels.shape_at(position)):
             run.values[v.key] = resampled(run.values[v.key], shape)
             refined.append(Refined(v.key, shape))
-    # The last view first: what is learned of media depends on the order, and earlier versions had this one.
     shards = [
-        Shard((n,), config.spp, config.seeds(ITERATION, view.sensor, i)[:1])
-        for n, view in reversed(problem.trained().items())
+        Shard((n,), config.spp, config.seeds(ITERATION, problem.views[n].sensor, i)[:1])
+        for n in batch(problem, config, i)
     ]
-    found = total(run.executor.run(run.values, shards, run.learned))
+    found = total(run.executor.run(run.values, shards, run.learned)).of(len(problem.trained()) / len(shards))
     if not np.isfinite(found.loss):
         raise PathreplayError(
             f"The loss is {found.loss} at iteration {i}; lower the learning rates, or bound the parameters that ran "
