@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import runpy
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -183,3 +186,22 @@ def test_an_object_of_the_same_name_is_told(folder: Path) -> None:
     (folder / "room.xml").write_text(SCENE.replace('id="wall"', 'id="shot_1"'))
     with pytest.raises(PathreplayError, match="has an object 'shot_1'"):
         optimize(make_config({**JOB, "parameters": [{"key": "shot_1.bsdf.reflectance.value"}]}), progress=False)
+
+
+@pytest.mark.slow
+def test_the_example_finds_texture_roughness_and_sky(folder: Path) -> None:
+    """A small version, by its own script and config."""
+    example = Path(__file__).parents[1] / "examples" / "capture"
+    pictures = folder / "small"
+    script = [sys.executable, str(example / "make_capture.py"), str(pictures)]
+    subprocess.run([*script, "--views", "12", "--width", "24", "--spp", "256"], check=True, capture_output=True)
+    changes = [f"capture.transforms={pictures / 'transforms.json'}", "iterations=300", "picture_spp=64"]
+    result = optimize(example / "config.toml", output="found", progress=False, define=changes)
+    assert result.held_out == ("00", "06")
+    before = json.loads((result.folder / "views.json").read_text())
+    for name in result.held_out:
+        assert result.views[name].psnr > before[name]["start"]["psnr"] + 6
+    assert result.parameters["ball.bsdf.roughness.value"].item() < 0.4
+    paint = runpy.run_path(str(example / "make_capture.py"))["paint"]()
+    found = result.parameters["ball.bsdf.base_color.data"]
+    assert np.corrcoef(found[4:12].ravel(), paint[4:12].ravel())[0, 1] > 0.8
