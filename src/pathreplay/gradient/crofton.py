@@ -14,7 +14,7 @@ number is looked at closer, in another, which thus wastes no lane, and has the s
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -37,6 +37,7 @@ class Sight:
     signature: mi.UInt32
     p: mi.Point3f  # where the view ends; zero where it does not
     n: mi.Normal3f
+    moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # between two that do not, an edge does nothing
 
     @staticmethod
     def nothing() -> Sight:
@@ -49,7 +50,8 @@ class Sight:
     def hint(self, other: Sight) -> mi.Float:
         """How likely it is that there is an edge between, as an importance: 0 where there is none for certain."""
         same = dr.select(hides_itself(self.p, self.n, other.p, other.n), bend_or_edge(self, other), 0)
-        return dr.select(self.signature != other.signature, 1, same)
+        hint = dr.select(self.signature != other.signature, 1, same)
+        return dr.select(self.moves | other.moves, hint, 0)
 
 
 def hides_itself(p: mi.Point3f, n: mi.Normal3f, p_other: mi.Point3f, n_other: mi.Normal3f) -> mi.Bool:
