@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from ..measures.job import Job, Point, Record
 from ..measures.methods import RECORDED, TRACED
-from ..tables import comparison, groups, markdown, method_cell
+from ..tables import comparison, markdown, method_cell
 
 TITLE = "edges"
 TAKES = (60, 600)
@@ -21,9 +21,9 @@ INNER, FILM = ("shadow", "silhouette", "ears"), ("black silhouette", "black ears
 VERSUS = (
     ("film edges alone", "edge list"),
     ("inner edges alone", "unguided inner"),
-    ("inner edges alone", "projective inner"),
+    ("projective inner", "inner edges alone"),
 )
-"""What is compared with what that finds the same."""
+"""What is compared with what that finds the same; the last the other way round, since it is many times as much."""
 STEPS = tuple(f"{name}, {way}" for name in ("prb", "all edges") for way in (TRACED, RECORDED))
 GUIDED = 120
 """Seconds after which `prb_projective` sits out, whose guiding takes most of them."""
@@ -45,8 +45,8 @@ def jobs(quick: bool) -> list[Job]:
             rr_depth=100,
             resolution=32,
             spp=16 if quick else 64,
-            rounds=4 if quick else 6 if patience else 16,
-            warm_up=0 if patience else 2,
+            rounds=4 if quick else 12 if patience else 24,
+            warm_up=1 if patience else 2,
             patience=patience,
             measure="edges",
         )
@@ -55,31 +55,53 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def table(record: Record) -> str:
-    """Time next to `prb`, and time x variance next to the rivals; then recorded steps next to their kernels."""
-    parts = [point for point in record.points if ", " not in point.method]
-    rows = [
-        [
-            p.scene,
-            method_cell(p),
-            *comparison(p, methods.get("prb"))[:2],
-            *(_cost(p, methods.get(rival)) if p.method == ours else "" for ours, rival in VERSUS),
-        ]
-        for methods in groups(parts).values()
-        for p in methods.values()
-    ]
-    columns_told = [f"time x variance / {rival}" for _, rival in VERSUS]
-    header = ["scene", "method", "seconds of kernels (median)", "time / prb", *columns_told]
+    """What edges cost, scene by scene; then all methods next to `prb`, and recorded steps next to their kernels."""
+    found = _by_job([point for point in record.points if ", " not in point.method])
+    rows = [[p.scene, method_cell(p), *_versus(p, job.get("prb"))[:2]] for job in found for p in job.values()]
+    header = ["scene", "method", "seconds of kernels (median)", "time / prb"]
     steps = {point.method: point for point in record.points if ", " in point.method}
-    return markdown(header, rows) + "\n\n" + _steps(steps)
+    return "\n\n".join((_costs(found), markdown(header, rows), _steps(steps)))
 
 
-def _cost(point: Point, rival: Point | None) -> str:
-    """Time x variance next to a rival that may have run in fewer rounds."""
-    if rival is None or rival.error:
-        return ""
+def _by_job(points: list[Point]) -> list[dict[str, Point]]:
+    """By method, what was measured in turn: `prb` comes first in each job."""
+    found: list[dict[str, Point]] = []
+    for point in points:
+        if point.method == "prb" or not found:
+            found.append({})
+        found[-1][point.method] = point
+    return found
+
+
+def _costs(found: list[dict[str, Point]]) -> str:
+    """A row for each scene: times next to `prb`, and time x variance next to rivals."""
+    timed = ("film edges alone", "inner edges alone", "edges alone", "projective inner")
+    header = ["scene", *(f"{name} / prb" for name in timed), *(f"time x variance of {a} / {b}" for a, b in VERSUS)]
+    rows = []
+    for scene in (*INNER, *FILM):
+        jobs = [job for job in found if any(point.scene == scene for point in job.values())]
+        at = {name: job for job in jobs for name in job}
+        times = [_versus(at[name][name], at[name].get("prb"))[1] if name in at else "" for name in timed]
+        rows.append([scene, *times, *(_cost(at.get(ours), ours, at.get(rival), rival) for ours, rival in VERSUS)])
+    return markdown(header, rows)
+
+
+def _versus(point: Point, rival: Point | None) -> list[str]:
+    """As `comparison`, of the rounds that both have: one may have sat out the last."""
+    if rival is None or rival is point:
+        return comparison(point, rival)
     n = min(len(point.seeds), len(rival.seeds))
     first = [replace(p, seconds=p.seconds[:n], squared_errors=p.squared_errors[:n]) for p in (point, rival)]
-    return comparison(*first)[3]
+    return comparison(*first)
+
+
+def _cost(job: dict[str, Point] | None, ours: str, other: dict[str, Point] | None, rival: str) -> str:
+    """Time x variance next to a rival. If that ran in another job, the times of `prb` in both make up for the load."""
+    if job is None or other is None or job[ours].error or other[rival].error:
+        return ""
+    seconds = [st.median(x["prb"].seconds) if "prb" in x and x["prb"].seconds else 1.0 for x in (job, other)]
+    scaled = tuple(s * seconds[0] / seconds[1] for s in other[rival].seconds)
+    return _versus(job[ours], replace(other[rival], seconds=scaled))[3]
 
 
 def _steps(steps: dict[str, Point]) -> str:

@@ -13,7 +13,7 @@ LOOKS = 8
 AROUND = 1.0
 """Lines that are thrown at the pixels around what was found, for one at its own."""
 EVENLY = 0.25
-"""Share of the lines that are thrown evenly, so that what the first look missed is found, too."""
+"""Share of the lines that are thrown evenly, unless one asks for more: the first look misses some."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Centres:
         """All places alike, of a film of so many pixels and lines of length l."""
         return Centres(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
 
-    def refined(self, c: mi.Point2f, found: mi.Float) -> Centres:
+    def refined(self, c: mi.Point2f, found: mi.Float, evenly: float = EVENLY) -> Centres:
         """More often where there was something, at places ``c`` so much, and around: edges go on."""
         n = self.width * self.height
         counts = dr.zeros(mi.Float, n)
@@ -39,7 +39,8 @@ class Centres:
             inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
             part = 1.0 if dx == dy == 0 else AROUND / 8
             dr.scatter_add(counts, part * dr.minimum(found, 1), mi.UInt32(y * self.width + x), inside)
-        share = dr.fma(counts, (1 - EVENLY) / dr.maximum(dr.sum(counts), 1), EVENLY / n)
+        total = dr.sum(counts)
+        share = dr.select(total > 0, dr.fma(counts, (1 - evenly) / total, evenly / n), 1 / n)
         until = dr.cumsum(share)
         return Centres(self.width, self.height, self.margin, until / dr.gather(mi.Float, until, n - 1))
 

@@ -14,7 +14,7 @@ number is looked at closer, in another, which thus wastes no lane, and has the s
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -26,6 +26,8 @@ OFF_PLANE = 0.1
 """Share of their distance by which two points leave each other's tangent planes, where a surface hides itself."""
 ROUNDING = 1e-5
 """Share of their coordinates by which points may be wrong."""
+HIDES, BENDS = 0.25, 0.02
+"""How much an edge is looked for between two points of one shape, as it were another: 1. Most of these are bends."""
 
 
 @dataclass
@@ -35,6 +37,7 @@ class Sight:
     signature: mi.UInt32
     p: mi.Point3f  # where the view ends; zero where it does not
     n: mi.Normal3f
+    moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # between two that do not, an edge does nothing
 
     @staticmethod
     def nothing() -> Sight:
@@ -42,15 +45,30 @@ class Sight:
 
     def differs(self, other: Sight) -> mi.Bool:
         """Whether it is another shape, or another sheet of the same: see `hides_itself`."""
-        return (self.signature != other.signature) | hides_itself(self.p, self.n, other.p, other.n)
+        return self.hint(other) > 0
+
+    def hint(self, other: Sight) -> mi.Float:
+        """How likely it is that there is an edge between, as an importance: 0 where there is none for certain."""
+        same = dr.select(hides_itself(self.p, self.n, other.p, other.n), bend_or_edge(self, other), 0)
+        hint = dr.select(self.signature != other.signature, 1, same)
+        return dr.select(self.moves | other.moves, hint, 0)
 
 
 def hides_itself(p: mi.Point3f, n: mi.Normal3f, p_other: mi.Point3f, n_other: mi.Normal3f) -> mi.Bool:
-    """Whether two points of one shape are on different sheets: no tangent plane comes close to the other point."""
+    """Whether two points of one shape may be on different sheets: one is off the tangent plane of the other.
+
+    Or the shape bends between them, which only points that are closer to each other can tell.
+    """
     across = p_other - p
     off = dr.maximum(dr.abs(dr.dot(n, across)), dr.abs(dr.dot(n_other, across)))
     rounding = ROUNDING * dr.max(dr.maximum(dr.abs(p), dr.abs(p_other)))
     return off > OFF_PLANE * dr.norm(across) + rounding
+
+
+def bend_or_edge(a: Sight, b: Sight) -> mi.Float:
+    """How likely one sheet hides the other: on a bend each point is on the same side of the other's tangent plane."""
+    across = b.p - a.p
+    return dr.select(dr.dot(a.n, across) * dr.dot(b.n, across) < 0, BENDS, HIDES)
 
 
 @dataclass
@@ -88,11 +106,11 @@ Look = Callable[..., Sight]
 
 def glance(look: Look, line: Any, active: mi.Bool) -> mi.Float:
     """How much a line counts, whose places are from ``line.begin`` to ``line.end``: 0 where it finds nothing."""
-    ends = (look(line, t, active) for t in (line.begin, line.end))
-    at_a, at_b = ends
+    at_a, at_b = (look(line, t, active) for t in (line.begin, line.end))
     at_c = look(line, 0.5 * (line.begin + line.end), active)
+    ends, halves = at_a.hint(at_b), dr.maximum(at_c.hint(at_a), at_c.hint(at_b))
     # Of two crossings, which count twice, one is chosen in time, for both: see `bisect`.
-    found = dr.select(at_a.differs(at_b), 1.0, dr.select(at_c.differs(at_a), 4.0, 0.0))
+    found = dr.select(ends > 0, dr.maximum(ends, halves), 4 * halves)
     return dr.select(active, found, 0)
 
 
@@ -121,8 +139,8 @@ class Picked:
 def bisect(look: Look, line: Any, weight: mi.Float, pick: mi.PCG32) -> Crossed:
     """A piece of each line with an edge, 2^-14 as long as the line, where ``weight`` is not zero.
 
-    Of several crossings one is chosen; what only the middle found counts twice in each half. None, where a surface was
-    merely bent, weighs 0.
+    Of several crossings one is chosen, by how likely they are edges; what only the middle found counts twice in each
+    half. None, where a surface was merely bent, weighs 0.
     """
     a, b, weight = mi.Float(line.begin), mi.Float(line.end), mi.Float(weight)
     at_a, at_b = look(line, a, weight > 0), look(line, b, weight > 0)
@@ -131,9 +149,10 @@ def bisect(look: Look, line: Any, weight: mi.Float, pick: mi.PCG32) -> Crossed:
     while dr.hint((weight > 0) & (n < BISECTIONS), exclude=[look, line], label="pathreplay: bisection"):
         c = 0.5 * (a + b)
         at_c = look(line, c, mi.Bool(True))
-        left, right = at_c.differs(at_a), at_c.differs(at_b)
-        weight = dr.select(left & right, 2 * weight, dr.select(left | right, weight, 0))
-        left &= ~right | (pick.next_float32() < 0.5)
+        to_a, to_b = at_c.hint(at_a), at_c.hint(at_b)
+        both = to_a + to_b
+        left = (to_b == 0) | (pick.next_float32() * both < to_a)
+        weight *= dr.select(both > 0, both / dr.select(left, to_a, to_b), 0)
         a, at_a = dr.select(left, a, c), dr.select(left, at_a, at_c)
         b, at_b = dr.select(left, c, b), dr.select(left, at_c, at_b)
         n += 1

@@ -47,6 +47,10 @@ EVENLY = 0.25
 """Share of the arcs that are thrown evenly: those that begin below the horizon, or where lobes are weak, count, too."""
 
 
+WIDELY = 0.5
+"""Share of the lines that are thrown evenly over the film: where things touch, few lines find what counts much."""
+
+
 @dataclass
 class Chosen:
     """The vertex of a camera path that looks for edges."""
@@ -295,7 +299,8 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
         moves = x.moves | may_move(walk, seen)
         if walk.media is not None:  # directions follow null boundaries, too
             place, moves = mixed(place, place_met(walk, first, active, facets=False)), moves | may_move(walk, first)
-        return dr.select(moves, Sight(mixed(place, turned), at.p, at.n), Sight.nothing())
+        sight = Sight(mixed(place, turned), at.p, at.n, moves)
+        return dr.select(_counts(walk, x, seen), sight, replace(Sight.nothing(), moves=moves))
 
     if search.chosen is None:
         return glance(look, line, ok)
@@ -327,6 +332,14 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
         L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
         K.append(dr.select(active, common * T * L, 0))
     return Hiding(edge, near, far, ray_near.d, ray_far.d, n, bend, steep, K[0], K[1], active)
+
+
+def _counts(walk: Walk, x: Chosen, seen: mi.PreliminaryIntersection3f) -> mi.Bool:
+    """Whether light may come from what x sees: at the end of a path only what glows has any."""
+    if walk.media is not None:
+        return mi.Bool(True)
+    glows = dr.select(seen.is_valid(), seen.shape.emitter() != None, walk.scene.environment() is not None)  # noqa: E711
+    return glows | (x.depth + 2 < walk.max_depth)
 
 
 def hiding_motion(walk: Walk, seer: Seer, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
@@ -381,7 +394,7 @@ def inner_edges(
 
     centres = Centres(int(places.size.x), int(places.size.y), 0.0)
     s, *found = glances(centres, max(lines // LOOKS, 1), seed ^ 0x7F4A7C15)
-    centres = centres.refined(s, found[0] + found[1])
+    centres = centres.refined(s, found[0] + found[1], WIDELY)
     _, *found = glances(centres, lines, seed)
     dr.eval(found)
     chosen = Picked.of(dr.concat(found), closer, seed)
