@@ -289,7 +289,7 @@ INDIRECT = [
          seeds=32),
     cell("indirect_rough", by_a_side_wall(
         lambda: {"type": "twosided", "inner": {"type": "roughconductor", "alpha": 0.3}}, patterned),
-        OBJECT, translate(1, 0.3, 0.4), 3),
+        OBJECT, translate(1, 0.3, 0.4), 3, seeds=24),
     cell("cube_in_wall", stands_in_the_wall, VERTICES, translate_vertices(0, 0, 1), 3, seeds=16),
     cell("indirect_contact", on_a_side_wall(lambda: cube24(IN_THE_WALL, paint(0.9))), VERTICES,
          translate_vertices(0.3, 1, 0.2), 3, seeds=48),
