@@ -28,15 +28,16 @@ from pathreplay.inverse.images import png_bytes  # isort: skip
 #: Files that compute and neither read nor write pictures, which a pool of one thread would wait for for ever.
 COMPUTING = {"test_truth_media", "test_pixel_sweep", "test_replay_attached", "test_primal_media", "test_rivals",
              "test_truth_materials", "test_truth_attached", "test_motion_noise", "test_fixed_set", "test_drivers",
-             "test_terms", "test_evaluated", "test_step", "test_truth_edges", "test_truth_edges_media"}  # fmt: skip
+             "test_terms", "test_evaluated", "test_step", "test_truth_edges", "test_truth_edges_inner",
+             "test_truth_edges_media"}  # fmt: skip
 VARIANT = "llvm_ad_rgb"
 #: Far above what any of these takes (a few seconds): a hanging process must not hang the tests.
 TIMEOUT_S = 120
 #: Files that take longest, begun first, so that of several processes none is left alone with one of them.
-LONGEST = ("test_truth_edges", "test_truth_media", "test_edges_ordinary", "test_mitsuba_configs",
-           "test_edges_in_use", "test_truth_edges_media", "test_pixel_sweep", "test_replay_attached",
-           "test_ordinary_use", "test_primal_media", "test_truth_materials", "test_truth_attached",
-           "test_rivals", "test_inverse_run", "test_motion_noise", "test_variants",
+LONGEST = ("test_truth_edges_inner", "test_truth_edges", "test_truth_media", "test_edges_ordinary",
+           "test_mitsuba_configs", "test_edges_in_use", "test_truth_edges_media", "test_pixel_sweep",
+           "test_replay_attached", "test_ordinary_use", "test_primal_media", "test_truth_materials",
+           "test_truth_attached", "test_rivals", "test_inverse_run", "test_motion_noise", "test_variants",
            "test_inverse_grids", "test_deterministic", "test_volume_example")  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """Scenes whose edges move: small rooms of one wall, one lamp and one thing before them, and what moves in each.
 
-`CELLS` are cases of truth tests, whose pictures are weighed by `weights`. Where a light's radiance or a wall's paint
+The cells are cases of truth tests, whose pictures are weighed by `weights`. Where a light's radiance or a wall's paint
 varies, it is bilinear noise, so that no side of an edge is constant. Steps are large, since a central difference is
 held to the mean of the gradient between its two places: behind a ball of glass, which images the camera close to what
 is there, the gradient changes by a tenth within a few hundredths, and no difference at one place would be right.
@@ -235,7 +235,7 @@ SEVERAL = ("wall.to_world", "lamp.to_world", "object.to_world")
 def cell(name: str, make: Callable[[], dict], key: str, move: Move, depth: int = 2, **more: Any) -> Case:
     """A case of everything moving but what paths choose at random; roulette would depend on the parameter."""
     settings: dict[str, Any] = dict(
-        step=0.05, spp=256, seeds=8, reference_spp=1024, rr_depth=1000, options={"edges": "all"}, drivers=("sweep",),
+        step=0.05, spp=256, seeds=12, reference_spp=1024, rr_depth=1000, options={"edges": "all"}, drivers=("sweep",),
         lanes=None,
     )  # fmt: skip
     return Case(name, make, key, move, depth, **{**settings, **more})
@@ -256,8 +256,7 @@ SHADE_BOX = SHADE.rotate([1, 0.4, 0], 30).scale(0.25)
 TURN, UP = turn_vertices(0, 1, 0), translate(0, 0, 1)
 OBJECT, VERTICES = "object.to_world", "object.vertex_positions"
 
-CELLS = [
-    # Seen by the camera.
+SEEN = [
     cell("rect_black", before_a_glow(lambda: shape(CARD, BLACK)), OBJECT, translate(*ASIDE)),
     cell("rect_emit", lambda: scene(object=lamp(T().translate([0.1, 0.05, 0]).scale([0.4, 0.3, 1]), 1)),
          OBJECT, translate(1, 0, 0)),
@@ -270,7 +269,9 @@ CELLS = [
     cell("can_moves", lit_box(can), VERTICES, translate_vertices(*ASIDE), seeds=16),
     cell("camera_moves", before_a_glow(lambda: shape(CARD, BLACK)), "camera.to_world", translate(*ASIDE)),
     cell("lamp_seen", lamp_seen, "lamp.to_world", translate(*ASIDE)),
-    # Shadows.
+]  # fmt: skip
+"""What the camera sees."""
+SHADOWS = [
     cell("shadow_occluder", shadow(), OBJECT, translate(*ASIDE)),
     cell("shadow_lamp", shadow(), "lamp.to_world", translate(*ASIDE)),
     cell("shadow_receiver", shadow(wall=plain), "wall.to_world", UP),
@@ -282,18 +283,21 @@ CELLS = [
     cell("sphere_lamp", shadow(light=ball_lamp), "lamp.to_world", translate(*ASIDE)),
     cell("shadow_env", shadow_of_sky, OBJECT, translate(*ASIDE)),
     cell("lamp_lights", lamp_lights, "lamp.to_world", translate(*ASIDE)),
-    # One bounce more.
+]  # fmt: skip
+INDIRECT = [
     cell("indirect", by_a_side_wall(patterned, lambda: paint(0.8, 0.7, 0.3)), OBJECT, translate(1, 0.3, 0.4), 3,
-         seeds=16),
+         seeds=32),
     cell("indirect_rough", by_a_side_wall(
         lambda: {"type": "twosided", "inner": {"type": "roughconductor", "alpha": 0.3}}, patterned),
-        OBJECT, translate(1, 0.3, 0.4), 3),
+        OBJECT, translate(1, 0.3, 0.4), 3, seeds=24),
     cell("cube_in_wall", stands_in_the_wall, VERTICES, translate_vertices(0, 0, 1), 3, seeds=16),
     cell("indirect_contact", on_a_side_wall(lambda: cube24(IN_THE_WALL, paint(0.9))), VERTICES,
-         translate_vertices(0.3, 1, 0.2), 3),
+         translate_vertices(0.3, 1, 0.2), 3, seeds=48),
     cell("indirect_can", on_a_side_wall(lambda: can(BESIDE, paint(0.9), 5)), VERTICES, turn_vertices(0, 1, 0.3), 3,
          seeds=16),
-    # Through delta lobes.
+]  # fmt: skip
+"""One bounce more."""
+BENT = [
     cell("mirror_z", mirror, "mirror.to_world", UP, 3),
     cell("mirror_x", mirror, "mirror.to_world", translate(1, 0, 0), 3),
     cell("glass_index", ball_of_glass, "ball.bsdf.eta", add(1.0), 5),
@@ -303,6 +307,7 @@ CELLS = [
     cell("emit_blocker", glowing_behind_glass, OBJECT, translate(1, 0, 0), 6, step=0.02),
     cell("emit_sphere", glowing_behind_glass, "ball.to_world", translate(*ASIDE), 6, step=0.01),
 ]  # fmt: skip
+"""By mirrors and through glass."""
 ALL_MOVE = cell("all_move", everything, ("wall.to_world", "lamp.to_world", "bulb.to_world", "mirror.to_world",
     "ball.to_world"), translate(*ASIDE), 3)  # fmt: skip
-BY_NAME = {each.name: each for each in CELLS}
+BY_NAME = {each.name: each for each in (*SEEN, *SHADOWS, *INDIRECT, *BENT)}

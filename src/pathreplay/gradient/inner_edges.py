@@ -27,7 +27,7 @@ from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
 from ..transport.traits import Tables
-from ..transport.velocity import held_direction, moved_direction
+from ..transport.velocity import held_direction, jumps_at_facets, moved_direction
 from ..transport.vertex import Arrival, Flight, Walk, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
 from .bends import Bend
@@ -296,6 +296,8 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
         turned = dr.select(dr.dot(at.sh_frame.n, ray.d) > 0, mi.UInt32(1), 0)
         place = dr.select(seer.keeps, place_met(walk, seen, active), place_met(walk, seen, active, facets=False))
+        facets = ~seer.keeps & jumps_at_facets(walk.traits.tables.blend_lengths, seer.origin, seen, at.p, at.n)
+        place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
         moves = x.moves | may_move(walk, seen)
         if walk.media is not None:  # directions follow null boundaries, too
             place, moves = mixed(place, place_met(walk, first, active, facets=False)), moves | may_move(walk, first)

@@ -30,6 +30,8 @@ from .surface import HeldPoint, held_point
 # h0 over the size of the shape that was hit. A larger one is less noisy and gives up more of the edges that are close
 # by; docs/gradients.md has both for 0.003 to 0.03.
 BLEND = 0.01
+# m from which on V follows y but for a thousandth.
+CLOSE = 7.0
 
 
 def blend_length(shape: mi.Shape) -> float:
@@ -60,6 +62,16 @@ def moved_direction(
     φ, slope = _share(h0, dr.detach(y), dr.detach(towards), ok)
     log_J = φ * log_J_H + dr.dot(slope, d_H)
     return dr.select(ok, dr.replace_grad(d, φ * d_H), d), dr.replace_grad(mi.Float(1), log_J)
+
+
+def jumps_at_facets(
+    lengths: mi.Float, origin: mi.Interaction3f, hit: mi.PreliminaryIntersection3f, p: mi.Point3f, n: mi.Normal3f
+) -> mi.Bool:
+    """Whether V jumps from facet to facet where ``hit`` is, at ``p`` with the normal ``n``: φ asks for their planes."""
+    towards = p - origin.p
+    h0 = dr.gather(mi.Float, lengths, dr.reinterpret_array(mi.UInt32, hit.shape), hit.is_valid())
+    near = dr.abs(dr.dot(n, towards)) * dr.norm(towards) < CLOSE * dr.square(h0)
+    return hit.is_valid() & hit.shape.is_mesh() & near
 
 
 def held_direction(
