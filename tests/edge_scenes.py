@@ -14,6 +14,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_configs import square
 from truth import RES, Case, Move, add, bitmap, camera, noise, rgb, translate, translate_vertices, turn_vertices
 
 Place = Any
@@ -137,6 +138,12 @@ def plain() -> dict:
 
 def ball_lamp() -> dict:
     return lamp(T().translate([1.6, 1.2, 2.5]).scale(0.4), kind="sphere")
+
+
+def painted_lamp() -> mi.Mesh:
+    """A mesh that glows with a texture."""
+    radiance = {**bitmap(noise(8, 3, 1, 10)), "filter_type": "bilinear"}
+    return square(OVERHEAD, bsdf=BLACK, emitter={"type": "area", "radiance": radiance})
 
 
 def shadow_of_sky() -> dict:
@@ -281,6 +288,7 @@ CELLS = [
     cell("shadow_copy", copies_shade, "group.box.vertex_positions", translate_vertices(*ASIDE)),
     cell("sphere_lamp", shadow(light=ball_lamp), "lamp.to_world", translate(*ASIDE)),
     cell("shadow_env", shadow_of_sky, OBJECT, translate(*ASIDE)),
+    cell("shadow_painted", shadow(light=painted_lamp), "lamp.vertex_positions", turn_vertices(0.3, 1, 0.2)),
     cell("lamp_lights", lamp_lights, "lamp.to_world", translate(*ASIDE)),
     # One bounce more.
     cell("indirect", by_a_side_wall(patterned, lambda: paint(0.8, 0.7, 0.3)), OBJECT, translate(1, 0.3, 0.4), 3,

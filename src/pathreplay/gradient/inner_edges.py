@@ -21,6 +21,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.emitters import even_sample
 from ..transport.motion import may_move
 from ..transport.passage import SHORT_OF
 from ..transport.path import PathState
@@ -191,16 +192,16 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     line, inside = emitter_line(walk, x, l, key)
 
     def shadowed(line: SquareLine, t: mi.Float, active: mi.Bool) -> tuple[Any, ...]:
-        light, Le = line.emitter.sample_direction(seer.origin, line.sample(t), active)
+        light, Le, density = even_sample(walk, line.emitter, seer.origin, line.sample(t), active)
         ray = seer.origin.spawn_ray_to(light.p)
         lit = active & (light.pdf != 0)
         hit = seer.behind(ray, seer.hit(ray, lit), lit)
         # A lamp's own limb hides it by rounding only.
         hidden = lit & hit.is_valid() & (hit.shape.emitter() != light.emitter)
-        return light, Le, ray, hit, hidden
+        return light, Le, ray, hit, density, hidden
 
     def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
-        *_, hit, hidden = shadowed(line, t, active)
+        *_, hit, _, hidden = shadowed(line, t, active)
         moves = x.moves | _lamp_moves(walk, line.emitter) | may_move(walk, hit)
         return Sight(mi.UInt32(hidden & moves), mi.Point3f(0), mi.Normal3f(0))
 
@@ -211,12 +212,11 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     a, b = (shadowed(line, t, active) for t in (found.a, found.b))
     a_hidden, b_hidden = a[-1], b[-1]
     active &= a_hidden != b_hidden
-    light, Le = dr.select(a_hidden, b[0], a[0]), dr.select(a_hidden, b[1], a[1])
+    light, Le, density = (dr.select(a_hidden, b[k], a[k]) for k in (0, 1, 4))
     ray, hit = dr.select(a_hidden, a[2], b[2]), dr.select(a_hidden, a[3], b[3])
     f, pdf = seer.towards(light.d, active)
     Le *= seer.past(light, hit.t, key, active)
-    density = light.pdf / line.share
-    F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density, pdf))
+    F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density / line.share, pdf))
     K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a_hidden, -1, 1)
     ends = line.sample(dr.select(a_hidden, found.a, found.b)), line.sample(dr.select(a_hidden, found.b, found.a))
     return Shaded(line, *ends, hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
@@ -234,7 +234,7 @@ def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
 def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
     """B: distance of the line to the emitter sample from the edge; differentiable in all that moves."""
     origin = seer.moved(at)
-    light, _ = c.line.emitter.sample_direction(origin, u, c.active)
+    light, *_ = even_sample(seer.walk, c.line.emitter, origin, u, c.active)
     return outline_gap(c.n, origin.p, light.d, c.hit, c.ray, c.active)
 
 

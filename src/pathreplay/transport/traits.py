@@ -53,6 +53,7 @@ class Traits:
     detached_names: tuple[str, ...]  # classes of the others with smooth lobes
     area_lights: bool  # there are emitters with an edge
     hard_lights: bool  # there are emitters whose shadows are hard
+    painted_meshes: bool  # there are meshes that emit, with a texture
     two_sides: bool  # a surface may have another BSDF on its back
     masks_mirrors: bool  # a mask lies over delta lobes
     glossy: bool  # a surface may have a narrow smooth lobe, and no texture has seams
@@ -84,6 +85,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         detached_names=tuple(sorted({bsdf.class_name() for bsdf in others})),
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
+        painted_meshes=any(shape.is_emitter() and shape.is_mesh() and _is_painted(shape.emitter()) for shape in shapes),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         glossy=_is_glossy(bsdfs, nodes),
@@ -126,8 +128,7 @@ def strips_of(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> tuple[mi.UI
     areas = {shape.emitter(): mesh_areas(shape) for shape in shapes if shape.is_emitter() and shape.is_mesh()}
     ends = [] if emitters else [np.ones(1)]  # an empty array in a walk would end the process
     for emitter in emitters:
-        painted = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
-        ends.append(np.cumsum(areas[emitter]) if emitter in areas and not painted else np.ones(1))
+        ends.append(np.cumsum(areas[emitter]) if emitter in areas else np.ones(1))
     lamps = np.repeat(np.arange(len(ends)), [len(x) for x in ends])
     return mi.UInt32(lamps.astype(np.uint32)), mi.Float(np.concatenate([x / x[-1] for x in ends]))
 
@@ -164,6 +165,10 @@ def nodes_of(root: mi.Object) -> set[mi.Object]:
 
     root.traverse(Collector())
     return seen
+
+
+def _is_painted(emitter: mi.Emitter) -> bool:
+    return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying))
 
 
 def _is_glossy(bsdfs: list[mi.BSDF], nodes: set[mi.Object]) -> bool:
