@@ -14,6 +14,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from mitsuba_configs import ball as sphere
+from mitsuba_configs import square
 from truth import RES, Case, Move, add, bitmap, camera, noise, rgb, translate, translate_vertices, turn_vertices
 
 Place = Any
@@ -137,6 +139,17 @@ def plain() -> dict:
 
 def ball_lamp() -> dict:
     return lamp(T().translate([1.6, 1.2, 2.5]).scale(0.4), kind="sphere")
+
+
+def painted_lamp() -> mi.Mesh:
+    """A mesh that glows with a texture."""
+    radiance = {**bitmap(noise(8, 3, 1, 10)), "filter_type": "bilinear"}
+    return square(OVERHEAD, bsdf=BLACK, emitter={"type": "area", "radiance": radiance})
+
+
+def ball_of_triangles() -> mi.Mesh:
+    """A ball that glows, of 224 triangles that are shaded smoothly."""
+    return sphere(T().translate([1.6, 1.2, 2.5]).scale(0.4), 8, emitter={"type": "area", "radiance": rgb(10, 10, 10)})
 
 
 def shadow_of_sky() -> dict:
@@ -282,6 +295,8 @@ SHADOWS = [
     cell("shadow_copy", copies_shade, "group.box.vertex_positions", translate_vertices(*ASIDE)),
     cell("sphere_lamp", shadow(light=ball_lamp), "lamp.to_world", translate(*ASIDE)),
     cell("shadow_env", shadow_of_sky, OBJECT, translate(*ASIDE)),
+    cell("shadow_painted", shadow(light=painted_lamp), "lamp.vertex_positions", turn_vertices(0.3, 1, 0.2)),
+    cell("mesh_lamp", shadow(light=ball_of_triangles), OBJECT, translate(*ASIDE), spp=512),
     cell("lamp_lights", lamp_lights, "lamp.to_world", translate(*ASIDE)),
 ]  # fmt: skip
 INDIRECT = [

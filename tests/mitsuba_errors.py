@@ -27,6 +27,7 @@ from pathreplay.backend import set_variant
 from pathreplay.check.objective import Objective
 from pathreplay.check.statistics import gap
 from pathreplay.check.stencil import CENTRAL
+from pathreplay.scenes.parameters import get_array
 
 SMALL = 32
 """Pixels in a row of the film, at most, unless in full."""
@@ -35,10 +36,8 @@ FLOOR_PRIMAL, FLOOR_FORWARD, FLOOR_REVERSE = 2e-2, 2e-1, 1e-3
 """Errors are relative to the reference, or to this where it is smaller."""
 ADJOINT = 1e-3
 """What reverse mode is given for each value of the image."""
-PASSES, LANES = 8, 1 << 22
+PASSES, LANES = 16, 1 << 22
 """With how many seeds, at least, and how many samples in one of them, at most."""
-TINY = 1e-6
-"""Derivatives of the weighted mean that count as zero."""
 
 
 class Found(NamedTuple):
@@ -48,7 +47,7 @@ class Found(NamedTuple):
     forward: tuple[float, float]
     reverse: float
     z: float  # forward against differences, sums with weights that differ from pixel to pixel
-    transpose: float  # reverse against forward, with these weights and the same random numbers
+    transpose: float  # reverse against forward, with these weights and the same random numbers; see `Setup.rounded`
 
     def misses(self, limits: Limits) -> list[str]:
         """Which of the three thresholds are exceeded."""
@@ -67,23 +66,41 @@ class Setup(Objective):
         gc.collect()  # earlier scenes would be traced, too
         scene = mi.load_dict(config.scene(size), optimize=False)
         super().__init__(scene, mi.traverse(scene), config.keys[0], config.move)
+        self.place = 0.0  # where derivatives are taken
+        self.rounded = 0.0  # magnitude of the last reverse derivative, parameter by parameter: its rounding is a share
         self.values = {key: type(self.params[key])(self.params[key]) for key in config.keys}
 
     def put(self, t: mi.Float) -> None:
         for key, value in self.values.items():
-            self.params[key] = self.move(value, t)
+            self.params[key] = self.move(value, t + self.place)
         self.params.update()
 
+    def along(self, integrator: mi.Integrator, places: np.ndarray, seed: int, spp: int) -> np.ndarray:
+        """Forward derivatives at places, each with its seed and ``spp`` samples in all."""
+        found = []
+        for k, place in enumerate(places):
+            self.place = float(place)
+            found.append(self.forward(integrator, seed + k, spp // len(places)))
+        self.place = 0.0
+        return np.array(found)
+
     def collect(self, t: mi.Float) -> float:
-        for key in self.values:
+        self.rounded = 0.0
+        for key, value in self.values.items():
+            ends = (get_array(self.move(value, mi.Float(t))) for t in (-0.5, 0.5))
+            tangent, gradient = np.subtract(*ends), get_array(dr.grad(self.params[key]))
+            self.rounded += float(np.abs(gradient * tangent).sum())
             dr.enqueue(dr.ADMode.Backward, self.params[key])
         dr.traverse(dr.ADMode.Backward)
         return float(dr.grad(t)[0])
 
+    def passes(self, spp: int) -> int:
+        size = self.sensor.film().crop_size()
+        return max(PASSES, -(-spp * int(size[0] * size[1]) // LANES))
+
     def pictures(self, picture: Callable[[int, int], np.ndarray], spp: int, seed: int) -> np.ndarray:
         """picture(seed, samples per pixel) of several passes with ``spp`` samples in all."""
-        size = self.sensor.film().crop_size()
-        passes = max(PASSES, -(-spp * int(size[0] * size[1]) // LANES))
+        passes = self.passes(spp)
         return np.array([picture(seed + k, spp // passes) for k in range(passes)])
 
 
@@ -96,7 +113,8 @@ def measure(config: Config, full: bool = False, edges: str = "all") -> Found:
 
     # As many samples in a row of pixels as with the large film; for reverse mode, in all.
     wide = config.res // size
-    reference_spp, spp = REFERENCE_SPP * wide, config.spp * wide
+    reference_spp, spp = REFERENCE_SPP * wide, config.spp * wide * (wide if config.as_many else 1)
+    places = config.step * ((np.arange(n := setup.passes(spp)) + 0.5) / n - 0.5)
 
     def difference(seed: int, spp: int) -> np.ndarray:
         return setup.difference(plain, CENTRAL, config.step / 2, seed, spp)
@@ -104,19 +122,21 @@ def measure(config: Config, full: bool = False, edges: str = "all") -> Found:
     expected = setup.pictures(lambda seed, spp: setup.image(plain, seed, spp), reference_spp, 1000).mean(axis=0)
     slopes = setup.pictures(difference, reference_spp, 2000)
     image = setup.pictures(lambda seed, spp: setup.image(ours, seed, spp), spp, 1).mean(axis=0)
-    tangents = setup.pictures(lambda seed, spp: setup.forward(ours, seed, spp), spp, 1)
+    tangents = setup.along(ours, places, 1, spp)
     slope, tangent = slopes.mean(axis=0), tangents.mean(axis=0)
 
     setup.weigh(np.full(image.shape, ADJOINT / image.size))
     gradient, sum_of_slope = setup.backward(ours, 1, config.reverse_spp * wide**2), setup.dot(slope)
     reverse = abs(gradient - sum_of_slope) / max(abs(sum_of_slope), FLOOR_REVERSE)
 
-    # Grey, since the weights take part in the choice of vertices.
-    weights = np.random.default_rng(0).uniform(0, 1, (*image.shape[:2], 1))
+    # Grey, since the weights take part in the choice of vertices; more at the right, or what moves would cancel.
+    weights = np.random.default_rng(0).uniform(0, 1, (*image.shape[:2], 1)) * np.linspace(0, 1, image.shape[1])[:, None]
     setup.weigh(np.broadcast_to(weights, image.shape) / image.size)
-    z = gap(*([setup.dot(x) for x in samples] for samples in (tangents, slopes))).z
+    ahead_sums, sums = (np.array([setup.dot(x) for x in samples]) for samples in (tangents, slopes))
+    ahead_sums -= np.polyfit(places, ahead_sums, 1)[0] * places  # no noise, and its mean is zero
+    z = gap(ahead_sums, sums).z
     ahead, back = setup.forward(ours, 1, 16), setup.backward(ours, 1, 16)
-    transpose = abs(setup.dot(ahead) - back) / max(setup.dot(np.abs(ahead)), TINY)
+    transpose = abs(setup.dot(ahead) - back) / max(setup.dot(np.abs(ahead)), setup.rounded)
     setup.put(mi.Float(0))
     primal, forward = relative(image, expected, FLOOR_PRIMAL), relative(tangent, slope, FLOOR_FORWARD)
     return Found(primal, forward, reverse, z, transpose)

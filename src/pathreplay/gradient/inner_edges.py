@@ -21,14 +21,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.emitters import even_sample
 from ..transport.motion import may_move
 from ..transport.passage import SHORT_OF
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
-from ..transport.traits import Tables
+from ..transport.traits import Strips
 from ..transport.velocity import held_direction, jumps_at_facets, moved_direction
-from ..transport.vertex import Arrival, Flight, Walk, mis_weight
+from ..transport.vertex import Arrival, Flight, Walk, mis_weight, reciprocal
 from .adjoint import derivative_by_place, derivative_by_ray
 from .bends import Bend
 from .centres import LOOKS, Centres
@@ -67,20 +68,12 @@ class Chosen:
 
 @dataclass
 class SquareLine(PlaneLine):
-    """A line in a strip of the unit square of samples of one emitter: of a mesh, that of a triangle.
-
-    Its own coordinates are from 0 to 1 in the strip, since samples jump from strip to strip.
-    """
+    """A line in the unit square of samples of one emitter or, of a mesh, of one of its triangles."""
 
     emitter: mi.EmitterPtr
     share: mi.Float  # 1 / probability of the emitter
-    strip: mi.Float  # where it begins
-    width: mi.Float
-
-    def sample(self, t: mi.Float) -> mi.Point2f:
-        """A place of the line in the unit square."""
-        at = self.at(t)
-        return mi.Point2f(at.x, dr.fma(at.y, self.width, self.strip))
+    triangle: mi.UInt32
+    part: mi.Float  # share of the emitter over the probability of the triangle
 
 
 @dataclass
@@ -171,23 +164,25 @@ def emitter_line(walk: Walk, x: Chosen, l: float, key: mi.UInt32) -> tuple[Squar
     inside = x.active & (begin < end)
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, x.active)
     begin, end = dr.select(inside, begin, 0), dr.select(inside, end, 0)
-    strip, width = _strip(walk.traits.tables, index, numbers.next_1d(), x.active)
-    return SquareLine(c, w, begin, end, emitter, share, strip, width), inside
+    triangle, part = _triangle(walk.traits.tables.strips, index, numbers.next_1d(), x.active)
+    return SquareLine(c, w, begin, end, emitter, share, triangle, part), inside
 
 
-def _strip(tables: Tables, emitter: mi.UInt32, u: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """Where a strip of the square begins in which u is, and how wide it is."""
-    lamps, until = tables.strips_of, tables.strips
-    n = dr.width(until)
+def _triangle(strips: Strips, emitter: mi.UInt32, u: mi.Float, active: mi.Bool) -> tuple[mi.UInt32, mi.Float]:
+    """The triangle of the emitter that u chooses, and its share of the area over the probability of that."""
+    n = dr.width(strips.until)
 
     def before(i: mi.UInt32) -> mi.Bool:
-        lamp = dr.gather(mi.UInt32, lamps, i, active)
-        return (lamp < emitter) | ((lamp == emitter) & (dr.gather(mi.Float, until, i, active) <= u))
+        lamp = dr.gather(mi.UInt32, strips.emitter, i, active)
+        return (lamp < emitter) | ((lamp == emitter) & (dr.gather(mi.Float, strips.until, i, active) <= u))
 
     i = dr.minimum(dr.binary_search(0, n - 1, before), n - 1)
-    first = (i == 0) | (dr.gather(mi.UInt32, lamps, dr.maximum(i, 1) - 1, active) != emitter)
-    begin = dr.select(first, 0, dr.gather(mi.Float, until, dr.maximum(i, 1) - 1, active))
-    return begin, dr.gather(mi.Float, until, i, active) - begin
+    last = dr.maximum(i, 1) - 1
+    first = (i == 0) | (dr.gather(mi.UInt32, strips.emitter, last, active) != emitter)
+    begin = dr.select(first, 0, dr.gather(mi.Float, strips.until, last, active))
+    chance = dr.gather(mi.Float, strips.until, i, active) - begin
+    part = dr.gather(mi.Float, strips.share, i, active) * reciprocal(chance)
+    return dr.gather(mi.UInt32, strips.triangle, i, active), part
 
 
 def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
@@ -195,16 +190,16 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     line, inside = emitter_line(walk, x, l, key)
 
     def shadowed(line: SquareLine, t: mi.Float, active: mi.Bool) -> tuple[Any, ...]:
-        light, Le = line.emitter.sample_direction(seer.origin, line.sample(t), active)
+        light, Le, density = even_sample(walk, line.emitter, line.triangle, seer.origin, line.at(t), active)
         ray = seer.origin.spawn_ray_to(light.p)
         lit = active & (light.pdf != 0)
         hit = seer.behind(ray, seer.hit(ray, lit), lit)
         # A lamp's own limb hides it by rounding only.
         hidden = lit & hit.is_valid() & (hit.shape.emitter() != light.emitter)
-        return light, Le, ray, hit, hidden
+        return light, Le, ray, hit, density, hidden
 
     def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
-        *_, hit, hidden = shadowed(line, t, active)
+        *_, hit, _, hidden = shadowed(line, t, active)
         moves = x.moves | _lamp_moves(walk, line.emitter) | may_move(walk, hit)
         return Sight(mi.UInt32(hidden & moves), mi.Point3f(0), mi.Normal3f(0))
 
@@ -215,14 +210,13 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     a, b = (shadowed(line, t, active) for t in (found.a, found.b))
     a_hidden, b_hidden = a[-1], b[-1]
     active &= a_hidden != b_hidden
-    light, Le = dr.select(a_hidden, b[0], a[0]), dr.select(a_hidden, b[1], a[1])
+    light, Le, density = (dr.select(a_hidden, b[k], a[k]) for k in (0, 1, 4))
     ray, hit = dr.select(a_hidden, a[2], b[2]), dr.select(a_hidden, a[3], b[3])
     f, pdf = seer.towards(light.d, active)
     Le *= seer.past(light, hit.t, key, active)
-    density = light.pdf / line.share
-    F = x.β * f * Le * line.share * dr.select(light.delta, 1, mis_weight(density, pdf))
+    F = x.β * f * Le * (line.share * line.part) * dr.select(light.delta, 1, mis_weight(density / line.share, pdf))
     K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a_hidden, -1, 1)
-    ends = line.sample(dr.select(a_hidden, found.a, found.b)), line.sample(dr.select(a_hidden, found.b, found.a))
+    ends = line.at(dr.select(a_hidden, found.a, found.b)), line.at(dr.select(a_hidden, found.b, found.a))
     return Shaded(line, *ends, hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
 
 
@@ -238,7 +232,7 @@ def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
 def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
     """B: distance of the line to the emitter sample from the edge; differentiable in all that moves."""
     origin = seer.moved(at)
-    light, _ = c.line.emitter.sample_direction(origin, u, c.active)
+    light, *_ = even_sample(seer.walk, c.line.emitter, c.line.triangle, origin, u, c.active)
     return outline_gap(c.n, origin.p, light.d, c.hit, c.ray, c.active)
 
 
@@ -248,7 +242,7 @@ def shadow_weight(seer: Seer, c: Shaded) -> mi.Spectrum:
     # Where a sample of the emitter jumps there is no edge: its other side is far off.
     off = dr.abs(shadow_gap(seer, c, seer.at.ray, c.u_lit) - shadow_gap(seer, c, seer.at.ray, c.u))
     jumps = off > JUMP * dr.norm(slope) * dr.norm(c.u_lit - c.u) + ROUNDING * (dr.norm(c.ray.o) + c.hit.t)
-    return c.line.passed(c.K, mi.Vector2f(slope.x, slope.y * c.line.width), c.active & ~jumps)
+    return c.line.passed(c.K, slope, c.active & ~jumps)
 
 
 @dataclass

@@ -73,10 +73,8 @@ class SceneFacts:
         """Made anew when shapes have changed their sizes, or meshes the number of their triangles."""
         boxes = [shape.bbox() for shape in self._shapes]
         if boxes != self._boxes:
-            lamps, strips = strips_of(self._lights, self._shapes)
-            tables = replace(
-                self._traits.tables, blend_lengths=blend_lengths(self._shapes), strips_of=lamps, strips=strips
-            )
+            strips = strips_of(self._lights, self._shapes)
+            tables = replace(self._traits.tables, blend_lengths=blend_lengths(self._shapes), strips=strips)
             self._traits, self._boxes = replace(self._traits, tables=tables), boxes
         if (sizes := _sizes(self._shapes)) != self._sizes:
             begins, pieces = pieces_of(self._shapes)

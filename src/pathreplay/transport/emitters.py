@@ -5,7 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .passage import beyond_null
 from .surface import held_point
+from .traits import UNDIVIDED
 from .vertex import Arrival, Walk, mis_weight, reciprocal
 
 
@@ -49,14 +51,89 @@ def redraw_emitter(
     """
     scene = walk.scene
     if attached:
-        light, Le = scene.sample_emitter_direction(origin, u, False, lit)
+        painted = mi.Bool(False)
+        if walk.traits.painted_meshes:
+            still, _ = draw_emitter(scene, dr.detach(origin), u, lit, visible=False)
+            painted = lit & _is_painted_mesh(still.emitter)
+        light, Le = scene.sample_emitter_direction(origin, u, False, lit & ~painted)
         if walk.traits.lights_deform:
-            Le *= _mesh_growth(scene, origin, light, lit)
+            Le *= _mesh_growth(scene, origin, light, lit & ~painted)
+        if walk.traits.painted_meshes:
+            glued, glow = _glued(walk, origin, still, painted)
+            light, Le = dr.select(painted, glued, light), dr.select(painted, glow, Le)
         return light, Le
     if light is None:
-        with dr.suspend_grad():
-            light, _ = scene.sample_emitter_direction(origin, u, False, lit)
+        light, _ = draw_emitter(scene, origin, u, lit, visible=False)
     return light, scene.eval_emitter_direction(origin, light, lit) * dr.detach(reciprocal(light.pdf))
+
+
+def even_sample(
+    walk: Walk, emitter: mi.EmitterPtr, triangle: mi.UInt32, origin: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
+) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Float]:
+    """A direction towards an emitter, with Le/p, and the density with which `draw_emitter` takes it among its samples.
+
+    Of meshes, towards a ``triangle``, evenly, whatever texture it has: numbers that choose it among thousands would
+    have no digits left to say where in it. The direction is differentiable in u, the origin, and the emitter.
+    """
+    if not walk.traits.mesh_lights:
+        light, Le = emitter.sample_direction(origin, u, active)
+        return light, Le, light.pdf
+    inside = active & (triangle != UNDIVIDED)
+    light, Le = emitter.sample_direction(origin, u, active & ~inside)
+    shape = emitter.get_shape()
+    si = _on_triangle(shape, triangle, origin, u, inside)
+    even = mi.DirectionSample3f(walk.scene, si=si, ref=origin)
+    with dr.suspend_grad():
+        faces = inside & (dr.dot(even.d, si.n) < 0)  # all of the triangle does, or none, unlike its shading normal
+        even.emitter, even.pdf = emitter, dr.select(faces, shape.pdf_direction(origin, even, faces), 0)
+        glow = emitter.eval_direction(origin, even, faces) * reciprocal(even.pdf)
+        density = emitter.pdf_direction(origin, even, faces)
+    even, Le = dr.select(inside, even, light), dr.select(inside, glow, Le)
+    return even, Le, dr.select(inside, density, light.pdf)
+
+
+def _on_triangle(
+    shape: mi.ShapePtr, triangle: mi.UInt32, origin: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
+) -> mi.SurfaceInteraction3f:
+    """The place of a triangle that has the coordinates ``u`` in the unit square, glued to it."""
+    hit = dr.zeros(mi.PreliminaryIntersection3f)
+    hit.valid, hit.t, hit.prim_index, hit.shape = mi.Bool(True), mi.Float(1), triangle, shape
+    hit.prim_uv = mi.warp.square_to_uniform_triangle(u)
+    ray = dr.detach(origin.spawn_ray(mi.Vector3f(0, 0, 1)))
+    return hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
+
+
+def _is_painted_mesh(emitter: mi.EmitterPtr) -> mi.Bool:
+    painted = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+    return painted & emitter.get_shape().is_mesh()
+
+
+def _glued(
+    walk: Walk, origin: mi.Interaction3f, still: mi.DirectionSample3f, active: mi.Bool
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+    """A sample of a mesh with a texture, at a point that is glued to it, with Le/p; ``still`` is the same, detached.
+
+    Mitsuba's own slides: it meets the mesh in space along a ray in the plane of texture coordinates.
+    """
+    ray = dr.detach(origin.spawn_ray_to(still.p))
+    ray.maxt = dr.largest(mi.Float)
+    hit = walk.scene.ray_intersect_preliminary(ray, active=active)
+    if walk.media is not None:
+        hit = beyond_null(walk.scene, ray, hit, active)
+    y = held_point(hit, ray, active)
+    towards = y.p - origin.p
+    facing = dr.abs(dr.dot(y.A, towards))
+    ok = active & hit.is_valid() & (hit.shape.emitter() == still.emitter) & (facing > 0)
+    dist2 = dr.select(ok, dr.squared_norm(towards), 1)
+    log_J = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)  # of the solid angle of an area around the point
+    J = dr.replace_grad(mi.Float(1), log_J)
+    light = dr.copy(still)
+    light.p = dr.select(ok, dr.replace_grad(still.p, y.p), still.p)
+    light.d = dr.select(ok, dr.replace_grad(still.d, towards * dr.rsqrt(dist2)), still.d)
+    light.dist = dr.select(ok, dr.replace_grad(still.dist, dr.sqrt(dist2)), still.dist)
+    light.pdf = dr.select(ok, dr.replace_grad(still.pdf, -still.pdf * log_J), still.pdf)
+    Le = walk.scene.eval_emitter_direction(dr.detach(origin), still, active) * reciprocal(still.pdf)
+    return light, Le * J
 
 
 def _mesh_growth(scene: mi.Scene, origin: mi.Interaction3f, light: mi.DirectionSample3f, lit: mi.Bool) -> mi.Float:

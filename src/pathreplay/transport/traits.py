@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .pieces import mesh_areas, mesh_pieces
+from .pieces import mesh_pieces, triangle_sizes
 from .velocity import blend_length
 
 # Classes by name: Mitsuba's objects do not tell these things of themselves.
@@ -23,9 +23,25 @@ DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
 INSTANCE = "Instance"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
+UNDIVIDED = 0xFFFFFFFF
+"""In place of a triangle: an emitter that is none of a mesh."""
 
 T = TypeVar("T")
 V = TypeVar("V")
+
+
+@dataclass
+class Strips:
+    """The parts of emitters in which edges of shadows are looked for, one after the other: triangles of mesh lamps.
+
+    In a triangle as often as it is far around it, since so many edges pass through it: with its area in place of that,
+    those that pass along thin ones would be found hardly ever, and count the more.
+    """
+
+    emitter: mi.UInt32
+    triangle: mi.UInt32  # or `UNDIVIDED`
+    share: mi.Float  # of the emitter's area
+    until: mi.Float  # probability to be chosen, summed up within the emitter
 
 
 @dataclass
@@ -39,8 +55,7 @@ class Tables:
     blend_lengths: mi.Float  # those of `velocity`, by shape
     pieces_at: mi.UInt32  # by shape: where the pieces of its triangles begin, if not `WHOLE` or `FACETS`
     pieces: mi.UInt32  # of all such meshes (see `pieces`), in a row; the first is no triangle's
-    strips_of: mi.UInt32  # emitters, for each strip of their unit squares of samples (see `strips_of`)
-    strips: mi.Float  # and where it ends
+    strips: Strips  # of emitters
 
 
 @dataclass(frozen=True)
@@ -53,6 +68,8 @@ class Traits:
     detached_names: tuple[str, ...]  # classes of the others with smooth lobes
     area_lights: bool  # there are emitters with an edge
     hard_lights: bool  # there are emitters whose shadows are hard
+    mesh_lights: bool  # there are meshes that emit
+    painted_meshes: bool  # there are meshes that emit, with a texture
     two_sides: bool  # a surface may have another BSDF on its back
     masks_mirrors: bool  # a mask lies over delta lobes
     glossy: bool  # a surface may have a narrow smooth lobe, and no texture has seams
@@ -84,6 +101,8 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         detached_names=tuple(sorted({bsdf.class_name() for bsdf in others})),
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
+        mesh_lights=any(shape.is_emitter() and shape.is_mesh() for shape in shapes),
+        painted_meshes=any(shape.is_emitter() and shape.is_mesh() and _is_painted(shape.emitter()) for shape in shapes),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         glossy=_is_glossy(bsdfs, nodes),
@@ -92,7 +111,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
             mi.Bool(_by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)) if attachables else None,
             blend_lengths(shapes),
             *pieces_of(shapes),
-            *strips_of(scene.emitters(), shapes),
+            strips_of(scene.emitters(), shapes),
         ),
     )
 
@@ -121,15 +140,19 @@ def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
     return mi.UInt32(begins), mi.UInt32(np.concatenate(found).astype(np.uint32))
 
 
-def strips_of(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.Float]:
-    """The strips of the unit squares of emitter samples, by emitter: of mesh lamps, which triangle a number chooses."""
-    areas = {shape.emitter(): mesh_areas(shape) for shape in shapes if shape.is_emitter() and shape.is_mesh()}
-    ends = [] if emitters else [np.ones(1)]  # an empty array in a walk would end the process
-    for emitter in emitters:
-        painted = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
-        ends.append(np.cumsum(areas[emitter]) if emitter in areas and not painted else np.ones(1))
-    lamps = np.repeat(np.arange(len(ends)), [len(x) for x in ends])
-    return mi.UInt32(lamps.astype(np.uint32)), mi.Float(np.concatenate([x / x[-1] for x in ends]))
+def strips_of(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> Strips:
+    """Look at emitters in the order of the scene."""
+    sizes = {s.emitter(): triangle_sizes(s) for s in shapes if s.is_emitter() and s.is_mesh()}
+    one = np.ones(1), np.ones(1)
+    of_each = [sizes.get(emitter) for emitter in emitters] or [None]  # an empty array would end the process
+    triangles = [[UNDIVIDED] if found is None else np.arange(len(found[0])) for found in of_each]
+    areas, around = zip(*(found or one for found in of_each), strict=True)
+    return Strips(
+        mi.UInt32(np.repeat(np.arange(len(areas)), [len(x) for x in areas]).astype(np.uint32)),
+        mi.UInt32(np.concatenate(triangles).astype(np.uint32)),
+        mi.Float(np.concatenate([x / np.sum(x) for x in areas])),
+        mi.Float(np.concatenate([np.cumsum(x) / np.sum(x) for x in around])),
+    )
 
 
 def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], otherwise: V) -> list[V]:
@@ -164,6 +187,10 @@ def nodes_of(root: mi.Object) -> set[mi.Object]:
 
     root.traverse(Collector())
     return seen
+
+
+def _is_painted(emitter: mi.Emitter) -> bool:
+    return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying))
 
 
 def _is_glossy(bsdfs: list[mi.BSDF], nodes: set[mi.Object]) -> bool:
