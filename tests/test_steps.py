@@ -15,6 +15,7 @@ import pytest
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.config import ITERATION
+from pathreplay.inverse.penalties import Penalty
 from pathreplay.inverse.schedules import rate
 from pathreplay.inverse.transforms import Transform
 
@@ -146,7 +147,42 @@ def test_a_job_steps_in_the_logarithm() -> None:
     assert np.abs(np.log(shares)) == pytest.approx([0.1] * 3, abs=1e-5)
 
 
+@pytest.mark.parametrize("shape", [(5, 4, 3), (3, 1, 4, 1)])
+def test_penalties_are_as_they_say_and_gradients_follow(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(0)
+    v, start, δ = (rng.uniform(0, 1, shape).astype(np.float32) for _ in range(3))
+    penalty = Penalty(0.3, 0.2, start)
+    value, gradient = penalty.of(v)
+    axes = [np.diff(v.astype(float), axis=k) for k in range(len(shape) - 1) if shape[k] > 1]
+    expected = sum(0.3 * (np.sqrt(Δ**2 + 1e-6) - 1e-3).mean() for Δ in axes) + 0.2 * ((v - start) ** 2).mean()
+    assert value == pytest.approx(expected, rel=1e-6)
+    h = 1e-3
+    slope = (penalty.of(v + h * δ)[0] - penalty.of(v - h * δ)[0]) / (2 * h)
+    assert np.vdot(gradient, δ) == pytest.approx(slope, rel=1e-3)
+
+
+def test_a_grid_that_is_refined_is_pulled_to_its_start() -> None:
+    start = np.full((2, 2, 2, 1), 0.25, np.float32)
+    assert Penalty(0.0, 1.0, start).of(np.full((4, 4, 4, 1), 0.75, np.float32))[0] == pytest.approx(0.25)
+
+
+def test_a_prior_keeps_values_between_start_and_truth() -> None:
+    entry, rest = JOB["parameters"][0], {"optimizer": {"type": "sgd"}, "learning_rate_schedule": "constant"}
+    job = {**JOB, **rest, "learning_rate": 5.0, "iterations": 30}
+    free = optimize(make_config(job), output="free", progress=False)
+    held = optimize(make_config({**job, "parameters": [{**entry, "prior": 0.1}]}), output="held", progress=False)
+    start, truth = np.float32(entry["initial"]), np.float32(JOB["target"]["values"][entry["key"]])
+    for k in (0, 2):  # the second channel starts at the truth
+        moved = [float((r.parameters[entry["key"]][k] - start[k]) / (truth[k] - start[k])) for r in (held, free)]
+        assert 0.1 < moved[0] < 0.8 < 0.9 < moved[1] < 1.1
+    assert held.history[0].penalty == 0 < held.history[-1].penalty and free.history[-1].penalty == 0
+
+
 REFUSED = {
+    "varying number": (
+        {"parameters": [{"key": "wall.bsdf.reflectance.value", "total_variation": 0.1}]},
+        "is no texture and no volume; leave 'total_variation' out",
+    ),
     "no option": ({"optimizer": {"type": "sgd", "beta_1": 0.5}}, "'beta_1' is no option of type = 'sgd'"),
     "misspelt": ({"optimizer": {"typ": "sgd"}}, "unknown key 'optimizer.typ'; did you mean 'type'?"),
     "beyond": ({"optimizer": {"beta_2": 1.0}}, "optimizer.beta_2"),

@@ -26,7 +26,7 @@ KEYS: dict[str, Mapping[str, Any]] = {
             "parameters.0.pose target target.images loss spp picture_spp seed learning_rate learning_rate_decay "
             "views_per_step held_out capture capture.transforms learning_rate_schedule warm_up "
             " optimizer optimizer.type optimizer.beta_1 optimizer.epsilon "
-            "parameters.0.transform checkpoint_every unknown"
+            "parameters.0.transform parameters.0.total_variation parameters.0.prior checkpoint_every unknown"
         ).split(),
         JOB,
     ),

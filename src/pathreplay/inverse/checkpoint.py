@@ -27,7 +27,7 @@ class Entry:
     ``dropped`` counts gradient entries that were NaN or infinite and were taken as zero in this step. ``errors`` are
     the root mean square errors, after the step, of the variables whose truth is known, and how far poses are from
     theirs (see `PoseError.of`); ``picture_error`` is that of the pictures without their noise, in the iterations in
-    which it was measured (jobs with a rival). Neither costs ``seconds``.
+    which it was measured (jobs with a rival). Neither costs ``seconds``. ``penalty`` is what values add to the loss.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
@@ -39,6 +39,7 @@ class Entry:
     dropped: NonNegativeInt = 0
     errors: dict[str, float] = field(default_factory=dict)
     picture_error: float | None = None
+    penalty: FiniteFloat = 0.0
 
 
 @dataclass

@@ -55,6 +55,9 @@ class Displacement(Table):
     rotation: Vector | None = None
 
 
+NOT_OF_A_POSE = frozenset("lower upper initial resolutions refine_at smooth transform total_variation prior".split())
+
+
 class Parameter(Table):
     """One scene parameter to recover, or several by a glob."""
 
@@ -72,6 +75,8 @@ class Parameter(Table):
     rotation_learning_rate: Positive | None = None
     smooth: Positive | None = None
     transform: TransformKind | None = None
+    total_variation: Positive | None = None
+    prior: Positive | None = None
 
     @model_validator(mode="after")
     def _of_one_kind(self) -> Parameter:
@@ -80,10 +85,7 @@ class Parameter(Table):
             if posed:
                 self._refuse(f"'{min(posed)}' belongs to a pose; add pose = 'translation', 'rotation' or 'rigid'")
             return self
-        if (
-            plain := {"lower", "upper", "initial", "resolutions", "refine_at", "smooth", "transform"}
-            & self.model_fields_set
-        ):
+        if plain := NOT_OF_A_POSE & self.model_fields_set:
             self._refuse(f"'{min(plain)}' does not go with a pose; displace its start with 'start'")
         parts = PARTS[self.pose]
         given = [] if self.start is None else sorted(self.start.model_fields_set)

@@ -125,17 +125,20 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
             f"The loss is {found.loss} at iteration {i}; lower the learning rates, or bound the parameters that ran "
             "away"
         )
+    penalties = {v.key: v.penalty.of(run.values[v.key]) for v in problem.variables if v.penalty}
+    gradients = found.gradients | {key: found.gradients[key] + slope for key, (_, slope) in penalties.items()}
     schedule, decay = config.learning_rate_schedule, config.learning_rate_decay
     factor = rate(schedule, position, config.iterations, decay, config.warm_up)
     rates = {v.key: v.learning_rate * factor for v in problem.variables}
-    stepped = _stepped(problem, run, found.gradients, rates)
+    stepped = _stepped(problem, run, gradients, rates)
     run.values = {v.key: np.clip(stepped[v.key], *v.bounds) for v in problem.variables}
     run.learned = found.learned
     seconds = time.perf_counter() - begin
-    norms = {key: float(np.linalg.norm(gradient)) for key, gradient in found.gradients.items()}
+    norms = {key: float(np.linalg.norm(gradient)) for key, gradient in gradients.items()}
     errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
     errors |= pose_errors(problem, run.values)
-    run.history.append(Entry(i, found.loss, seconds, norms, found.dropped, errors))
+    penalty = sum(value for value, _ in penalties.values())
+    run.history.append(Entry(i, found.loss, seconds, norms, found.dropped, errors, penalty=penalty))
     return refined
 
 

@@ -21,6 +21,7 @@ from pathreplay.inverse.config import Config, Parameter, Plugin
 from pathreplay.inverse.grids import Levels, make_levels, resampled
 from pathreplay.inverse.images import Image, picture_size
 from pathreplay.inverse.losses import Loss, find_loss
+from pathreplay.inverse.penalties import Penalty
 from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.surface import Surface
 from pathreplay.inverse.targets import (
@@ -63,6 +64,8 @@ class Variable:
     """Of a grid that is refined on the way."""
     coordinates: Coordinates | None = None
     """Where steps are taken, if not in the values themselves."""
+    penalty: Penalty | None = None
+    """What is added to the loss for its values alone."""
     form: Form = AS_STORED
     """How Mitsuba stores it; everything here is what people see."""
 
@@ -274,7 +277,8 @@ def _variables(
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
                 like = type(like)(start)
-            variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, form))
+            penalty = _penalty(key, entry, start)
+            variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
             continue
         limits.require_near(scene, key, parameters.get_array(params[key]), entry)
         pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
@@ -302,6 +306,16 @@ def _coordinates(params: mi.SceneParameters, key: str, entry: Parameter, start: 
     if name != "vertex_positions" or (faces := f"{owner}.faces") not in params:
         raise PathreplayError(f"Parameter '{key}' is no mesh's vertex_positions; leave 'smooth' out")
     return Surface(parameters.get_array(params[key]), np.array(params[faces]), entry.smooth)
+
+
+def _penalty(key: str, entry: Parameter, start: Array) -> Penalty | None:
+    if entry.total_variation is not None and start.ndim < 3:
+        raise PathreplayError(
+            f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'total_variation' out"
+        )
+    if entry.total_variation is None and entry.prior is None:
+        return None
+    return Penalty(entry.total_variation or 0.0, entry.prior or 0.0, start)
 
 
 def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:
