@@ -296,7 +296,8 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
         if walk.media is not None:  # directions follow null boundaries, too
             place, moves = mixed(place, place_met(walk, first, active, facets=False)), moves | may_move(walk, first)
         sight = Sight(mixed(place, turned), at.p, at.n, moves)
-        return dr.select(_counts(walk, x, seen), sight, replace(Sight.nothing(), moves=moves))
+        dark = replace(Sight.nothing(), signature=mi.UInt32(1), moves=moves)  # as nothing, a sky would be
+        return dr.select(_counts(walk, x, seen), sight, dark)
 
     if search.chosen is None:
         return glance(look, line, ok)
