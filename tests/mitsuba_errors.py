@@ -143,7 +143,8 @@ def measure(config: Config, full: bool = False, edges: str = "all") -> Found:
     ahead_sums -= np.polyfit(places, ahead_sums, 1)[0] * places  # no noise, and its mean is zero
     z = gap(ahead_sums, sums).z
     ahead, back = setup.forward(ours, 1, 16), setup.backward(ours, 1, 16)
-    transpose = abs(setup.dot(ahead) - back) / max(setup.dot(np.abs(ahead)), setup.magnitude(ours, 1, 16))
+    scale = max(setup.dot(np.abs(ahead)), setup.magnitude(ours, 1, 16))
+    transpose = abs(setup.dot(ahead) - back) / (scale or 1)
     setup.put(mi.Float(0))
     primal, forward = relative(image, expected, FLOOR_PRIMAL), relative(tangent, slope, FLOOR_FORWARD)
     return Found(primal, forward, reverse, z, transpose)
