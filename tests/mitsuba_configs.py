@@ -40,7 +40,9 @@ class Config:
     spp: int = 1024
     step: float = 1e-3
     reverse_spp: int = 128
-    as_many: bool = False  # on a smaller film as many samples in all as on the large one, not only in a row of pixels
+    rise: int = (
+        1  # on a smaller film as many samples as on the large one per pixel (0), in a row of them (1), in all (2)
+    )
     options: dict = field(default_factory=dict)  # of the integrator
 
 
@@ -274,7 +276,8 @@ FINE = {"edge_spp": 512}
 in each of 16 passes."""
 SWEPT = 5e-3
 """Step for edges. Mitsuba's own are from 1e-4 to 1e-3, with which few samples of a difference see an edge pass, so that
-its noise exceeds the limits; a larger one is as right, since it is held to derivatives all along the step."""
+its noise exceeds the limits; a larger one is as right, since it is held to derivatives all along the step.
+Samples of shadows' derivatives are a quarter of Mitsuba's where that is enough."""
 
 PLANE, LIGHT = ("plane.vertex_positions",), ("light.vertex_positions",)
 COLOUR = ("plane.bsdf.reflectance.value",)
@@ -313,7 +316,7 @@ STATIC = {
 }
 
 MOVING = {
-    "textured plane": Config(textured, PLANE, along_x, Limits(0.1, 56), res=64, reverse_spp=256, as_many=True),
+    "textured plane": Config(textured, PLANE, along_x, Limits(0.1, 56), res=64, reverse_spp=256, rise=2),
     "plane under a sky": Config(under_sky, PLANE, along_z, Limits(0.03, 0.2), res=64),
     "plane under a projector": Config(projected, PLANE, along_z, Limits(0.03, 0.2), res=64),
     "pane of rough glass": Config(
@@ -332,7 +335,7 @@ MOVING = {
 
 EDGES = {
     "rectangle under a sky": Config(
-        lambda n: facing(n, square(), light=sky()), PLANE, along_x, Limits(0.02, 0.5, 0.25), step=SWEPT
+        lambda n: facing(n, square(), light=sky()), PLANE, along_x, Limits(0.02, 0.5, 0.25), step=SWEPT, rise=0
     ),
     "rectangle that glows": Config(
         lambda n: glowing(n, square(T().translate([1.25, 0, 0]), emitter=glow(1, 1, 1))),
@@ -340,9 +343,17 @@ EDGES = {
         along_x,
         Limits(0.03, 1, 0.2),
         step=SWEPT,
+        rise=0,
     ),
     "disk that glows": Config(
-        disk_over_grey, ("disk.to_world",), translate(1, 0, 0), Limits(0.03, 1, 0.2), step=SWEPT, depth=1, res=64
+        disk_over_grey,
+        ("disk.to_world",),
+        translate(1, 0, 0),
+        Limits(0.03, 1, 0.2),
+        step=SWEPT,
+        rise=0,
+        depth=1,
+        res=64,
     ),
     "sphere that glows": Config(
         lambda n: glowing(n, ball(T().translate([1.25, 0, 0]), emitter=glow(1, 1, 1))),
@@ -350,6 +361,7 @@ EDGES = {
         along_x,
         Limits(0.08, 2, 0.15),
         step=SWEPT,
+        rise=0,
         options=FINE,
     ),
     "sphere that grows": Config(
@@ -358,6 +370,7 @@ EDGES = {
         grow,
         Limits(0.08, 0.5, 0.1),
         step=SWEPT,
+        rise=0,
         res=64,
         options=FINE,
     ),
@@ -367,19 +380,23 @@ EDGES = {
         along_x,
         Limits(0.03, 1.75, 0.25),
         step=SWEPT,
+        rise=0,
         spp=4192 * 4,
     ),
     "receiver of a shadow": Config(
-        lambda n: shadowed(n, square()), PLANE, along_x, Limits(0.02, 0.5, 0.25), step=SWEPT, spp=4096
+        lambda n: shadowed(n, square()), PLANE, along_x, Limits(0.02, 0.5, 0.25), step=SWEPT, rise=0, spp=4096 // 4
     ),
-    "plane and lamp": Config(lamp_below, PLANE + LIGHT, along_z, Limits(0.01, 0.1, 0.25), step=SWEPT, spp=4096),
+    "plane and lamp": Config(
+        lamp_below, PLANE + LIGHT, along_z, Limits(0.01, 0.1, 0.25), step=2 * SWEPT, spp=4096 // 4
+    ),
     "wall and floor": Config(
         corner,
         ("wall.vertex_positions", "floor.vertex_positions"),
         along_z,
         Limits(0.01, 0.05, 0.25),
         step=SWEPT,
-        spp=4096,
+        rise=0,
+        spp=4096 // 4,
     ),
 }
 

@@ -2,7 +2,7 @@
 
 There an integrator passes with its picture, its forward derivative value by value against differences, and its reverse
 derivative against their sum: 24 configurations, 72 tests. References are made as there, by `path` with 12 000 samples
-per pixel and common random numbers on both sides.
+per pixel and common random numbers on both sides. Steps may be larger, since derivatives are taken all along a step.
 
     python tests/mitsuba_errors.py [--full] [--edges none] [NAME ...]
 
@@ -47,7 +47,7 @@ class Found(NamedTuple):
     forward: tuple[float, float]
     reverse: float
     z: float  # forward against differences, sums with weights that differ from pixel to pixel
-    transpose: float  # reverse against forward, with these weights and the same random numbers; see `Setup.rounded`
+    transpose: float  # reverse against forward, with these weights and the same random numbers; see `Setup.magnitude`
 
     def misses(self, limits: Limits) -> list[str]:
         """Which of the three thresholds are exceeded."""
@@ -67,7 +67,6 @@ class Setup(Objective):
         scene = mi.load_dict(config.scene(size), optimize=False)
         super().__init__(scene, mi.traverse(scene), config.keys[0], config.move)
         self.place = 0.0  # where derivatives are taken
-        self.rounded = 0.0  # magnitude of the last reverse derivative, parameter by parameter: its rounding is a share
         self.values = {key: type(self.params[key])(self.params[key]) for key in config.keys}
 
     def put(self, t: mi.Float) -> None:
@@ -85,14 +84,23 @@ class Setup(Objective):
         return np.array(found)
 
     def collect(self, t: mi.Float) -> float:
-        self.rounded = 0.0
-        for key, value in self.values.items():
-            ends = (get_array(self.move(value, mi.Float(t))) for t in (-0.5, 0.5))
-            tangent, gradient = np.subtract(*ends), get_array(dr.grad(self.params[key]))
-            self.rounded += float(np.abs(gradient * tangent).sum())
+        for key in self.values:
             dr.enqueue(dr.ADMode.Backward, self.params[key])
         dr.traverse(dr.ADMode.Backward)
         return float(dr.grad(t)[0])
+
+    def magnitude(self, integrator: mi.Integrator, seed: int, spp: int) -> float:
+        """That of the reverse derivative, number by number of the parameters: some of it is rounding."""
+        self.put(mi.Float(0))
+        dr.enable_grad(*(self.params[key] for key in self.values))
+        self.params.update()
+        integrator.render_backward(self.scene, self.params, self.adjoint, self.sensor, seed=seed, spp=spp)
+        magnitude = 0.0
+        for key, value in self.values.items():
+            begin, end = (get_array(self.move(value, mi.Float(t))) for t in (-0.5, 0.5))
+            magnitude += float(np.abs(get_array(dr.grad(self.params[key])) * (end - begin)).sum())
+        self.put(mi.Float(0))
+        return magnitude
 
     def passes(self, spp: int) -> int:
         size = self.sensor.film().crop_size()
@@ -111,9 +119,8 @@ def measure(config: Config, full: bool = False, edges: str = "all") -> Found:
     plain = mi.load_dict({"type": "path", "max_depth": config.depth})
     ours = mi.load_dict({"type": "pathreplay", "max_depth": config.depth, "edges": edges} | config.options)
 
-    # As many samples in a row of pixels as with the large film; for reverse mode, in all.
     wide = config.res // size
-    reference_spp, spp = REFERENCE_SPP * wide, config.spp * wide * (wide if config.as_many else 1)
+    reference_spp, spp = REFERENCE_SPP * wide ** min(config.rise, 1), config.spp * wide**config.rise
     places = config.step * ((np.arange(n := setup.passes(spp)) + 0.5) / n - 0.5)
 
     def difference(seed: int, spp: int) -> np.ndarray:
@@ -136,7 +143,8 @@ def measure(config: Config, full: bool = False, edges: str = "all") -> Found:
     ahead_sums -= np.polyfit(places, ahead_sums, 1)[0] * places  # no noise, and its mean is zero
     z = gap(ahead_sums, sums).z
     ahead, back = setup.forward(ours, 1, 16), setup.backward(ours, 1, 16)
-    transpose = abs(setup.dot(ahead) - back) / max(setup.dot(np.abs(ahead)), setup.rounded)
+    scale = max(setup.dot(np.abs(ahead)), setup.magnitude(ours, 1, 16))
+    transpose = abs(setup.dot(ahead) - back) / (scale or 1)
     setup.put(mi.Float(0))
     primal, forward = relative(image, expected, FLOOR_PRIMAL), relative(tangent, slope, FLOOR_FORWARD)
     return Found(primal, forward, reverse, z, transpose)
