@@ -21,21 +21,20 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.emitters import even_sample
 from ..transport.motion import may_move
 from ..transport.passage import SHORT_OF
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
-from ..transport.traits import Strips
 from ..transport.velocity import held_direction, jumps_at_facets, moved_direction
-from ..transport.vertex import Arrival, Flight, Walk, mis_weight, reciprocal
+from ..transport.vertex import Arrival, Flight, Walk, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
 from .bends import Bend
 from .centres import LOOKS, Centres
 from .counted import Counted, quasi_random
 from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places
+from .lamps import Lamp, View, followed, view
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
 from .seer import Seer, may_see
@@ -68,12 +67,10 @@ class Chosen:
 
 @dataclass
 class SquareLine(PlaneLine):
-    """A line in the unit square of samples of one emitter or, of a mesh, of one of its triangles."""
+    """A line in the unit square of one emitter: see `lamps`."""
 
-    emitter: mi.EmitterPtr
+    lamp: Lamp
     share: mi.Float  # 1 / probability of the emitter
-    triangle: mi.UInt32
-    part: mi.Float  # share of the emitter over the probability of the triangle
 
 
 @dataclass
@@ -144,6 +141,7 @@ class Shaded:
     line: SquareLine
     u: mi.Point2f  # at the side in the shadow
     u_lit: mi.Point2f  # and at the other
+    lit: View  # there
     hit: mi.PreliminaryIntersection3f  # of what casts it
     ray: mi.Ray3f
     n: mi.Vector3f
@@ -162,62 +160,35 @@ def emitter_line(walk: Walk, x: Chosen, l: float, key: mi.UInt32) -> tuple[Squar
         cuts = (BORDER - c[axis]) / w[axis], (1 - BORDER - c[axis]) / w[axis]
         begin, end = dr.maximum(begin, dr.minimum(*cuts)), dr.minimum(end, dr.maximum(*cuts))
     inside = x.active & (begin < end)
-    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), index, x.active)
     begin, end = dr.select(inside, begin, 0), dr.select(inside, end, 0)
-    triangle, part = _triangle(walk.traits.tables.strips, index, numbers.next_1d(), x.active)
-    return SquareLine(c, w, begin, end, emitter, share, triangle, part), inside
-
-
-def _triangle(strips: Strips, emitter: mi.UInt32, u: mi.Float, active: mi.Bool) -> tuple[mi.UInt32, mi.Float]:
-    """The triangle of the emitter that u chooses, and its share of the area over the probability of that."""
-    n = dr.width(strips.until)
-
-    def before(i: mi.UInt32) -> mi.Bool:
-        lamp = dr.gather(mi.UInt32, strips.emitter, i, active)
-        return (lamp < emitter) | ((lamp == emitter) & (dr.gather(mi.Float, strips.until, i, active) <= u))
-
-    i = dr.minimum(dr.binary_search(0, n - 1, before), n - 1)
-    last = dr.maximum(i, 1) - 1
-    first = (i == 0) | (dr.gather(mi.UInt32, strips.emitter, last, active) != emitter)
-    begin = dr.select(first, 0, dr.gather(mi.Float, strips.until, last, active))
-    chance = dr.gather(mi.Float, strips.until, i, active) - begin
-    part = dr.gather(mi.Float, strips.share, i, active) * reciprocal(chance)
-    return dr.gather(mi.UInt32, strips.triangle, i, active), part
+    return SquareLine(c, w, begin, end, Lamp.of(walk, index, x.active), share), inside
 
 
 def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
     """Find the edge of a shadow among the samples of an emitter, and weigh it: see `Search`. Detached."""
     line, inside = emitter_line(walk, x, l, key)
 
-    def shadowed(line: SquareLine, t: mi.Float, active: mi.Bool) -> tuple[Any, ...]:
-        light, Le, density = even_sample(walk, line.emitter, line.triangle, seer.origin, line.at(t), active)
-        ray = seer.origin.spawn_ray_to(light.p)
-        lit = active & (light.pdf != 0)
-        hit = seer.behind(ray, seer.hit(ray, lit), lit)
-        # A lamp's own limb hides it by rounding only.
-        hidden = lit & hit.is_valid() & (hit.shape.emitter() != light.emitter)
-        return light, Le, ray, hit, density, hidden
-
     def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
-        *_, hit, _, hidden = shadowed(line, t, active)
-        moves = x.moves | _lamp_moves(walk, line.emitter) | may_move(walk, hit)
-        return Sight(mi.UInt32(hidden & moves), mi.Point3f(0), mi.Normal3f(0))
+        seen = view(walk, seer, line.lamp, line.at(t), active)
+        moves = x.moves | _lamp_moves(walk, line.lamp.emitter) | may_move(walk, seen.hit)
+        return Sight(mi.UInt32(seen.hidden & moves), mi.Point3f(0), mi.Normal3f(0))
 
     if search.chosen is None:
         return glance(look, line, inside)
     found = search.closer(look, line, inside)
     active = found.weight > 0
-    a, b = (shadowed(line, t, active) for t in (found.a, found.b))
-    a_hidden, b_hidden = a[-1], b[-1]
-    active &= a_hidden != b_hidden
-    light, Le, density = (dr.select(a_hidden, b[k], a[k]) for k in (0, 1, 4))
-    ray, hit = dr.select(a_hidden, a[2], b[2]), dr.select(a_hidden, a[3], b[3])
+    a, b = (view(walk, seer, line.lamp, line.at(t), active) for t in (found.a, found.b))
+    active &= a.hidden != b.hidden
+    lit, dark = dr.select(a.hidden, b, a), dr.select(a.hidden, a, b)
+    active &= (line.lamp.radius == 0) | (dark.hit.t < lit.hit.t)  # or it is the mesh that ends there
+    light, hit = lit.light, dark.hit
     f, pdf = seer.towards(light.d, active)
-    Le *= seer.past(light, hit.t, key, active)
-    F = x.β * f * Le * (line.share * line.part) * dr.select(light.delta, 1, mis_weight(density / line.share, pdf))
-    K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a_hidden, -1, 1)
-    ends = line.at(dr.select(a_hidden, found.a, found.b)), line.at(dr.select(a_hidden, found.b, found.a))
-    return Shaded(line, *ends, hit, ray, edge_normal(hit, ray, active), K, active & dr.all(dr.isfinite(K)))
+    F = x.β * f * lit.Le * seer.past(light, hit.t, key, active) * line.share
+    F *= dr.select(light.delta, 1, mis_weight(lit.density / line.share, pdf))
+    K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a.hidden, -1, 1)
+    active &= dr.any(K != 0) & dr.all(dr.isfinite(K))
+    u, u_lit = (line.at(dr.select(a.hidden, *ends)) for ends in ((found.a, found.b), (found.b, found.a)))
+    return Shaded(line, u, u_lit, lit, hit, dark.ray, edge_normal(hit, dark.ray, active), K, active)
 
 
 def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
@@ -232,8 +203,8 @@ def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
 def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
     """B: distance of the line to the emitter sample from the edge; differentiable in all that moves."""
     origin = seer.moved(at)
-    light, *_ = even_sample(seer.walk, c.line.emitter, c.line.triangle, origin, u, c.active)
-    return outline_gap(c.n, origin.p, light.d, c.hit, c.ray, c.active)
+    d = followed(seer.walk, c.line.lamp, origin, u, c.lit, c.active)
+    return outline_gap(c.n, origin.p, d, c.hit, c.ray, c.active)
 
 
 def shadow_weight(seer: Seer, c: Shaded) -> mi.Spectrum:

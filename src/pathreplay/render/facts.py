@@ -14,9 +14,9 @@ from ..transport.traits import (
     blend_lengths,
     fixed_traits,
     is_null,
+    lamp_balls,
     nodes_of,
     pieces_of,
-    strips_of,
     with_gradients,
 )
 from ..transport.traits import Tables as Tables
@@ -73,8 +73,8 @@ class SceneFacts:
         """Made anew when shapes have changed their sizes, or meshes the number of their triangles."""
         boxes = [shape.bbox() for shape in self._shapes]
         if boxes != self._boxes:
-            strips = strips_of(self._lights, self._shapes)
-            tables = replace(self._traits.tables, blend_lengths=blend_lengths(self._shapes), strips=strips)
+            balls = lamp_balls(self._lights, self._shapes)
+            tables = replace(self._traits.tables, blend_lengths=blend_lengths(self._shapes), lamp_balls=balls)
             self._traits, self._boxes = replace(self._traits, tables=tables), boxes
         if (sizes := _sizes(self._shapes)) != self._sizes:
             begins, pieces = pieces_of(self._shapes)

@@ -7,7 +7,6 @@ import mitsuba as mi
 
 from .passage import beyond_null
 from .surface import held_point
-from .traits import UNDIVIDED
 from .vertex import Arrival, Walk, mis_weight, reciprocal
 
 
@@ -65,42 +64,6 @@ def redraw_emitter(
     if light is None:
         light, _ = draw_emitter(scene, origin, u, lit, visible=False)
     return light, scene.eval_emitter_direction(origin, light, lit) * dr.detach(reciprocal(light.pdf))
-
-
-def even_sample(
-    walk: Walk, emitter: mi.EmitterPtr, triangle: mi.UInt32, origin: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
-) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Float]:
-    """A direction towards an emitter, with Le/p, and the density with which `draw_emitter` takes it among its samples.
-
-    Of meshes, towards a ``triangle``, evenly, whatever texture it has: numbers that choose it among thousands would
-    have no digits left to say where in it. The direction is differentiable in u, the origin, and the emitter.
-    """
-    if not walk.traits.mesh_lights:
-        light, Le = emitter.sample_direction(origin, u, active)
-        return light, Le, light.pdf
-    inside = active & (triangle != UNDIVIDED)
-    light, Le = emitter.sample_direction(origin, u, active & ~inside)
-    shape = emitter.get_shape()
-    si = _on_triangle(shape, triangle, origin, u, inside)
-    even = mi.DirectionSample3f(walk.scene, si=si, ref=origin)
-    with dr.suspend_grad():
-        faces = inside & (dr.dot(even.d, si.n) < 0)  # all of the triangle does, or none, unlike its shading normal
-        even.emitter, even.pdf = emitter, dr.select(faces, shape.pdf_direction(origin, even, faces), 0)
-        glow = emitter.eval_direction(origin, even, faces) * reciprocal(even.pdf)
-        density = emitter.pdf_direction(origin, even, faces)
-    even, Le = dr.select(inside, even, light), dr.select(inside, glow, Le)
-    return even, Le, dr.select(inside, density, light.pdf)
-
-
-def _on_triangle(
-    shape: mi.ShapePtr, triangle: mi.UInt32, origin: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
-) -> mi.SurfaceInteraction3f:
-    """The place of a triangle that has the coordinates ``u`` in the unit square, glued to it."""
-    hit = dr.zeros(mi.PreliminaryIntersection3f)
-    hit.valid, hit.t, hit.prim_index, hit.shape = mi.Bool(True), mi.Float(1), triangle, shape
-    hit.prim_uv = mi.warp.square_to_uniform_triangle(u)
-    ray = dr.detach(origin.spawn_ray(mi.Vector3f(0, 0, 1)))
-    return hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.FollowShape, active)
 
 
 def _is_painted_mesh(emitter: mi.EmitterPtr) -> mi.Bool:

@@ -12,17 +12,6 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 
-def triangle_sizes(mesh: mi.Mesh) -> tuple[np.ndarray, np.ndarray] | None:
-    """Twice the areas of triangles, and how far it is around them. Mitsuba's rectangle hides its mesh: None."""
-    params = mi.traverse(mesh)
-    if "faces" not in params:
-        return None
-    positions = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
-    a, b, c = (positions[corner] for corner in np.array(params["faces"]).reshape(-1, 3).T)
-    around = np.linalg.norm([b - a, c - b, a - c], axis=2).sum(axis=0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1), around
-
-
 def mesh_pieces(mesh: mi.Mesh) -> np.ndarray:
     """The `smooth_pieces` of a mesh that has vertex normals; Mitsuba's rectangle, which hides its mesh, is one."""
     params = mi.traverse(mesh)

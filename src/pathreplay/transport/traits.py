@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .pieces import mesh_pieces, triangle_sizes
+from .pieces import mesh_pieces
 from .velocity import blend_length
 
 # Classes by name: Mitsuba's objects do not tell these things of themselves.
@@ -23,25 +23,9 @@ DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
 INSTANCE = "Instance"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
-UNDIVIDED = 0xFFFFFFFF
-"""In place of a triangle: an emitter that is none of a mesh."""
 
 T = TypeVar("T")
 V = TypeVar("V")
-
-
-@dataclass
-class Strips:
-    """The parts of emitters in which edges of shadows are looked for, one after the other: triangles of mesh lamps.
-
-    In a triangle as often as it is far around it, since so many edges pass through it: with its area in place of that,
-    those that pass along thin ones would be found hardly ever, and count the more.
-    """
-
-    emitter: mi.UInt32
-    triangle: mi.UInt32  # or `UNDIVIDED`
-    share: mi.Float  # of the emitter's area
-    until: mi.Float  # probability to be chosen, summed up within the emitter
 
 
 @dataclass
@@ -55,7 +39,7 @@ class Tables:
     blend_lengths: mi.Float  # those of `velocity`, by shape
     pieces_at: mi.UInt32  # by shape: where the pieces of its triangles begin, if not `WHOLE` or `FACETS`
     pieces: mi.UInt32  # of all such meshes (see `pieces`), in a row; the first is no triangle's
-    strips: Strips  # of emitters
+    lamp_balls: mi.Float  # of emitters that are meshes: see `lamp_balls`
 
 
 @dataclass(frozen=True)
@@ -111,7 +95,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
             mi.Bool(_by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)) if attachables else None,
             blend_lengths(shapes),
             *pieces_of(shapes),
-            strips_of(scene.emitters(), shapes),
+            lamp_balls(scene.emitters(), shapes),
         ),
     )
 
@@ -140,19 +124,21 @@ def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
     return mi.UInt32(begins), mi.UInt32(np.concatenate(found).astype(np.uint32))
 
 
-def strips_of(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> Strips:
-    """Look at emitters in the order of the scene."""
-    sizes = {s.emitter(): triangle_sizes(s) for s in shapes if s.is_emitter() and s.is_mesh()}
-    one = np.ones(1), np.ones(1)
-    of_each = [sizes.get(emitter) for emitter in emitters] or [None]  # an empty array would end the process
-    triangles = [[UNDIVIDED] if found is None else np.arange(len(found[0])) for found in of_each]
-    areas, around = zip(*(found or one for found in of_each), strict=True)
-    return Strips(
-        mi.UInt32(np.repeat(np.arange(len(areas)), [len(x) for x in areas]).astype(np.uint32)),
-        mi.UInt32(np.concatenate(triangles).astype(np.uint32)),
-        mi.Float(np.concatenate([x / np.sum(x) for x in areas])),
-        mi.Float(np.concatenate([np.cumsum(x) / np.sum(x) for x in around])),
-    )
+def lamp_balls(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:
+    """For each emitter, in the order of the scene, a ball around its mesh: centre, and radius, 0 without one."""
+    lamps = {shape.emitter(): shape for shape in shapes if shape.is_emitter() and shape.is_mesh()}
+    balls = [_ball(lamps[emitter]) if emitter in lamps else np.zeros(4) for emitter in emitters]
+    return mi.Float(np.ravel(balls or [np.zeros(4)]))  # an empty array would end the process
+
+
+def _ball(mesh: mi.Mesh) -> np.ndarray:
+    """Around the middle of its box. Mitsuba's rectangle hides its mesh: none."""
+    params = mi.traverse(mesh)
+    if "vertex_positions" not in params:
+        return np.zeros(4)
+    positions = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
+    centre = (positions.min(axis=0) + positions.max(axis=0)) / 2
+    return np.array([*centre, np.linalg.norm(positions - centre, axis=1).max()])
 
 
 def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], otherwise: V) -> list[V]:
