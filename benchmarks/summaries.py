@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from .measures.estimates import Versus
 from .measures.job import Record
 from .tables import Turns, groups, markdown
-from .tasks import attached, depth, iteration, media, surface, truth
+from .tasks import attached, depth, edges, iteration, media, surface, truth
 
 
 def _surface(record: Record) -> str:
@@ -44,6 +44,11 @@ def _media(record: Record) -> str:
         for key, versus in _pairs(record, "score", media.RIVAL)
     ]
     return markdown(["gradient of media", "time x variance, prbvolpath / pathreplay"], rows)
+
+
+def _edges(record: Record) -> str:
+    """What edges cost, scene by scene."""
+    return edges.costs(edges.by_job([point for point in record.points if ", " not in point.method]))
 
 
 def _depth(record: Record) -> str:
@@ -99,5 +104,6 @@ SUMMARIES: dict[str, tuple[str, Callable[[Record], str]]] = {
         (media.TITLE, _media),
         (depth.TITLE, _depth),
         (truth.TITLE, _truth),
+        (edges.TITLE, _edges),
     )
 } | {"wrong-summary": (truth.TITLE, _wrong)}

@@ -56,14 +56,14 @@ def jobs(quick: bool) -> list[Job]:
 
 def table(record: Record) -> str:
     """What edges cost, scene by scene; then all methods next to `prb`, and recorded steps next to their kernels."""
-    found = _by_job([point for point in record.points if ", " not in point.method])
+    found = by_job([point for point in record.points if ", " not in point.method])
     rows = [[p.scene, method_cell(p), *_versus(p, job.get("prb"))[:2]] for job in found for p in job.values()]
     header = ["scene", "method", "seconds of kernels (median)", "time / prb"]
     steps = {point.method: point for point in record.points if ", " in point.method}
-    return "\n\n".join((_costs(found), markdown(header, rows), _steps(steps)))
+    return "\n\n".join((costs(found), markdown(header, rows), _steps(steps)))
 
 
-def _by_job(points: list[Point]) -> list[dict[str, Point]]:
+def by_job(points: list[Point]) -> list[dict[str, Point]]:
     """By method, what was measured in turn: `prb` comes first in each job."""
     found: list[dict[str, Point]] = []
     for point in points:
@@ -73,7 +73,7 @@ def _by_job(points: list[Point]) -> list[dict[str, Point]]:
     return found
 
 
-def _costs(found: list[dict[str, Point]]) -> str:
+def costs(found: list[dict[str, Point]]) -> str:
     """A row for each scene: times next to `prb`, and time x variance next to rivals."""
     timed = ("film edges alone", "inner edges alone", "edges alone", "projective inner")
     header = ["scene", *(f"{name} / prb" for name in timed), *(f"time x variance of {a} / {b}" for a, b in VERSUS)]

@@ -12,6 +12,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import OpenEXR
+import PIL.Image
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
@@ -58,9 +59,13 @@ def read_image(path: Path, *, raw: bool = False) -> Image:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height of a picture. Raises as `read_image`."""
-    height, width, _ = read_image(path).shape
-    return width, height
+    """Width and height of a picture, of its head alone where Pillow knows its format. Raises as `read_image`."""
+    try:
+        with PIL.Image.open(path) as picture:
+            return picture.size
+    except (OSError, ValueError, PIL.Image.DecompressionBombError):  # no format of Pillow's, or no picture
+        height, width, _ = read_image(path).shape
+        return width, height
 
 
 def with_channels(image: Image, channels: int) -> Image | None:
