@@ -28,6 +28,7 @@ from mitsuba_errors import ADJOINT, FLOOR_FORWARD, FLOOR_PRIMAL, FLOOR_REVERSE, 
 from pathreplay.backend import set_variant
 
 TESTS = "src/integrators/tests/test_ad_integrators.py"
+REFERENCE_SPP = 12000
 OTHERS = {"guiding", "sppc", "sppi"}
 """Options of projective integrators."""
 HEAD = (
@@ -103,6 +104,19 @@ def measure(tests: ModuleType, config: Any, options: dict[str, Any]) -> tuple[tu
     return errors, Limits(config.error_mean_threshold, config.error_max_threshold, config.error_mean_threshold_bwd)
 
 
+def made_again(tests: ModuleType, config: Any, seed: int) -> tuple[float, float]:
+    """How far the forward reference is from itself, made by its own recipe with another seed."""
+    gc.collect()
+    config.initialize()
+    plain = mi.load_dict({"type": "path", "max_depth": config.integrator_dict["max_depth"]})
+    ends = []
+    for side in (-0.5, 0.5):
+        config.update(mi.Float(side * config.ref_fd_epsilon))
+        ends.append(np.array(plain.render(config.scene, seed=seed, spp=REFERENCE_SPP), np.float64))
+    slope = (ends[1] - ends[0]) / config.ref_fd_epsilon
+    return relative(slope, reference(tests, config, "fwd"), FLOOR_FORWARD)
+
+
 def attached(config: Any) -> mi.Float:
     """The parameter that moves the scene, with gradients."""
     theta = mi.Float(0.0)
@@ -130,6 +144,7 @@ def main() -> None:
     parser.add_argument("--edges", default="all", help="of pathreplay: all, film or none")
     parser.add_argument("--edge-spp", type=int, default=0, help="of pathreplay: lines per pixel")
     parser.add_argument("--share", type=float, default=1.0, help="of Mitsuba's samples: fewer are harder to pass with")
+    parser.add_argument("--again", type=int, default=0, metavar="N", help="only make references again, with N seeds")
     given = parser.parse_intermixed_args()
     set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
@@ -139,9 +154,16 @@ def main() -> None:
     kinds = (
         tests.BASIC_CONFIGS_LIST + tests.CONTINUOUS_BUT_NON_STATIC_GEOM_CONFIGS_LIST + tests.DISCONTINUOUS_CONFIGS_LIST
     )
-    print(HEAD, flush=True)
+    if not given.again:
+        print(HEAD, flush=True)
     for config in (kind() for kind in kinds):
         if given.names and config.name not in given.names:
+            continue
+        for seed in range(1, given.again + 1):
+            mean, most = made_again(tests, config, seed)
+            limits = f"{config.error_mean_threshold:g} and {config.error_max_threshold:g}"
+            print(f"{config.name:58s} reference, seed {seed}: mean {mean:.4f}, max {most:.3f} for {limits}", flush=True)
+        if given.again:
             continue
         begun = time.time()
         config.spp = round(config.spp * given.share)
