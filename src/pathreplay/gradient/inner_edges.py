@@ -34,7 +34,7 @@ from .centres import LOOKS, Centres
 from .counted import Counted, quasi_random
 from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places
-from .lamps import Lamp, View, followed, view
+from .lamps import Glimpse, Lamp, followed, glimpse
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
 from .seer import Seer, may_see
@@ -141,7 +141,7 @@ class Shaded:
     line: SquareLine
     u: mi.Point2f  # at the side in the shadow
     u_lit: mi.Point2f  # and at the other
-    lit: View  # there
+    lit: Glimpse  # there
     hit: mi.PreliminaryIntersection3f  # of what casts it
     ray: mi.Ray3f
     n: mi.Vector3f
@@ -169,7 +169,7 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     line, inside = emitter_line(walk, x, l, key)
 
     def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
-        seen = view(walk, seer, line.lamp, line.at(t), active)
+        seen = glimpse(walk, seer, line.lamp, line.at(t), active)
         moves = x.moves | _lamp_moves(walk, line.lamp.emitter) | may_move(walk, seen.hit)
         return Sight(mi.UInt32(seen.hidden & moves), mi.Point3f(0), mi.Normal3f(0))
 
@@ -177,7 +177,7 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
         return glance(look, line, inside)
     found = search.closer(look, line, inside)
     active = found.weight > 0
-    a, b = (view(walk, seer, line.lamp, line.at(t), active) for t in (found.a, found.b))
+    a, b = (glimpse(walk, seer, line.lamp, line.at(t), active) for t in (found.a, found.b))
     active &= a.hidden != b.hidden
     lit, dark = dr.select(a.hidden, b, a), dr.select(a.hidden, a, b)
     active &= (line.lamp.radius == 0) | (dark.hit.t < lit.hit.t)  # or it is the mesh that ends there

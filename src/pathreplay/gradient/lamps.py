@@ -36,7 +36,7 @@ class Lamp:
 
 
 @dataclass
-class View:
+class Glimpse:
     """Of a lamp, at a place of its square."""
 
     light: mi.DirectionSample3f
@@ -47,7 +47,7 @@ class View:
     hidden: mi.Bool
 
 
-def view(walk: Walk, seer: Seer, lamp: Lamp, u: mi.Point2f, active: mi.Bool) -> View:
+def glimpse(walk: Walk, seer: Seer, lamp: Lamp, u: mi.Point2f, active: mi.Bool) -> Glimpse:
     """Look at a place of a lamp's square. Detached."""
     in_cone = active & (lamp.radius > 0)
     light, Le = lamp.emitter.sample_direction(seer.origin, u, active & ~in_cone)
@@ -55,7 +55,7 @@ def view(walk: Walk, seer: Seer, lamp: Lamp, u: mi.Point2f, active: mi.Bool) -> 
     looks = active & (light.pdf != 0)
     if not walk.traits.mesh_lights:
         hit = seer.behind(ray, seer.hit(ray, looks), looks)
-        return View(light, Le, light.pdf, ray, hit, _hides(hit, light.emitter, looks))
+        return Glimpse(light, Le, light.pdf, ray, hit, _hides(hit, light.emitter, looks))
     d, Ω = direction(lamp, seer.origin.p, u)
     ray = dr.select(in_cone, seer.origin.spawn_ray(d), ray)
     looks |= in_cone
@@ -69,7 +69,7 @@ def view(walk: Walk, seer: Seer, lamp: Lamp, u: mi.Point2f, active: mi.Bool) -> 
     density = dr.select(seen, lamp.emitter.pdf_direction(seer.origin, there, seen), density)
     # What is behind the ball does not hide it.
     near = ~in_cone | (hit.t < dr.norm(lamp.centre - seer.origin.p) + lamp.radius)
-    return View(light, Le, density, ray, hit, _hides(hit, lamp.emitter, looks) & near)
+    return Glimpse(light, Le, density, ray, hit, _hides(hit, lamp.emitter, looks) & near)
 
 
 def _hides(hit: mi.PreliminaryIntersection3f, emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Bool:
@@ -94,7 +94,7 @@ def direction(lamp: Lamp, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi
 
 
 def followed(
-    walk: Walk, lamp: Lamp, origin: mi.Interaction3f, u: mi.Point2f, glue: View, active: mi.Bool
+    walk: Walk, lamp: Lamp, origin: mi.Interaction3f, u: mi.Point2f, glue: Glimpse, active: mi.Bool
 ) -> mi.Vector3f:
     """The direction to a place of a lamp, differentiable in it, and in the origin and the lamp.
 
