@@ -102,6 +102,7 @@ def test_rates_follow_their_schedule() -> None:
     assert all_of("constant", 3) == pytest.approx([0.25, 0.5, 0.75, 1, 1])
 
 
+@pytest.mark.slow
 def test_a_schedule_is_that_of_the_job() -> None:
     changed = {"optimizer": {"type": "sgd"}, "learning_rate_schedule": "cosine", "warm_up": 2}
     result = optimize(make_config({**JOB, **changed}), progress=False)
@@ -166,6 +167,7 @@ def test_a_grid_that_is_refined_is_pulled_to_its_start() -> None:
     assert Penalty(0.0, 1.0, start).of(np.full((4, 4, 4, 1), 0.75, np.float32))[0] == pytest.approx(0.25)
 
 
+@pytest.mark.slow
 def test_a_prior_keeps_values_between_start_and_truth() -> None:
     entry, rest = JOB["parameters"][0], {"optimizer": {"type": "sgd"}, "learning_rate_schedule": "constant"}
     job = {**JOB, **rest, "learning_rate": 5.0, "iterations": 30}

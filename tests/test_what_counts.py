@@ -77,7 +77,7 @@ def halves(result: Any) -> list[float]:
 @pytest.mark.parametrize(
     "target", [{"images": ["target.exr"], "masks": ["mask.exr"]}, {"images": ["with-alpha.exr"], "alpha": "mask"}]
 )
-@pytest.mark.parametrize("sweeps", [True, False])
+@pytest.mark.parametrize("sweeps", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_only_what_the_mask_leaves_is_learned_from(target: dict[str, Any], sweeps: bool) -> None:
     integrator = {"type": "pathreplay" if sweeps else "prb", "max_depth": 2}
     result = optimize(make_config({**JOB, "target": target, "integrator": integrator}), progress=False)
@@ -150,6 +150,7 @@ def test_batches_have_every_view_once_in_a_round() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_batch_stands_for_all_views(room: Path) -> None:
     """Of two views with the same target, one has the loss and the gradient of both."""
     both = {**JOB, "sensors": None, "target": {"images": ["target.exr", "target.exr"]}}
