@@ -19,6 +19,7 @@ from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.capture import read_capture
 from pathreplay.inverse.config import Capture
 from pathreplay.inverse.images import exr_bytes, picture_size, png_bytes
+from pathreplay.inverse.problem import build_problem
 from pathreplay.scenes.loading import load_scene_for
 
 WIDTH, HEIGHT = 12, 8
@@ -146,6 +147,10 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "flat pixels": ({**PLAIN, "fl_x": 15, "fl_y": 19}, "no squares (fl_x = 15, fl_y = 19)"),
     "other shape": ({**PLAIN, "w": 12, "h": 12}, "said to be 12 x 12, and its picture is 12 x 8"),
     "no picture": (with_frame(file_path="gone"), "picture 'gone' does not exist"),
+    "no name": (with_frame(file_path="/"), "is a folder"),
+    "a long name": (with_frame(file_path="x" * 4096), "cannot be reached"),
+    "a far camera": (with_frame(transform_matrix=placed(1e300)), "'frames.0.transform_matrix"),
+    "a flagged fisheye": ({**PLAIN, "is_fisheye": True}, "is a fisheye's; undistort"),
     "a NUL": (with_frame(file_path="go\0ne"), "cannot be reached"),
     "sheared": (with_frame(transform_matrix=np.diag([1, 2, 1, 1]).tolist()), "no rotation and translation"),
     "a mirror": (with_frame(transform_matrix=np.diag([-1, 1, 1, 1]).tolist()), "no rotation and translation"),
@@ -205,3 +210,30 @@ def test_the_example_finds_texture_roughness_and_sky(folder: Path) -> None:
     paint = runpy.run_path(str(example / "make_capture.py"))["paint"]()
     found = result.parameters["ball.bsdf.base_color.data"]
     assert np.corrcoef(found[4:12].ravel(), paint[4:12].ravel())[0, 1] > 0.8
+
+
+def test_pictures_go_with_their_cameras_whatever_views_are_called(folder: Path) -> None:
+    """A sensor without a name is called view-0, and so is the first picture of this capture."""
+    (folder / "room.xml").write_text(SCENE.replace(' id="other"', ""))
+    for k in range(4):
+        (folder / "capture" / "pictures" / f"shot {k}.exr").rename(folder / "capture" / f"view-{k}.exr")
+    write({**PLAIN, "frames": [{**frame, "file_path": f"view-{k}.exr"} for k, frame in enumerate(FRAMES)]})
+    config = make_config({**JOB, "sensors": ["view-2", "view-0"], "capture": {"transforms": "capture/transforms.json"}})
+    problem = build_problem(config, folder)
+    assert [problem.scene.sensors()[view.sensor].id() for view in problem.views] == ["view-2", "view-0"]
+    for k in range(4):
+        grey = np.full((HEIGHT, WIDTH, 3), k / 10, np.float32)
+        (folder / "capture" / f"view-{k}.exr").write_bytes(exr_bytes(grey))
+    assert [view.target.mean() for view in build_problem(config, folder).views] == pytest.approx([0.2, 0.0])
+
+
+def test_what_is_behind_transparent_pixels_does_not_bleed(folder: Path) -> None:
+    """A PNG holds any colour where it is transparent, here black beside white."""
+    opaque = np.repeat([[1.0] * 5 + [0.0] * 7], HEIGHT, axis=0).astype(np.float32)[:, :, None]
+    (folder / "capture" / "alpha.png").write_bytes(png_bytes(np.concatenate([opaque] * 4, axis=2)))
+    write(with_frame(file_path="alpha.png"))
+    changes = {"capture": {"transforms": "capture/transforms.json", "width": 6}, "target": {"alpha": "mask"}}
+    (view,) = build_problem(make_config({**JOB, **changes}), folder).views
+    assert view.weight is not None
+    counts = view.weight[:, :, 0] > 0.05
+    assert counts.any() and view.target[counts] == pytest.approx(1.0, abs=0.02)

@@ -52,6 +52,8 @@ REFUSED = {
     "parameters.2.key=c": "no place in a list of 2",
     "parameters.first.key=c": "no place in a list of 2",
     "spp.x=1": "no table",
+    f"parameters.{'9' * 5000}.key=c": "no place in a list of 2",
+    f"{'.'.join('a' * 3000)}=1": "names no key",
 }
 
 

@@ -9,10 +9,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import edge_scenes as scenes
 from pathreplay.gradient.centres import Centres
 from pathreplay.gradient.counted import quasi_random
 from pathreplay.gradient.crofton import Picked, PlaneLine, Sight, bisect, glance
 from pathreplay.render.camera_pass import Pass
+from pathreplay.render.facts import SceneFacts
 from pathreplay.render.places import FilmPlaces
 from pathreplay.transport.pieces import smooth_pieces
 
@@ -191,3 +193,22 @@ def test_where_nothing_moves_nothing_is_added() -> None:
         found[edges] = grad, len(kernels)
     assert np.array_equal(found["none"][0], found["all"][0])
     assert found["none"][1] == found["all"][1]
+
+
+def test_the_cone_around_a_mesh_lamp_follows_it() -> None:
+    """Also where vertices move within a box that stays."""
+    scene = mi.load_dict(scenes.scene(wall=scenes.shape(scenes.BACK, scenes.BLACK), lamp=scenes.ball_of_triangles()))
+    facts, params = SceneFacts(scene), mi.traverse(scene)
+    key = next(key for key in params.keys() if key.endswith("vertex_positions"))
+    before = np.array(facts.tables().lamp_balls).reshape(-1, 4)
+    assert before[0, 3] == pytest.approx(0.4, rel=0.05)
+    vertices = np.array(params[key]).reshape(-1, 3)
+    box = vertices.min(axis=0), vertices.max(axis=0)
+    vertices[5] = box[1]
+    params[key] = mi.Float(vertices.ravel())
+    params.update()
+    centre, radius = np.mean(box, axis=0), np.linalg.norm(box[1] - box[0]) / 2
+    assert np.array(facts.tables().lamp_balls) == pytest.approx([*centre, radius], rel=1e-4)
+    params[key] = mi.Float((vertices + 1).ravel())
+    params.update()
+    assert np.array(facts.tables().lamp_balls) == pytest.approx([*(centre + 1), radius], rel=1e-4)

@@ -60,7 +60,7 @@ def test_an_optimiser_gets_there(make: Make) -> None:
     values = go_on(make(start()), start(), 200)
     for key, goal in GOAL.items():
         assert values[key].shape == goal.shape and values[key].dtype == np.float32
-        np.testing.assert_allclose(values[key], goal, atol=0.06)
+        np.testing.assert_allclose(values[key], goal, atol=0.06 if "rmsprop" in str(make) else 0.02)
 
 
 def test_an_optimiser_leaves_what_it_was_given(make: Make) -> None:

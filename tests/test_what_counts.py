@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.batches import batch
 from pathreplay.inverse.images import exr_bytes, read_image
 from pathreplay.inverse.likeness import MOST_DB, Likeness
+from pathreplay.inverse.losses import find_loss
 from pathreplay.threads import spare_thread
 
 KEY = "wall.bsdf.reflectance.data"
@@ -137,17 +139,14 @@ class Views:
 def test_batches_have_every_view_once_in_a_round() -> None:
     views: Any = Views(0, 2, 3, 5, 7)
     config = make_config({**JOB, "views_per_step": 2, "seed": 3})
-    seen = [batch(views, config, i) for i in range(10)]
-    assert all(len(each) == 2 for each in seen)
-    rounds = np.reshape(seen, (4, 5))
+    seen = [batch(views, config, i) for i in range(12)]
+    assert [len(each) for each in seen] == 4 * [2, 2, 1]
+    rounds = np.concatenate(seen).reshape(4, 5)
     assert (np.sort(rounds, axis=1) == [0, 2, 3, 5, 7]).all()
     assert len({tuple(each) for each in rounds.tolist()}) > 1
-    assert seen != [batch(views, make_config({**JOB, "views_per_step": 2, "seed": 4}), i) for i in range(10)]
-    assert (
-        batch(views, make_config({**JOB, "views_per_step": 5}), 3)
-        == [7, 5, 3, 2, 0]
-        == batch(views, make_config(JOB), 1)
-    )
+    assert seen != [batch(views, make_config({**JOB, "views_per_step": 2, "seed": 4}), i) for i in range(12)]
+    everything = batch(views, make_config({**JOB, "views_per_step": 5}), 3)
+    assert everything == [7, 5, 3, 2, 0] == batch(views, make_config(JOB), 1)
 
 
 @pytest.mark.slow
@@ -174,7 +173,7 @@ REFUSED = {
     ),
     "no alpha": ({"target": {"images": ["target.exr"], "alpha": "mask"}}, "has no alpha to be its mask"),
     "no picture": ({"target": {"values": {KEY: 0.5}, "alpha": "mask"}}, "alpha = 'mask' is about 'images'"),
-    "nothing left": ({"held_out": [0]}, "held_out names every sensor"),
+    "nothing left": ({"held_out": [0]}, "Every sensor of the job is held out"),
     "elsewhere": ({"held_out": ["other"]}, "sensor 'other' is not among 'sensors'"),
     "unknown view": ({"held_out": ["third"]}, "No sensor 'third' in the scene"),
     "no module": ({"loss": "not_there:loss"}, "Loss 'not_there:loss' cannot be imported (No module named 'not_there')"),
@@ -214,3 +213,22 @@ def test_a_display_ends_at_white() -> None:
     with spare_thread():
         bright, brighter = (np.full((4, 4, 3), x, np.float32) for x in (2.0, 3.0))
     assert Likeness.of(bright, brighter, 1.0).psnr == MOST_DB > Likeness.of(bright, brighter, 0.3).psnr
+
+
+def test_a_mask_that_is_lost_is_missed(room: Path) -> None:
+    job = {**JOB, "iterations": 1, "target": {"images": ["target.exr"], "masks": ["mask.exr"]}}
+    folder = optimize(make_config(job), progress=False).folder
+    (folder / "images" / "weight-one.exr").write_bytes(exr_bytes(LEFT[:2]))
+    with pytest.raises(PathreplayError, match="The mask of sensor 'one' in the run folder"):
+        optimize(resume=folder, progress=False)
+    (folder / "images" / "weight-one.exr").unlink()
+    with pytest.raises(PathreplayError, match="The mask of sensor 'one' in the run folder"):
+        optimize(resume=folder, progress=False)
+
+
+def test_losses_of_one_name_in_two_folders_are_two(tmp_path: Path) -> None:
+    for k in (1, 3):
+        (tmp_path / str(k)).mkdir()
+        (tmp_path / str(k) / "mine.py").write_text(f"def loss(image, target):\n    return {k} * (image - target)\n")
+    found = [find_loss("mine:loss", tmp_path / str(k)) for k in (1, 3)]
+    assert [each(mi.TensorXf([2.0]), mi.TensorXf([1.0])).array[0] for each in found] == [1, 3]

@@ -83,7 +83,7 @@ class EdgePass:
         run = self.recordings[method].differentiate if records else differentiate
         number = dr.opaque(mi.UInt32, seed)
         return run(
-            self.params, self.scene, 0, integrator, self.target, number, self.job.spp, l2, 1.0, False, self.tables
+            self.params, self.scene, 0, integrator, self.target, None, number, self.job.spp, l2, 1.0, False, self.tables
         )
 
     def _integrator(self, name: str) -> Any:

@@ -59,7 +59,9 @@ def glimpse(walk: Walk, seer: Seer, lamp: Lamp, u: mi.Point2f, active: mi.Bool) 
     d, Ω = direction(lamp, seer.origin.p, u)
     ray = dr.select(in_cone, seer.origin.spawn_ray(d), ray)
     looks |= in_cone
-    hit = seer.behind(ray, seer.hit(ray, looks), looks)
+    first = seer.hit(ray, looks)
+    at_lamp = in_cone & first.is_valid() & (first.shape.emitter() == lamp.emitter)  # also if light goes through it
+    hit = dr.select(at_lamp, first, seer.behind(ray, first, looks & ~at_lamp))
     seen = in_cone & hit.is_valid() & (hit.shape.emitter() == lamp.emitter)
     si = hit.compute_surface_interaction(ray, mi.RayFlags.All, seen)
     there = mi.DirectionSample3f(walk.scene, si=si, ref=seer.origin)

@@ -11,14 +11,15 @@ from pathreplay.inverse.problem import Problem
 def batch(problem: Problem, config: Config, iteration: int) -> list[int]:
     """Places of the views of an iteration, in the order in which they are evaluated.
 
-    A round has every view that is learned from once; what is left of one fills the batch with which the next begins. It
-    depends on the seed and the iteration alone, so that a run that goes on takes the views that it would have taken.
+    A round has every view that is learned from once; its last batch has what is left. It depends on the seed and the
+    iteration alone, so that a run that goes on takes the views that it would have taken.
     """
     views = list(problem.trained())
     n, size = len(views), config.views_per_step
     if size is None or size >= n:
         return views[::-1]  # what is learned of media depends on the order, and earlier versions had this one
-    return [views[_shuffled(config, k // n, n)[k % n]] for k in range(iteration * size, (iteration + 1) * size)]
+    number, k = divmod(iteration, -(-n // size))
+    return [views[i] for i in _shuffled(config, number, n)[k * size : (k + 1) * size]]
 
 
 def _shuffled(config: Config, number: int, n: int) -> list[int]:

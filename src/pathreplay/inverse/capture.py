@@ -33,8 +33,11 @@ OFF = 0.5
 FACING = np.diag([-1.0, 1.0, -1.0, 1.0])
 """From Mitsuba's camera to OpenGL's."""
 
-Size = Annotated[FiniteFloat, Field(gt=0)]
-Row = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
+Row = Annotated[list[Annotated[FiniteFloat, Field(gt=-1e9, lt=1e9)]], Field(min_length=4, max_length=4)]
+
+
+Length = Annotated[FiniteFloat, Field(gt=1e-3, lt=1e6)]
+Place = Annotated[FiniteFloat, Field(gt=-1e6, lt=1e6)]
 
 
 class _Lens(BaseModel):
@@ -43,13 +46,14 @@ class _Lens(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     camera_model: str | None = None
-    camera_angle_x: Annotated[FiniteFloat, Field(gt=0, lt=math.pi)] | None = None
-    fl_x: Size | None = None
-    fl_y: Size | None = None
-    cx: FiniteFloat | None = None
-    cy: FiniteFloat | None = None
-    w: Size | None = None
-    h: Size | None = None
+    camera_angle_x: Annotated[FiniteFloat, Field(gt=1e-3, lt=math.pi - 1e-3)] | None = None
+    fl_x: Length | None = None
+    fl_y: Length | None = None
+    cx: Place | None = None
+    cy: Place | None = None
+    w: Length | None = None
+    h: Length | None = None
+    is_fisheye: bool = False
     k1: FiniteFloat = 0.0
     k2: FiniteFloat = 0.0
     k3: FiniteFloat = 0.0
@@ -89,9 +93,11 @@ def read_capture(capture: Capture, base: Path, size_of: Callable[[Path], tuple[i
     names = _names([frame.file_path for frame in found.frames])
     shots: dict[str, Shot] = {}
     for name, frame, image in zip(names, found.frames, images, strict=True):
-        lens = found.model_dump(include=set(_Lens.model_fields)) | frame.model_dump(
-            include=set(_Lens.model_fields), exclude_unset=True
-        )
+        fields = set(_Lens.model_fields)
+        own = frame.model_dump(include=fields, exclude_unset=True)
+        lens = found.model_dump(include=fields) | own
+        if own.get("camera_angle_x") is not None and own.get("fl_x") is None:
+            lens |= {"fl_x": None, "fl_y": None}
         camera = _camera(f"{path}: frame {shown(frame.file_path)}", lens, frame, size_of(image), capture.width)
         mask = None if frame.mask_path is None else _picture(frame.mask_path, path)
         shots[name] = Shot(image, mask, {**camera, "id": name})
@@ -114,9 +120,9 @@ def _read(path: Path) -> _Transforms:
 
 def _picture(name: str, path: Path) -> Path:
     image = path.parent / name
-    if "\0" not in name and not image.suffix:
+    if image.name and not image.suffix:
         named = [image.with_name(image.name + ending) for ending in ENDINGS]
-        image = next((path for path in named if path.is_file()), image)
+        image = next((path for path in named if not file_problem(path)), image)
     if problem := file_problem(image):
         raise PathreplayError(f"Capture {path}: picture {shown(name)} {problem}; correct the path or create the file")
     return image
@@ -137,6 +143,8 @@ def _names(files: list[str]) -> list[str]:
 def _camera(
     where: str, lens: dict[str, Any], frame: _Frame, size: tuple[int, int], width: int | None
 ) -> dict[str, Any]:
+    if lens["is_fisheye"]:
+        raise PathreplayError(f"{where} is a fisheye's; undistort it to a PINHOLE first")
     if (model := lens["camera_model"]) is not None and model not in MODELS:
         raise PathreplayError(f"{where} has the camera_model {shown(model)}; undistort it to a PINHOLE first")
     if bent := {name: lens[name] for name in DISTORTIONS if lens[name]}:

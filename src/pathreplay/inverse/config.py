@@ -110,6 +110,10 @@ class Parameter(Table):
             )
         if sorted(set(begins)) != begins:
             self._refuse(f"refine_at {begins} does not increase; put it in order")
+        if self.transform == "log" and self.lower is not None and self.lower < 0:
+            self._refuse(f"transform = 'log' has values above 0 only, and lower = {self.lower:g}; take 'softplus'")
+        if self.transform == "logit" and (self.lower is None) != (self.upper is None):
+            self._refuse("transform = 'logit' goes between two bounds; give 'lower' and 'upper', or neither (0 and 1)")
         if self.lower is not None and self.upper is not None and self.upper <= self.lower:
             bounds = f"upper bound {self.upper:g} is not above lower bound {self.lower:g}"
             self._refuse(f"{bounds}; swap or widen them")

@@ -13,6 +13,8 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+DEEPEST = 16
+"""Parts of a key: no job has tables as deep."""
 _VALUES = (bool, int, float, str, list, dict)
 
 
@@ -39,7 +41,7 @@ def _path(key: str, change: str) -> list[str]:
     while isinstance(found, dict) and len(found) == 1:
         ((name, found),) = found.items()
         path.append(name)
-    if found != 0 or not path:
+    if found != 0 or not 0 < len(path) <= DEEPEST:
         raise PathreplayError(
             f"-D {shown(change)} names no key; write it as in TOML, such as integrator.max_depth, and quote what has "
             "dots in its name"
@@ -60,7 +62,7 @@ def _put(table: Any, path: list[str], value: Any, option: str) -> Any:
         return value
     name, *rest = path
     if isinstance(table, list):
-        if not name.isdecimal() or int(name) >= len(table):
+        if not name.isdecimal() or len(name) > 9 or int(name) >= len(table):
             raise PathreplayError(f"{option}: {shown(name)} is no place in a list of {len(table)}; count from 0")
         return [_put(each, rest, value, option) if i == int(name) else each for i, each in enumerate(table)]
     if not isinstance(table, dict):

@@ -99,12 +99,11 @@ class Evaluator:
 
     def __init__(self, problem: Problem, integrator: mi.Integrator, record: bool = True) -> None:
         self.problem, self.integrator = problem, integrator
-        facts = SceneFacts(problem.scene)
+        self._facts = facts = SceneFacts(problem.scene)
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
         self.freezes = record and is_recordable(integrator, facts.has_media)
         self._targets = [mi.TensorXf(view.target) for view in problem.views]
         self._weights = [None if view.weight is None else mi.TensorXf(view.weight) for view in problem.views]
-        self._tables = facts.traits().tables
         self._recordings = Recordings()
         self._sweeps: dict[int, bool] = {}  # of each view that was seen: whether its pixels can be swept
         self._learned: Arrays = {}  # what the integrator knows
@@ -162,7 +161,7 @@ class Evaluator:
         with plain_errors():
             value, lost = (self._recordings.differentiate if records else differentiate)(
                 problem.params, problem.scene, sensor, self.integrator, target, self._weights[view], number, spp,
-                problem.loss, share, self._sweeps[view], self._tables,
+                problem.loss, share, self._sweeps[view], self._facts.tables(),
             )  # fmt: skip
         if lost is not None:
             self.integrator.tell_lost(lost, target.shape[0] * target.shape[1] * spp)

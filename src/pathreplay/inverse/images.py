@@ -92,10 +92,8 @@ def over_black(image: Image, path: Path) -> Image:
     return np.concatenate([image[:, :, :-1] * image[:, :, -1:], image[:, :, -1:]], axis=2)
 
 
-def unpremultiplied(image: Image, path: Path) -> Image:
-    """The colours of an image with alpha as if it were opaque; EXR files hold them times alpha. Alpha stays."""
-    if image.shape[2] not in (2, 4) or path.suffix.lower() != ".exr":
-        return image
+def unpremultiplied(image: Image) -> Image:
+    """The colours of an image with alpha, which is over black, as if it were opaque. Alpha stays."""
     alpha = image[:, :, -1:]
     colours = np.divide(image[:, :, :-1], alpha, out=np.zeros_like(image[:, :, :-1]), where=alpha > 0)
     return np.concatenate([colours, alpha], axis=2)

@@ -131,6 +131,11 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     factor = rate(schedule, position, config.iterations, decay, config.warm_up)
     rates = {v.key: v.learning_rate * factor for v in problem.variables}
     stepped = _stepped(problem, run, gradients, rates)
+    for key, value in stepped.items():
+        if not np.isfinite(value).all():
+            raise PathreplayError(
+                f"'{key}' is no finite number after iteration {i}; lower its learning rate, or bound it"
+            )
     run.values = {v.key: np.clip(stepped[v.key], *v.bounds) for v in problem.variables}
     run.learned = found.learned
     seconds = time.perf_counter() - begin
@@ -169,14 +174,14 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
     root (negative ones count as zero). The noise of the targets stays in.
     """
     put_values(problem, values)
-    total, views = 0.0, problem.trained().values()
+    squares, views = 0.0, problem.trained().values()
     for view in views:
         a, b = (
             _picture(problem, view.sensor, problem.judge, config.spp, seed).astype(np.float64) - view.target
             for seed in config.seeds(JUDGEMENT, view.sensor, iteration)
         )
-        total += float(np.mean(a * b if view.weight is None else a * b * view.weight)) / len(views)
-    return float(np.sqrt(max(total, 0.0)))
+        squares += float(np.mean(a * b if view.weight is None else a * b * view.weight)) / len(views)
+    return float(np.sqrt(max(squares, 0.0)))
 
 
 def _picture(problem: Problem, sensor: int, integrator: mi.Integrator, spp: int, seed: int) -> Image:

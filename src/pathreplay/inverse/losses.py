@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import sys
+import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -80,16 +80,11 @@ def find_loss(name: str, base: Path | None = None) -> Loss:
 
 
 def _imported(name: str, module: str, function: str, base: Path | None) -> Loss:
-    before = list(sys.path)
-    if base is not None:
-        sys.path.insert(0, str(base.resolve()))
     try:
-        found = getattr(importlib.import_module(module), function)
+        found = getattr(_module(module, base), function)
     except Exception as error:  # whatever the module does when it is imported
         why = one_line(error) or type(error).__name__
         raise PathreplayError(f"Loss '{name}' cannot be imported ({why}); write module:function") from None
-    finally:
-        sys.path[:] = before
     if not callable(found):
         raise PathreplayError(f"Loss '{name}' is no function of image and target, but {shown(found)}; name another")
 
@@ -107,3 +102,16 @@ def _imported(name: str, module: str, function: str, base: Path | None) -> Loss:
         return value
 
     return loss
+
+
+def _module(name: str, base: Path | None) -> Any:
+    """The module in the folder, anew, since other folders may have others of that name; else an installed one."""
+    path = None if base is None else base / f"{name}.py"
+    if path is None or not path.is_file():
+        return importlib.import_module(name)
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path} is no module")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.errors import PathreplayError
+from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import file_names
 from pathreplay.inverse import limits
 from pathreplay.inverse.capture import Shot, read_capture
@@ -30,6 +30,7 @@ from pathreplay.inverse.targets import (
     read_masks,
     read_targets,
     rendered_targets,
+    require_weights,
     target_scene,
     truth_of,
 )
@@ -164,7 +165,8 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
         _edges(params, keys, rival)  # for its log: one note is enough
     judge = integrator if config.brings_pictures else load_integrator(config.target.integrator.model_dump())
     # Before any target is rendered: the cheap mistakes first.
-    sensors = _sensors(scene, config.sensors or list(shots) or None)
+    sensors = _sensors(scene, list(shots) or None if config.sensors is None else config.sensors)
+    taken = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
     held_out = _held_out(scene, sensors, config, list(shots))
     limits.require_visible(scene, params, keys)
     limits.require_films(scene, sensors, {"spp": config.spp, "picture_spp": config.picture_spp})
@@ -182,7 +184,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
         del other
         gc.collect()
     elif targets is None:
-        targets, said = _pictures(config, shots, scene, sensors, base)
+        targets, said = _pictures(config, taken, scene, sensors, base)
         notes += said
     if first and config.target.masks is not None:
         masks = by_view("masks", config.target.masks, sensors)
@@ -190,6 +192,8 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
 
     if missing := set(sensors) - set(targets.images):
         raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
+    given = config.target.masks is not None or config.target.alpha == "mask"
+    require_weights(targets, {name for name in sensors if given or (name in taken and taken[name].mask is not None)})
     views = tuple(
         View(name, index, targets.images[name], targets.weights.get(name), name in held_out)
         for name, index in sensors.items()
@@ -209,13 +213,13 @@ def _pictures(
 ) -> tuple[Targets, tuple[str, ...]]:
     """Targets from the files of a capture, or from those that the job names, and what is to be said about them."""
     alpha = config.target.alpha
-    if not shots:
+    if config.capture is None:
         files = by_view("target images", config.target.images or [], sensors)
         return read_targets(files, alpha, scene, sensors, base)
     if other := set(sensors) - set(shots):
         raise PathreplayError(f"sensors: '{min(other)}' is no camera of the capture, and has no picture; leave it out")
-    pictures = {name: str(shots[name].image.resolve()) for name in sensors}
-    masks = {name: str(mask.resolve()) for name in sensors if (mask := shots[name].mask) is not None}
+    pictures = {name: str(shot.image.resolve()) for name, shot in shots.items()}
+    masks = {name: str(shot.mask.resolve()) for name, shot in shots.items() if shot.mask is not None}
     if masks and alpha == "mask":
         raise PathreplayError("target: the capture has masks, and alpha = 'mask' is another; leave alpha out")
     targets, notes = read_targets(pictures, alpha, scene, sensors, base, resize=True)
@@ -370,7 +374,9 @@ def _place(item: int | str, ids: list[str], names: list[str]) -> int:
     """The index of a sensor that is named, or given by its number."""
     index = next((each.index(item) for each in (ids, names) if item in each), item)
     if not isinstance(index, int) or not 0 <= index < len(names):
-        raise PathreplayError(f"No sensor {item!r} in the scene; it has {', '.join(names)} (0 to {len(names) - 1})")
+        raise PathreplayError(
+            f"No sensor {shown(item)} in the scene; it has {', '.join(names)} (0 to {len(names) - 1})"
+        )
     return index
 
 
@@ -384,7 +390,8 @@ def _held_out(scene: mi.Scene, sensors: dict[str, int], config: Config, shots: l
     if len(found) < len(places):
         other = next(name for name, index in everywhere.items() if index in places and name not in found)
         raise PathreplayError(f"held_out: sensor '{other}' is not among 'sensors'; add it there, or leave it out here")
-    found |= set(sensors) & set(shots[::every] if every else ())
+    regular = set(shots[::every]) if every else set()
+    found |= {name for name, index in sensors.items() if ids[index] in regular}
     if len(found) == len(sensors):
-        raise PathreplayError("held_out names every sensor of the job; leave one to learn from")
+        raise PathreplayError("Every sensor of the job is held out; leave one to learn from")
     return found

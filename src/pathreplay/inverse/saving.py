@@ -67,8 +67,6 @@ def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
     before = {view.name: _read(folder / _picture("start", view.name)) for view in problem.views}
     for view in problem.views:
         wanted = picture_shape(problem.scene.sensors()[view.sensor])
-        if view.weight is not None and (view.weight.shape != (*wanted[:2], 1) or not view.weight.any()):
-            raise PathreplayError(f"{folder / _picture('weight', view.name)} is damaged; start the job from its config")
         for kind, found in (("target", view.target), ("start", before[view.name])):
             path = folder / _picture(kind, view.name)
             if found.shape != wanted:

@@ -102,12 +102,11 @@ def read_targets(
                 raise PathreplayError(
                     f"Target image '{file}' has no alpha to be its mask; give masks, or leave alpha = 'mask' out"
                 )
-            seen = _sized(f"Target image '{file}'", image[:, :, -1:], name, shape, resize)
-            weights[name] = _weight(f"the alpha of '{file}'", seen, name)
-            image = unpremultiplied(image, path)
-        else:
-            image = over_black(image, path)
-        image = _sized(f"Target image '{file}'", image, name, shape, resize)
+        # Resized as it looks over black: colours of what is transparent are anything.
+        image = _sized(f"Target image '{file}'", over_black(image, path), name, shape, resize)
+        if alpha == "mask":
+            weights[name] = _weight(f"the alpha of '{file}'", image[:, :, -1:], name)
+            image = unpremultiplied(image)
         targets[name] = adapted_image(f"Target image '{file}'", image, f"sensor '{name}' renders", channels)
         share = transparent_share(image)
         if share and channels in (1, 3) and alpha == "black":
@@ -128,6 +127,19 @@ def read_masks(
         mask = _sized(f"Mask '{file}'", mask, name, picture_shape(scene.sensors()[sensors[name]]), resize)
         weights[name] = _weight(f"mask '{file}'", adapted_image(f"Mask '{file}'", mask, "a mask has", 1), name)
     return weights
+
+
+def require_weights(targets: Targets, masked: set[str]) -> None:
+    """Raise PathreplayError unless the views that are ``masked``, and no others, have fitting weights."""
+    for name, image in targets.images.items():
+        weight = targets.weights.get(name)
+        shape = (*image.shape[:2], 1)
+        fits = weight is not None and weight.shape == shape and bool(np.isfinite(weight).all() and weight.any())
+        if (weight is None and name in masked) or (weight is not None and not (fits and name in masked)):
+            raise PathreplayError(
+                f"The mask of sensor '{name}' in the run folder (images/weight-{name}.exr) is missing, damaged, or one "
+                "too many; start a new run"
+            )
 
 
 def by_view(what: str, files: list[str], sensors: dict[str, int]) -> dict[str, str]:

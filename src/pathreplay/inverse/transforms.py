@@ -15,7 +15,7 @@ from pathreplay.inverse.values import Array
 CLOSEST = 1e-6
 """How close values come to a bound of theirs, in shares of the range: beyond, a step would do nothing more."""
 
-LARGEST = 88.0
+LARGEST_LOG = 88.0
 """The largest logarithm of a value: beyond, single precision ends."""
 
 
@@ -89,7 +89,7 @@ class Transform:
         """See `Coordinates`."""
         u = latent.astype(np.float64)
         if self.kind == "log":
-            v = np.exp(np.minimum(u, LARGEST))
+            v = np.exp(np.minimum(u, LARGEST_LOG))
         elif self.kind == "softplus":
             v = self.lower + np.logaddexp(0, u)
         else:

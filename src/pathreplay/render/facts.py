@@ -62,20 +62,22 @@ class SceneFacts:
         """What the drivers want to know now; ``tables`` are those of this scene, where they cannot be made."""
         return replace(
             self._traits,
-            tables=self._tables() if tables is None else tables,
+            tables=self.tables() if tables is None else tables,
             lights_deform=any(with_gradients(lamp, "vertex_positions") for lamp in self._lamps),
             instances_move=any(with_gradients(instance, "to_world") for instance in self._instances),
             opacity_moves=any(with_gradients(mask, "opacity") for mask in self._masks),
             lights_vary=any(map(with_gradients, self._emitters)),
         )
 
-    def _tables(self) -> Tables:
-        """Made anew when shapes have changed their sizes, or meshes the number of their triangles."""
+    def tables(self) -> Tables:
+        """Those of the scene as it is now, made anew as far as it has changed."""
         boxes = [shape.bbox() for shape in self._shapes]
         if boxes != self._boxes:
-            balls = lamp_balls(self._lights, self._shapes)
-            tables = replace(self._traits.tables, blend_lengths=blend_lengths(self._shapes), lamp_balls=balls)
+            tables = replace(self._traits.tables, blend_lengths=blend_lengths(self._shapes))
             self._traits, self._boxes = replace(self._traits, tables=tables), boxes
+        if self._traits.mesh_lights:  # whose vertices may move within a box
+            tables = replace(self._traits.tables, lamp_balls=lamp_balls(self._lights, self._shapes))
+            self._traits = replace(self._traits, tables=tables)
         if (sizes := _sizes(self._shapes)) != self._sizes:
             begins, pieces = pieces_of(self._shapes)
             tables = replace(self._traits.tables, pieces_at=begins, pieces=pieces)
