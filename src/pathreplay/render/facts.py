@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import mitsuba as mi
+import numpy as np
 
 from ..transport.media import Media, scene_media
 from ..transport.traits import (
@@ -76,8 +77,9 @@ class SceneFacts:
             tables = replace(self._traits.tables, blend_lengths=blend_lengths(self._shapes))
             self._traits, self._boxes = replace(self._traits, tables=tables), boxes
         if self._traits.mesh_lights:  # whose vertices may move within a box
-            tables = replace(self._traits.tables, lamp_balls=lamp_balls(self._lights, self._shapes))
-            self._traits = replace(self._traits, tables=tables)
+            balls = lamp_balls(self._lights, self._shapes)
+            if not np.array_equal(np.array(balls), np.array(self._traits.tables.lamp_balls)):
+                self._traits = replace(self._traits, tables=replace(self._traits.tables, lamp_balls=balls))
         if (sizes := _sizes(self._shapes)) != self._sizes:
             begins, pieces = pieces_of(self._shapes)
             tables = replace(self._traits.tables, pieces_at=begins, pieces=pieces)

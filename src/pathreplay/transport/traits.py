@@ -85,7 +85,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         detached_names=tuple(sorted({bsdf.class_name() for bsdf in others})),
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
-        mesh_lights=any(shape.is_emitter() and shape.is_mesh() for shape in shapes),
+        mesh_lights=any(shape.is_emitter() and shape.is_mesh() and _ball(shape)[3] > 0 for shape in shapes),
         painted_meshes=any(shape.is_emitter() and shape.is_mesh() and _is_painted(shape.emitter()) for shape in shapes),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
