@@ -95,9 +95,13 @@ def some(cells: list[Case]) -> list[Any]:
 def hold_gradients(name: str) -> None:
     """To finite differences."""
     found = measured(name)
-    g, d = found.gradients, found.differences
+    hold_agreement(name, found.gradients, found.differences, found.transpose)
+
+
+def hold_agreement(name: str, g: np.ndarray, d: np.ndarray, transpose: float) -> None:
+    """Gradients of seeds to differences of seeds; adds a row to the table of truth."""
     difference = gap(g, d)
-    row = Row(f"edges: {name}", "sweep", g.mean(), d.mean(), difference.error, difference.z, np.nan, found.transpose)
+    row = Row(f"edges: {name}", "sweep", g.mean(), d.mean(), difference.error, difference.z, np.nan, transpose)
     ROWS.append(row)
     assert abs(row.z) < Z_LIMIT, row
     assert row.error < RESOLUTION * max(abs(row.gradient), abs(row.reference)), row

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from edge_ordinary import SCENES, Measured, measured
-from pathreplay.check.statistics import gap
-from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
+from edge_truth import hold_agreement
 from pathreplay.errors import PathreplayError
-from truth import ROWS, Row
 
 AGREE = ("smooth_torus", "flat_torus", "constant", "mesh_lamp", "mesh_lamp_moves")
 """Those of `SCENES` that have been seen to agree."""
@@ -42,12 +40,8 @@ def test_batch_sensors_are_refused() -> None:
 
 
 def hold(name: str, found: Measured) -> None:
-    g, d = found.gradients, found.differences
-    difference = gap(g, d)
-    row = Row(f"edges: {name}", "sweep", g.mean(), d.mean(), difference.error, difference.z, np.nan, found.transpose)
-    ROWS.append(row)
-    assert abs(row.z) < Z_LIMIT, row
-    assert row.error < RESOLUTION * max(abs(row.gradient), abs(row.reference)), row
+    g = found.gradients
+    hold_agreement(name, g, found.differences, found.transpose)
     share = np.square(g - g.mean())
     assert share.max() < TAIL * share.sum(), g
 

@@ -91,9 +91,8 @@ def read_capture(capture: Capture, base: Path, size_of: Callable[[Path], tuple[i
     found = _read(path)
     images = [_picture(frame.file_path, path) for frame in found.frames]
     names = _names([frame.file_path for frame in found.frames])
-    shots: dict[str, Shot] = {}
+    fields, shots = set(_Lens.model_fields), {}
     for name, frame, image in zip(names, found.frames, images, strict=True):
-        fields = set(_Lens.model_fields)
         own = frame.model_dump(include=fields, exclude_unset=True)
         lens = found.model_dump(include=fields) | own
         if own.get("camera_angle_x") is not None and own.get("fl_x") is None:

@@ -155,6 +155,12 @@ def encoded(linear: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
 
 
+def displayed(image: Image, exposure: float) -> NDArray[np.floating]:
+    """The colours of an image (one channel, or three) times ``exposure``, as a display shows them: from 0 to 1."""
+    colours = image[:, :, : 1 if image.shape[2] < 3 else 3].astype(np.float64)
+    return encoded(np.clip(colours * exposure, 0, 1))
+
+
 def exposure_for(image: Image) -> float:
     """Exposure under which 98 % of the pixels stay below white (1 for a black picture)."""
     level = float(np.quantile(image[..., :3].max(axis=2), 0.98))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.ndimage
 
-from pathreplay.inverse.images import Image, encoded
+from pathreplay.inverse.images import Image, displayed
 
 # Of the structural similarity of Wang et al. 2004: the window's width in pixels, cut at 5, and what keeps it stable.
 SIGMA, CUT = 1.5, 5
@@ -29,16 +29,11 @@ class Likeness:
 
         PSNR = -10 log10 (mean square difference); SSIM is the mean over pixels and channels, alpha left out.
         """
-        a, b = (_shown(picture, exposure) for picture in (image, target))
+        a, b = (displayed(picture, exposure) for picture in (image, target))
         w = np.ones((1, 1, 1)) if weight is None else weight.astype(np.float64)
         error = float(np.mean(w * (a - b) ** 2))
         psnr = MOST_DB if error <= 10 ** (-MOST_DB / 10) else -10 * float(np.log10(error))
         return Likeness(psnr, float(np.mean(w * _similarity(a, b))))
-
-
-def _shown(image: Image, exposure: float) -> np.ndarray:
-    colours = image[:, :, : 1 if image.shape[2] < 3 else 3].astype(np.float64)
-    return encoded(np.clip(colours * exposure, 0, 1))
 
 
 def _similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -45,16 +46,21 @@ class ViewPictures:
         squares = np.square(image.astype(np.float64) - self.target)
         return float(np.sqrt(np.mean(squares if self.weight is None else squares * self.weight)))
 
-    def likeness(self, image: Image) -> Likeness:
-        """Of what counts, at the exposure of the view."""
-        return Likeness.of(image, self.target, self.exposure, self.weight)
+    @cached_property
+    def likenesses(self) -> dict[str, Likeness]:
+        """Of 'start', 'result' and 'rival', where there is one: of what counts, at the exposure of the view."""
+        images = {"result": self.result, "start": self.start, "rival": self.rival}
+        return {
+            kind: Likeness.of(image, self.target, self.exposure, self.weight)
+            for kind, image in images.items()
+            if image is not None
+        }
 
     def as_dict(self) -> dict[str, Any]:
         """For views.json."""
         table: dict[str, Any] = {"held_out": self.held_out, "exposure": self.exposure}
-        for kind, image in (("result", self.result), ("start", self.start), ("rival", self.rival)):
-            if image is not None:
-                table[kind] = {"rmse": self.error(image), **asdict(self.likeness(image))}
+        for kind, likeness in self.likenesses.items():
+            table[kind] = {"rmse": self.error(getattr(self, kind)), **asdict(likeness)}
         return table
 
     def pictures(self) -> dict[str, Image]:

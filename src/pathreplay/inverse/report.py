@@ -17,7 +17,7 @@ import PIL.Image
 from matplotlib.figure import Figure
 
 from pathreplay.inverse.checkpoint import Entry
-from pathreplay.inverse.images import Image, encoded, png_bytes
+from pathreplay.inverse.images import displayed, encoded, png_bytes
 from pathreplay.inverse.outcome import Contestant, Outcome
 from pathreplay.inverse.pose import error_names
 
@@ -127,7 +127,7 @@ def summary(outcome: Outcome) -> bytes:
         for axes in line:
             axes.axis("off")
         for column, (kind, image) in enumerate(pictures.items()):
-            line[column].imshow(_shown(image, exposure), interpolation="nearest", vmin=0, vmax=1, cmap="gray")
+            line[column].imshow(displayed(image, exposure), interpolation="nearest", vmin=0, vmax=1, cmap="gray")
             label = outcome.caption(kind)
             short = name if len(name) <= 24 else f"…{name[-23:]}"  # what fits over a picture
             line[column].set_title(label if column else f"{short}: {label}", fontsize=8)
@@ -154,11 +154,6 @@ def swatch(values: list[float]) -> str:
     """A CSS colour for linear RGB; brighter than white is scaled to full brightness, hue kept."""
     colour = np.array(values, dtype=np.float32).clip(min=0)
     return "#" + "".join(f"{round(float(c) * 255):02x}" for c in encoded(colour / max(1.0, float(colour.max()))))
-
-
-def _shown(image: Image, exposure: float) -> Image:
-    colours = encoded(np.clip(image[:, :, :3] * exposure, 0, 1))
-    return colours[:, :, 0] if image.shape[2] < 3 else colours
 
 
 def _uri(kind: str, data: bytes) -> str:

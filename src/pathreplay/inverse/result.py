@@ -150,7 +150,7 @@ def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
         parameters=outcome.values,
         errors={item.key: error for item in outcome.recovered if (error := item.error()) is not None},
         poses={item.pose.key: errors["error"] for item in outcome.poses if (errors := item.errors())},
-        views={view.name: view.likeness(view.result) for view in outcome.views},
+        views={view.name: view.likenesses["result"] for view in outcome.views},
         held_out=tuple(view.name for view in outcome.held_out()),
     )
 

@@ -135,7 +135,7 @@ def require_weights(targets: Targets, masked: set[str]) -> None:
         weight = targets.weights.get(name)
         shape = (*image.shape[:2], 1)
         fits = weight is not None and weight.shape == shape and bool(np.isfinite(weight).all() and weight.any())
-        if (weight is None and name in masked) or (weight is not None and not (fits and name in masked)):
+        if not (fits if name in masked else weight is None):
             raise PathreplayError(
                 f"The mask of sensor '{name}' in the run folder (images/weight-{name}.exr) is missing, damaged, or one "
                 "too many; start a new run"

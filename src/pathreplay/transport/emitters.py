@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from .passage import beyond_null
 from .surface import held_point
+from .traits import is_painted
 from .vertex import Arrival, Walk, mis_weight, reciprocal
 
 
@@ -53,7 +54,7 @@ def redraw_emitter(
         painted = mi.Bool(False)
         if walk.traits.painted_meshes:
             still, _ = draw_emitter(scene, dr.detach(origin), u, lit, visible=False)
-            painted = lit & _is_painted_mesh(still.emitter)
+            painted = lit & is_painted(still.emitter) & still.emitter.get_shape().is_mesh()
         light, Le = scene.sample_emitter_direction(origin, u, False, lit & ~painted)
         if walk.traits.lights_deform:
             Le *= _mesh_growth(scene, origin, light, lit & ~painted)
@@ -64,11 +65,6 @@ def redraw_emitter(
     if light is None:
         light, _ = draw_emitter(scene, origin, u, lit, visible=False)
     return light, scene.eval_emitter_direction(origin, light, lit) * dr.detach(reciprocal(light.pdf))
-
-
-def _is_painted_mesh(emitter: mi.EmitterPtr) -> mi.Bool:
-    painted = mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
-    return painted & emitter.get_shape().is_mesh()
 
 
 def _glued(

@@ -85,8 +85,8 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         detached_names=tuple(sorted({bsdf.class_name() for bsdf in others})),
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
-        mesh_lights=any(shape.is_emitter() and shape.is_mesh() and _ball(shape)[3] > 0 for shape in shapes),
-        painted_meshes=any(shape.is_emitter() and shape.is_mesh() and _is_painted(shape.emitter()) for shape in shapes),
+        mesh_lights=any(_ball(lamp)[3] > 0 for lamp in _mesh_lamps(shapes)),
+        painted_meshes=any(is_painted(lamp.emitter()) for lamp in _mesh_lamps(shapes)),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         glossy=_is_glossy(bsdfs, nodes),
@@ -126,9 +126,13 @@ def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
 
 def lamp_balls(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:
     """For each emitter, in the order of the scene, a ball around its mesh: centre, and radius, 0 without one."""
-    lamps = {shape.emitter(): shape for shape in shapes if shape.is_emitter() and shape.is_mesh()}
+    lamps = {lamp.emitter(): lamp for lamp in _mesh_lamps(shapes)}
     balls = [_ball(lamps[emitter]) if emitter in lamps else np.zeros(4) for emitter in emitters]
     return mi.Float(np.ravel(balls or [np.zeros(4)]))  # an empty array would end the process
+
+
+def _mesh_lamps(shapes: list[mi.Shape]) -> list[mi.Shape]:
+    return [shape for shape in shapes if shape.is_emitter() and shape.is_mesh()]
 
 
 def _ball(mesh: mi.Mesh) -> np.ndarray:
@@ -175,8 +179,9 @@ def nodes_of(root: mi.Object) -> set[mi.Object]:
     return seen
 
 
-def _is_painted(emitter: mi.Emitter) -> bool:
-    return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying))
+def is_painted(emitter: mi.Emitter | mi.EmitterPtr) -> bool | mi.Bool:
+    """Whether (or where) an emitter glows with a texture."""
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 
 def _is_glossy(bsdfs: list[mi.BSDF], nodes: set[mi.Object]) -> bool:
