@@ -141,7 +141,7 @@ def check(
 
 @app.command(short_help="Recover scene parameters from pictures.")
 def optimize(
-    config: Annotated[Path | None, typer.Argument(help="Job in TOML; see docs/optimize.md.")] = None,
+    config: Annotated[Path | None, typer.Argument(help="Job in TOML or YAML; see docs/optimize.md.")] = None,
     resume: Annotated[
         Path | None, typer.Option(metavar="RUN_FOLDER", help="Go on with an unfinished run instead.")
     ] = None,

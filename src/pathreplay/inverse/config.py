@@ -1,11 +1,9 @@
-"""The optimisation job as the user writes it: a TOML file, checked key by key before anything is rendered."""
+"""The optimisation job as the user writes it: a TOML or YAML file, checked key by key before anything is rendered."""
 
 from __future__ import annotations
 
 import difflib
-import json
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,11 +18,7 @@ from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.pose import PARTS, PoseKind
 from pathreplay.inverse.schedules import Schedule
 from pathreplay.inverse.tables import Count, Finite, Positive, Switch, Table, Whole
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from pathreplay.inverse.texts import YAML, parsed
 
 
 class Picture(Table):
@@ -278,54 +272,33 @@ _TABLES: dict[str, type[BaseModel]] = {
 
 
 def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
-    """Read a job from a TOML file (or from the JSON that a run folder may hold); for ``changes`` see `defined`.
+    """Read a job from a TOML or YAML file (or the JSON that a run folder may hold); for ``changes`` see `defined`.
 
     Raises PathreplayError for an unreadable file, an unknown key (names the nearest), a value out of its range.
     """
     problem = file_problem(path, 64 * 2**20)  # no job is as long: what is larger is some other file
     if problem == MISSING:
-        near = [str(p) for p in path.parent.glob("*.toml")] if path.parent.is_dir() else []
+        found = path.parent.glob("*") if path.parent.is_dir() else []
+        near = [str(p) for p in found if p.suffix in (".toml", *YAML)]
         close = difflib.get_close_matches(str(path), near, n=1, cutoff=0.3)
-        hint = f"did you mean {close[0]}?" if close else "give the path of a TOML file"
+        hint = f"did you mean {close[0]}?" if close else "give the path of a TOML or YAML file"
         raise PathreplayError(f"No config file {path}; {hint}")
     if problem:
-        raise PathreplayError(f"Config {path} {problem}; give the path of a TOML file")
+        raise PathreplayError(f"Config {path} {problem}; give the path of a TOML or YAML file")
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise PathreplayError(f"Config {path} cannot be read ({error}); give a TOML file in UTF-8") from None
-    if path.suffix != ".json":
-        return _checked(str(path), Config.model_validate, defined(_toml(path, text), changes))
-    if not changes:
-        return _checked(str(path), Config.model_validate_json, text)
-    return _checked(str(path), Config.model_validate, defined(_json(path, text), changes))
-
-
-def _toml(path: Path, text: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except RecursionError:
-        raise PathreplayError(f"Config {path} is nested too deep; write the job as in docs/optimize.md") from None
-    except tomllib.TOMLDecodeError as error:
-        raise PathreplayError(f"Config {path} is not valid TOML: {error}; mend it there") from None
-    except ValueError:
-        raise PathreplayError(f"Config {path} has a number of more digits than Python reads; shorten it") from None
-
-
-def _json(path: Path, text: str) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise PathreplayError(f"Config {path} is not valid JSON: {error}; mend it there") from None
+        raise PathreplayError(f"Config {path} cannot be read ({error}); give a text file in UTF-8") from None
+    return _checked(str(path), defined(parsed(path, text), changes))
 
 
 def make_config(values: dict[str, Any]) -> Config:
     """A job from a dictionary, with the same checks and messages as a file."""
-    return _checked("config", Config.model_validate, values)
+    return _checked("config", values)
 
 
-def _checked(name: str, validate: Callable[[Any], Config], job: Any) -> Config:
+def _checked(name: str, job: Any) -> Config:
     try:
-        return validate(job)
+        return Config.model_validate(job)
     except ValidationError as error:
         raise PathreplayError(f"{name}: {first_error(error, Config, _TABLES)}") from None

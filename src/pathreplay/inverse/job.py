@@ -36,7 +36,7 @@ def optimize(
     """Recover the parameters that a job names, and write its run folder.
 
     Args:
-        config: path of a TOML file, or a Config (relative paths in it start at the current folder).
+        config: path of a TOML or YAML file, or a Config (relative paths in it start at the current folder).
         resume: run folder of an earlier, unfinished run, to go on with; excludes ``config`` and ``output``.
         output: run folder to make; the default is the config's ``output``, else ``runs/<name of the config>``. Where it
             exists, a number is appended: an earlier run is never touched.
@@ -147,7 +147,7 @@ def _started(
         raise PathreplayError("Nothing to do: give a config file, or --resume RUN_FOLDER")
     if not isinstance(config, (str, Path, Config)):
         raise PathreplayError(
-            f"config is a {type(config).__name__}; give the path of a TOML file, or make_config of a dictionary"
+            f"config is a {type(config).__name__}; give the path of a TOML or YAML file, or make_config of a dictionary"
         )
     if isinstance(config, Config):
         if changes:
