@@ -24,7 +24,9 @@ from pathreplay.inverse.values import Array, Arrays
 class Entry:
     """One iteration of the history: loss before the step, wall-clock seconds, L2 norm of each variable's gradient.
 
-    ``dropped`` counts gradient entries that were NaN or infinite and were taken as zero in this step. ``errors`` are
+    ``dropped`` counts gradient entries that were NaN or infinite in a view and were taken as zero in this step;
+    ``dropped_shares`` says how many of each variable's that were, of all in all views. ``spp`` are samples per pixel,
+    and ``noise_norms`` how long the noise of a gradient is, where the job measures it (see `noise`). ``errors`` are
     the root mean square errors, after the step, of the variables whose truth is known, and how far poses are from
     theirs (see `PoseError.of`); ``picture_error`` is that of the pictures without their noise, in the iterations in
     which it was measured (jobs with a rival). Neither costs ``seconds``. ``penalty`` is what values add to the loss.
@@ -40,6 +42,9 @@ class Entry:
     errors: dict[str, float] = field(default_factory=dict)
     picture_error: float | None = None
     penalty: FiniteFloat = 0.0
+    spp: NonNegativeInt = 0
+    noise_norms: dict[str, float] = field(default_factory=dict)
+    dropped_shares: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass
@@ -55,6 +60,8 @@ class Run:
     history: list[Entry] = field(default_factory=list)
     rival: Run | None = None
     """Solves the same problem from the same start by another integrator in the same time."""
+    whole: bool = True
+    """Not in the middle of a step, in which it cannot be saved."""
 
     def seconds(self) -> float:
         return sum(entry.seconds for entry in self.history)

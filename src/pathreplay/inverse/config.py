@@ -14,6 +14,7 @@ from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import MISSING, file_problem
 from pathreplay.inverse.config_errors import first_error
 from pathreplay.inverse.definitions import defined
+from pathreplay.inverse.noise_options import AUTO, AutoSpp, Spp
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.pose import PARTS, PoseKind
 from pathreplay.inverse.schedules import Schedule
@@ -206,7 +207,10 @@ class Config(Table):
     target: Target = Target()
     loss: str = "l2"
     iterations: Count = 200
-    spp: Count = 16
+    spp: Spp = 16
+    auto_spp: AutoSpp = AutoSpp()
+    signal_to_noise: Switch = False
+    non_finite_in_a_row: Count = 10
     views_per_step: Count | None = None
     picture_spp: Count = 128
     seed: Annotated[Whole, Field(ge=0, le=10**18)] = 0
@@ -223,6 +227,24 @@ class Config(Table):
     def brings_pictures(self) -> bool:
         """Whether targets are files, and not rendered."""
         return self.capture is not None or self.target.images is not None
+
+    @property
+    def most_spp(self) -> int:
+        """Samples per pixel that an iteration may have."""
+        return self.spp if isinstance(self.spp, int) else self.auto_spp.highest
+
+    @property
+    def halves_samples(self) -> bool:
+        """Whether iterations take their samples in two halves, which tell signal from noise."""
+        return self.signal_to_noise or self.spp == AUTO
+
+    @model_validator(mode="after")
+    def _samples(self) -> Config:
+        if self.spp != AUTO and "auto_spp" in self.model_fields_set:
+            raise ValueError(f"auto_spp goes with spp = 'auto', and spp is {self.spp}; leave one out")
+        if self.signal_to_noise and self.spp != AUTO and self.spp % 2:
+            raise ValueError(f"signal_to_noise takes two halves of the samples, and spp is {self.spp}; make it even")
+        return self
 
     @model_validator(mode="after")
     def _has_pictures(self) -> Config:
@@ -268,6 +290,7 @@ _TABLES: dict[str, type[BaseModel]] = {
     "start": Displacement,
     "optimizer": Optimizer,
     "capture": Capture,
+    "auto_spp": AutoSpp,
 }
 
 

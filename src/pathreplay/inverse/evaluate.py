@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -40,8 +41,8 @@ class Evaluation:
 
     loss: float
     gradients: dict[str, Array]
-    dropped: int
-    """Gradient entries that were NaN or infinite in a view, and count as zero there."""
+    dropped: dict[str, int]
+    """By key, how many entries of its gradient were NaN or infinite in a view, and count as zero there."""
     learned: Arrays
 
     def of(self, share: float) -> Evaluation:
@@ -64,7 +65,7 @@ def total(evaluations: Sequence[Evaluation]) -> Evaluation:
     return Evaluation(
         sum(each.loss for each in evaluations),
         {key: reduce(np.add, [each.gradients[key] for each in evaluations]) for key in evaluations[0].gradients},
-        sum(each.dropped for each in evaluations),
+        dict(sum((Counter(each.dropped) for each in evaluations), Counter())),
         evaluations[-1].learned,
     )
 
@@ -104,8 +105,9 @@ class Evaluator:
         self.freezes = record and is_recordable(integrator, facts.has_media)
         self._targets = [mi.TensorXf(view.target) for view in problem.views]
         self._weights = [None if view.weight is None else mi.TensorXf(view.weight) for view in problem.views]
-        self._recordings = Recordings()
-        self._sweeps: dict[int, bool] = {}  # of each view that was seen: whether its pixels can be swept
+        self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
+        # Of each view and number of samples that was seen: whether pixels can be swept.
+        self._sweeps: dict[tuple[int, int], bool] = {}
         self._learned: Arrays = {}  # what the integrator knows
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
@@ -138,7 +140,7 @@ class Evaluator:
         gradients = {key: get_array(dr.grad(value)) for key, value in variables.items()}
         fine = {key: np.isfinite(gradient) for key, gradient in gradients.items()}
         # One bad path does not end a long run.
-        dropped = sum(int((~each).sum()) for each in fine.values())
+        dropped = {key: int((~each).sum()) for key, each in fine.items() if not each.all()}
         if dropped:
             gradients = {key: np.where(fine[key], gradient, 0) for key, gradient in gradients.items()}
         if hasattr(self.integrator, "learned"):
@@ -150,18 +152,19 @@ class Evaluator:
         problem, target = self.problem, self._targets[view]
         sensor = problem.views[view].sensor
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
-        records = self.freezes and view in self._sweeps
-        if view not in self._sweeps:
+        which = view, spp
+        records = self.freezes and which in self._sweeps
+        if which not in self._sweeps:
             may = problem.loss in QUADRATIC and hasattr(self.integrator, "sweeps_pixels")
             scene = problem.scene
-            self._sweeps[view] = may and bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))
+            self._sweeps[which] = may and bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         share = 1 / len(problem.trained())
         with plain_errors():
-            value, lost = (self._recordings.differentiate if records else differentiate)(
+            value, lost = (self._recordings[spp].differentiate if records else differentiate)(
                 problem.params, problem.scene, sensor, self.integrator, target, self._weights[view], number, spp,
-                problem.loss, share, self._sweeps[view], self._facts.tables(),
+                problem.loss, share, self._sweeps[which], self._facts.tables(),
             )  # fmt: skip
         if lost is not None:
             self.integrator.tell_lost(lost, target.shape[0] * target.shape[1] * spp)

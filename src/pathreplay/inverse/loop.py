@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -12,21 +12,25 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.interrupts import Stop
+from pathreplay.inverse import noise
 from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
-from pathreplay.inverse.evaluate import Evaluator, Local, Shard, total
+from pathreplay.inverse.evaluate import Evaluation, Evaluator, Local, Shard, total
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.optimiser import DrJitOptimiser
 from pathreplay.inverse.optimizer_options import Optimizer
-from pathreplay.inverse.problem import Problem, pose_errors, put_values
+from pathreplay.inverse.problem import Problem, View, pose_errors, put_values
 from pathreplay.inverse.schedules import rate
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.scenes.parameters import get_array, to_value
 
 # How often the pictures are judged in a job with a rival: enough for a curve, at some per cent of its time.
 JUDGEMENTS = 10
+
+# Of a gradient's entries, that were not finite: with less, the others still lead the way.
+HALF = 0.5
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,26 @@ class Refined:
 
 
 @dataclass(frozen=True)
+class NonFinite:
+    """So many entries of the gradient of a view were NaN or infinite, and count as zero."""
+
+    key: str
+    view: str
+    iteration: int
+    entries: int
+
+
+@dataclass(frozen=True)
+class Faint:
+    """The gradient of a variable is lost in noise: signal to noise, over the last iterations."""
+
+    key: str
+    ratio: float
+    iteration: int
+    spp: int
+
+
+@dataclass(frozen=True)
 class Stepped:
     """An iteration is done."""
 
@@ -59,7 +83,7 @@ class Stopped:
     done: int
 
 
-Event = Started | Refined | Stepped | Stopped
+Event = Started | Refined | NonFinite | Faint | Stepped | Stopped
 
 
 def new_run(
@@ -81,8 +105,11 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
 
     After each step the run's rival takes as many as bring it to the same number of seconds. Taking turns, both have the
     same share of a machine whose load changes. Its learning rate and resolutions are those of the job's iteration.
+
+    Raises PathreplayError where loss or values are no longer finite, and after `Config.non_finite_in_a_row`.
     """
     yield Started(len(run.history), config.iterations)
+    faint: set[str] = set()
     for i in range(len(run.history), config.iterations):
         yield from take_step(problem, config, run, i)
         if rival := run.rival:
@@ -93,77 +120,137 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
                 for each in (run, rival):
                     error = judged(problem, config, each.values, i)
                     each.history[-1] = replace(each.history[-1], picture_error=error)
+        for key, ratio in noise.ratios(run.history).items():
+            if ratio < noise.FAINT and key not in faint:
+                faint.add(key)
+                yield Faint(key, ratio, i, run.history[-1].spp)
         yield Stepped(run.history[-1])
+        _require_gradients(config, run)
         if stop.by is not None:
             break
     yield Stopped(len(run.history))
 
 
-def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Refined]:
+def _require_gradients(config: Config, run: Run) -> None:
+    """Raise PathreplayError if half of a gradient and more was not finite in so many iterations in a row."""
+    last = run.history[-config.non_finite_in_a_row :]
+    if len(last) < config.non_finite_in_a_row:
+        return
+    for key in last[-1].dropped_shares:
+        if all(entry.dropped_shares.get(key, 0) >= HALF for entry in last):
+            raise PathreplayError(
+                f"The gradient of '{key}' was NaN or infinite, half of it or more, in iterations {last[0].iteration} "
+                f"to {last[-1].iteration}; bound it, start it elsewhere, or raise 'non_finite_in_a_row'"
+            )
+
+
+def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Event]:
     """One step, with the learning rates and resolutions of iteration ``position``; adds an entry to the history.
 
-    Evaluate the views of its `batch`, a shard with a seed of its own for each, and sum in their order; step with the
-    learning rate of that iteration (see `schedules`), project every variable into its bounds. A grid whose next
-    resolution is due is interpolated before that, and returned; the optimiser starts anew on it. What is differentiated
-    is decided by the integrator; targets, bounds and the seeds' choice of paths are not.
+    Evaluate the views of its `batch`, a shard with a seed of its own for each (or two halves, see `noise`), and sum in
+    their order; step with the learning rate of that iteration (see `schedules`), project every variable into its
+    bounds. A grid whose next resolution is due is interpolated before that; the optimiser starts anew on it. What is
+    differentiated is decided by the integrator; targets, bounds and the seeds' choice of paths are not.
 
-    Raises PathreplayError where the loss is no longer finite.
+    Returns what there is to tell. Raises PathreplayError where the loss is no longer finite.
     """
     begin, i = time.perf_counter(), len(run.history)
-    refined = []
-    for v in problem.variables:
-        if v.levels and run.values[v.key].shape != (shape := v.levels.shape_at(position)):
-            run.values[v.key] = resampled(run.values[v.key], shape)
-            refined.append(Refined(v.key, shape))
-    shards = [
-        Shard((n,), config.spp, config.seeds(ITERATION, problem.views[n].sensor, i)[:1])
-        for n in batch(problem, config, i)
-    ]
-    found = total(run.executor.run(run.values, shards, run.learned)).of(len(problem.trained()) / len(shards))
+    values, told = _refined(problem, run.values, position)
+    spp = config.spp if isinstance(config.spp, int) else noise.next_spp(config.auto_spp, run.history)
+    shards = _shards(problem, config, i, spp)
+    evaluations = run.executor.run(values, shards, run.learned)
+    share = len(problem.trained()) / len({shard.views for shard in shards})
+    found = total(evaluations).of(share / 2 if config.halves_samples else share)
     if not np.isfinite(found.loss):
         raise PathreplayError(
             f"The loss is {found.loss} at iteration {i}; lower the learning rates, or bound the parameters that ran "
             "away"
         )
-    penalties = {v.key: v.penalty.of(run.values[v.key]) for v in problem.variables if v.penalty}
+    for shard, each in zip(shards, evaluations, strict=True):
+        view = problem.views[shard.views[0]].name
+        told += [NonFinite(key, view, i, count) for key, count in each.dropped.items()]
+    penalties = {v.key: v.penalty.of(values[v.key]) for v in problem.variables if v.penalty}
     gradients = found.gradients | {key: found.gradients[key] + slope for key, (_, slope) in penalties.items()}
-    schedule, decay = config.learning_rate_schedule, config.learning_rate_decay
-    factor = rate(schedule, position, config.iterations, decay, config.warm_up)
+    run.whole = False
+    run.values = _stepped(problem, config, run, values, gradients, position)
+    run.learned = found.learned
+    seconds = time.perf_counter() - begin
+    errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
+    entry = Entry(
+        i,
+        found.loss,
+        seconds,
+        _norms(gradients),
+        sum(found.dropped.values()),
+        errors | pose_errors(problem, run.values),
+        penalty=sum(value for value, _ in penalties.values()),
+        spp=spp,
+        noise_norms=_noise_norms(evaluations, share) if config.halves_samples else {},
+        dropped_shares={key: n / (gradients[key].size * len(shards)) for key, n in found.dropped.items()},
+    )
+    run.history.append(entry)
+    run.whole = True
+    return told
+
+
+def _refined(problem: Problem, values: Arrays, position: int) -> tuple[dict[str, Array], list[Event]]:
+    """The values, where the next resolution is due in that, and the grids that are."""
+    due = {v.key: v.levels.shape_at(position) for v in problem.variables if v.levels}
+    due = {key: shape for key, shape in due.items() if values[key].shape != shape}
+    grids = {key: resampled(values[key], shape) for key, shape in due.items()}
+    return {**values, **grids}, [Refined(key, shape) for key, shape in due.items()]
+
+
+def _shards(problem: Problem, config: Config, iteration: int, spp: int) -> list[Shard]:
+    """What an iteration evaluates: its views, one after the other, each whole or in two halves."""
+    halves = 2 if config.halves_samples else 1
+    return [
+        Shard((n,), spp // halves, (seed,))
+        for n in batch(problem, config, iteration)
+        for seed in config.seeds(ITERATION, problem.views[n].sensor, iteration)[:halves]
+    ]
+
+
+def _norms(gradients: Arrays) -> dict[str, float]:
+    return {key: float(np.linalg.norm(gradient)) for key, gradient in gradients.items()}
+
+
+def _noise_norms(evaluations: Sequence[Evaluation], share: float) -> dict[str, float]:
+    """|a - b|/2 of the two halves of each gradient, which are the even and the odd ones, added up over views."""
+    a, b = (total(evaluations[half::2]).of(share).gradients for half in (0, 1))
+    return {key: norm / 2 for key, norm in _norms({key: a[key] - b[key] for key in a}).items()}
+
+
+def _stepped(
+    problem: Problem, config: Config, run: Run, values: Arrays, gradients: Arrays, position: int
+) -> dict[str, Array]:
+    """The values after a step of the optimiser, taken in the coordinates of each variable, and held within bounds."""
+    decay, iterations = config.learning_rate_decay, config.iterations
+    factor = rate(config.learning_rate_schedule, position, iterations, decay, config.warm_up)
     rates = {v.key: v.learning_rate * factor for v in problem.variables}
-    stepped = _stepped(problem, run, gradients, rates)
+    others = {v.key: v.coordinates for v in problem.variables if v.coordinates}
+    latent = {key: other.latent(values[key]) for key, other in others.items()}
+    slopes = {key: other.gradient(values[key], gradients[key]) for key, other in others.items()}
+    stepped = run.optimiser.step({**values, **latent}, {**gradients, **slopes}, rates)
+    stepped |= {key: other.values(stepped[key]) for key, other in others.items()}
     for key, value in stepped.items():
         if not np.isfinite(value).all():
             raise PathreplayError(
-                f"'{key}' is no finite number after iteration {i}; lower its learning rate, or bound it"
+                f"'{key}' is no finite number after iteration {len(run.history)}; lower its learning rate, or bound it"
             )
-    run.values = {v.key: np.clip(stepped[v.key], *v.bounds) for v in problem.variables}
-    run.learned = found.learned
-    seconds = time.perf_counter() - begin
-    norms = {key: float(np.linalg.norm(gradient)) for key, gradient in gradients.items()}
-    errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
-    errors |= pose_errors(problem, run.values)
-    penalty = sum(value for value, _ in penalties.values())
-    run.history.append(Entry(i, found.loss, seconds, norms, found.dropped, errors, penalty=penalty))
-    return refined
-
-
-def _stepped(problem: Problem, run: Run, gradients: Arrays, rates: dict[str, float]) -> dict[str, Array]:
-    """The values after a step of the optimiser, which is taken in the coordinates of each variable."""
-    others = {v.key: v.coordinates for v in problem.variables if v.coordinates}
-    latent = {key: other.latent(run.values[key]) for key, other in others.items()}
-    slopes = {key: other.gradient(run.values[key], gradients[key]) for key, other in others.items()}
-    stepped = run.optimiser.step({**run.values, **latent}, {**gradients, **slopes}, rates)
-    return stepped | {key: other.values(stepped[key]) for key, other in others.items()}
+    return {v.key: np.clip(stepped[v.key], *v.bounds) for v in problem.variables}
 
 
 def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:
     """Pictures of all views with these values in the scene, by the job's integrator; same noise at every call."""
+    return {view.name: picture_of(problem, config, values, view) for view in problem.views}
+
+
+def picture_of(problem: Problem, config: Config, values: Arrays, view: View) -> Image:
+    """One of them."""
     put_values(problem, values)
-    spp = config.picture_spp
-    return {
-        v.name: _picture(problem, v.sensor, problem.integrator, spp, config.seeds(PICTURE, v.sensor)[0])
-        for v in problem.views
-    }
+    seed = config.seeds(PICTURE, view.sensor)[0]
+    return _picture(problem, view.sensor, problem.integrator, config.picture_spp, seed)
 
 
 def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> float:
@@ -177,7 +264,7 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
     squares, views = 0.0, problem.trained().values()
     for view in views:
         a, b = (
-            _picture(problem, view.sensor, problem.judge, config.spp, seed).astype(np.float64) - view.target
+            _picture(problem, view.sensor, problem.judge, config.most_spp, seed).astype(np.float64) - view.target
             for seed in config.seeds(JUDGEMENT, view.sensor, iteration)
         )
         squares += float(np.mean(a * b if view.weight is None else a * b * view.weight)) / len(views)

@@ -169,7 +169,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     taken = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
     held_out = _held_out(scene, sensors, config, list(shots))
     limits.require_visible(scene, params, keys)
-    limits.require_films(scene, sensors, {"spp": config.spp, "picture_spp": config.picture_spp})
+    limits.require_films(scene, sensors, {"spp": config.most_spp, "picture_spp": config.picture_spp})
     unsolved, moved = _variables(scene, params, keys, config, base)
 
     truth: dict[str, Array] = {}

@@ -35,7 +35,7 @@ class RunResult:
     stopped: bool
     """True when a signal ended the run early; it can be resumed."""
     stopped_by: str | None
-    """'Ctrl-C', 'SIGTERM' or 'SIGHUP'."""
+    """'Ctrl-C', 'SIGTERM', 'SIGHUP' or 'finish()'."""
     history: tuple[Entry, ...]
     parameters: dict[str, Array]
     errors: dict[str, float]
@@ -138,7 +138,7 @@ def result_files(outcome: Outcome) -> dict[str, bytes]:
 
 
 def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
-    """What Python gets; ``stopped_by`` is the name of a signal, which may have come too late to stop anything."""
+    """What Python gets; ``stopped_by`` is the name of a signal, say, which may have come too late to stop anything."""
     stopped = len(outcome.run.history) < outcome.config.iterations
     return RunResult(
         folder=outcome.folder,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -36,6 +37,22 @@ class Saving:
                 self._write(done)
         elif isinstance(event, Stopped) and event.done > self.saved:
             self._write(event.done)
+
+    def close(self) -> None:
+        """Write what is not yet saved. Raises as `observe` does."""
+        if self._runs_are_whole() and len(self.run.history) > self.saved:
+            self._write(len(self.run.history))
+
+    def rescued(self) -> bool:
+        """Write what is not yet saved after an error of the run; whether all that was done is saved now."""
+        if not self._runs_are_whole() or not self.run.history:
+            return False
+        with contextlib.suppress(PathreplayError):  # the first error is the one to tell
+            self.close()
+        return self.saved == len(self.run.history)
+
+    def _runs_are_whole(self) -> bool:
+        return all(run.whole for run in _runs(self.run).values())
 
     def _write(self, done: int) -> None:
         self.folder.write(_checkpoints(self.run))
