@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -89,13 +89,15 @@ def save(run: Run) -> bytes:
     return safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata)
 
 
-def restore(path: Path, run: Run, levels: Mapping[str, Levels | None]) -> None:
+def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Collection[str] = ()) -> None:
     """Bring a run to where it was when ``path`` was saved; ``levels`` are those of its grids, by key.
+
+    ``held`` are variables that some stages do not step.
 
     Raises PathreplayError if the file is damaged, holds what no run has written, or belongs to other variables.
     """
     try:
-        values, state, history, learned = _read(path, run.values, levels)
+        values, state, history, learned = _read(path, run.values, levels, held)
         run.optimiser.restore(state, values)
         run.values, run.history, run.learned = values, history, learned
         return
@@ -108,7 +110,7 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None]) -> None:
 
 
 def _read(
-    path: Path, values: Arrays, levels: Mapping[str, Levels | None]
+    path: Path, values: Arrays, levels: Mapping[str, Levels | None], held: Collection[str]
 ) -> tuple[dict[str, Array], State, list[Entry], Arrays]:
     """Values, state of the optimiser, history and what was learned; raises what `restore` makes plain."""
     if not path.is_file():
@@ -133,7 +135,7 @@ def _read(
     for key, value in values.items():
         grid, array = levels[key], found[key]
         # Optimisers begin anew on a grid that was refined.
-        if steps[key] > len(history) or (steps[key] < len(history) and grid is None):
+        if steps[key] > len(history) or (steps[key] < len(history) and grid is None and key not in held):
             raise ValueError(f"{steps[key]} steps of '{key}' in {len(history)} iterations")
         shapes = [value.shape] if grid is None else list(grid.shapes)
         if array.dtype != value.dtype or array.shape not in shapes:

@@ -18,6 +18,7 @@ from pathreplay.inverse.noise_options import AUTO, AutoSpp, Spp
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.pose import PARTS, PoseKind
 from pathreplay.inverse.schedules import Schedule
+from pathreplay.inverse.stage_options import Stage, begins
 from pathreplay.inverse.tables import Count, Finite, Positive, Switch, Table, Whole
 from pathreplay.inverse.texts import YAML, parsed
 
@@ -98,11 +99,9 @@ class Parameter(Table):
         if self.smooth is not None and self.transform is not None:
             self._refuse("'smooth' does not go with 'transform': both say where steps are taken; leave one out")
         sizes, begins = self.resolutions or [], self.refine_at or []
-        if len(begins) != max(0, len(sizes) - 1):
-            self._refuse(
-                f"{len(sizes)} resolutions and {len(begins)} entries in refine_at; give the iteration at which each "
-                "resolution after the first begins"
-            )
+        # Without refine_at each stage of the job may have one: see `Config`.
+        if self.refine_at is not None and len(begins) != max(0, len(sizes) - 1):
+            self._refuse_count()
         if sorted(set(begins)) != begins:
             self._refuse(f"refine_at {begins} does not increase; put it in order")
         if self.transform == "log" and self.lower is not None and self.lower < 0:
@@ -113,6 +112,12 @@ class Parameter(Table):
             bounds = f"upper bound {self.upper:g} is not above lower bound {self.lower:g}"
             self._refuse(f"{bounds}; swap or widen them")
         return self
+
+    def _refuse_count(self) -> None:
+        self._refuse(
+            f"{len(self.resolutions or [])} resolutions and {len(self.refine_at or [])} entries in refine_at; give the "
+            "iteration at which each resolution after the first begins"
+        )
 
     def _refuse(self, why: str) -> None:
         raise ValueError(f"parameter '{self.key}': {why}")
@@ -219,6 +224,7 @@ class Config(Table):
     learning_rate_schedule: Schedule = "exponential"
     warm_up: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 0
     optimizer: Optimizer = Optimizer()
+    stages: Annotated[list[Stage], Field(min_length=1)] | None = None
     checkpoint_every: Count = 25
     deterministic: Switch = False
     output: str | None = None
@@ -231,12 +237,35 @@ class Config(Table):
     @property
     def most_spp(self) -> int:
         """Samples per pixel that an iteration may have."""
-        return self.spp if isinstance(self.spp, int) else self.auto_spp.highest
+        most = self.spp if isinstance(self.spp, int) else self.auto_spp.highest
+        return max([most, *(stage.spp for stage in self.stages or [] if stage.spp is not None)])
 
     @property
     def halves_samples(self) -> bool:
         """Whether iterations take their samples in two halves, which tell signal from noise."""
         return self.signal_to_noise or self.spp == AUTO
+
+    def refine_at(self, entry: Parameter) -> list[int]:
+        """The iterations at which the resolutions of a parameter after the first begin."""
+        if entry.refine_at is None and entry.resolutions is not None and self.stages is not None:
+            return begins(self.stages)[1 : len(entry.resolutions)]
+        return entry.refine_at or []
+
+    @model_validator(mode="after")
+    def _in_stages(self) -> Config:
+        total = begins(self.stages or [])[-1]
+        if self.stages is not None:
+            if "iterations" not in self.model_fields_set:
+                self.__dict__["iterations"] = total  # frozen, and not to be written down as if it had been given
+            elif self.iterations != total:
+                raise ValueError(
+                    f"iterations is {self.iterations}, and the stages have {total}; leave 'iterations' out"
+                )
+        for entry in self.parameters:
+            sizes = len(entry.resolutions or [])
+            if entry.refine_at is None and sizes > 1 and sizes != len(self.stages or []):
+                entry._refuse_count()
+        return self
 
     @model_validator(mode="after")
     def _samples(self) -> Config:
@@ -244,6 +273,11 @@ class Config(Table):
             raise ValueError(f"auto_spp goes with spp = 'auto', and spp is {self.spp}; leave one out")
         if self.signal_to_noise and self.spp != AUTO and self.spp % 2:
             raise ValueError(f"signal_to_noise takes two halves of the samples, and spp is {self.spp}; make it even")
+        for stage in self.stages or []:
+            if self.signal_to_noise and stage.spp is not None and stage.spp % 2:
+                raise ValueError(
+                    f"signal_to_noise takes two halves of the samples, and a stage has spp = {stage.spp}; make it even"
+                )
         return self
 
     @model_validator(mode="after")
@@ -291,6 +325,7 @@ _TABLES: dict[str, type[BaseModel]] = {
     "optimizer": Optimizer,
     "capture": Capture,
     "auto_spp": AutoSpp,
+    "stages": Stage,
 }
 
 

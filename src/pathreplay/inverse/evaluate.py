@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any, Protocol
@@ -18,6 +18,7 @@ from pathreplay.inverse.problem import Problem, scene_values, variables_of
 from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.render.facts import SceneFacts
+from pathreplay.render.film import fit_film
 from pathreplay.render.path_integrator import plain_errors
 from pathreplay.scenes.parameters import get_array
 
@@ -29,6 +30,8 @@ class Shard:
     views: tuple[int, ...]
     samples: int
     seeds: tuple[int, ...]
+    stage: int = 0
+    """Of the job, whose views these are, and which says what is differentiated."""
 
 
 @dataclass(frozen=True)
@@ -95,11 +98,20 @@ class Local:
 class Evaluator:
     """Evaluates shards of a problem by one integrator, in its scene, which keeps the values of the last shard.
 
+    ``moving`` are the variables that are differentiated (default: all).
+
     One view is rendered and back-propagated after the other: memory holds the graph of one.
     """
 
-    def __init__(self, problem: Problem, integrator: mi.Integrator, record: bool = True) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        integrator: mi.Integrator,
+        record: bool = True,
+        moving: Collection[str] | None = None,
+    ) -> None:
         self.problem, self.integrator = problem, integrator
+        self._moving = {v.key for v in problem.variables} if moving is None else set(moving)
         self._facts = facts = SceneFacts(problem.scene)
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
         self.freezes = record and is_recordable(integrator, facts.has_media)
@@ -129,15 +141,17 @@ class Evaluator:
         self._learned = learned
 
     def _view(self, values: Arrays, view: int, seed: int, spp: int) -> Evaluation:
+        fit_film(self.problem.scene.sensors()[self.problem.views[view].sensor], self._targets[view].shape)
         variables = variables_of(self.problem, values)
-        dr.enable_grad(variables)
+        moving = {key: value for key, value in variables.items() if key in self._moving}
+        dr.enable_grad(moving)
         self.problem.params.update(scene_values(self.problem, variables))
         try:
             loss = self._differentiated(view, seed, spp)
         except NotRecordable:  # a part of the gradient may be there: once more, with variables of its own
             self.freezes = False
             return self._view(values, view, seed, spp)
-        gradients = {key: get_array(dr.grad(value)) for key, value in variables.items()}
+        gradients = {key: get_array(dr.grad(value)) for key, value in moving.items()}
         fine = {key: np.isfinite(gradient) for key, gradient in gradients.items()}
         # One bad path does not end a long run.
         dropped = {key: int((~each).sum()) for key, each in fine.items() if not each.all()}

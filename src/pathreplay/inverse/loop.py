@@ -16,14 +16,17 @@ from pathreplay.inverse import noise
 from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
-from pathreplay.inverse.evaluate import Evaluation, Evaluator, Local, Shard, total
+from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Local, Shard, total
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.optimiser import DrJitOptimiser
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.problem import Problem, View, pose_errors, put_values
 from pathreplay.inverse.schedules import rate
+from pathreplay.inverse.stage_options import place
+from pathreplay.inverse.stages import Part, part_at
 from pathreplay.inverse.values import Array, Arrays
+from pathreplay.render.film import fit_film
 from pathreplay.scenes.parameters import get_array, to_value
 
 # How often the pictures are judged in a job with a rival: enough for a curve, at some per cent of its time.
@@ -47,6 +50,14 @@ class Refined:
 
     key: str
     shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Entered:
+    """A stage (from 1) of so many begins, or is gone on with."""
+
+    number: int
+    of: int
 
 
 @dataclass(frozen=True)
@@ -83,16 +94,20 @@ class Stopped:
     done: int
 
 
-Event = Started | Refined | NonFinite | Faint | Stepped | Stopped
+Event = Started | Entered | Refined | NonFinite | Faint | Stepped | Stopped
 
 
 def new_run(
-    problem: Problem, integrator: mi.Integrator, record: bool = True, optimizer: Optimizer | None = None
+    problem: Problem,
+    integrator: mi.Integrator,
+    record: bool = True,
+    optimizer: Optimizer | None = None,
+    evaluate: Evaluate | None = None,
 ) -> Run:
-    """A run at the problem's start values, in this process."""
+    """A run at the problem's start values, in this process; ``evaluate`` is what does it, if not an `Evaluator`."""
     values = {v.key: get_array(to_value(v.like, v.start)) for v in problem.variables}
     return Run(
-        Local(Evaluator(problem, integrator, record)),
+        Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
         DrJitOptimiser(
             values, optimizer, [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
         ),
@@ -110,7 +125,11 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
     """
     yield Started(len(run.history), config.iterations)
     faint: set[str] = set()
+    stage, stages = None, config.stages or []
     for i in range(len(run.history), config.iterations):
+        if stages and place(stages, i) != stage:
+            stage = place(stages, i)
+            yield Entered(stage + 1, len(stages))
         yield from take_step(problem, config, run, i)
         if rival := run.rival:
             while rival.seconds() < run.seconds():
@@ -149,18 +168,20 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
 
     Evaluate the views of its `batch`, a shard with a seed of its own for each (or two halves, see `noise`), and sum in
     their order; step with the learning rate of that iteration (see `schedules`), project every variable into its
-    bounds. A grid whose next resolution is due is interpolated before that; the optimiser starts anew on it. What is
-    differentiated is decided by the integrator; targets, bounds and the seeds' choice of paths are not.
+    bounds. A grid that moves, and whose next resolution is due, is interpolated before that; the optimiser starts anew
+    on it. What is differentiated is decided by the integrator; targets, bounds and the seeds' choice of paths are not.
 
     Returns what there is to tell. Raises PathreplayError where the loss is no longer finite.
     """
     begin, i = time.perf_counter(), len(run.history)
-    values, told = _refined(problem, run.values, position)
-    spp = config.spp if isinstance(config.spp, int) else noise.next_spp(config.auto_spp, run.history)
-    shards = _shards(problem, config, i, spp)
+    part = part_at(problem, config, position)
+    values, told = _refined(part, run.values, position)
+    asked, halves = part.config.spp, part.config.halves_samples
+    spp = asked if isinstance(asked, int) else noise.next_spp(config.auto_spp, run.history)
+    shards = _shards(part, i, spp)
     evaluations = run.executor.run(values, shards, run.learned)
-    share = len(problem.trained()) / len({shard.views for shard in shards})
-    found = total(evaluations).of(share / 2 if config.halves_samples else share)
+    share = len(part.problem.trained()) / len({shard.views for shard in shards})
+    found = total(evaluations).of(share / 2 if halves else share)
     if not np.isfinite(found.loss):
         raise PathreplayError(
             f"The loss is {found.loss} at iteration {i}; lower the learning rates, or bound the parameters that ran "
@@ -170,9 +191,11 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
         view = problem.views[shard.views[0]].name
         told += [NonFinite(key, view, i, count) for key, count in each.dropped.items()]
     penalties = {v.key: v.penalty.of(values[v.key]) for v in problem.variables if v.penalty}
-    gradients = found.gradients | {key: found.gradients[key] + slope for key, (_, slope) in penalties.items()}
+    gradients = {
+        key: gradient + penalties[key][1] if key in penalties else gradient for key, gradient in found.gradients.items()
+    }
     run.whole = False
-    run.values = _stepped(problem, config, run, values, gradients, position)
+    run.values = _stepped(part, run, values, gradients, position)
     run.learned = found.learned
     seconds = time.perf_counter() - begin
     errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
@@ -185,7 +208,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
         errors | pose_errors(problem, run.values),
         penalty=sum(value for value, _ in penalties.values()),
         spp=spp,
-        noise_norms=_noise_norms(evaluations, share) if config.halves_samples else {},
+        noise_norms=_noise_norms(evaluations, share) if halves else {},
         dropped_shares={key: n / (gradients[key].size * len(shards)) for key, n in found.dropped.items()},
     )
     run.history.append(entry)
@@ -193,21 +216,22 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     return told
 
 
-def _refined(problem: Problem, values: Arrays, position: int) -> tuple[dict[str, Array], list[Event]]:
-    """The values, where the next resolution is due in that, and the grids that are."""
-    due = {v.key: v.levels.shape_at(position) for v in problem.variables if v.levels}
+def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array], list[Event]]:
+    """The values, where the next resolution is due in that, and the grids that are; those that are held can wait."""
+    moving = [v for v in part.problem.variables if v.key in part.moving]
+    due = {v.key: v.levels.shape_at(position) for v in moving if v.levels}
     due = {key: shape for key, shape in due.items() if values[key].shape != shape}
     grids = {key: resampled(values[key], shape) for key, shape in due.items()}
     return {**values, **grids}, [Refined(key, shape) for key, shape in due.items()]
 
 
-def _shards(problem: Problem, config: Config, iteration: int, spp: int) -> list[Shard]:
+def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
     """What an iteration evaluates: its views, one after the other, each whole or in two halves."""
-    halves = 2 if config.halves_samples else 1
+    halves, config, views = 2 if part.config.halves_samples else 1, part.config, part.problem.views
     return [
-        Shard((n,), spp // halves, (seed,))
-        for n in batch(problem, config, iteration)
-        for seed in config.seeds(ITERATION, problem.views[n].sensor, iteration)[:halves]
+        Shard((n,), spp // halves, (seed,), part.number)
+        for n in batch(part.problem, config, iteration)
+        for seed in config.seeds(ITERATION, views[n].sensor, iteration)[:halves]
     ]
 
 
@@ -221,24 +245,25 @@ def _noise_norms(evaluations: Sequence[Evaluation], share: float) -> dict[str, f
     return {key: norm / 2 for key, norm in _norms({key: a[key] - b[key] for key in a}).items()}
 
 
-def _stepped(
-    problem: Problem, config: Config, run: Run, values: Arrays, gradients: Arrays, position: int
-) -> dict[str, Array]:
+def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int) -> dict[str, Array]:
     """The values after a step of the optimiser, taken in the coordinates of each variable, and held within bounds."""
+    config = part.config
     decay, iterations = config.learning_rate_decay, config.iterations
-    factor = rate(config.learning_rate_schedule, position, iterations, decay, config.warm_up)
-    rates = {v.key: v.learning_rate * factor for v in problem.variables}
-    others = {v.key: v.coordinates for v in problem.variables if v.coordinates}
+    factor = part.factor * rate(config.learning_rate_schedule, position, iterations, decay, config.warm_up)
+    moving = [v for v in part.problem.variables if v.key in gradients]
+    rates = {v.key: v.learning_rate * factor for v in moving}
+    others = {v.key: v.coordinates for v in moving if v.coordinates}
     latent = {key: other.latent(values[key]) for key, other in others.items()}
     slopes = {key: other.gradient(values[key], gradients[key]) for key, other in others.items()}
-    stepped = run.optimiser.step({**values, **latent}, {**gradients, **slopes}, rates)
+    now = {v.key: values[v.key] for v in moving}
+    stepped = run.optimiser.step({**now, **latent}, {**gradients, **slopes}, rates)
     stepped |= {key: other.values(stepped[key]) for key, other in others.items()}
     for key, value in stepped.items():
         if not np.isfinite(value).all():
             raise PathreplayError(
                 f"'{key}' is no finite number after iteration {len(run.history)}; lower its learning rate, or bound it"
             )
-    return {v.key: np.clip(stepped[v.key], *v.bounds) for v in problem.variables}
+    return {**values, **{v.key: np.clip(stepped[v.key], *v.bounds) for v in moving}}
 
 
 def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:
@@ -250,7 +275,7 @@ def picture_of(problem: Problem, config: Config, values: Arrays, view: View) -> 
     """One of them."""
     put_values(problem, values)
     seed = config.seeds(PICTURE, view.sensor)[0]
-    return _picture(problem, view.sensor, problem.integrator, config.picture_spp, seed)
+    return _picture(problem, view, problem.integrator, config.picture_spp, seed)
 
 
 def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> float:
@@ -264,14 +289,15 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
     squares, views = 0.0, problem.trained().values()
     for view in views:
         a, b = (
-            _picture(problem, view.sensor, problem.judge, config.most_spp, seed).astype(np.float64) - view.target
+            _picture(problem, view, problem.judge, config.most_spp, seed).astype(np.float64) - view.target
             for seed in config.seeds(JUDGEMENT, view.sensor, iteration)
         )
         squares += float(np.mean(a * b if view.weight is None else a * b * view.weight)) / len(views)
     return float(np.sqrt(max(squares, 0.0)))
 
 
-def _picture(problem: Problem, sensor: int, integrator: mi.Integrator, spp: int, seed: int) -> Image:
+def _picture(problem: Problem, view: View, integrator: mi.Integrator, spp: int, seed: int) -> Image:
+    fit_film(problem.scene.sensors()[view.sensor], view.target.shape)
     with dr.suspend_grad():
-        image = mi.render(problem.scene, sensor=sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
+        image = mi.render(problem.scene, sensor=view.sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
     return np.array(image, dtype=np.float32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from pathreplay.errors import PathreplayError
@@ -76,8 +76,10 @@ def saved_targets(folder: Path) -> Targets:
     return Targets(images, weights)
 
 
-def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
+def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) -> dict[str, Image]:
     """Bring a run to where the folder's checkpoint was; returns the pictures of its start.
+
+    ``held`` are variables that some stages do not step.
 
     Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
     """
@@ -93,7 +95,7 @@ def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
                 )
             require_finite_array(str(path), found)
     for name, each in _runs(run).items():
-        checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables})
+        checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables}, held)
     return before
 
 

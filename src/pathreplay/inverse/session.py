@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
+import mitsuba as mi
+
 from pathreplay import backend
 from pathreplay.errors import PathreplayError
 from pathreplay.interrupts import Stop, stopping, undisturbed
 from pathreplay.inverse.checkpoint import Entry, Run
-from pathreplay.inverse.config import Config
+from pathreplay.inverse.config import Config, Plugin
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
 from pathreplay.inverse.loop import Event, Stepped, iterate, new_run, picture_of, render_views
@@ -22,6 +24,7 @@ from pathreplay.inverse.progress import Progress
 from pathreplay.inverse.result import RunResult, outcome_of, result_files, result_of
 from pathreplay.inverse.run_folder import Job, RunFolder, create_run_folder
 from pathreplay.inverse.saving import Saving, first_files, go_on, saved_targets
+from pathreplay.inverse.stages import Staged, require_stages
 from pathreplay.inverse.values import Array
 from pathreplay.scenes.descriptions import told
 from pathreplay.threads import one_thread
@@ -134,11 +137,12 @@ def _states(
         bar = stack.enter_context(Progress(progress))
         bar.say("preparing")
         problem = build_problem(config, job.base, None if resumed is None else saved_targets(resumed.path))
+        require_stages(problem, config)
         for note in problem.notes:
             bar.note(note)
-        run = new_run(problem, problem.integrator, not config.deterministic, config.optimizer)
-        if problem.rival is not None:
-            run.rival = new_run(problem, problem.rival, not config.deterministic, config.optimizer)
+        run = _run(problem, config, problem.integrator, config.integrator)
+        if problem.rival is not None and config.rival is not None:
+            run.rival = _run(problem, config, problem.rival, config.rival)
         if resumed is None:
             folder, before = _begun(output, job, problem, run)
             stack.callback(folder.lock.close)
@@ -173,6 +177,13 @@ def _states(
         outcome = outcome_of(job, folder.path, problem, run, before, after, theirs)
         folder.write(result_files(outcome))
         return result_of(outcome, stop.by)
+
+
+def _run(problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin) -> Run:
+    """A run that begins, by an integrator, which is made of that plugin."""
+    record = not config.deterministic
+    staged = None if config.stages is None else Staged(problem, config, integrator, plugin, record)
+    return new_run(problem, integrator, record, config.optimizer, staged)
 
 
 def _events(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
@@ -222,7 +233,8 @@ def _begun(output: Path, job: Job, problem: Problem, run: Run) -> tuple[RunFolde
 
 
 def _went_on(folder: RunFolder, config: Config, problem: Problem, run: Run) -> dict[str, Image]:
-    before = go_on(folder.path, problem, run)
+    held = {v.key for v in problem.variables} if config.stages else set()  # some of them, in some stages
+    before = go_on(folder.path, problem, run, held)
     # All iterations but no report: the disk was full at the end. Then only the end is done again.
     if len(run.history) >= config.iterations and (folder.path / "report.html").exists():
         raise PathreplayError(
