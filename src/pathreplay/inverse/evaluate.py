@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.losses import QUADRATIC
+from pathreplay.inverse.losses import ELSEWHERE, QUADRATIC
 from pathreplay.inverse.problem import Problem, scene_values, variables_of
 from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.values import Array, Arrays
@@ -114,7 +114,7 @@ class Evaluator:
         self._moving = {v.key for v in problem.variables} if moving is None else set(moving)
         self._facts = facts = SceneFacts(problem.scene)
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
-        self.freezes = record and is_recordable(integrator, facts.has_media)
+        self.freezes = record and is_recordable(integrator, facts.has_media) and problem.loss not in ELSEWHERE
         self._targets = [mi.TensorXf(view.target) for view in problem.views]
         self._weights = [None if view.weight is None else mi.TensorXf(view.weight) for view in problem.views]
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
