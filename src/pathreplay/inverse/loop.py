@@ -19,7 +19,8 @@ from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
 from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Local, Shard, total
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
-from pathreplay.inverse.optimiser import DrJitOptimiser
+from pathreplay.inverse.line_search import LineSearch
+from pathreplay.inverse.optimiser import DrJitOptimiser, Optimiser
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.problem import Problem, View, pose_errors, put_values
 from pathreplay.inverse.schedules import rate
@@ -50,6 +51,13 @@ class Refined:
 
     key: str
     shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The optimiser takes no more steps."""
+
+    why: str
 
 
 @dataclass(frozen=True)
@@ -94,7 +102,7 @@ class Stopped:
     done: int
 
 
-Event = Started | Entered | Refined | NonFinite | Faint | Stepped | Stopped
+Event = Started | Entered | Finished | Refined | NonFinite | Faint | Stepped | Stopped
 
 
 def new_run(
@@ -108,11 +116,27 @@ def new_run(
     values = {v.key: get_array(to_value(v.like, v.start)) for v in problem.variables}
     return Run(
         Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
-        DrJitOptimiser(
-            values, optimizer, [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
-        ),
+        _optimiser(problem, values, optimizer or Optimizer()),
         values,
     )
+
+
+def _optimiser(problem: Problem, values: Arrays, options: Optimizer) -> Optimiser:
+    if options.searches:
+        free = -np.inf, np.inf  # other coordinates have their own ways to hold bounds
+        bounds = {v.key: free if v.coordinates else v.bounds for v in problem.variables}
+        return LineSearch(values, options, bounds)
+    uniform = [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
+    return DrJitOptimiser(values, options, uniform)
+
+
+def answer_of(problem: Problem, run: Run) -> dict[str, Array]:
+    """The values that a run has come to: after its last step, or at the best one of a line search."""
+    found = run.optimiser.answer()
+    for v in problem.variables:
+        if v.coordinates and v.key in found:
+            found[v.key] = v.coordinates.values(found[v.key])
+    return {v.key: np.clip(found.get(v.key, run.values[v.key]), *v.bounds) for v in problem.variables}
 
 
 def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
@@ -127,6 +151,9 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
     faint: set[str] = set()
     stage, stages = None, config.stages or []
     for i in range(len(run.history), config.iterations):
+        if run.optimiser.finished:
+            yield Finished(run.optimiser.finished)
+            break
         if stages and place(stages, i) != stage:
             stage = place(stages, i)
             yield Entered(stage + 1, len(stages))
@@ -194,8 +221,9 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     gradients = {
         key: gradient + penalties[key][1] if key in penalties else gradient for key, gradient in found.gradients.items()
     }
+    penalty = sum(value for value, _ in penalties.values())
     run.whole = False
-    run.values = _stepped(part, run, values, gradients, position)
+    run.values = _stepped(part, run, values, gradients, position, found.loss + penalty)
     run.learned = found.learned
     seconds = time.perf_counter() - begin
     errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
@@ -206,7 +234,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
         _norms(gradients),
         sum(found.dropped.values()),
         errors | pose_errors(problem, run.values),
-        penalty=sum(value for value, _ in penalties.values()),
+        penalty=penalty,
         spp=spp,
         noise_norms=_noise_norms(evaluations, share) if halves else {},
         dropped_shares={key: n / (gradients[key].size * len(shards)) for key, n in found.dropped.items()},
@@ -227,11 +255,12 @@ def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array
 
 def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
     """What an iteration evaluates: its views, one after the other, each whole or in two halves."""
+    same = 0 if part.config.optimizer.searches else iteration
     halves, config, views = 2 if part.config.halves_samples else 1, part.config, part.problem.views
     return [
         Shard((n,), spp // halves, (seed,), part.number)
         for n in batch(part.problem, config, iteration)
-        for seed in config.seeds(ITERATION, views[n].sensor, iteration)[:halves]
+        for seed in config.seeds(ITERATION, views[n].sensor, same)[:halves]
     ]
 
 
@@ -245,7 +274,7 @@ def _noise_norms(evaluations: Sequence[Evaluation], share: float) -> dict[str, f
     return {key: norm / 2 for key, norm in _norms({key: a[key] - b[key] for key in a}).items()}
 
 
-def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int) -> dict[str, Array]:
+def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int, loss: float) -> dict[str, Array]:
     """The values after a step of the optimiser, taken in the coordinates of each variable, and held within bounds."""
     config = part.config
     decay, iterations = config.learning_rate_decay, config.iterations
@@ -256,7 +285,7 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
     latent = {key: other.latent(values[key]) for key, other in others.items()}
     slopes = {key: other.gradient(values[key], gradients[key]) for key, other in others.items()}
     now = {v.key: values[v.key] for v in moving}
-    stepped = run.optimiser.step({**now, **latent}, {**gradients, **slopes}, rates)
+    stepped = run.optimiser.step({**now, **latent}, {**gradients, **slopes}, rates, loss)
     stepped |= {key: other.values(stepped[key]) for key, other in others.items()}
     for key, value in stepped.items():
         if not np.isfinite(value).all():

@@ -11,7 +11,7 @@ import rich.progress
 from rich.console import Console
 
 from pathreplay.errors import plain_line
-from pathreplay.inverse.loop import Entered, Event, Faint, NonFinite, Refined, Started, Stepped, Stopped
+from pathreplay.inverse.loop import Entered, Event, Faint, Finished, NonFinite, Refined, Started, Stepped, Stopped
 
 # Between two lines, where there is no bar: a log of a long run stays readable.
 _SECONDS = 10.0
@@ -92,10 +92,12 @@ class Progress:
         elif self._shown and not isinstance(event, Stopped) and (note := self._note_of(event)):
             self.note(note)
 
-    def _note_of(self, event: Entered | Refined | NonFinite | Faint) -> str:
+    def _note_of(self, event: Entered | Finished | Refined | NonFinite | Faint) -> str:
         """What is said of an event; nothing of what has been said of the same parameter."""
         if isinstance(event, Entered):
             return f"stage {event.number} of {event.of}"
+        if isinstance(event, Finished):
+            return f"no more steps: {event.why}"
         if isinstance(event, Refined):
             return f"{event.key} goes on with the shape {event.shape}"
         told = type(event), event.key

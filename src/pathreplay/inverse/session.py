@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 
@@ -17,7 +17,7 @@ from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config, Plugin
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
-from pathreplay.inverse.loop import Event, Stepped, iterate, new_run, picture_of, render_views
+from pathreplay.inverse.loop import Event, Stepped, answer_of, iterate, new_run, picture_of, render_views
 from pathreplay.inverse.outcome import resume_command
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
@@ -158,7 +158,7 @@ def _states(
                 saving.observe(event)
                 if isinstance(event, Stepped):
                     views = tuple(view.name for view in problem.views)
-                    yield State(event.entry, dict(run.values), views, folder.path, look)
+                    yield State(event.entry, answer_of(problem, run), views, folder.path, look)
         except GeneratorExit:
             saving.close()
             raise
@@ -171,6 +171,7 @@ def _states(
                 raise PathreplayError(f"{error}; {way_out}") from error
             raise
         bar.say("writing")
+        run = replace(run, values=answer_of(problem, run))
         with computing(config):
             after = render_views(problem, config, run.values)
             theirs = render_views(problem, config, run.rival.values) if run.rival else {}
@@ -236,7 +237,13 @@ def _went_on(folder: RunFolder, config: Config, problem: Problem, run: Run) -> d
     held = {v.key for v in problem.variables} if config.stages else set()  # some of them, in some stages
     before = go_on(folder.path, problem, run, held)
     # All iterations but no report: the disk was full at the end. Then only the end is done again.
-    if len(run.history) >= config.iterations and (folder.path / "report.html").exists():
+    if not (folder.path / "report.html").exists():
+        return before
+    if run.optimiser.finished:
+        raise PathreplayError(
+            f"Run {folder.path} has ended by itself ({run.optimiser.finished}); lower 'tolerance' in its config"
+        )
+    if len(run.history) >= config.iterations:
         raise PathreplayError(
             f"Run {folder.path} has all its {len(run.history)} iterations; raise 'iterations' in its config"
         )
