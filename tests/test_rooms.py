@@ -26,7 +26,8 @@ SOURCE = Path(pathreplay.__file__).parent
 FILES = "files"
 #: Each room, and the rooms that it may use. Nobody uses `cli` or `rivals`.
 ALLOWED: dict[str, set[str]] = {
-    "cli": {"inverse", "check", "scenes", FILES},
+    "cli": {"inverse", "check", "watch", "scenes", FILES},
+    "watch": {"inverse", "pages", FILES},
     "inverse": {"render", "scenes", "media", "pages", FILES},
     "check": {"render", "scenes", FILES},
     "rivals": {"render", "gradient", "transport", FILES},

@@ -18,6 +18,7 @@ from pathreplay.inverse.config_errors import first_error
 from pathreplay.inverse.definitions import defined
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.pose import PARTS, PoseKind
+from pathreplay.inverse.preview_options import Preview
 from pathreplay.inverse.schedules import Schedule
 from pathreplay.inverse.tables import Count, Finite, Positive, Switch, Table, Whole
 
@@ -222,6 +223,7 @@ class Config(Table):
     warm_up: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 0
     optimizer: Optimizer = Optimizer()
     checkpoint_every: Count = 25
+    preview: Preview = Preview()
     deterministic: Switch = False
     output: str | None = None
 
@@ -273,6 +275,7 @@ _TABLES: dict[str, type[BaseModel]] = {
     "Picture": Picture,
     "start": Displacement,
     "optimizer": Optimizer,
+    "preview": Preview,
     "capture": Capture,
 }
 

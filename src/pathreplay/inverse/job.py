@@ -16,6 +16,7 @@ from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
 from pathreplay.inverse.loop import iterate, new_run, render_views
 from pathreplay.inverse.outcome import resume_command
+from pathreplay.inverse.previews import Previews
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
 from pathreplay.inverse.result import RunResult, outcome_of, result_files, result_of
@@ -86,11 +87,13 @@ def _run(job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> R
         way_out = f"aborted; go on from the last checkpoint with: {resume_command(folder.path)}"
         stop = stack.enter_context(stopping(bar.say, way_out))
         saving = Saving(folder, run, config.checkpoint_every)
+        previews = Previews(folder, config, problem, run, before, stop)
         try:
             with _computing(config):
                 for event in iterate(problem, config, run, stop):
                     bar.observe(event)
                     saving.observe(event)
+                    previews.observe(event)
         except PathreplayError:
             # A new folder goes again where not even the first iteration can be done; one that is resumed never does.
             if resumed is None and not run.history and not stop.aborted:
@@ -101,7 +104,7 @@ def _run(job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> R
             after = render_views(problem, config, run.values)
             theirs = render_views(problem, config, run.rival.values) if run.rival else {}
         outcome = outcome_of(job, folder.path, problem, run, before, after, theirs)
-        folder.write(result_files(outcome))
+        folder.write(result_files(outcome, previews.finished(after)))
         return result_of(outcome, stop.by)
 
 
