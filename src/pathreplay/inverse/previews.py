@@ -10,7 +10,7 @@ import contextlib
 import io
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 
 import drjit as dr
@@ -25,7 +25,7 @@ from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import PICTURE, Config
 from pathreplay.inverse.images import Image, displayed, exposure_for
 from pathreplay.inverse.loop import Event, Refined, Started, Stepped, Stopped
-from pathreplay.inverse.outcome import DIFFERENCE_GAIN, ViewPictures, resume_command
+from pathreplay.inverse.outcome import DIFFERENCE_GAIN, Recovered, ViewPictures, resume_command
 from pathreplay.inverse.page_parts import (
     about,
     common_exposure,
@@ -78,7 +78,8 @@ class Previews:
         self._began = self._written = time.perf_counter()
         self._pause = PAUSE_S
         self._spent = self._cost = 0.0
-        self._next = self._resumed = 0
+        self._resumed, self._stride = 0, 1.0
+        self._kept = [0]
         self._shown_at = 0
         self._stale = (folder.path / STOP).exists()  # a wish to stop an earlier part of the run
         self._log: list[str] = list(problem.notes)
@@ -87,9 +88,9 @@ class Previews:
         """Raises nothing but what ends the process."""
         if isinstance(event, Started):
             self._log.append(f"iterations {event.done} to {event.wanted}")
-            self._resumed, self._next = event.done, event.done + self._spacing()
+            self._resumed = event.done
             if event.done == 0:
-                self._write(self._begun() | self._frames(0, self._before))
+                self._write(self._begun() | (self._frames(0, self._before) if self._share else {}))
         elif isinstance(event, Refined):
             self._log.append(f"{event.key} goes on with the shape {event.shape}")
         elif isinstance(event, Stepped):
@@ -114,21 +115,34 @@ class Previews:
                 self.folder.write(self._frames(len(self.run.history), {name: after[name] for name in self._before}))
         return films(self.folder.path, MOST_FILM_BYTES)
 
-    def _spacing(self) -> int:
-        return max(1, self.config.iterations // self.config.preview.frames)
-
     def _stepped(self, done: int, seconds: float) -> None:
         now = time.perf_counter()
         # An iteration renders its views, and differentiates them: pictures of a few take less.
-        due = done >= self._next and self._spent + (self._cost or seconds) <= self._share * (now - self._began)
-        if due:
-            self._next = done + self._spacing()
+        if self._share and self._spent + (self._cost or seconds) <= self._share * (now - self._began):
             files = self._look(done)
-            self._write(files)
+            passed = self._passed(done)
+            self._write(files, passed)
             self._cost = time.perf_counter() - now
             self._spent += self._cost
         elif now - self._written >= self._pause:
             self._write({})
+
+    def _passed(self, done: int) -> set[int]:
+        """Keep the frame of this iteration, and let others go: the last one is always there, the rest are apart."""
+        kept = self._kept
+        passed = {kept.pop()} if len(kept) > 1 and kept[-1] - kept[-2] < self._stride else set()
+        kept.append(done)
+        if len(kept) > self.config.preview.frames + 1:
+            passed |= set(kept[1:-1:2])
+            kept[:] = [i for i in kept if i not in passed]
+            self._stride = (kept[-1] - kept[0]) / max(1, len(kept) - 1)
+        return passed
+
+    def _forget(self, passed: Callable[[int], bool]) -> None:
+        for iteration, _, path in frames(self.folder.path):
+            if passed(iteration):
+                with contextlib.suppress(OSError):
+                    path.unlink()
 
     def _look(self, done: int) -> dict[str, bytes]:
         """Pictures of the views as they are now."""
@@ -167,6 +181,9 @@ class Previews:
         for view in self._views:
             for kind, image in self._now[view.name].pictures().items():
                 files[f"{FOLDER}/{kind}-{view.name}.png"] = _encoded(image, self._stored(view), LARGEST, "png")
+        for item in recovered_of(self.problem, self.run):
+            for kind, image in _grids(item).items():
+                files[_address(kind, item)] = _encoded(image, 1.0, LARGEST, "png")
         return files
 
     def _frames(self, done: int, images: Mapping[str, Image]) -> dict[str, bytes]:
@@ -187,20 +204,21 @@ class Previews:
 
         Frames that a killed run has made beyond its checkpoint are none of this run's.
         """
-        for iteration, _, path in frames(self.folder.path):
-            if iteration > self._resumed:
-                with contextlib.suppress(OSError):
-                    path.unlink()
+        self._forget(lambda iteration: iteration > self._resumed)
+        self._kept = sorted({0, *(iteration for iteration, _, _ in frames(self.folder.path))})
         if self._stale:
             self._take_wish()
         if self._resumed:
             self._write(self._begun())
 
-    def _write(self, files: Mapping[str, bytes]) -> None:
+    def _write(self, files: Mapping[str, bytes], passed: Collection[int] = ()) -> None:
+        """Pictures and page; the frames of iterations that have ``passed`` go, once newer ones are there."""
         begin = time.perf_counter()
         with contextlib.suppress(PathreplayError):  # a full disk ends the run with its next checkpoint
             if files:
                 self.folder.write(files)
+            if passed:
+                self._forget(passed.__contains__)
             self.folder.write({PAGE: PAGES.dump_json(self._page())})
         self._written = time.perf_counter()
         self._pause = max(PAUSE_S, PAUSE * (self._written - begin))
@@ -249,9 +267,13 @@ class Previews:
         found = []
         for item in recovered_of(self.problem, self.run):
             film = shown.get(f"texture-{item.file_name}") or shown.get(f"volume-{item.file_name}") or ()
-            pictures = (Picture("now", f"after iteration {film[-1].iteration}", film[-1].src),) if film else ()
+            pictures = [
+                Picture(kind, kind, _address(kind, item)) for kind in ("start", "truth") if kind in _grids(item)
+            ]
+            if film:
+                pictures.insert(1, Picture("now", f"after {film[-1].iteration} iterations", film[-1].src))
             rows = numbers(item)
-            found.append(Parameter(item.key, pictures, rows=rows, note="" if rows else about(item), film=film))
+            found.append(Parameter(item.key, tuple(pictures), rows=rows, note="" if rows else about(item), film=film))
         for pose in poses_of(self.problem, self.run):
             found.append(Parameter(pose.pose.key, rows=pose_rows(pose), note=pose_note(pose)))
         return tuple(found)
@@ -268,6 +290,15 @@ def _chosen(problem: Problem, count: int) -> list[View]:
 
 def _evenly(views: list[View], count: int) -> list[View]:
     return views if len(views) <= count else [views[i * len(views) // count] for i in range(count)]
+
+
+def _grids(item: Recovered) -> dict[str, Image]:
+    """Start and truth of a texture or a volume, as far as they are known."""
+    return {kind: image for kind, image in (item.textures() or item.volumes()).items() if kind in ("start", "truth")}
+
+
+def _address(kind: str, item: Recovered) -> str:
+    return f"{FOLDER}/{kind}-of-{item.file_name}.png"
 
 
 def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:

@@ -107,9 +107,12 @@ class Handler(BaseHTTPRequestHandler):
         if not self.server.knows(self.headers.get("Host", "")):
             self._answer(403, "text/plain", b"this server is not called that\n")
             return None
-        token, _, place = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
+        token, slash, place = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
         if not secrets.compare_digest(token.encode("utf-8", "replace"), self.server.token.encode()):
             self._answer(403, "text/plain", b"give the whole address that pathreplay watch printed\n")
+            return None
+        if not slash:  # what the page names would be looked for beside it
+            self._answer(404, "text/plain", b"the address ends with a /\n")
             return None
         return place
 
