@@ -26,8 +26,9 @@ SOURCE = Path(pathreplay.__file__).parent
 FILES = "files"
 #: Each room, and the rooms that it may use. Nobody uses `cli` or `rivals`.
 ALLOWED: dict[str, set[str]] = {
-    "cli": {"inverse", "check", "scenes", FILES},
-    "inverse": {"render", "scenes", "media", FILES},
+    "cli": {"inverse", "check", "watch", "scenes", FILES},
+    "watch": {"inverse", "pages", FILES},
+    "inverse": {"render", "scenes", "media", "pages", FILES},
     "check": {"render", "scenes", FILES},
     "rivals": {"render", "gradient", "transport", FILES},
     "render": {"gradient", "transport", "scenes", FILES},
@@ -36,6 +37,7 @@ ALLOWED: dict[str, set[str]] = {
     "scenes": {"media", FILES},
     "media": {FILES},
     "bsdfs": {FILES},
+    "pages": {FILES},
     FILES: set(),
 }
 #: Each driver, and the file of its own.

@@ -160,6 +160,30 @@ def optimize(
     typer.echo(result.describe())
 
 
+@app.command(short_help="Follow a run in the browser.")
+def watch(
+    run: Annotated[Path, typer.Argument(help="Run folder, of a run under way or of one that has ended.")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to serve at; 0: any that is free.")] = 0,
+    host: Annotated[str, typer.Option(help="Address to serve at; others than loopback are seen by others.")] = (
+        "127.0.0.1"
+    ),
+) -> None:
+    """Serve a page that follows a run, with a button to stop it; Ctrl-C ends the command, and not the run."""
+    with interrupts.undisturbed():
+        from pathreplay.watch.run_files import require_run
+        from pathreplay.watch.server import RunServer, serve
+
+    require_run(run)
+    server = RunServer(run, host, port)
+    typer.echo(f"{server.address}\nWho has this address can look at the run and stop it. Ctrl-C ends this command.")
+    sys.stdout.flush()
+    try:
+        serve(server)
+    except interrupts.Interrupted as ended:
+        if ended.number != signal.SIGINT:
+            raise
+
+
 @app.command(short_help="Print the JSON schema of a job.")
 def schema() -> None:
     """Print the JSON schema of a job: editors complete and check configs with it."""

@@ -17,6 +17,7 @@ from pathreplay.inverse.definitions import defined
 from pathreplay.inverse.noise_options import AUTO, AutoSpp, Spp
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.pose import PARTS, PoseKind
+from pathreplay.inverse.preview_options import Preview
 from pathreplay.inverse.schedules import Schedule
 from pathreplay.inverse.stage_options import Stage, begins
 from pathreplay.inverse.tables import Count, Finite, Positive, Switch, Table, Whole
@@ -226,6 +227,7 @@ class Config(Table):
     optimizer: Optimizer = Optimizer()
     stages: Annotated[list[Stage], Field(min_length=1)] | None = None
     checkpoint_every: Count = 25
+    preview: Preview = Preview()
     deterministic: Switch = False
     output: str | None = None
 
@@ -323,6 +325,7 @@ _TABLES: dict[str, type[BaseModel]] = {
     "Picture": Picture,
     "start": Displacement,
     "optimizer": Optimizer,
+    "preview": Preview,
     "capture": Capture,
     "auto_spp": AutoSpp,
     "stages": Stage,
