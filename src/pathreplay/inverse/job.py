@@ -14,7 +14,7 @@ from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
-from pathreplay.inverse.loop import iterate, new_run, render_views
+from pathreplay.inverse.loop import iterate, new_run, render_views, with_exposures
 from pathreplay.inverse.outcome import resume_command
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
@@ -98,6 +98,8 @@ def _run(job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> R
             raise
         bar.say("writing")
         with _computing(config):
+            for each in filter(None, (run, run.rival)):
+                each.values = dict(with_exposures(problem, config, each.values))
             after = render_views(problem, config, run.values)
             theirs = render_views(problem, config, run.rival.values) if run.rival else {}
         outcome = outcome_of(job, folder.path, problem, run, before, after, theirs)

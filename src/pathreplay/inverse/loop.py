@@ -16,6 +16,7 @@ from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
 from pathreplay.inverse.evaluate import Evaluator, Local, Shard, total
+from pathreplay.inverse.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.optimiser import DrJitOptimiser
@@ -161,9 +162,25 @@ def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, 
     put_values(problem, values)
     spp = config.picture_spp
     return {
-        v.name: _picture(problem, v.sensor, problem.integrator, spp, config.seeds(PICTURE, v.sensor)[0])
-        for v in problem.views
+        v.name: exposed(
+            values, n, _picture(problem, v.sensor, problem.integrator, spp, config.seeds(PICTURE, v.sensor)[0])
+        )
+        for n, v in enumerate(problem.views)
     }
+
+
+def with_exposures(problem: Problem, config: Config, values: Arrays) -> Arrays:
+    """The values, with the exposures of held-out views: nothing was learned from them, so that they are fitted now."""
+    if EXPOSURE not in values or not any(view.held_out for view in problem.views):
+        return values
+    put_values(problem, values)
+    spp, of = config.picture_spp, problem.integrator
+    pictures = {
+        n: (_picture(problem, v.sensor, of, spp, config.seeds(PICTURE, v.sensor)[0]), v.target, v.weight)
+        for n, v in enumerate(problem.views)
+        if v.held_out
+    }
+    return with_held_out(values, pictures)
 
 
 def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> float:
@@ -174,13 +191,14 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
     root (negative ones count as zero). The noise of the targets stays in.
     """
     put_values(problem, values)
-    squares, views = 0.0, problem.trained().values()
-    for view in views:
+    squares, views = 0.0, problem.trained()
+    for n, view in views.items():
         a, b = (
-            _picture(problem, view.sensor, problem.judge, config.spp, seed).astype(np.float64) - view.target
+            exposed(values, n, _picture(problem, view.sensor, problem.judge, config.spp, seed)).astype(np.float64)
+            - view.target
             for seed in config.seeds(JUDGEMENT, view.sensor, iteration)
         )
-        squares += float(np.mean(a * b if view.weight is None else a * b * view.weight)) / len(views)
+        squares += view.share * float(np.mean(a * b if view.weight is None else a * b * view.weight)) / len(views)
     return float(np.sqrt(max(squares, 0.0)))
 
 

@@ -40,6 +40,8 @@ class ViewPictures:
     weight: Image | None = None
     """How much pixels count, if not all the same."""
     held_out: bool = False
+    factors: tuple[float, ...] = ()
+    """What the result is multiplied with, where exposures were recovered: one number, or one for each colour."""
 
     def error(self, image: Image) -> float:
         """Root mean square difference from the target, of what counts."""
@@ -59,6 +61,8 @@ class ViewPictures:
     def as_dict(self) -> dict[str, Any]:
         """For views.json."""
         table: dict[str, Any] = {"held_out": self.held_out, "exposure": self.exposure}
+        if self.factors:
+            table["recovered_exposure"] = list(self.factors)
         for kind, likeness in self.likenesses.items():
             table[kind] = {"rmse": self.error(getattr(self, kind)), **asdict(likeness)}
         return table

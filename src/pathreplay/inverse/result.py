@@ -12,6 +12,7 @@ import safetensors.numpy
 
 from pathreplay.files import file_names
 from pathreplay.inverse.checkpoint import Entry, Run
+from pathreplay.inverse.exposures import EXPOSURE
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes
 from pathreplay.inverse.likeness import Likeness
 from pathreplay.inverse.outcome import Outcome, Recovered, RecoveredPose, ViewPictures, resume_command
@@ -97,8 +98,9 @@ def outcome_of(
             rivals.get(v.name),
             v.weight,
             v.held_out,
+            tuple(values[EXPOSURE][n].tolist()) if EXPOSURE in values else (),
         )
-        for v in problem.views
+        for n, v in enumerate(problem.views)
     )
     poses = tuple(
         RecoveredPose(pose, _parts(pose, starts), _parts(pose, values), values[pose.key], starts[pose.key])
