@@ -23,9 +23,9 @@ EXPOSURE = "exposure"
 
 
 class Factors:
-    """Steps are taken in the logarithm of the factors; one of them, or their geometric mean, stays 1.
+    """Steps are taken in the logarithm of the factors; those of one view stay 1, or their geometric mean does.
 
-    ``fixed`` are the rows whose mean logarithm is taken off after each step; none of them: nothing is.
+    ``fixed`` are the rows whose mean logarithm (of each colour) is taken off after each step; none: nothing is.
     """
 
     uniform = False
@@ -44,7 +44,7 @@ class Factors:
 
     def values(self, latent: Array) -> Array:
         """See `Coordinates`."""
-        return self._log.values(latent - latent[self.fixed].mean(axis=0).mean() if self.fixed else latent)
+        return self._log.values(latent - latent[self.fixed].mean(axis=0) if self.fixed else latent)
 
 
 def start(views: int, channels: int, white_balance: bool) -> Array:
