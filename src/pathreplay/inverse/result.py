@@ -69,8 +69,8 @@ class RunResult:
         if self.held_out:
             psnr, ssim = (np.mean([getattr(self.views[v], kind) for v in self.held_out]) for kind in ("psnr", "ssim"))
             flips = [flip for v in self.held_out if (flip := self.views[v].flip) is not None]
-            flip = f", FLIP {np.mean(flips):.4f}" if flips else ""
-            lines.append(f"held-out views ({len(self.held_out)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}{flip}")
+            told = f", FLIP {np.mean(flips):.4f}" if flips else ""
+            lines.append(f"held-out views ({len(self.held_out)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}{told}")
         lines.append(f"report: {self.report}")
         if self.stopped:
             lines.append(f"stopped early by {self.stopped_by}; go on with: {resume_command(self.folder)}")
