@@ -115,6 +115,7 @@ def spoil_file(change: dict[str, Any]) -> None:
     write({**PLAIN, "frames": [{**FRAMES[0], **change}, *FRAMES[1:]]})
 
 
+@pytest.mark.slow
 def test_a_run_does_not_go_on_with_other_cameras(folder: Path) -> None:
     first = optimize(make_config({**JOB, "iterations": 2}), progress=False)
     job = first.folder / "config.json"
@@ -123,6 +124,13 @@ def test_a_run_does_not_go_on_with_other_cameras(folder: Path) -> None:
     with pytest.raises(PathreplayError, match="The capture has other cameras than when this run was started; put it"):
         optimize(resume=first.folder, progress=False)
     spoil_file({"colour": "blue"})  # which nobody looks at
+    mark = first.folder / "capture.sha256"
+    kept = mark.read_bytes()
+    for spoil in (mark.unlink, lambda: mark.write_bytes(b"\xff"), lambda: mark.write_bytes(b"0" * 2**20)):
+        spoil()
+        with pytest.raises(PathreplayError, match="The capture has "):
+            optimize(resume=first.folder, progress=False)
+    mark.write_bytes(kept)
     assert optimize(resume=first.folder, progress=False).iterations == 3
 
 
@@ -249,6 +257,7 @@ def test_the_example_finds_texture_roughness_and_sky(folder: Path) -> None:
     pictures = folder / "small"
     script = [sys.executable, str(example / "make_capture.py"), str(pictures)]
     subprocess.run([*script, "--views", "12", "--width", "24", "--spp", "256"], check=True, capture_output=True)
+    assert len(json.loads((pictures / "transforms.json").read_text())["frames"]) == 12
     changes = [f"capture.transforms={pictures / 'transforms.json'}", "iterations=300", "picture_spp=64"]
     result = optimize(example / "config.toml", output="found", progress=False, define=changes)
     assert result.held_out == ("00", "06")

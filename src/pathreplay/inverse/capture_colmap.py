@@ -186,7 +186,7 @@ def _text_images(file: BinaryIO) -> Iterator[_Posed]:
         if not line.strip():
             continue
         words = line.split(maxsplit=9)
-        if len(words) < 10:
+        if len(words) < 10 or len(words[9]) > LONGEST_NAME:
             raise ValueError(f"the line {shown(line)}")
         if (count := count + 1) > MOST_IMAGES:
             raise ValueError(f"more than {MOST_IMAGES} images")

@@ -118,6 +118,10 @@ def read_targets(
         image = over_black(image, path)
         if name in lenses:
             image, there = lenses[name].undone(image)
+            if not there.any():
+                raise PathreplayError(
+                    f"{what} has nothing of what a pinhole would see in place of its lens; correct k1, k2, ..."
+                )
             weights[name] = _weight(f"what the lens leaves of '{file}'", resized(there, *shape[:2]).clip(0, 1), name)
         image = _sized(what, image, name, shape, resize)
         if alpha == "mask":
