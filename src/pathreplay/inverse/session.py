@@ -17,7 +17,7 @@ from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config, Plugin
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
-from pathreplay.inverse.loop import Event, Stepped, iterate, new_run, picture_of, render_views
+from pathreplay.inverse.loop import Event, Stepped, iterate, new_run, picture_of, render_views, with_exposures
 from pathreplay.inverse.outcome import resume_command
 from pathreplay.inverse.previews import Previews
 from pathreplay.inverse.problem import Problem, build_problem
@@ -176,6 +176,8 @@ def _states(
             raise
         bar.say("writing")
         with computing(config):
+            for each in filter(None, (run, run.rival)):
+                each.values = dict(with_exposures(problem, config, each.values))
             after = render_views(problem, config, run.values)
             theirs = render_views(problem, config, run.rival.values) if run.rival else {}
         outcome = outcome_of(job, folder.path, problem, run, before, after, theirs)
