@@ -24,9 +24,10 @@ from test_drivers import KEYS, foggy
 SOURCE = Path(pathreplay.__file__).parent
 #: The files at the top, but for `cli.py`.
 FILES = "files"
-#: Each room, and the rooms that it may use. Nobody uses `cli` or `rivals`.
+#: Each room, and the rooms that it may use. Nobody uses `cli` or `rivals`, and `output` only `cli` does.
 ALLOWED: dict[str, set[str]] = {
-    "cli": {"inverse", "check", "scenes", FILES},
+    "cli": {"inverse", "check", "output", "scenes", FILES},
+    "output": {"inverse", "render", "scenes", "media", FILES},
     "inverse": {"render", "scenes", "media", FILES},
     "check": {"render", "scenes", FILES},
     "rivals": {"render", "gradient", "transport", FILES},
