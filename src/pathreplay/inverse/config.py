@@ -12,11 +12,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import MISSING, file_problem
+from pathreplay.inverse.capture_options import Capture, Exposure
 from pathreplay.inverse.config_errors import first_error
 from pathreplay.inverse.definitions import defined
 from pathreplay.inverse.noise_options import AUTO, AutoSpp, Spp
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.pose import PARTS, PoseKind
+from pathreplay.inverse.preview_options import Preview
 from pathreplay.inverse.schedules import Schedule
 from pathreplay.inverse.stage_options import Stage, begins
 from pathreplay.inverse.tables import Count, Finite, Positive, Switch, Table, Whole
@@ -150,20 +152,12 @@ class Plugin(BaseModel):
 NOTHING = "target: nothing to match; give 'images', or 'values' and/or 'scene' to render"
 
 
-class Capture(Table):
-    """Pictures and their cameras, by the file that lists them; ``width`` in pixels is that of renderings."""
-
-    transforms: str
-    width: Count | None = None
-    hold_out_every: Annotated[Whole, Field(ge=2, le=2**31 - 1)] | None = None
-
-
 class Target(Table):
     """What the pictures should look like: image files, one per sensor, or a scene to render."""
 
-    images: list[str] | None = None
-    masks: list[str] | None = None
-    alpha: Literal["black", "mask"] = "black"
+    images: list[str] | str | None = None
+    masks: list[str] | str | None = None
+    alpha: Literal["black", "mask", "scene", "compare"] = "black"
     scene: str | None = None
     scene_parameters: dict[str, Argument] | None = None
     values: dict[str, Value] = Field(default_factory=dict)
@@ -182,8 +176,8 @@ class Target(Table):
                 raise ValueError("target: 'masks' and alpha = 'mask' are two masks; leave one out")
         elif self.model_fields_set <= {"alpha"}:
             return self  # fit for a capture, which brings pictures
-        elif self.alpha == "mask":
-            raise ValueError("target: alpha = 'mask' is about 'images'; leave it out, or name them")
+        elif self.alpha != "black":
+            raise ValueError(f"target: alpha = '{self.alpha}' is about 'images'; leave it out, or name them")
         elif not self.values and self.scene is None:
             raise ValueError(NOTHING)
         if self.integrator.type == "pathreplay":
@@ -209,6 +203,8 @@ class Config(Table):
     rival: Plugin | None = None
     parameters: Annotated[list[Parameter], Field(min_length=1)]
     capture: Capture | None = None
+    exposure: Exposure | None = None
+    view_weights: dict[str, Positive] = Field(default_factory=dict)
     target: Target = Target()
     loss: str = "l2"
     iterations: Count = 200
@@ -226,6 +222,7 @@ class Config(Table):
     optimizer: Optimizer = Optimizer()
     stages: Annotated[list[Stage], Field(min_length=1)] | None = None
     checkpoint_every: Count = 25
+    preview: Preview = Preview()
     deterministic: Switch = False
     output: str | None = None
 
@@ -339,9 +336,11 @@ _TABLES: dict[str, type[BaseModel]] = {
     "Picture": Picture,
     "start": Displacement,
     "optimizer": Optimizer,
+    "preview": Preview,
     "capture": Capture,
     "auto_spp": AutoSpp,
     "stages": Stage,
+    "exposure": Exposure,
 }
 
 

@@ -29,6 +29,9 @@ _KINDS = {
     "scene_parameters": "a number, true, false or a text in quotes",
     "sensors": "the names or numbers of sensors: [0, ...]",
     "held_out": "the names or numbers of sensors: [0, ...]",
+    "reference": "the name or number of a sensor",
+    "images": "file names, or a pattern such as 'photos/*.png'",
+    "masks": "file names, or a pattern such as 'masks/*.png'",
 }
 
 

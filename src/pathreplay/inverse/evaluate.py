@@ -13,6 +13,8 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.exposures import EXPOSURE, factor_of
+from pathreplay.inverse.exposures import gradient as exposure_gradient
 from pathreplay.inverse.losses import ELSEWHERE, QUADRATIC
 from pathreplay.inverse.problem import Problem, scene_values, variables_of
 from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
@@ -147,11 +149,14 @@ class Evaluator:
         dr.enable_grad(moving)
         self.problem.params.update(scene_values(self.problem, variables))
         try:
-            loss = self._differentiated(view, seed, spp)
+            factor = factor_of(values, view, self._targets[view].shape[2])
+            loss, by_factor = self._differentiated(view, seed, spp, None if factor is None else mi.TensorXf(factor))
         except NotRecordable:  # a part of the gradient may be there: once more, with variables of its own
             self.freezes = False
             return self._view(values, view, seed, spp)
         gradients = {key: get_array(dr.grad(value)) for key, value in moving.items()}
+        if by_factor is not None and EXPOSURE in gradients:
+            gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
         fine = {key: np.isfinite(gradient) for key, gradient in gradients.items()}
         # One bad path does not end a long run.
         dropped = {key: int((~each).sum()) for key, each in fine.items() if not each.all()}
@@ -161,8 +166,8 @@ class Evaluator:
             self._learned = self.integrator.learned()
         return Evaluation(loss, gradients, dropped, self._learned)
 
-    def _differentiated(self, view: int, seed: int, spp: int) -> float:
-        """What the view adds to the loss; its gradient is added to the scene's parameters."""
+    def _differentiated(self, view: int, seed: int, spp: int, factor: Any = None) -> tuple[float, Any]:
+        """What the view adds to the loss, and the derivative by its ``factor``; the rest is added to the parameters."""
         problem, target = self.problem, self._targets[view]
         sensor = problem.views[view].sensor
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
@@ -174,12 +179,12 @@ class Evaluator:
             self._sweeps[which] = may and bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
-        share = 1 / len(problem.trained())
+        share = problem.views[view].share / len(problem.trained())
         with plain_errors():
-            value, lost = (self._recordings[spp].differentiate if records else differentiate)(
+            value, lost, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
                 problem.params, problem.scene, sensor, self.integrator, target, self._weights[view], number, spp,
-                problem.loss, share, self._sweeps[which], self._facts.tables(),
+                problem.loss, share, self._sweeps[which], self._facts.tables(), factor,
             )  # fmt: skip
         if lost is not None:
             self.integrator.tell_lost(lost, target.shape[0] * target.shape[1] * spp)
-        return float(value[0]) if dr.width(value) else float("nan")
+        return float(value[0]) if dr.width(value) else float("nan"), by_factor

@@ -17,6 +17,7 @@ from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
 from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Local, Shard, total
+from pathreplay.inverse.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.line_search import LineSearch
@@ -300,11 +301,29 @@ def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, 
     return {view.name: picture_of(problem, config, values, view) for view in problem.views}
 
 
-def picture_of(problem: Problem, config: Config, values: Arrays, view: View) -> Image:
-    """One of them."""
+def picture_of(problem: Problem, config: Config, values: Arrays, view: View, spp: int | None = None) -> Image:
+    """One of them, with so many samples per pixel."""
     put_values(problem, values)
-    seed = config.seeds(PICTURE, view.sensor)[0]
-    return _picture(problem, view, problem.integrator, config.picture_spp, seed)
+    at = next(n for n, each in enumerate(problem.views) if each.name == view.name)
+    return exposed(values, at, _plain(problem, config, view, config.picture_spp if spp is None else spp))
+
+
+def _plain(problem: Problem, config: Config, view: View, spp: int) -> Image:
+    """At the exposure 1, with the values that the scene has."""
+    return _picture(problem, view, problem.integrator, spp, config.seeds(PICTURE, view.sensor)[0])
+
+
+def with_exposures(problem: Problem, config: Config, values: Arrays) -> Arrays:
+    """The values, with the exposures of held-out views: nothing was learned from them, so that they are fitted now."""
+    if EXPOSURE not in values or not any(view.held_out for view in problem.views):
+        return values
+    put_values(problem, values)
+    pictures = {
+        n: (_plain(problem, config, view, config.picture_spp), view.target, view.weight)
+        for n, view in enumerate(problem.views)
+        if view.held_out
+    }
+    return with_held_out(values, pictures)
 
 
 def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> float:
@@ -315,13 +334,14 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
     root (negative ones count as zero). The noise of the targets stays in.
     """
     put_values(problem, values)
-    squares, views = 0.0, problem.trained().values()
-    for view in views:
+    squares, views = 0.0, problem.trained()
+    for n, view in views.items():
         a, b = (
-            _picture(problem, view, problem.judge, config.most_spp, seed).astype(np.float64) - view.target
+            exposed(values, n, _picture(problem, view, problem.judge, config.most_spp, seed)).astype(np.float64)
+            - view.target
             for seed in config.seeds(JUDGEMENT, view.sensor, iteration)
         )
-        squares += float(np.mean(a * b if view.weight is None else a * b * view.weight)) / len(views)
+        squares += view.share * float(np.mean(a * b if view.weight is None else a * b * view.weight)) / len(views)
     return float(np.sqrt(max(squares, 0.0)))
 
 

@@ -18,6 +18,9 @@ from pathreplay.inverse.targets import Targets
 from pathreplay.inverse.values import require_finite_array
 from pathreplay.render.film import picture_shape
 
+CAPTURE = "capture.sha256"
+"""What tells the cameras of a run from those of a capture that was changed since."""
+
 
 class Saving:
     """Writes the checkpoints of a run into the folder, after every so many iterations (``every``) and at the end."""
@@ -64,7 +67,8 @@ def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict
     pictures = {_picture("target", view.name): view.target for view in problem.views}
     pictures |= {_picture("weight", view.name): view.weight for view in problem.views if view.weight is not None}
     pictures |= {_picture("start", name): image for name, image in before.items()}
-    return {name: exr_bytes(image) for name, image in pictures.items()} | _checkpoints(run)
+    capture = {} if problem.capture is None else {CAPTURE: problem.capture.encode() + b"\n"}
+    return {name: exr_bytes(image) for name, image in pictures.items()} | capture | _checkpoints(run)
 
 
 def saved_targets(folder: Path) -> Targets:
@@ -83,6 +87,7 @@ def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) 
 
     Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
     """
+    _require_capture(folder / CAPTURE, problem)
     before = {view.name: _read(folder / _picture("start", view.name)) for view in problem.views}
     for view in problem.views:
         wanted = picture_shape(problem.scene.sensors()[view.sensor])
@@ -97,6 +102,19 @@ def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) 
     for name, each in _runs(run).items():
         checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables}, held)
     return before
+
+
+def _require_capture(path: Path, problem: Problem) -> None:
+    """Raise PathreplayError if the cameras of the capture are no longer those that the run was started with."""
+    if problem.capture is None:
+        return
+    try:
+        saved = "" if file_problem(path, 1024) else path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        saved = ""
+    if saved != problem.capture:
+        changed = "has other cameras than when this run was started" if saved else f"has no mark in {path}"
+        raise PathreplayError(f"The capture {changed}; put it back as it was, or start a new run")
 
 
 def _runs(run: Run) -> dict[str, Run]:

@@ -17,8 +17,18 @@ from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config, Plugin
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
-from pathreplay.inverse.loop import Event, Stepped, answer_of, iterate, new_run, picture_of, render_views
+from pathreplay.inverse.loop import (
+    Event,
+    Stepped,
+    answer_of,
+    iterate,
+    new_run,
+    picture_of,
+    render_views,
+    with_exposures,
+)
 from pathreplay.inverse.outcome import resume_command
+from pathreplay.inverse.previews import Previews
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
 from pathreplay.inverse.result import RunResult, outcome_of, result_files, result_of
@@ -151,11 +161,14 @@ def _states(
         way_out = f"aborted; go on from the last checkpoint with: {resume_command(folder.path)}"
         stack.enter_context(stopping(bar.say, way_out, stop))
         saving = Saving(folder, run, config.checkpoint_every)
+        previews = Previews(folder, config, problem, run, before, stop)
         look = _looker(problem, config)
         try:
             for event in _events(problem, config, run, stop):
                 bar.observe(event)
                 saving.observe(event)
+                with computing(config):
+                    previews.observe(event)
                 if isinstance(event, Stepped):
                     views = tuple(view.name for view in problem.views)
                     yield State(event.entry, answer_of(problem, run), views, folder.path, look)
@@ -173,10 +186,12 @@ def _states(
         bar.say("writing")
         run = replace(run, values=answer_of(problem, run))
         with computing(config):
+            for each in filter(None, (run, run.rival)):
+                each.values = dict(with_exposures(problem, config, each.values))
             after = render_views(problem, config, run.values)
             theirs = render_views(problem, config, run.rival.values) if run.rival else {}
         outcome = outcome_of(job, folder.path, problem, run, before, after, theirs)
-        folder.write(result_files(outcome))
+        folder.write(result_files(outcome, previews.finished(after)))
         return result_of(outcome, stop.by)
 
 
