@@ -308,6 +308,15 @@ class Config(Table):
         return self
 
     @model_validator(mode="after")
+    def _one_factor(self) -> Config:
+        if self.exposure is not None and self.loss == "scale-invariant":
+            raise ValueError(
+                "exposure: loss = 'scale-invariant' has a factor of its own for each view; leave 'exposure' out, or "
+                "take another loss"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _searched(self) -> Config:
         if not self.optimizer.searches:
             return self

@@ -1,10 +1,10 @@
-"""The optimisation loop: evaluate, step, project; interruptible and resumable, and what it tells of itself."""
+"""The optimisation loop: evaluate, step, project; interruptible and resumable."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +17,7 @@ from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
 from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Local, Shard, total
+from pathreplay.inverse.events import Entered, Event, Faint, Finished, NonFinite, Refined, Started, Stepped, Stopped
 from pathreplay.inverse.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
@@ -36,74 +37,6 @@ JUDGEMENTS = 10
 
 # Of a gradient's entries, that were not finite: with less, the others still lead the way.
 HALF = 0.5
-
-
-@dataclass(frozen=True)
-class Started:
-    """Iterations begin: so many are done, of so many."""
-
-    done: int
-    wanted: int
-
-
-@dataclass(frozen=True)
-class Refined:
-    """A grid goes on in another resolution."""
-
-    key: str
-    shape: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Finished:
-    """The optimiser takes no more steps."""
-
-    why: str
-
-
-@dataclass(frozen=True)
-class Entered:
-    """A stage (from 1) of so many begins, or is gone on with."""
-
-    number: int
-    of: int
-
-
-@dataclass(frozen=True)
-class NonFinite:
-    """So many entries of the gradient of a view were NaN or infinite, and count as zero."""
-
-    key: str
-    view: str
-    iteration: int
-    entries: int
-
-
-@dataclass(frozen=True)
-class Faint:
-    """The gradient of a variable is lost in noise: signal to noise, over the last iterations."""
-
-    key: str
-    ratio: float
-    iteration: int
-    spp: int
-
-
-@dataclass(frozen=True)
-class Stepped:
-    """An iteration is done."""
-
-    entry: Entry
-
-
-@dataclass(frozen=True)
-class Stopped:
-    """No more iterations: so many are done."""
-
-    done: int
-
-
-Event = Started | Entered | Finished | Refined | NonFinite | Faint | Stepped | Stopped
 
 
 def new_run(

@@ -21,8 +21,9 @@ from pathreplay.errors import PathreplayError, plain_line
 from pathreplay.interrupts import Stop
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config
+from pathreplay.inverse.events import Event, Notes, Started, Stepped, Stopped
 from pathreplay.inverse.images import Image, displayed, exposure_for
-from pathreplay.inverse.loop import Event, Refined, Started, Stepped, Stopped, answer_of, picture_of
+from pathreplay.inverse.loop import answer_of, picture_of
 from pathreplay.inverse.outcome import DIFFERENCE_GAIN, Recovered, ViewPictures, resume_command
 from pathreplay.inverse.page_parts import (
     about,
@@ -81,16 +82,17 @@ class Previews:
         self._shown_at = 0
         self._stale = (folder.path / STOP).exists()  # a wish to stop an earlier part of the run
         self._log: list[str] = list(problem.notes)
+        self._notes = Notes()
 
     def observe(self, event: Event) -> None:
         """Raises nothing but what ends the process."""
+        if note := self._notes.of(event):
+            self._log.append(note)
         if isinstance(event, Started):
             self._log.append(f"iterations {event.done} to {event.wanted}")
             self._resumed = event.done
             if event.done == 0:
                 self._write(self._begun() | (self._frames(0, self._before) if self._share else {}))
-        elif isinstance(event, Refined):
-            self._log.append(f"{event.key} goes on with the shape {event.shape}")
         elif isinstance(event, Stepped):
             if event.entry.iteration == self._resumed:
                 self._went_on()

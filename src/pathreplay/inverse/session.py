@@ -15,18 +15,10 @@ from pathreplay.errors import PathreplayError
 from pathreplay.interrupts import Stop, stopping, undisturbed
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config, Plugin
+from pathreplay.inverse.events import Event, Stepped
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
-from pathreplay.inverse.loop import (
-    Event,
-    Stepped,
-    answer_of,
-    iterate,
-    new_run,
-    picture_of,
-    render_views,
-    with_exposures,
-)
+from pathreplay.inverse.loop import answer_of, iterate, new_run, picture_of, render_views, with_exposures
 from pathreplay.inverse.outcome import resume_command
 from pathreplay.inverse.previews import Previews
 from pathreplay.inverse.problem import Problem, build_problem
