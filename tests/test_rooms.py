@@ -24,10 +24,12 @@ from test_drivers import KEYS, foggy
 SOURCE = Path(pathreplay.__file__).parent
 #: The files at the top, but for `cli.py`.
 FILES = "files"
-#: Each room, and the rooms that it may use. Nobody uses `cli` or `rivals`.
+#: Each room, and the rooms that it may use. Nobody uses `cli` or `rivals`, and `output` only `cli` does.
 ALLOWED: dict[str, set[str]] = {
-    "cli": {"inverse", "check", "scenes", FILES},
-    "inverse": {"render", "scenes", "media", FILES},
+    "cli": {"inverse", "check", "watch", "output", "scenes", FILES},
+    "watch": {"inverse", "pages", FILES},
+    "output": {"inverse", "render", "scenes", "media", FILES},
+    "inverse": {"render", "scenes", "media", "pages", FILES},
     "check": {"render", "scenes", FILES},
     "rivals": {"render", "gradient", "transport", FILES},
     "render": {"gradient", "transport", "scenes", FILES},
@@ -36,6 +38,7 @@ ALLOWED: dict[str, set[str]] = {
     "scenes": {"media", FILES},
     "media": {FILES},
     "bsdfs": {FILES},
+    "pages": {FILES},
     FILES: set(),
 }
 #: Each driver, and the file of its own.

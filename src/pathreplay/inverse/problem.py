@@ -180,7 +180,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     limits.require_visible(scene, params, keys)
     if config.target.alpha == "scene":
         require_known(scene, params, keys)
-    limits.require_films(scene, sensors, {"spp": config.spp, "picture_spp": config.picture_spp})
+    limits.require_films(scene, sensors, {"spp": config.most_spp, "picture_spp": config.picture_spp})
     unsolved, moved = _variables(scene, params, keys, config, base)
 
     truth: dict[str, Array] = {}
@@ -333,7 +333,7 @@ def _variables(
                 limits.require_learning_rate(key, rate, coordinates.latent(start))
             else:
                 limits.require_learning_rate(key, rate, start, (entry.lower, entry.upper))
-            levels = _levels(key, entry, start)
+            levels = _levels(key, entry, config.refine_at(entry), start)
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
                 like = type(like)(start)
@@ -378,7 +378,7 @@ def _penalty(key: str, entry: Parameter, start: Array) -> Penalty | None:
     return Penalty(entry.total_variation or 0.0, entry.prior or 0.0, start)
 
 
-def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:
+def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> Levels | None:
     if entry.resolutions is None:
         return None
     if start.ndim < 3:
@@ -386,7 +386,7 @@ def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:
             f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'resolutions' out"
         )
     limits.require_grid(key, start.shape, entry.resolutions)
-    return make_levels(start.shape, entry.resolutions, entry.refine_at or [])
+    return make_levels(start.shape, entry.resolutions, refine_at)
 
 
 def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path) -> Array:

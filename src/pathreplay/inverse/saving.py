@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from pathreplay.errors import PathreplayError
@@ -40,6 +41,22 @@ class Saving:
         elif isinstance(event, Stopped) and event.done > self.saved:
             self._write(event.done)
 
+    def close(self) -> None:
+        """Write what is not yet saved. Raises as `observe` does."""
+        if self._runs_are_whole() and len(self.run.history) > self.saved:
+            self._write(len(self.run.history))
+
+    def rescued(self) -> bool:
+        """Write what is not yet saved after an error of the run; whether all that was done is saved now."""
+        if not self._runs_are_whole() or not self.run.history:
+            return False
+        with contextlib.suppress(PathreplayError):  # the first error is the one to tell
+            self.close()
+        return self.saved == len(self.run.history)
+
+    def _runs_are_whole(self) -> bool:
+        return all(run.whole for run in _runs(self.run).values())
+
     def _write(self, done: int) -> None:
         self.folder.write(_checkpoints(self.run))
         self.saved = done
@@ -63,8 +80,10 @@ def saved_targets(folder: Path) -> Targets:
     return Targets(images, weights)
 
 
-def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
+def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) -> dict[str, Image]:
     """Bring a run to where the folder's checkpoint was; returns the pictures of its start.
+
+    ``held`` are variables that some stages do not step.
 
     Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
     """
@@ -81,7 +100,7 @@ def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
                 )
             require_finite_array(str(path), found)
     for name, each in _runs(run).items():
-        checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables})
+        checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables}, held)
     return before
 
 
