@@ -74,11 +74,6 @@ def exposed(values: Arrays, view: int, picture: Image) -> Image:
     return picture if factor is None else picture * factor
 
 
-def of_exposed(loss: Loss, factor: Any) -> Loss:
-    """The loss of a rendering that is multiplied with the factor before."""
-    return lambda image, target: loss(image * factor, target)
-
-
 def derivative(loss: Loss, a: Any, b: Any, factor: Any, target: Any, weight: Any) -> Any:
     """Of the mean loss by the logarithm of the factor, for each channel, from two independent renderings."""
     image = dr.detach(a) * factor
