@@ -34,7 +34,8 @@ def test_wheel_and_source_archive_hold_the_licence(tmp_path: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     (licence,) = [name for name in names if name.endswith("LICENSE")]
     assert zipfile.ZipFile(wheel).read(licence) == (ROOT / "LICENSE").read_bytes()
-    assert {"pathreplay/py.typed", "pathreplay/inverse/report.html.j2"} <= set(names)
+    wanted = ("py.typed", *(f"pages/page.{end}" for end in ("html.j2", "css", "js")))
+    assert {f"pathreplay/{name}" for name in wanted} <= set(names)
     metadata = next(name for name in names if name.endswith("METADATA"))
     told = zipfile.ZipFile(wheel).read(metadata).decode()
     assert "License-Expression: BSD-3-Clause\n" in told and "License-File: LICENSE\n" in told

@@ -26,10 +26,11 @@ SOURCE = Path(pathreplay.__file__).parent
 FILES = "files"
 #: Each room, and the rooms that it may use. Nobody uses `cli`, `bridge` or `rivals`, and `output` only `cli` does.
 ALLOWED: dict[str, set[str]] = {
-    "cli": {"inverse", "check", "output", "scenes", FILES},
+    "cli": {"inverse", "check", "watch", "output", "scenes", FILES},
+    "watch": {"inverse", "pages", FILES},
     "output": {"inverse", "render", "scenes", "media", FILES},
     "bridge": {"render", "scenes", FILES},
-    "inverse": {"render", "scenes", "media", FILES},
+    "inverse": {"render", "scenes", "media", "pages", FILES},
     "check": {"render", "scenes", FILES},
     "rivals": {"render", "gradient", "transport", FILES},
     "render": {"gradient", "transport", "scenes", FILES},
@@ -38,6 +39,7 @@ ALLOWED: dict[str, set[str]] = {
     "scenes": {"media", FILES},
     "media": {FILES},
     "bsdfs": {FILES},
+    "pages": {FILES},
     FILES: set(),
 }
 #: Each driver, and the file of its own.

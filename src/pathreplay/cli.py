@@ -141,7 +141,7 @@ def check(
 
 @app.command(short_help="Recover scene parameters from pictures.")
 def optimize(
-    config: Annotated[Path | None, typer.Argument(help="Job in TOML; see docs/optimize.md.")] = None,
+    config: Annotated[Path | None, typer.Argument(help="Job in TOML or YAML; see docs/optimize.md.")] = None,
     resume: Annotated[
         Path | None, typer.Option(metavar="RUN_FOLDER", help="Go on with an unfinished run instead.")
     ] = None,
@@ -158,6 +158,30 @@ def optimize(
 
     result = run_job(config, resume=resume, output=output, progress=not quiet, define=define or ())
     typer.echo(result.describe())
+
+
+@app.command(short_help="Follow a run in the browser.")
+def watch(
+    run: Annotated[Path, typer.Argument(help="Run folder, of a run under way or of one that has ended.")],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to serve at; 0: any that is free.")] = 0,
+    host: Annotated[str, typer.Option(help="Address to serve at; others than loopback are seen by others.")] = (
+        "127.0.0.1"
+    ),
+) -> None:
+    """Serve a page that follows a run, with a button to stop it; Ctrl-C ends the command, and not the run."""
+    with interrupts.undisturbed():
+        from pathreplay.watch.run_files import require_run
+        from pathreplay.watch.server import RunServer, serve
+
+    require_run(run)
+    server = RunServer(run, host, port)
+    typer.echo(f"{server.address}\nWho has this address can look at the run and stop it. Ctrl-C ends this command.")
+    sys.stdout.flush()
+    try:
+        serve(server)
+    except interrupts.Interrupted as ended:
+        if ended.number != signal.SIGINT:
+            raise
 
 
 @app.command(short_help="Render a scene into a picture.")

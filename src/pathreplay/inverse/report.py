@@ -2,55 +2,201 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
-import jinja2
 import mitsuba as mi
 import numpy as np
 import PIL.Image
 from matplotlib.figure import Figure
 
 from pathreplay.inverse.checkpoint import Entry
-from pathreplay.inverse.images import displayed, encoded, png_bytes
-from pathreplay.inverse.outcome import Contestant, Outcome
+from pathreplay.inverse.images import Image, displayed, png_bytes, resized
+from pathreplay.inverse.outcome import Contestant, Outcome, ViewPictures
+from pathreplay.inverse.page_parts import (
+    about,
+    common_exposure,
+    dropped_notice,
+    facts,
+    integrator_row,
+    lead,
+    numbers,
+    plots,
+    plots_note,
+    pose_note,
+    pose_rows,
+    target_row,
+    uri,
+)
 from pathreplay.inverse.pose import error_names
+from pathreplay.pages.document import document
+from pathreplay.pages.page import Comparison, Head, Page, Parameter, Picture, Row, Still, Table, View
 
 # Colours that read on light and dark ground alike.
 OURS, RIVAL, GREY = "#3b82f6", "#e07b39", "#808080"
+
+# A report is opened in a mail, too: pictures of so many views, of so many pixels in all (a noisy one takes about four
+# bytes of the page). The others, and the whole ones, are files in the run folder.
+MOST_VIEWS, MOST_PIXELS = 24, 6_000_000
+
+Film = tuple[Still, ...]
 
 # So many parameters get a panel of their own beside that of the pictures.
 PANELS = 2
 
 
-def report_files(outcome: Outcome) -> dict[str, bytes]:
-    """report.html, the curves (SVG, PNG) and summary.png, as file name -> content."""
+def report_files(outcome: Outcome, films: Mapping[str, Film] | None = None) -> dict[str, bytes]:
+    """report.html, the curves (SVG, PNG) and summary.png, as file name -> content; ``films`` are by view and key."""
     curves = {"loss": loss_figure(outcome.run.history)}
     contestants = outcome.comparison()
     if contestants:
         curves["comparison"] = comparison_figure(contestants)
     drawings = {f"{name}.{kind}": drawn(curve, kind) for name, curve in curves.items() for kind in ("svg", "png")}
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pathreplay.inverse", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    sources = {name: uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves}
+    page = report_page(outcome, contestants, sources, films or {})
+    return {"report.html": document(page), **drawings, "summary.png": summary(outcome)}
+
+
+def report_page(
+    outcome: Outcome, contestants: Sequence[Contestant], drawings: Mapping[str, str], films: Mapping[str, Film]
+) -> Page:
+    """What the report says; ``drawings`` are the addresses of the curves by name."""
+    config, history = outcome.config, outcome.run.history
+    stopped = f"Stopped after {len(history)} of {config.iterations} iterations."
+    held_out, count = len(outcome.held_out()), len(outcome.recovered) + len(outcome.poses)
+    exposure = common_exposure(view.target for view in outcome.views)
+    return Page(
+        title=outcome.folder.name,
+        lead=lead(config, count, len(outcome.views) - held_out, held_out),
+        notices=((stopped,) if len(history) < config.iterations else ()) + dropped_notice(history),
+        facts=facts(config, history),
+        comparison=_comparison(outcome, contestants, drawings["comparison"]) if contestants else None,
+        views=_views(outcome, exposure, films),
+        likeness=_likeness(outcome),
+        likeness_note="Of what a display shows of each view at an exposure of its own, noise included"
+        + (". Nothing was learned from views that are held out." if held_out else "."),
+        views_note="Difference: red where the result is brighter than the target, blue where it is darker."
+        + _left_out(outcome),
+        exposure=exposure,
+        plots=plots(history),
+        plots_note=plots_note(history),
+        drawing=drawings["loss"],
+        parameters=_parameters(outcome, films),
+        command=outcome.command(),
+        how=(
+            *(Row(name, (version,)) for name, version in versions().items()),
+            *(Row("note", (note,)) for note in outcome.notes),
+            integrator_row(config),
+            target_row(config),
+        ),
     )
-    environment.filters["swatch"] = swatch
-    html = environment.get_template("report.html.j2").render(
-        outcome=outcome,
-        data_uri=lambda image, exposure=1.0: _uri("image/png", png_bytes(image, exposure)),
-        curves={name: _uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves},
-        contestants=contestants,
-        versions=versions(),
+
+
+def _comparison(outcome: Outcome, contestants: Sequence[Contestant], drawing: str) -> Comparison:
+    judge = (outcome.config if outcome.config.brings_pictures else outcome.config.target).integrator.type
+    heads = [Head(text) for text in ("", "iterations", "seconds", "error of the pictures")]
+    heads += [Head("error of", key) for key in contestants[0].errors]
+    rows = []
+    for each in contestants:
+        measured = (each.run.picture_error(), *each.errors.values())
+        cells = (str(len(each.run.history)), f"{each.run.seconds():.0f}", *(f"{error:.4g}" for error in measured))
+        rows.append(Row(each.name, cells))
+    note = (
+        "Root mean square errors. Those of the pictures are without the noise of rendering them; "
+        f"{judge} rendered them for both. The rival started from the same values and had the same samples per step and "
+        "seeds. Both took turns: after each step the rival took as many as brought it to the same time, with the "
+        "learning rate and resolution of the other. Compiling counts, judging does not."
     )
-    return {"report.html": html.encode(), **drawings, "summary.png": summary(outcome)}
+    title = f"Next to {contestants[1].name}, in the same time"
+    return Comparison(title, drawing, Table(tuple(heads), tuple(rows)), note)
+
+
+def _likeness(outcome: Outcome) -> Table:
+    heads = ["", "PSNR at the start", "in the result", "SSIM at the start", "in the result"]
+    flips, exposed = outcome.has_flip(), any(view.factors for view in outcome.views)
+    heads += ["FLIP at the start", "in the result"] * flips + ["exposure found"] * exposed
+    rows = []
+    for view in outcome.views:
+        before, after = view.likenesses["start"], view.likenesses["result"]
+        cells = [f"{before.psnr:.2f} dB", f"{after.psnr:.2f} dB", f"{before.ssim:.4f}", f"{after.ssim:.4f}"]
+        if flips:
+            cells += ["" if each.flip is None else f"{each.flip:.4f}" for each in (before, after)]
+        if exposed:
+            cells.append("× " + ", ".join(f"{factor:.3f}" for factor in view.factors))
+        rows.append(Row(view.name + " (held out)" * view.held_out, tuple(cells)))
+    return Table(tuple(Head(text) for text in heads), tuple(rows))
+
+
+def _shown(outcome: Outcome) -> tuple[list[ViewPictures], float]:
+    """The views whose pictures are in the report, and by how much these are made smaller, for it to stay a page."""
+    views = list(outcome.views)
+    if len(views) > MOST_VIEWS:
+        views = [views[i * len(views) // MOST_VIEWS] for i in range(MOST_VIEWS)]
+    pixels = sum(view.target[..., 0].size * len(view.pictures()) for view in views)
+    return views, min(1.0, (MOST_PIXELS / pixels) ** 0.5)
+
+
+def _left_out(outcome: Outcome) -> str:
+    views, scale = _shown(outcome)
+    said = ""
+    if len(views) < len(outcome.views):
+        said += f" Pictures of {len(views)} of the {len(outcome.views)} views are here, of all of them in images/."
+    if scale < 1:
+        said += f" Pictures are {100 * scale:.0f} % as wide and high as those in images/."
+    return said
+
+
+def _views(outcome: Outcome, exposure: float, films: Mapping[str, Film]) -> tuple[View, ...]:
+    found = []
+    views, scale = _shown(outcome)
+    for view in views:
+        stored = min(exposure, view.exposure)
+        pictures = tuple(
+            Picture(kind, outcome.caption(kind), uri("image/png", png_bytes(_smaller(image, scale), stored)))
+            for kind, image in view.pictures().items()
+        )
+        mask = ", where its mask is" if view.weight is not None else ""
+        note = (
+            f"Root mean square difference from the target: {view.error(view.start):.4g} at the start, "
+            f"{view.error(view.result):.4g} in the result, noise included{mask}. Shown at exposure {stored:.3g}."
+        )
+        film = films.get(f"view-{view.name}", ())
+        found.append(View(view.name, pictures, stored, view.exposure, view.held_out, note, film))
+    return tuple(found)
+
+
+def _smaller(image: Image, scale: float) -> Image:
+    if scale == 1:
+        return image
+    return resized(image, max(1, round(image.shape[0] * scale)), max(1, round(image.shape[1] * scale)))
+
+
+def _parameters(outcome: Outcome, films: Mapping[str, Film]) -> tuple[Parameter, ...]:
+    """Textures, volumes, numbers, poses, and what is none of these."""
+
+    def pictures(images: Mapping[str, Image]) -> tuple[Picture, ...]:
+        made = {kind: uri("image/png", png_bytes(image)) for kind, image in images.items()}
+        return tuple(Picture(kind, outcome.caption(kind), source) for kind, source in made.items())
+
+    rival = outcome.names()[1]
+    kinds: list[list[Parameter]] = [[], [], [], []]
+    for item in outcome.recovered:
+        if images := item.textures():
+            film = films.get(f"texture-{item.file_name}", ())
+            kinds[0].append(Parameter(item.key, pictures(images), note=about(item), film=film))
+        elif images := item.volumes():
+            film = films.get(f"volume-{item.file_name}", ())
+            kinds[1].append(Parameter(item.key, pictures(images), 2, note=about(item, rival), film=film))
+        elif rows := numbers(item):
+            kinds[2].append(Parameter(item.key, rows=rows))
+        else:
+            kinds[3].append(Parameter(item.key, note=about(item)))
+    poses = [Parameter(item.pose.key, rows=pose_rows(item), note=pose_note(item)) for item in outcome.poses]
+    return (*kinds[0], *kinds[1], *kinds[2], *poses, *kinds[3])
 
 
 def loss_figure(history: Sequence[Entry]) -> Figure:
@@ -148,13 +294,3 @@ def versions() -> dict[str, str]:
         "Python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }
-
-
-def swatch(values: list[float]) -> str:
-    """A CSS colour for linear RGB; brighter than white is scaled to full brightness, hue kept."""
-    colour = np.array(values, dtype=np.float32).clip(min=0)
-    return "#" + "".join(f"{round(float(c) * 255):02x}" for c in encoded(colour / max(1.0, float(colour.max()))))
-
-
-def _uri(kind: str, data: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 import safetensors.numpy
 
-from pathreplay.files import file_names
 from pathreplay.inverse.checkpoint import Entry, Run
+from pathreplay.inverse.exposures import EXPOSURE
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes
 from pathreplay.inverse.likeness import Likeness
-from pathreplay.inverse.outcome import Outcome, Recovered, RecoveredPose, ViewPictures, resume_command
-from pathreplay.inverse.pose import Pose, PoseError
-from pathreplay.inverse.problem import Problem, scene_values, variables_of
-from pathreplay.inverse.report import report_files
+from pathreplay.inverse.outcome import Outcome, ViewPictures, resume_command
+from pathreplay.inverse.pose import PoseError
+from pathreplay.inverse.problem import Problem
+from pathreplay.inverse.recovered import poses_of, recovered_of, with_scene
+from pathreplay.inverse.report import Film, report_files
 from pathreplay.inverse.run_folder import Job
-from pathreplay.inverse.values import Array, Arrays
+from pathreplay.inverse.values import Array
 from pathreplay.media.volume_files import vol_bytes
-from pathreplay.scenes.parameters import get_array
 
 
 @dataclass(frozen=True, repr=False)
@@ -35,7 +35,7 @@ class RunResult:
     stopped: bool
     """True when a signal ended the run early; it can be resumed."""
     stopped_by: str | None
-    """'Ctrl-C', 'SIGTERM' or 'SIGHUP'."""
+    """'Ctrl-C', 'SIGTERM', 'SIGHUP', 'the stop button' or 'finish()'."""
     history: tuple[Entry, ...]
     parameters: dict[str, Array]
     errors: dict[str, float]
@@ -67,7 +67,9 @@ class RunResult:
         lines += [f"{key}: {error}" for key, error in self.poses.items()]
         if self.held_out:
             psnr, ssim = (np.mean([getattr(self.views[v], kind) for v in self.held_out]) for kind in ("psnr", "ssim"))
-            lines.append(f"held-out views ({len(self.held_out)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}")
+            flips = [flip for v in self.held_out if (flip := self.views[v].flip) is not None]
+            told = f", FLIP {np.mean(flips):.4f}" if flips else ""
+            lines.append(f"held-out views ({len(self.held_out)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}{told}")
         lines.append(f"report: {self.report}")
         if self.stopped:
             lines.append(f"stopped early by {self.stopped_by}; go on with: {resume_command(self.folder)}")
@@ -84,9 +86,6 @@ def outcome_of(
     rivals: dict[str, Image],
 ) -> Outcome:
     """All that is told of a run; ``before``, ``after`` and the ``rivals`` are pictures by view."""
-    theirs = run.rival.values if run.rival else {}
-    starts = _with_scene(problem, {v.key: v.start for v in problem.variables})
-    values = _with_scene(problem, run.values)
     views = tuple(
         ViewPictures(
             v.name,
@@ -97,24 +96,17 @@ def outcome_of(
             rivals.get(v.name),
             v.weight,
             v.held_out,
+            tuple(run.values[EXPOSURE][n].tolist()) if EXPOSURE in run.values else (),
         )
-        for v in problem.views
+        for n, v in enumerate(problem.views)
     )
-    poses = tuple(
-        RecoveredPose(pose, _parts(pose, starts), _parts(pose, values), values[pose.key], starts[pose.key])
-        for pose in problem.poses
-    )
-    files_of = file_names(v.key for v in problem.variables)
-    recovered = tuple(
-        Recovered(v.key, files_of[v.key], v.start, values[v.key], v.truth, theirs.get(v.key))
-        for v in problem.variables
-        if v.key in problem.params
-    )
+    recovered, poses = recovered_of(problem, run), poses_of(problem, run)
+    values = with_scene(problem, run.values)
     return Outcome(job.config, job.source, job.changes, folder, views, recovered, poses, run, values, problem.notes)
 
 
-def result_files(outcome: Outcome) -> dict[str, bytes]:
-    """All files of the end of a run, the report among them, by name in the run folder."""
+def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, bytes]:
+    """All files of the end of a run, the report with its ``films`` among them, by name in the run folder."""
     table = {item.key: item.as_dict() for item in outcome.recovered}
     table |= {item.pose.key: item.as_dict() for item in outcome.poses}
     files = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}
@@ -134,11 +126,11 @@ def result_files(outcome: Outcome) -> dict[str, bytes]:
             files[f"images/volume-{kind}-{item.file_name}.png"] = png_bytes(image)
         if item.result.ndim == 4:
             files[f"volumes/{item.file_name}.vol"] = vol_bytes(item.result)
-    return {**files, **report_files(outcome)}
+    return {**files, **report_files(outcome, films)}
 
 
 def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
-    """What Python gets; ``stopped_by`` is the name of a signal, which may have come too late to stop anything."""
+    """What Python gets; ``stopped_by`` is the name of a signal, say, which may have come too late to stop anything."""
     stopped = len(outcome.run.history) < outcome.config.iterations
     return RunResult(
         folder=outcome.folder,
@@ -153,18 +145,6 @@ def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
         views={view.name: view.likenesses["result"] for view in outcome.views},
         held_out=tuple(view.name for view in outcome.held_out()),
     )
-
-
-def _with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
-    """The values of the variables, and what they make of the scene's parameters."""
-    stored = scene_values(problem, variables_of(problem, values))
-    return {key: get_array(value) for key, value in stored.items()} | dict(values)
-
-
-def _parts(pose: Pose, values: Arrays) -> dict[str, Array]:
-    """Translation and rotation vector (degrees) of a pose."""
-    parts = {part: values[name] for part, name in pose.parts().items()}
-    return {part: np.degrees(value) if part == "rotation" else value for part, value in parts.items()}
 
 
 def _run_files(folder: str, history: Sequence[Entry], values: Mapping[str, Array]) -> dict[str, bytes]:

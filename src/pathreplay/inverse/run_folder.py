@@ -19,8 +19,10 @@ from pathreplay.files import file_problem
 from pathreplay.interrupts import undisturbed
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.folder_lock import FolderLock
+from pathreplay.inverse.texts import YAML
 
 PART = ".part"
+_CONFIGS = "config.toml", "config.yaml", "config.json"
 CHECKPOINT = "checkpoint.safetensors"
 RIVAL_CHECKPOINT = "rival/checkpoint.safetensors"
 
@@ -113,11 +115,12 @@ class RunFolder:
 def create_run_folder(output: Path, job: Job, files: Mapping[str, bytes]) -> RunFolder:
     """Make ``output``, or ``output-2``, ``-3``, … where that exists, and put the job and its first files into it.
 
-    The config is copied as it was written (``config.toml``), or as JSON where it came from Python or was changed. What
-    fails leaves no folder behind. Raises PathreplayError where the folder cannot be made or written.
+    The config is copied as it was written (``config.toml`` or ``.yaml``), or as JSON where it came from Python or was
+    changed. What fails leaves no folder behind. Raises PathreplayError where the folder cannot be made or written.
     """
     if job.source is not None and job.source.suffix != ".json" and not job.changes:
-        copy = {"config.toml": job.source.read_bytes()}
+        name = "config.yaml" if job.source.suffix.lower() in YAML else "config.toml"
+        copy = {name: job.source.read_bytes()}
     else:
         copy = {"config.json": job.config.model_dump_json(indent=2, exclude_unset=True).encode()}
     origin: dict[str, Any] = {
@@ -164,7 +167,7 @@ def read_job(path: Path) -> Job:
 
 
 def _config_in(path: Path) -> Path:
-    copy = next((path / name for name in ("config.toml", "config.json") if (path / name).is_file()), None)
+    copy = next((path / name for name in _CONFIGS if (path / name).is_file()), None)
     if copy is None or not (path / "run.json").is_file():
         raise PathreplayError(f"{path} is no run folder (no config, no run.json); give a folder that optimize has made")
     return copy

@@ -1,0 +1,48 @@
+"""Where the parameters of a run are, each with its start and its truth: as people see them, and as scenes do."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pathreplay.files import file_names
+from pathreplay.inverse.checkpoint import Run
+from pathreplay.inverse.outcome import Recovered, RecoveredPose
+from pathreplay.inverse.pose import Pose
+from pathreplay.inverse.problem import Problem, scene_values, variables_of
+from pathreplay.inverse.values import Array, Arrays
+from pathreplay.scenes.parameters import get_array
+
+
+def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
+    """The parameters that are no poses."""
+    values, theirs = with_scene(problem, run.values), run.rival.values if run.rival else {}
+    files_of = file_names(v.key for v in problem.variables)
+    return tuple(
+        Recovered(v.key, files_of[v.key], v.start, values[v.key], v.truth, theirs.get(v.key))
+        for v in problem.variables
+        if v.key in problem.params
+    )
+
+
+def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:
+    """The parameters that are poses."""
+    if not problem.poses:
+        return ()
+    starts = with_scene(problem, {v.key: v.start for v in problem.variables})
+    values = with_scene(problem, run.values)
+    return tuple(
+        RecoveredPose(pose, _parts(pose, starts), _parts(pose, values), values[pose.key], starts[pose.key])
+        for pose in problem.poses
+    )
+
+
+def with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
+    """The values of the variables, and what they make of the scene's parameters."""
+    stored = scene_values(problem, variables_of(problem, values))
+    return {key: get_array(value) for key, value in stored.items()} | dict(values)
+
+
+def _parts(pose: Pose, values: Arrays) -> dict[str, Array]:
+    """Translation and rotation vector (degrees) of a pose."""
+    parts = {part: values[name] for part, name in pose.parts().items()}
+    return {part: np.degrees(value) if part == "rotation" else value for part, value in parts.items()}

@@ -1,0 +1,83 @@
+"""Pages as documents: whatever they are told is text, their policy fits what they hold, and curves stay short."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from page_samples import HOSTILE, sample
+from pathreplay.inverse.page_parts import common_exposure
+from pathreplay.pages.document import document
+from pathreplay.pages.page import MOST_POINTS, thinned
+
+
+class Elements(HTMLParser):
+    """The elements of a document, what stands in scripts and styles, and all other text."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.within: dict[str, list[str]] = {"script": [], "style": []}
+        self.text = ""
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        if self.lasttag in self.within and self.cdata_elem:
+            self.within[self.lasttag].append(data)
+        else:
+            self.text += data
+
+
+@pytest.mark.parametrize("word", HOSTILE, ids=range(len(HOSTILE)))
+@pytest.mark.parametrize("live", [False, True])
+def test_whatever_a_page_says_is_text(word: str, live: bool) -> None:
+    plain, hostile = (Elements(document(sample(w), live).decode()) for w in ("plain", word))
+    assert [tag for tag, _ in hostile.found] == [tag for tag, _ in plain.found]
+    allowed = {name for _, attributes in plain.found for name in attributes}
+    assert {name for _, attributes in hostile.found for name in attributes} <= allowed
+    assert not {name for name in allowed if name.startswith("on")} and "style" not in allowed
+    assert hostile.text.count(word.replace("\r\n", "\n")) + hostile.text.count(word) > 10
+    assert len(hostile.within["script"]) == 2
+
+
+def test_data_come_through_whatever_they_hold() -> None:
+    for word in HOSTILE:
+        parsed = Elements(document(sample(word)).decode())
+        data = json.loads(parsed.within["script"][0])
+        assert data["views"][0]["name"] == f"{word} 0" and data["plots"][1]["code"] == word
+
+
+def test_the_policy_lets_its_own_script_and_style_run_and_nothing_else() -> None:
+    parsed = Elements(document(sample()).decode())
+    (policy,) = [a["content"] for tag, a in parsed.found if a.get("http-equiv") == "Content-Security-Policy"]
+    rules = dict(rule.split(" ", 1) for rule in (policy or "").split("; "))
+    for kind, text in (("script", parsed.within["script"][1]), ("style", parsed.within["style"][0])):
+        wanted = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert rules[f"{kind}-src"] == f"'sha256-{wanted}'"
+    assert rules["default-src"] == "'none'" and rules["img-src"] == "data:" and rules["connect-src"] == "'none'"
+
+
+def test_a_page_names_no_other_host() -> None:
+    html = document(sample()).decode()
+    assert not re.search(r"https?:|//[a-z]+\.|url\((?!#)|@import", re.sub(r"data:[^\"]*", "", html))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, MOST_POINTS, MOST_POINTS + 1, 10 * MOST_POINTS + 7])
+def test_long_curves_are_thinned_and_keep_their_ends(count: int) -> None:
+    places = thinned(count)
+    assert len(places) <= MOST_POINTS + 1 and places == sorted(set(places))
+    assert count == 0 or (places[0], places[-1]) == (0, count - 1)
+
+
+def test_one_exposure_is_that_of_all_pixels_together() -> None:
+    dark, bright = np.full((4, 4, 3), 0.5, np.float32), np.full((4, 4, 3), 2.0, np.float32)
+    assert common_exposure([dark]) == pytest.approx(2) and common_exposure([dark, bright]) == pytest.approx(0.5)
