@@ -234,10 +234,10 @@ function plot(spec, first) {
     const parts = spec.series.map((series, s) => {
       const near = points[s].length && at !== null ? points[s].reduce((a, b) => (Math.abs(b[0] - at) < Math.abs(a[0] - at) ? b : a)) : null;
       const name = series.name ? `${series.name} ` : "";
-      const value = near ? `${spec.series.length > 1 ? "" : `iteration ${near[0]}: `}${short(near[1])}` : "";
+      const value = near ? `${spec.series.length > 1 ? "" : `${spec.along} ${short(near[0])}: `}${short(near[1])}` : "";
       return name || value ? make("span", {}, ...(series.name ? [make("b", { class: `c${s % 8}` }, "● ")] : []), `${name}${value}  `) : "";
     });
-    const where = at !== null && spec.series.length > 1 ? [`iteration ${Math.round(at)}: `] : [];
+    const where = at !== null && spec.series.length > 1 ? [`${spec.along} ${short(Math.round(at))}: `] : [];
     told.replaceChildren(...where, ...parts);
   }
   function draw() {
@@ -245,7 +245,7 @@ function plot(spec, first) {
     const X = (x) => left + ((x - lowX) / (highX - lowX)) * (width - left - right);
     const share = log ? (y) => Math.log(y / lowY) / Math.log(highY / lowY) : (y) => (y - lowY) / (highY - lowY);
     const Y = (y) => height - bottom - share(y) * (height - top - bottom);
-    const svg = make("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img", "aria-label": `${spec.title} ${spec.code} against iterations` });
+    const svg = make("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img", "aria-label": `${spec.title} ${spec.code} by ${spec.along}` });
     for (const y of ticks(lowY, highY, log)) {
       svg.append(make("line", { class: "grid", x1: left, x2: width - right, y1: Y(y), y2: Y(y) }),
         make("text", { x: left - 6, y: Y(y) + 4, "text-anchor": "end" }, short(y)));
