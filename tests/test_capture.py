@@ -111,6 +111,53 @@ def test_a_job_learns_from_a_capture() -> None:
     assert "capture/transforms.json" in result.report.read_text()
 
 
+def spoil_file(change: dict[str, Any]) -> None:
+    write({**PLAIN, "frames": [{**FRAMES[0], **change}, *FRAMES[1:]]})
+
+
+@pytest.mark.slow
+def test_a_run_does_not_go_on_with_other_cameras(folder: Path) -> None:
+    first = optimize(make_config({**JOB, "iterations": 2}), progress=False)
+    job = first.folder / "config.json"
+    job.write_text(job.read_text().replace('"iterations": 2', '"iterations": 3'))
+    spoil_file({"transform_matrix": placed(0.01)})
+    with pytest.raises(PathreplayError, match="The capture has other cameras than when this run was started; put it"):
+        optimize(resume=first.folder, progress=False)
+    spoil_file({"colour": "blue"})  # which nobody looks at
+    mark = first.folder / "capture.sha256"
+    kept = mark.read_bytes()
+    for spoil in (mark.unlink, lambda: mark.write_bytes(b"\xff"), lambda: mark.write_bytes(b"0" * 2**20)):
+        spoil()
+        with pytest.raises(PathreplayError, match="The capture has "):
+            optimize(resume=first.folder, progress=False)
+    mark.write_bytes(kept)
+    assert optimize(resume=first.folder, progress=False).iterations == 3
+
+
+def test_lenses_of_a_transforms_json_are_undone(folder: Path) -> None:
+    """What is seen through a lens is put where the pinhole sees it."""
+    u, v = np.meshgrid(np.arange(60) + 0.5, np.arange(40) + 0.5)
+    k1, k2, p1, p2 = -0.2, 0.05, 0.01, -0.02
+
+    def dot(x: float, y: float) -> np.ndarray:
+        return np.repeat(np.exp(-((u - x) ** 2 + (v - y) ** 2) / 3)[:, :, None], 3, axis=2).astype(np.float32)
+
+    x, y = 0.3, -0.25  # in the plane at distance 1
+    r2 = x * x + y * y
+    f = 1 + k1 * r2 + k2 * r2 * r2
+    bent = x * f + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * f + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    (folder / "capture" / "bent.exr").write_bytes(exr_bytes(dot(50 * bent[0] + 29, 55 * bent[1] + 21)))
+    lens = {"camera_model": "OPENCV", "fl_x": 50, "fl_y": 55, "cx": 29, "cy": 21}
+    lens |= {"k1": k1, "k2": k2, "p1": p1, "p2": p2}
+    write({**lens, "frames": [{"file_path": "bent.exr", "transform_matrix": placed(0)}]})
+    problem = build_problem(make_config({**JOB, "capture": {"transforms": "capture/transforms.json"}}), folder)
+    (view,) = problem.views
+    centre = [(view.target[:, :, 0] * axis).sum() / view.target[:, :, 0].sum() for axis in (u, v)]
+    assert centre == pytest.approx([50 * x + 29, 50 * y + 21], abs=0.1)
+    assert view.weight is not None and view.weight.mean() == pytest.approx(1, abs=1e-6)
+    assert "come from a distorting lens" in " ".join(problem.notes)
+
+
 def test_pictures_are_brought_to_the_width_of_renderings() -> None:
     job = {**JOB, "capture": {"transforms": "capture/transforms.json", "width": 6}, "sensors": ["shot_1", "shot_2"]}
     result = optimize(make_config(job), progress=False)
@@ -142,15 +189,14 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "a list": ([1], "is no transforms.json as we know it"),
     "no frames": ({"frames": []}, "'frames'"),
     "no lens": ({"frames": FRAMES}, "neither fl_x nor camera_angle_x"),
-    "fisheye": ({**PLAIN, "camera_model": "OPENCV_FISHEYE"}, "camera_model 'OPENCV_FISHEYE'; undistort"),
-    "distorted": ({**PLAIN, "k1": 0.1, "p2": -0.01}, "is distorted (k1 = 0.1, p2 = -0.01); undistort"),
-    "flat pixels": ({**PLAIN, "fl_x": 15, "fl_y": 19}, "no squares (fl_x = 15, fl_y = 19)"),
+    "another lens": ({**PLAIN, "camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR'; undistort"),
+    "k4 of whom": ({**PLAIN, "k1": 0.1, "k4": -0.01}, "has k4 = -0.01, which is one thing to OpenCV and another"),
+    "bent without end": ({**PLAIN, "k1": 1e300}, "is no transforms.json as we know it ('k1'"),
     "other shape": ({**PLAIN, "w": 12, "h": 12}, "said to be 12 x 12, and its picture is 12 x 8"),
     "no picture": (with_frame(file_path="gone"), "picture 'gone' does not exist"),
     "no name": (with_frame(file_path="/"), "is a folder"),
     "a long name": (with_frame(file_path="x" * 4096), "cannot be reached"),
     "a far camera": (with_frame(transform_matrix=placed(1e300)), "'frames.0.transform_matrix"),
-    "a flagged fisheye": ({**PLAIN, "is_fisheye": True}, "is a fisheye's; undistort"),
     "a NUL": (with_frame(file_path="go\0ne"), "cannot be reached"),
     "sheared": (with_frame(transform_matrix=np.diag([1, 2, 1, 1]).tolist()), "no rotation and translation"),
     "a mirror": (with_frame(transform_matrix=np.diag([-1, 1, 1, 1]).tolist()), "no rotation and translation"),
@@ -170,6 +216,17 @@ def test_captures_that_cannot_be_used_are_refused_in_one_line(case: str, folder:
 
 
 JOBS_REFUSED = {
+    "two sources": (
+        {"capture": {"transforms": "a.json", "colmap": "sparse/0"}},
+        "give 'transforms' (a transforms.json)",
+    ),
+    "no source": ({"capture": {"width": 6}}, "give 'transforms' (a transforms.json) or 'colmap'"),
+    "folder of a file": ({"capture": {"transforms": "a.json", "images": "b"}}, "'images' is the folder of a COLMAP"),
+    "no masks": ({"capture": {"transforms": "capture/transforms.json", "masks": "gone"}}, "has no shot 0.exr.png"),
+    "all of a weight": ({"view_weights": {"shot_0": 2.0}}, "view_weights: view 'shot_0' is held out"),
+    "weight of nobody": ({"view_weights": {"shot_9": 2.0}}, "No sensor 'shot_9' in the scene"),
+    "weight of another": ({"view_weights": {"other": 2.0}, "sensors": ["shot_1"]}, "'other' is not among 'sensors'"),
+    "no alpha to compare": ({"target": {"alpha": "compare"}}, "has no alpha to go with alpha = 'compare'"),
     "no file": ({"capture": {"transforms": "gone.json"}}, "gone.json; give the path of a transforms.json"),
     "pictures twice": ({"target": {"images": ["a.png"]}}, "'capture' brings the pictures; leave 'images' out"),
     "another camera": ({"sensors": ["other", "shot_1"]}, "'other' is no camera of the capture"),
@@ -200,6 +257,7 @@ def test_the_example_finds_texture_roughness_and_sky(folder: Path) -> None:
     pictures = folder / "small"
     script = [sys.executable, str(example / "make_capture.py"), str(pictures)]
     subprocess.run([*script, "--views", "12", "--width", "24", "--spp", "256"], check=True, capture_output=True)
+    assert len(json.loads((pictures / "transforms.json").read_text())["frames"]) == 12
     changes = [f"capture.transforms={pictures / 'transforms.json'}", "iterations=300", "picture_spp=64"]
     result = optimize(example / "config.toml", output="found", progress=False, define=changes)
     assert result.held_out == ("00", "06")

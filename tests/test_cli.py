@@ -40,7 +40,7 @@ def test_help_lists_the_commands(run) -> None:
     assert "doctor" in out
 
 
-@pytest.mark.parametrize("command", [(), ("doctor",), ("check",), ("optimize",)])
+@pytest.mark.parametrize("command", [(), ("doctor",), ("check",), ("optimize",), ("render",), ("export",)])
 def test_flags_take_no_value_in_the_help(run, command: tuple[str, ...]) -> None:
     status, out, _ = run(*command, "--help")
     assert status == 0 and "--help" in out

@@ -113,7 +113,7 @@ def test_each_view_is_recorded_once_where_it_can_be(changes: dict[str, Any], rec
     run = new_run(problem, problem.integrator)
     for i in range(6):
         take_step(problem, config, run, i)
-    recordings = run.executor.evaluate._recordings._frozen.values()  # type: ignore[attr-defined]
+    recordings = run.executor.evaluate._recordings[config.spp]._frozen.values()  # type: ignore[attr-defined]
     assert [each.n_recordings for each in recordings] == [1, 1] * records
 
 

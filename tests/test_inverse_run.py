@@ -15,7 +15,7 @@ import pytest
 import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import RunResult, job, make_config, optimize
+from pathreplay.inverse import RunResult, make_config, optimize, session
 from pathreplay.inverse import run_folder as folders
 from pathreplay.inverse.images import read_image
 from pathreplay.inverse.progress import Progress
@@ -231,11 +231,11 @@ def test_a_folder_that_is_resumed_stays_even_where_no_iteration_can_be_done(monk
     def failing(*_: object) -> None:
         raise PathreplayError("no iteration can be done")
 
-    monkeypatch.setattr(job, "iterate", aborted)
+    monkeypatch.setattr(session, "iterate", aborted)
     with pytest.raises(KeyboardInterrupt):
         run()
     (folder,) = Path("runs").iterdir()
-    monkeypatch.setattr(job, "iterate", failing)
+    monkeypatch.setattr(session, "iterate", failing)
     with pytest.raises(PathreplayError, match="no iteration"):
         optimize(resume=folder, progress=False)
     assert (folder / "checkpoint.safetensors").is_file()

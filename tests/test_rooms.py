@@ -24,10 +24,11 @@ from test_drivers import KEYS, foggy
 SOURCE = Path(pathreplay.__file__).parent
 #: The files at the top, but for `cli.py`.
 FILES = "files"
-#: Each room, and the rooms that it may use. Nobody uses `cli` or `rivals`.
+#: Each room, and the rooms that it may use. Nobody uses `cli` or `rivals`, and `output` only `cli` does.
 ALLOWED: dict[str, set[str]] = {
-    "cli": {"inverse", "check", "watch", "scenes", FILES},
+    "cli": {"inverse", "check", "watch", "output", "scenes", FILES},
     "watch": {"inverse", "pages", FILES},
+    "output": {"inverse", "render", "scenes", "media", FILES},
     "inverse": {"render", "scenes", "media", "pages", FILES},
     "check": {"render", "scenes", FILES},
     "rivals": {"render", "gradient", "transport", FILES},

@@ -193,6 +193,25 @@ def test_what_cannot_count_is_refused_in_one_line(case: str, room: Path) -> None
     assert not (room / "runs").exists()
 
 
+def test_flip_is_that_of_flip_evaluator_where_the_mask_is() -> None:
+    """Black against white is 0.9674, as the package says of plain pictures."""
+    pytest.importorskip("flip_evaluator")
+    black, white = np.zeros((8, 8, 3), np.float32), np.ones((8, 8, 3), np.float32)
+    assert Likeness.of(black, black, 1.0, flip=True).flip == 0
+    assert Likeness.of(black, white, 1.0, flip=True).flip == pytest.approx(0.9674, abs=1e-3)
+    assert Likeness.of(black[:, :, :1], white[:, :, :1], 1.0, flip=True).flip == pytest.approx(0.9674, abs=1e-3)
+    assert Likeness.of(black, white, 1.0).flip is None
+    # 67 pixels per degree blur by more than this: a mask takes a part of the map, not of the pictures.
+    half = np.repeat([[2.0] * 4 + [0.0] * 4], 8, axis=0).astype(np.float32)[:, :, None]
+    both = np.where(half > 0, black, white).astype(np.float32)
+    assert 0 < Likeness.of(both, black, 1.0, half, flip=True).flip < Likeness.of(both, black, 1.0, flip=True).flip
+
+
+def test_flip_is_left_out_where_the_package_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pathreplay.inverse.likeness.has_flip", lambda: False)
+    assert Likeness.of(np.zeros((2, 2, 3)), np.ones((2, 2, 3)), 1.0, flip=True).flip is None
+
+
 def test_likeness_has_its_closed_forms() -> None:
     rng = np.random.default_rng(0)
     image = rng.uniform(0.1, 0.9, (24, 32, 3)).astype(np.float32)

@@ -1,6 +1,6 @@
 """Takes 24 pictures all around a ball below a sky, and writes them down as a capture: transforms.json and EXR files.
 
-    python examples/capture/make_capture.py [FOLDER] [--views 24] [--width 64] [--spp 1024]
+    python examples/capture/make_capture.py [FOLDER] [--views 24] [--width 64] [--spp 1024] [--recover]
 
 What is in the pictures stands here only: neither the job nor its scene file know the texture, the roughness or the sky.
 """
@@ -13,6 +13,7 @@ import math
 from pathlib import Path
 
 from pathreplay.backend import set_variant  # before mitsuba: finds a libLLVM
+from pathreplay.inverse import optimize
 
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
@@ -62,6 +63,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=24)
     parser.add_argument("--width", type=int, default=64)
     parser.add_argument("--spp", type=int, default=1024)
+    parser.add_argument("--recover", action="store_true", help="run the job of config.toml on them, too")
     given = parser.parse_args()
     set_variant()
     given.folder.mkdir(parents=True, exist_ok=True)
@@ -94,7 +96,10 @@ def main() -> None:
         frames.append({"file_path": f"{k:02d}.exr", "transform_matrix": matrix.tolist()})
     table = {"camera_angle_x": FOV, "w": given.width, "h": given.width, "frames": frames}
     (given.folder / "transforms.json").write_text(json.dumps(table, indent=1))
-    print(f"{given.views} pictures and transforms.json in {given.folder}")
+    print(f"{given.views} pictures and transforms.json in {given.folder}", flush=True)
+    if given.recover:
+        found = (given.folder / "transforms.json").resolve()
+        print(optimize(Path(__file__).parent / "config.toml", define=[f"capture.transforms={found}"]).describe())
 
 
 if __name__ == "__main__":

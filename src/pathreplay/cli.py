@@ -142,7 +142,7 @@ def check(
 
 @app.command(short_help="Recover scene parameters from pictures.")
 def optimize(
-    config: Annotated[Path | None, typer.Argument(help="Job in TOML; see docs/optimize.md.")] = None,
+    config: Annotated[Path | None, typer.Argument(help="Job in TOML or YAML; see docs/optimize.md.")] = None,
     resume: Annotated[
         Path | None, typer.Option(metavar="RUN_FOLDER", help="Go on with an unfinished run instead.")
     ] = None,
@@ -186,6 +186,57 @@ def watch(
 
 
 commands.add_to(app)
+
+
+@app.command(short_help="Render a scene into a picture.")
+def render(
+    scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or a built-in scene such as cornell-box.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="Picture to write: .exr or .png.")],
+    integrator: Annotated[
+        str | None, typer.Option(help="Plugin that renders, Mitsuba's or ours (default: the scene's).")
+    ] = None,
+    option: Annotated[
+        list[str] | None,
+        typer.Option("--option", "-I", metavar="NAME=VALUE", help="Of the integrator, as in -I max_depth=8."),
+    ] = None,
+    sensor: Annotated[str | None, typer.Option(help="Id or number of the sensor (default: the first).")] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="In pixels; WIDTH alone keeps the proportions.")
+    ] = None,
+    spp: Annotated[int | None, typer.Option(help="Samples per pixel (default: the sensor's).")] = None,
+    seed: Annotated[int, typer.Option(help="Chooses all random numbers.")] = 0,
+    define: Annotated[
+        list[str] | None,
+        typer.Option("--define", "-D", metavar="NAME=VALUE", help="Scene parameter, as in -D res=64."),
+    ] = None,
+    variant: Annotated[str | None, typer.Option(help="Mitsuba variant (default: the best that runs here).")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress on the screen.")] = False,
+) -> None:
+    """Render a scene by any integrator into one file, which is there whole or not at all."""
+    with interrupts.undisturbed():  # as in `optimize`
+        from pathreplay import backend
+        from pathreplay.output.render import render_to_file
+
+        backend.set_variant(variant)
+    line = render_to_file(
+        scene, output, integrator=integrator, options=option or (), sensor=sensor, size=size, spp=spp, seed=seed,
+        define=define or (), progress=not quiet,
+    )  # fmt: skip
+    typer.echo(line)
+
+
+@app.command(short_help="Write out what a run recovered.")
+def export(
+    run: Annotated[Path, typer.Argument(help="Run folder that optimize has made.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FOLDER", help="New folder; default: RUN/export.")
+    ] = None,
+) -> None:
+    """Write out what a run recovered: textures, volumes, meshes, cameras, and the scene as Mitsuba XML."""
+    with interrupts.undisturbed():  # as in `optimize`
+        from pathreplay.output.export import export_run
+
+    typer.echo(export_run(run, output))
 
 
 @app.command(short_help="Print the JSON schema of a job.")

@@ -108,13 +108,14 @@ class Stop:
 
 
 @contextmanager
-def stopping(say: Callable[[str], None], way_out: str) -> Iterator[Stop]:
+def stopping(say: Callable[[str], None], way_out: str, stop: Stop | None = None) -> Iterator[Stop]:
     """Within this block a first signal asks for a stop, and a second one that is a Ctrl-C raises KeyboardInterrupt.
 
     SIGTERM and SIGHUP only ask, however often they come: schedulers and terminals send them more than once. ``say`` is
-    told what is going on; ``way_out`` is the message of the KeyboardInterrupt.
+    told what is going on; ``way_out`` is the message of the KeyboardInterrupt; ``stop`` is what is asked, if it is
+    there before.
     """
-    stop = Stop()
+    stop = Stop() if stop is None else stop
 
     def handle(number: int, frame: FrameType | None) -> None:
         if stop.by is None:

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-from . import of_command, of_config, of_mesh, of_picture, of_process, of_python, of_run, of_scene, of_volume
+from . import of_capture, of_command, of_config, of_mesh, of_picture, of_process, of_python, of_run, of_scene, of_volume
 from .case import RECIPES, Case
 
 KINDS = tuple(
     module.KIND
-    for module in (of_config, of_command, of_scene, of_mesh, of_picture, of_volume, of_run, of_python, of_process)
+    for module in (
+        of_config,
+        of_command,
+        of_scene,
+        of_mesh,
+        of_picture,
+        of_capture,
+        of_volume,
+        of_run,
+        of_python,
+        of_process,
+    )
 )
 
 #: How many cases are tried by default. The recipes alone are more than 400.

@@ -24,7 +24,9 @@ KEYS: dict[str, Mapping[str, Any]] = {
             "parameters.0 parameters.0.key parameters.0.lower parameters.0.upper parameters.0.learning_rate "
             "parameters.0.initial parameters.0.initial.image parameters.0.resolutions parameters.0.refine_at "
             "parameters.0.pose target target.images loss spp picture_spp seed learning_rate learning_rate_decay "
-            "views_per_step held_out capture capture.transforms learning_rate_schedule warm_up "
+            "views_per_step held_out capture capture.transforms capture.colmap exposure exposure.reference "
+            "exposure.white_balance exposure.free view_weights view_weights.eye target.masks target.alpha "
+            "learning_rate_schedule warm_up "
             " optimizer optimizer.type optimizer.beta_1 optimizer.epsilon "
             "parameters.0.transform parameters.0.total_variation parameters.0.prior checkpoint_every unknown"
         ).split(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathreplay.inverse.config import Config, load_config, make_config
-from pathreplay.inverse.job import RunResult, optimize
+from pathreplay.inverse.job import RunResult, iterate, optimize
+from pathreplay.inverse.session import Session, State
 
-__all__ = ["Config", "RunResult", "load_config", "make_config", "optimize"]
+__all__ = ["Config", "RunResult", "Session", "State", "iterate", "load_config", "make_config", "optimize"]

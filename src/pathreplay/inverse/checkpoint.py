@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -24,7 +24,9 @@ from pathreplay.inverse.values import Array, Arrays
 class Entry:
     """One iteration of the history: loss before the step, wall-clock seconds, L2 norm of each variable's gradient.
 
-    ``dropped`` counts gradient entries that were NaN or infinite and were taken as zero in this step. ``errors`` are
+    ``dropped`` counts gradient entries that were NaN or infinite in a view and were taken as zero in this step;
+    ``dropped_shares`` says how many of each variable's that were, of all in all views. ``spp`` are samples per pixel,
+    and ``noise_norms`` how long the noise of a gradient is, where the job measures it (see `noise`). ``errors`` are
     the root mean square errors, after the step, of the variables whose truth is known, and how far poses are from
     theirs (see `PoseError.of`); ``picture_error`` is that of the pictures without their noise, in the iterations in
     which it was measured (jobs with a rival). Neither costs ``seconds``. ``penalty`` is what values add to the loss.
@@ -40,6 +42,9 @@ class Entry:
     errors: dict[str, float] = field(default_factory=dict)
     picture_error: float | None = None
     penalty: FiniteFloat = 0.0
+    spp: NonNegativeInt = 0
+    noise_norms: dict[str, float] = field(default_factory=dict)
+    dropped_shares: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass
@@ -55,6 +60,8 @@ class Run:
     history: list[Entry] = field(default_factory=list)
     rival: Run | None = None
     """Solves the same problem from the same start by another integrator in the same time."""
+    whole: bool = True
+    """Not in the middle of a step, in which it cannot be saved."""
 
     def seconds(self) -> float:
         return sum(entry.seconds for entry in self.history)
@@ -82,13 +89,15 @@ def save(run: Run) -> bytes:
     return safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata)
 
 
-def restore(path: Path, run: Run, levels: Mapping[str, Levels | None]) -> None:
+def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Collection[str] = ()) -> None:
     """Bring a run to where it was when ``path`` was saved; ``levels`` are those of its grids, by key.
+
+    ``held`` are variables that some stages do not step.
 
     Raises PathreplayError if the file is damaged, holds what no run has written, or belongs to other variables.
     """
     try:
-        values, state, history, learned = _read(path, run.values, levels)
+        values, state, history, learned = _read(path, run.values, levels, held)
         run.optimiser.restore(state, values)
         run.values, run.history, run.learned = values, history, learned
         return
@@ -101,7 +110,7 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None]) -> None:
 
 
 def _read(
-    path: Path, values: Arrays, levels: Mapping[str, Levels | None]
+    path: Path, values: Arrays, levels: Mapping[str, Levels | None], held: Collection[str]
 ) -> tuple[dict[str, Array], State, list[Entry], Arrays]:
     """Values, state of the optimiser, history and what was learned; raises what `restore` makes plain."""
     if not path.is_file():
@@ -126,7 +135,7 @@ def _read(
     for key, value in values.items():
         grid, array = levels[key], found[key]
         # Optimisers begin anew on a grid that was refined.
-        if steps[key] > len(history) or (steps[key] < len(history) and grid is None):
+        if steps[key] > len(history) or (steps[key] < len(history) and grid is None and key not in held):
             raise ValueError(f"{steps[key]} steps of '{key}' in {len(history)} iterations")
         shapes = [value.shape] if grid is None else list(grid.shapes)
         if array.dtype != value.dtype or array.shape not in shapes:

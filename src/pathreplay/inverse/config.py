@@ -1,11 +1,9 @@
-"""The optimisation job as the user writes it: a TOML file, checked key by key before anything is rendered."""
+"""The optimisation job as the user writes it: a TOML or YAML file, checked key by key before anything is rendered."""
 
 from __future__ import annotations
 
 import difflib
-import json
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,18 +12,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import MISSING, file_problem
+from pathreplay.inverse.capture_options import Capture, Exposure
 from pathreplay.inverse.config_errors import first_error
 from pathreplay.inverse.definitions import defined
+from pathreplay.inverse.noise_options import AUTO, AutoSpp, Spp
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.pose import PARTS, PoseKind
 from pathreplay.inverse.preview_options import Preview
 from pathreplay.inverse.schedules import Schedule
+from pathreplay.inverse.stage_options import Stage, begins
 from pathreplay.inverse.tables import Count, Finite, Positive, Switch, Table, Whole
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from pathreplay.inverse.texts import YAML, parsed
 
 
 class Picture(Table):
@@ -104,11 +101,9 @@ class Parameter(Table):
         if self.smooth is not None and self.transform is not None:
             self._refuse("'smooth' does not go with 'transform': both say where steps are taken; leave one out")
         sizes, begins = self.resolutions or [], self.refine_at or []
-        if len(begins) != max(0, len(sizes) - 1):
-            self._refuse(
-                f"{len(sizes)} resolutions and {len(begins)} entries in refine_at; give the iteration at which each "
-                "resolution after the first begins"
-            )
+        # Without refine_at each stage of the job may have one: see `Config`.
+        if self.refine_at is not None and len(begins) != max(0, len(sizes) - 1):
+            self._refuse_count()
         if sorted(set(begins)) != begins:
             self._refuse(f"refine_at {begins} does not increase; put it in order")
         if self.transform == "log" and self.lower is not None and self.lower < 0:
@@ -119,6 +114,12 @@ class Parameter(Table):
             bounds = f"upper bound {self.upper:g} is not above lower bound {self.lower:g}"
             self._refuse(f"{bounds}; swap or widen them")
         return self
+
+    def _refuse_count(self) -> None:
+        self._refuse(
+            f"{len(self.resolutions or [])} resolutions and {len(self.refine_at or [])} entries in refine_at; give the "
+            "iteration at which each resolution after the first begins"
+        )
 
     def _refuse(self, why: str) -> None:
         raise ValueError(f"parameter '{self.key}': {why}")
@@ -151,20 +152,12 @@ class Plugin(BaseModel):
 NOTHING = "target: nothing to match; give 'images', or 'values' and/or 'scene' to render"
 
 
-class Capture(Table):
-    """Pictures and their cameras, by the file that lists them; ``width`` in pixels is that of renderings."""
-
-    transforms: str
-    width: Count | None = None
-    hold_out_every: Annotated[Whole, Field(ge=2, le=2**31 - 1)] | None = None
-
-
 class Target(Table):
     """What the pictures should look like: image files, one per sensor, or a scene to render."""
 
-    images: list[str] | None = None
-    masks: list[str] | None = None
-    alpha: Literal["black", "mask"] = "black"
+    images: list[str] | str | None = None
+    masks: list[str] | str | None = None
+    alpha: Literal["black", "mask", "scene", "compare"] = "black"
     scene: str | None = None
     scene_parameters: dict[str, Argument] | None = None
     values: dict[str, Value] = Field(default_factory=dict)
@@ -183,8 +176,8 @@ class Target(Table):
                 raise ValueError("target: 'masks' and alpha = 'mask' are two masks; leave one out")
         elif self.model_fields_set <= {"alpha"}:
             return self  # fit for a capture, which brings pictures
-        elif self.alpha == "mask":
-            raise ValueError("target: alpha = 'mask' is about 'images'; leave it out, or name them")
+        elif self.alpha != "black":
+            raise ValueError(f"target: alpha = '{self.alpha}' is about 'images'; leave it out, or name them")
         elif not self.values and self.scene is None:
             raise ValueError(NOTHING)
         if self.integrator.type == "pathreplay":
@@ -210,10 +203,15 @@ class Config(Table):
     rival: Plugin | None = None
     parameters: Annotated[list[Parameter], Field(min_length=1)]
     capture: Capture | None = None
+    exposure: Exposure | None = None
+    view_weights: dict[str, Positive] = Field(default_factory=dict)
     target: Target = Target()
     loss: str = "l2"
     iterations: Count = 200
-    spp: Count = 16
+    spp: Spp = 16
+    auto_spp: AutoSpp = AutoSpp()
+    signal_to_noise: Switch = False
+    non_finite_in_a_row: Count = 10
     views_per_step: Count | None = None
     picture_spp: Count = 128
     seed: Annotated[Whole, Field(ge=0, le=10**18)] = 0
@@ -222,6 +220,7 @@ class Config(Table):
     learning_rate_schedule: Schedule = "exponential"
     warm_up: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 0
     optimizer: Optimizer = Optimizer()
+    stages: Annotated[list[Stage], Field(min_length=1)] | None = None
     checkpoint_every: Count = 25
     preview: Preview = Preview()
     deterministic: Switch = False
@@ -231,6 +230,52 @@ class Config(Table):
     def brings_pictures(self) -> bool:
         """Whether targets are files, and not rendered."""
         return self.capture is not None or self.target.images is not None
+
+    @property
+    def most_spp(self) -> int:
+        """Samples per pixel that an iteration may have."""
+        most = self.spp if isinstance(self.spp, int) else self.auto_spp.highest
+        return max([most, *(stage.spp for stage in self.stages or [] if stage.spp is not None)])
+
+    @property
+    def halves_samples(self) -> bool:
+        """Whether iterations take their samples in two halves, which tell signal from noise."""
+        return self.signal_to_noise or self.spp == AUTO
+
+    def refine_at(self, entry: Parameter) -> list[int]:
+        """The iterations at which the resolutions of a parameter after the first begin."""
+        if entry.refine_at is None and entry.resolutions is not None and self.stages is not None:
+            return begins(self.stages)[1 : len(entry.resolutions)]
+        return entry.refine_at or []
+
+    @model_validator(mode="after")
+    def _in_stages(self) -> Config:
+        total = begins(self.stages or [])[-1]
+        if self.stages is not None:
+            if "iterations" not in self.model_fields_set:
+                self.__dict__["iterations"] = total  # frozen, and not to be written down as if it had been given
+            elif self.iterations != total:
+                raise ValueError(
+                    f"iterations is {self.iterations}, and the stages have {total}; leave 'iterations' out"
+                )
+        for entry in self.parameters:
+            sizes = len(entry.resolutions or [])
+            if entry.refine_at is None and sizes > 1 and sizes != len(self.stages or []):
+                entry._refuse_count()
+        return self
+
+    @model_validator(mode="after")
+    def _samples(self) -> Config:
+        if self.spp != AUTO and "auto_spp" in self.model_fields_set:
+            raise ValueError(f"auto_spp goes with spp = 'auto', and spp is {self.spp}; leave one out")
+        if self.signal_to_noise and self.spp != AUTO and self.spp % 2:
+            raise ValueError(f"signal_to_noise takes two halves of the samples, and spp is {self.spp}; make it even")
+        for stage in self.stages or []:
+            if self.signal_to_noise and stage.spp is not None and stage.spp % 2:
+                raise ValueError(
+                    f"signal_to_noise takes two halves of the samples, and a stage has spp = {stage.spp}; make it even"
+                )
+        return self
 
     @model_validator(mode="after")
     def _has_pictures(self) -> Config:
@@ -277,58 +322,40 @@ _TABLES: dict[str, type[BaseModel]] = {
     "optimizer": Optimizer,
     "preview": Preview,
     "capture": Capture,
+    "auto_spp": AutoSpp,
+    "stages": Stage,
+    "exposure": Exposure,
 }
 
 
 def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
-    """Read a job from a TOML file (or from the JSON that a run folder may hold); for ``changes`` see `defined`.
+    """Read a job from a TOML or YAML file (or the JSON that a run folder may hold); for ``changes`` see `defined`.
 
     Raises PathreplayError for an unreadable file, an unknown key (names the nearest), a value out of its range.
     """
     problem = file_problem(path, 64 * 2**20)  # no job is as long: what is larger is some other file
     if problem == MISSING:
-        near = [str(p) for p in path.parent.glob("*.toml")] if path.parent.is_dir() else []
+        found = path.parent.glob("*") if path.parent.is_dir() else []
+        near = [str(p) for p in found if p.suffix in (".toml", *YAML)]
         close = difflib.get_close_matches(str(path), near, n=1, cutoff=0.3)
-        hint = f"did you mean {close[0]}?" if close else "give the path of a TOML file"
+        hint = f"did you mean {close[0]}?" if close else "give the path of a TOML or YAML file"
         raise PathreplayError(f"No config file {path}; {hint}")
     if problem:
-        raise PathreplayError(f"Config {path} {problem}; give the path of a TOML file")
+        raise PathreplayError(f"Config {path} {problem}; give the path of a TOML or YAML file")
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise PathreplayError(f"Config {path} cannot be read ({error}); give a TOML file in UTF-8") from None
-    if path.suffix != ".json":
-        return _checked(str(path), Config.model_validate, defined(_toml(path, text), changes))
-    if not changes:
-        return _checked(str(path), Config.model_validate_json, text)
-    return _checked(str(path), Config.model_validate, defined(_json(path, text), changes))
-
-
-def _toml(path: Path, text: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except RecursionError:
-        raise PathreplayError(f"Config {path} is nested too deep; write the job as in docs/optimize.md") from None
-    except tomllib.TOMLDecodeError as error:
-        raise PathreplayError(f"Config {path} is not valid TOML: {error}; mend it there") from None
-    except ValueError:
-        raise PathreplayError(f"Config {path} has a number of more digits than Python reads; shorten it") from None
-
-
-def _json(path: Path, text: str) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise PathreplayError(f"Config {path} is not valid JSON: {error}; mend it there") from None
+        raise PathreplayError(f"Config {path} cannot be read ({error}); give a text file in UTF-8") from None
+    return _checked(str(path), defined(parsed(path, text), changes))
 
 
 def make_config(values: dict[str, Any]) -> Config:
     """A job from a dictionary, with the same checks and messages as a file."""
-    return _checked("config", Config.model_validate, values)
+    return _checked("config", values)
 
 
-def _checked(name: str, validate: Callable[[Any], Config], job: Any) -> Config:
+def _checked(name: str, job: Any) -> Config:
     try:
-        return validate(job)
+        return Config.model_validate(job)
     except ValidationError as error:
         raise PathreplayError(f"{name}: {first_error(error, Config, _TABLES)}") from None

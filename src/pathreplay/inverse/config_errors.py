@@ -29,6 +29,9 @@ _KINDS = {
     "scene_parameters": "a number, true, false or a text in quotes",
     "sensors": "the names or numbers of sensors: [0, ...]",
     "held_out": "the names or numbers of sensors: [0, ...]",
+    "reference": "the name or number of a sensor",
+    "images": "file names, or a pattern such as 'photos/*.png'",
+    "masks": "file names, or a pattern such as 'masks/*.png'",
 }
 
 
@@ -64,4 +67,8 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
 def _path(loc: tuple[int | str, ...]) -> list[str]:
     """Where an error is, as a user would say it: without the names of the alternatives that were tried."""
     tried = ("list[", "function-", "constrained-", "nullable[")
-    return [str(p) for p in loc if p not in ("int", "float", "bool", "str", "Picture") and not str(p).startswith(tried)]
+    return [
+        str(p)
+        for p in loc
+        if p not in ("int", "float", "bool", "str", "count", "Picture") and not str(p).startswith(tried)
+    ]

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from typing import Any
 
 from pathreplay.errors import PathreplayError, shown
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from pathreplay.inverse.texts import from_toml
 
 DEEPEST = 16
 """Parts of a key: no job has tables as deep."""
@@ -34,8 +29,8 @@ def defined(job: Any, changes: Sequence[str]) -> Any:
 
 def _path(key: str, change: str) -> list[str]:
     try:
-        found = tomllib.loads(f"{key} = 0")
-    except (tomllib.TOMLDecodeError, RecursionError):
+        found = from_toml(f"{key} = 0")
+    except (ValueError, RecursionError):
         found = {}
     path: list[str] = []
     while isinstance(found, dict) and len(found) == 1:
@@ -51,7 +46,7 @@ def _path(key: str, change: str) -> list[str]:
 
 def _value(text: str) -> Any:
     try:
-        found = tomllib.loads(f"value = {text}")
+        found = from_toml(f"value = {text}")
     except (ValueError, RecursionError):
         return text
     return found["value"] if len(found) == 1 and isinstance(found["value"], _VALUES) else text

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any, Protocol
@@ -12,11 +13,14 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.losses import QUADRATIC
+from pathreplay.inverse.exposures import EXPOSURE, factor_of
+from pathreplay.inverse.exposures import gradient as exposure_gradient
+from pathreplay.inverse.losses import ELSEWHERE, QUADRATIC
 from pathreplay.inverse.problem import Problem, scene_values, variables_of
 from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.render.facts import SceneFacts
+from pathreplay.render.film import fit_film
 from pathreplay.render.path_integrator import plain_errors
 from pathreplay.scenes.parameters import get_array
 
@@ -28,6 +32,8 @@ class Shard:
     views: tuple[int, ...]
     samples: int
     seeds: tuple[int, ...]
+    stage: int = 0
+    """Of the job, whose views these are, and which says what is differentiated."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +46,8 @@ class Evaluation:
 
     loss: float
     gradients: dict[str, Array]
-    dropped: int
-    """Gradient entries that were NaN or infinite in a view, and count as zero there."""
+    dropped: dict[str, int]
+    """By key, how many entries of its gradient were NaN or infinite in a view, and count as zero there."""
     learned: Arrays
 
     def of(self, share: float) -> Evaluation:
@@ -64,7 +70,7 @@ def total(evaluations: Sequence[Evaluation]) -> Evaluation:
     return Evaluation(
         sum(each.loss for each in evaluations),
         {key: reduce(np.add, [each.gradients[key] for each in evaluations]) for key in evaluations[0].gradients},
-        sum(each.dropped for each in evaluations),
+        dict(sum((Counter(each.dropped) for each in evaluations), Counter())),
         evaluations[-1].learned,
     )
 
@@ -94,18 +100,28 @@ class Local:
 class Evaluator:
     """Evaluates shards of a problem by one integrator, in its scene, which keeps the values of the last shard.
 
+    ``moving`` are the variables that are differentiated (default: all).
+
     One view is rendered and back-propagated after the other: memory holds the graph of one.
     """
 
-    def __init__(self, problem: Problem, integrator: mi.Integrator, record: bool = True) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        integrator: mi.Integrator,
+        record: bool = True,
+        moving: Collection[str] | None = None,
+    ) -> None:
         self.problem, self.integrator = problem, integrator
+        self._moving = {v.key for v in problem.variables} if moving is None else set(moving)
         self._facts = facts = SceneFacts(problem.scene)
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
-        self.freezes = record and is_recordable(integrator, facts.has_media)
+        self.freezes = record and is_recordable(integrator, facts.has_media) and problem.loss not in ELSEWHERE
         self._targets = [mi.TensorXf(view.target) for view in problem.views]
         self._weights = [None if view.weight is None else mi.TensorXf(view.weight) for view in problem.views]
-        self._recordings = Recordings()
-        self._sweeps: dict[int, bool] = {}  # of each view that was seen: whether its pixels can be swept
+        self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
+        # Of each view and number of samples that was seen: whether pixels can be swept.
+        self._sweeps: dict[tuple[int, int], bool] = {}
         self._learned: Arrays = {}  # what the integrator knows
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
@@ -127,42 +143,48 @@ class Evaluator:
         self._learned = learned
 
     def _view(self, values: Arrays, view: int, seed: int, spp: int) -> Evaluation:
+        fit_film(self.problem.scene.sensors()[self.problem.views[view].sensor], self._targets[view].shape)
         variables = variables_of(self.problem, values)
-        dr.enable_grad(variables)
+        moving = {key: value for key, value in variables.items() if key in self._moving}
+        dr.enable_grad(moving)
         self.problem.params.update(scene_values(self.problem, variables))
         try:
-            loss = self._differentiated(view, seed, spp)
+            factor = factor_of(values, view, self._targets[view].shape[2])
+            loss, by_factor = self._differentiated(view, seed, spp, None if factor is None else mi.TensorXf(factor))
         except NotRecordable:  # a part of the gradient may be there: once more, with variables of its own
             self.freezes = False
             return self._view(values, view, seed, spp)
-        gradients = {key: get_array(dr.grad(value)) for key, value in variables.items()}
+        gradients = {key: get_array(dr.grad(value)) for key, value in moving.items()}
+        if by_factor is not None and EXPOSURE in gradients:
+            gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
         fine = {key: np.isfinite(gradient) for key, gradient in gradients.items()}
         # One bad path does not end a long run.
-        dropped = sum(int((~each).sum()) for each in fine.values())
+        dropped = {key: int((~each).sum()) for key, each in fine.items() if not each.all()}
         if dropped:
             gradients = {key: np.where(fine[key], gradient, 0) for key, gradient in gradients.items()}
         if hasattr(self.integrator, "learned"):
             self._learned = self.integrator.learned()
         return Evaluation(loss, gradients, dropped, self._learned)
 
-    def _differentiated(self, view: int, seed: int, spp: int) -> float:
-        """What the view adds to the loss; its gradient is added to the scene's parameters."""
+    def _differentiated(self, view: int, seed: int, spp: int, factor: Any = None) -> tuple[float, Any]:
+        """What the view adds to the loss, and the derivative by its ``factor``; the rest is added to the parameters."""
         problem, target = self.problem, self._targets[view]
         sensor = problem.views[view].sensor
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
-        records = self.freezes and view in self._sweeps
-        if view not in self._sweeps:
+        which = view, spp
+        records = self.freezes and which in self._sweeps
+        if which not in self._sweeps:
             may = problem.loss in QUADRATIC and hasattr(self.integrator, "sweeps_pixels")
             scene = problem.scene
-            self._sweeps[view] = may and bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))
+            self._sweeps[which] = may and bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
-        share = 1 / len(problem.trained())
+        share = problem.views[view].share / len(problem.trained())
         with plain_errors():
-            value, lost = (self._recordings.differentiate if records else differentiate)(
+            value, lost, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
                 problem.params, problem.scene, sensor, self.integrator, target, self._weights[view], number, spp,
-                problem.loss, share, self._sweeps[view], self._facts.tables(),
+                problem.loss, share, self._sweeps[which], self._facts.tables(), factor,
             )  # fmt: skip
         if lost is not None:
             self.integrator.tell_lost(lost, target.shape[0] * target.shape[1] * spp)
-        return float(value[0]) if dr.width(value) else float("nan")
+        return float(value[0]) if dr.width(value) else float("nan"), by_factor

@@ -6,6 +6,7 @@ PNGs are sRGB encoded after multiplication with an exposure; written EXRs are li
 
 from __future__ import annotations
 
+import contextlib
 import io
 from pathlib import Path
 
@@ -22,6 +23,9 @@ from pathreplay.threads import spare_thread
 
 Image = NDArray[np.float32]
 """Linear pixels, shape (height, width, channels)."""
+
+_ORIENTATION = 274
+"""Exif's tag of that name."""
 
 SAMPLE = "matplotlib:"
 """Prefix of a picture that matplotlib ships, e.g. ``matplotlib:grace_hopper.jpg``."""
@@ -68,6 +72,19 @@ def picture_size(path: Path) -> tuple[int, int]:
         return width, height
 
 
+def oddities(path: Path) -> list[str]:
+    """What a picture says of itself that is not looked at, in words that follow its name."""
+    found = []
+    # What is wrong with it is told by who reads it.
+    with contextlib.suppress(Exception), PIL.Image.open(path) as picture:
+        profile = picture.info.get("icc_profile") or b""
+        if profile and b"sRGB" not in profile and "sRGB".encode("utf-16-be") not in profile:
+            found.append("has a colour profile (ICC) that is not sRGB's: it is ignored, and its numbers taken as sRGB")
+        if picture.getexif().get(_ORIENTATION, 1) != 1:
+            found.append("is to be turned (Exif): it is taken as it is stored")
+    return found
+
+
 def with_channels(image: Image, channels: int) -> Image | None:
     """The image with that many channels: alpha is dropped, grey repeated, colour averaged by luminance; else None."""
     have = image.shape[2]
@@ -97,6 +114,11 @@ def unpremultiplied(image: Image) -> Image:
     alpha = image[:, :, -1:]
     colours = np.divide(image[:, :, :-1], alpha, out=np.zeros_like(image[:, :, :-1]), where=alpha > 0)
     return np.concatenate([colours, alpha], axis=2)
+
+
+def over(image: Image, behind: Image) -> Image:
+    """An image with alpha, which is over black, before a picture (of one channel, or as many): without alpha."""
+    return image[:, :, :-1] + (1 - image[:, :, -1:]) * behind
 
 
 def transparent_share(image: Image) -> float:

@@ -1,7 +1,8 @@
-"""How alike two pictures look: PSNR and SSIM, as captures are judged by them, of pictures as a display shows them."""
+"""How alike two pictures look: PSNR, SSIM and FLIP, as captures are judged by them, of what a display shows."""
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,22 +19,44 @@ MOST_DB = 100.0
 
 @dataclass(frozen=True)
 class Likeness:
-    """Of a picture to its target: PSNR in decibels, and SSIM (1: the same)."""
+    """Of a picture to its target: PSNR in decibels, SSIM (1: the same), and, if asked for, FLIP (0: the same)."""
 
     psnr: float
     ssim: float
+    flip: float | None = None
 
     @staticmethod
-    def of(image: Image, target: Image, exposure: float, weight: Image | None = None) -> Likeness:
+    def of(
+        image: Image, target: Image, exposure: float, weight: Image | None = None, *, flip: bool = False
+    ) -> Likeness:
         """Of colours times ``exposure``, cut off at white and sRGB encoded; ``weight`` is that of pixels, with mean 1.
 
-        PSNR = -10 log10 (mean square difference); SSIM is the mean over pixels and channels, alpha left out.
+        PSNR = -10 log10 (mean square difference); SSIM is the mean over pixels and channels, alpha left out. ``flip``
+        asks for FLIP (Andersson et al. 2020, NVIDIA's flip-evaluator, 67 pixels per degree), None where that is absent.
         """
         a, b = (displayed(picture, exposure) for picture in (image, target))
         w = np.ones((1, 1, 1)) if weight is None else weight.astype(np.float64)
         error = float(np.mean(w * (a - b) ** 2))
         psnr = MOST_DB if error <= 10 ** (-MOST_DB / 10) else -10 * float(np.log10(error))
-        return Likeness(psnr, float(np.mean(w * _similarity(a, b))))
+        seen = _flip(a, b) if flip else None
+        perceived = None if seen is None else float(np.mean(w * seen))
+        return Likeness(psnr, float(np.mean(w * _similarity(a, b))), perceived)
+
+
+def has_flip() -> bool:
+    """Whether FLIP can be computed here."""
+    return importlib.util.find_spec("flip_evaluator") is not None
+
+
+def _flip(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
+    """FLIP of every pixel (height x width x 1), or None where nobody computes it."""
+    if not has_flip():
+        return None
+    from flip_evaluator import evaluate
+
+    test, reference = (np.ascontiguousarray(np.broadcast_to(x, (*x.shape[:2], 3)), np.float32) for x in (a, b))
+    found, _, _ = evaluate(reference, test, "LDR", True, False, False, {})
+    return np.asarray(found, np.float64)
 
 
 def _similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -12,21 +12,29 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.interrupts import Stop
+from pathreplay.inverse import noise
 from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
-from pathreplay.inverse.evaluate import Evaluator, Local, Shard, total
+from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Local, Shard, total
+from pathreplay.inverse.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.optimiser import DrJitOptimiser
 from pathreplay.inverse.optimizer_options import Optimizer
-from pathreplay.inverse.problem import Problem, pose_errors, put_values
+from pathreplay.inverse.problem import Problem, View, pose_errors, put_values
 from pathreplay.inverse.schedules import rate
+from pathreplay.inverse.stage_options import place
+from pathreplay.inverse.stages import Part, part_at
 from pathreplay.inverse.values import Array, Arrays
+from pathreplay.render.film import fit_film
 from pathreplay.scenes.parameters import get_array, to_value
 
 # How often the pictures are judged in a job with a rival: enough for a curve, at some per cent of its time.
 JUDGEMENTS = 10
+
+# Of a gradient's entries, that were not finite: with less, the others still lead the way.
+HALF = 0.5
 
 
 @dataclass(frozen=True)
@@ -46,6 +54,34 @@ class Refined:
 
 
 @dataclass(frozen=True)
+class Entered:
+    """A stage (from 1) of so many begins, or is gone on with."""
+
+    number: int
+    of: int
+
+
+@dataclass(frozen=True)
+class NonFinite:
+    """So many entries of the gradient of a view were NaN or infinite, and count as zero."""
+
+    key: str
+    view: str
+    iteration: int
+    entries: int
+
+
+@dataclass(frozen=True)
+class Faint:
+    """The gradient of a variable is lost in noise: signal to noise, over the last iterations."""
+
+    key: str
+    ratio: float
+    iteration: int
+    spp: int
+
+
+@dataclass(frozen=True)
 class Stepped:
     """An iteration is done."""
 
@@ -59,16 +95,20 @@ class Stopped:
     done: int
 
 
-Event = Started | Refined | Stepped | Stopped
+Event = Started | Entered | Refined | NonFinite | Faint | Stepped | Stopped
 
 
 def new_run(
-    problem: Problem, integrator: mi.Integrator, record: bool = True, optimizer: Optimizer | None = None
+    problem: Problem,
+    integrator: mi.Integrator,
+    record: bool = True,
+    optimizer: Optimizer | None = None,
+    evaluate: Evaluate | None = None,
 ) -> Run:
-    """A run at the problem's start values, in this process."""
+    """A run at the problem's start values, in this process; ``evaluate`` is what does it, if not an `Evaluator`."""
     values = {v.key: get_array(to_value(v.like, v.start)) for v in problem.variables}
     return Run(
-        Local(Evaluator(problem, integrator, record)),
+        Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
         DrJitOptimiser(
             values, optimizer, [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
         ),
@@ -81,9 +121,16 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
 
     After each step the run's rival takes as many as bring it to the same number of seconds. Taking turns, both have the
     same share of a machine whose load changes. Its learning rate and resolutions are those of the job's iteration.
+
+    Raises PathreplayError where loss or values are no longer finite, and after `Config.non_finite_in_a_row`.
     """
     yield Started(len(run.history), config.iterations)
+    faint: set[str] = set()
+    stage, stages = None, config.stages or []
     for i in range(len(run.history), config.iterations):
+        if stages and place(stages, i) != stage:
+            stage = place(stages, i)
+            yield Entered(stage + 1, len(stages))
         yield from take_step(problem, config, run, i)
         if rival := run.rival:
             while rival.seconds() < run.seconds():
@@ -93,77 +140,161 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
                 for each in (run, rival):
                     error = judged(problem, config, each.values, i)
                     each.history[-1] = replace(each.history[-1], picture_error=error)
+        for key, ratio in noise.ratios(run.history).items():
+            if ratio < noise.FAINT and key not in faint:
+                faint.add(key)
+                yield Faint(key, ratio, i, run.history[-1].spp)
         yield Stepped(run.history[-1])
+        _require_gradients(config, run)
         if stop.by is not None:
             break
     yield Stopped(len(run.history))
 
 
-def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Refined]:
+def _require_gradients(config: Config, run: Run) -> None:
+    """Raise PathreplayError if half of a gradient and more was not finite in so many iterations in a row."""
+    last = run.history[-config.non_finite_in_a_row :]
+    if len(last) < config.non_finite_in_a_row:
+        return
+    for key in last[-1].dropped_shares:
+        if all(entry.dropped_shares.get(key, 0) >= HALF for entry in last):
+            raise PathreplayError(
+                f"The gradient of '{key}' was NaN or infinite, half of it or more, in iterations {last[0].iteration} "
+                f"to {last[-1].iteration}; bound it, start it elsewhere, or raise 'non_finite_in_a_row'"
+            )
+
+
+def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Event]:
     """One step, with the learning rates and resolutions of iteration ``position``; adds an entry to the history.
 
-    Evaluate the views of its `batch`, a shard with a seed of its own for each, and sum in their order; step with the
-    learning rate of that iteration (see `schedules`), project every variable into its bounds. A grid whose next
-    resolution is due is interpolated before that, and returned; the optimiser starts anew on it. What is differentiated
-    is decided by the integrator; targets, bounds and the seeds' choice of paths are not.
+    Evaluate the views of its `batch`, a shard with a seed of its own for each (or two halves, see `noise`), and sum in
+    their order; step with the learning rate of that iteration (see `schedules`), project every variable into its
+    bounds. A grid that moves, and whose next resolution is due, is interpolated before that; the optimiser starts anew
+    on it. What is differentiated is decided by the integrator; targets, bounds and the seeds' choice of paths are not.
 
-    Raises PathreplayError where the loss is no longer finite.
+    Returns what there is to tell. Raises PathreplayError where the loss is no longer finite.
     """
     begin, i = time.perf_counter(), len(run.history)
-    refined = []
-    for v in problem.variables:
-        if v.levels and run.values[v.key].shape != (shape := v.levels.shape_at(position)):
-            run.values[v.key] = resampled(run.values[v.key], shape)
-            refined.append(Refined(v.key, shape))
-    shards = [
-        Shard((n,), config.spp, config.seeds(ITERATION, problem.views[n].sensor, i)[:1])
-        for n in batch(problem, config, i)
-    ]
-    found = total(run.executor.run(run.values, shards, run.learned)).of(len(problem.trained()) / len(shards))
+    part = part_at(problem, config, position)
+    values, told = _refined(part, run.values, position)
+    asked, halves = part.config.spp, part.config.halves_samples
+    spp = asked if isinstance(asked, int) else noise.next_spp(config.auto_spp, run.history)
+    shards = _shards(part, i, spp)
+    evaluations = run.executor.run(values, shards, run.learned)
+    share = len(part.problem.trained()) / len({shard.views for shard in shards})
+    found = total(evaluations).of(share / 2 if halves else share)
     if not np.isfinite(found.loss):
         raise PathreplayError(
             f"The loss is {found.loss} at iteration {i}; lower the learning rates, or bound the parameters that ran "
             "away"
         )
-    penalties = {v.key: v.penalty.of(run.values[v.key]) for v in problem.variables if v.penalty}
-    gradients = found.gradients | {key: found.gradients[key] + slope for key, (_, slope) in penalties.items()}
-    schedule, decay = config.learning_rate_schedule, config.learning_rate_decay
-    factor = rate(schedule, position, config.iterations, decay, config.warm_up)
-    rates = {v.key: v.learning_rate * factor for v in problem.variables}
-    stepped = _stepped(problem, run, gradients, rates)
+    for shard, each in zip(shards, evaluations, strict=True):
+        view = problem.views[shard.views[0]].name
+        told += [NonFinite(key, view, i, count) for key, count in each.dropped.items()]
+    penalties = {v.key: v.penalty.of(values[v.key]) for v in problem.variables if v.penalty}
+    gradients = {
+        key: gradient + penalties[key][1] if key in penalties else gradient for key, gradient in found.gradients.items()
+    }
+    run.whole = False
+    run.values = _stepped(part, run, values, gradients, position)
+    run.learned = found.learned
+    seconds = time.perf_counter() - begin
+    errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
+    entry = Entry(
+        i,
+        found.loss,
+        seconds,
+        _norms(gradients),
+        sum(found.dropped.values()),
+        errors | pose_errors(problem, run.values),
+        penalty=sum(value for value, _ in penalties.values()),
+        spp=spp,
+        noise_norms=_noise_norms(evaluations, share) if halves else {},
+        dropped_shares={key: n / (gradients[key].size * len(shards)) for key, n in found.dropped.items()},
+    )
+    run.history.append(entry)
+    run.whole = True
+    return told
+
+
+def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array], list[Event]]:
+    """The values, where the next resolution is due in that, and the grids that are; those that are held can wait."""
+    moving = [v for v in part.problem.variables if v.key in part.moving]
+    due = {v.key: v.levels.shape_at(position) for v in moving if v.levels}
+    due = {key: shape for key, shape in due.items() if values[key].shape != shape}
+    grids = {key: resampled(values[key], shape) for key, shape in due.items()}
+    return {**values, **grids}, [Refined(key, shape) for key, shape in due.items()]
+
+
+def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
+    """What an iteration evaluates: its views, one after the other, each whole or in two halves."""
+    halves, config, views = 2 if part.config.halves_samples else 1, part.config, part.problem.views
+    return [
+        Shard((n,), spp // halves, (seed,), part.number)
+        for n in batch(part.problem, config, iteration)
+        for seed in config.seeds(ITERATION, views[n].sensor, iteration)[:halves]
+    ]
+
+
+def _norms(gradients: Arrays) -> dict[str, float]:
+    return {key: float(np.linalg.norm(gradient)) for key, gradient in gradients.items()}
+
+
+def _noise_norms(evaluations: Sequence[Evaluation], share: float) -> dict[str, float]:
+    """|a - b|/2 of the two halves of each gradient, which are the even and the odd ones, added up over views."""
+    a, b = (total(evaluations[half::2]).of(share).gradients for half in (0, 1))
+    return {key: norm / 2 for key, norm in _norms({key: a[key] - b[key] for key in a}).items()}
+
+
+def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int) -> dict[str, Array]:
+    """The values after a step of the optimiser, taken in the coordinates of each variable, and held within bounds."""
+    config = part.config
+    decay, iterations = config.learning_rate_decay, config.iterations
+    factor = part.factor * rate(config.learning_rate_schedule, position, iterations, decay, config.warm_up)
+    moving = [v for v in part.problem.variables if v.key in gradients]
+    rates = {v.key: v.learning_rate * factor for v in moving}
+    others = {v.key: v.coordinates for v in moving if v.coordinates}
+    latent = {key: other.latent(values[key]) for key, other in others.items()}
+    slopes = {key: other.gradient(values[key], gradients[key]) for key, other in others.items()}
+    now = {v.key: values[v.key] for v in moving}
+    stepped = run.optimiser.step({**now, **latent}, {**gradients, **slopes}, rates)
+    stepped |= {key: other.values(stepped[key]) for key, other in others.items()}
     for key, value in stepped.items():
         if not np.isfinite(value).all():
             raise PathreplayError(
-                f"'{key}' is no finite number after iteration {i}; lower its learning rate, or bound it"
+                f"'{key}' is no finite number after iteration {len(run.history)}; lower its learning rate, or bound it"
             )
-    run.values = {v.key: np.clip(stepped[v.key], *v.bounds) for v in problem.variables}
-    run.learned = found.learned
-    seconds = time.perf_counter() - begin
-    norms = {key: float(np.linalg.norm(gradient)) for key, gradient in gradients.items()}
-    errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
-    errors |= pose_errors(problem, run.values)
-    penalty = sum(value for value, _ in penalties.values())
-    run.history.append(Entry(i, found.loss, seconds, norms, found.dropped, errors, penalty=penalty))
-    return refined
-
-
-def _stepped(problem: Problem, run: Run, gradients: Arrays, rates: dict[str, float]) -> dict[str, Array]:
-    """The values after a step of the optimiser, which is taken in the coordinates of each variable."""
-    others = {v.key: v.coordinates for v in problem.variables if v.coordinates}
-    latent = {key: other.latent(run.values[key]) for key, other in others.items()}
-    slopes = {key: other.gradient(run.values[key], gradients[key]) for key, other in others.items()}
-    stepped = run.optimiser.step({**run.values, **latent}, {**gradients, **slopes}, rates)
-    return stepped | {key: other.values(stepped[key]) for key, other in others.items()}
+    return {**values, **{v.key: np.clip(stepped[v.key], *v.bounds) for v in moving}}
 
 
 def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:
     """Pictures of all views with these values in the scene, by the job's integrator; same noise at every call."""
+    return {view.name: picture_of(problem, config, values, view) for view in problem.views}
+
+
+def picture_of(problem: Problem, config: Config, values: Arrays, view: View, spp: int | None = None) -> Image:
+    """One of them, with so many samples per pixel."""
     put_values(problem, values)
-    spp = config.picture_spp
-    return {
-        v.name: _picture(problem, v.sensor, problem.integrator, spp, config.seeds(PICTURE, v.sensor)[0])
-        for v in problem.views
+    at = next(n for n, each in enumerate(problem.views) if each.name == view.name)
+    return exposed(values, at, _plain(problem, config, view, config.picture_spp if spp is None else spp))
+
+
+def _plain(problem: Problem, config: Config, view: View, spp: int) -> Image:
+    """At the exposure 1, with the values that the scene has."""
+    return _picture(problem, view, problem.integrator, spp, config.seeds(PICTURE, view.sensor)[0])
+
+
+def with_exposures(problem: Problem, config: Config, values: Arrays) -> Arrays:
+    """The values, with the exposures of held-out views: nothing was learned from them, so that they are fitted now."""
+    if EXPOSURE not in values or not any(view.held_out for view in problem.views):
+        return values
+    put_values(problem, values)
+    pictures = {
+        n: (_plain(problem, config, view, config.picture_spp), view.target, view.weight)
+        for n, view in enumerate(problem.views)
+        if view.held_out
     }
+    return with_held_out(values, pictures)
 
 
 def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> float:
@@ -174,17 +305,19 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
     root (negative ones count as zero). The noise of the targets stays in.
     """
     put_values(problem, values)
-    squares, views = 0.0, problem.trained().values()
-    for view in views:
+    squares, views = 0.0, problem.trained()
+    for n, view in views.items():
         a, b = (
-            _picture(problem, view.sensor, problem.judge, config.spp, seed).astype(np.float64) - view.target
+            exposed(values, n, _picture(problem, view, problem.judge, config.most_spp, seed)).astype(np.float64)
+            - view.target
             for seed in config.seeds(JUDGEMENT, view.sensor, iteration)
         )
-        squares += float(np.mean(a * b if view.weight is None else a * b * view.weight)) / len(views)
+        squares += view.share * float(np.mean(a * b if view.weight is None else a * b * view.weight)) / len(views)
     return float(np.sqrt(max(squares, 0.0)))
 
 
-def _picture(problem: Problem, sensor: int, integrator: mi.Integrator, spp: int, seed: int) -> Image:
+def _picture(problem: Problem, view: View, integrator: mi.Integrator, spp: int, seed: int) -> Image:
+    fit_film(problem.scene.sensors()[view.sensor], view.target.shape)
     with dr.suspend_grad():
-        image = mi.render(problem.scene, sensor=sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
+        image = mi.render(problem.scene, sensor=view.sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
     return np.array(image, dtype=np.float32)

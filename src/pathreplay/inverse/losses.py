@@ -2,8 +2,9 @@
 
 A loss is f(I, T), entry by entry, with I the rendered picture (noisy, differentiable) and T the target; what counts is
 its mean over pixels and channels, or over those that a weight leaves. No path is judged by itself (see `recorded`),
-hence a loss whose f' is linear in I has an unbiased gradient: ``l2`` and ``relative-l2``. The gradients of ``l1`` and
-``log`` are biased by the noise in I (less with more samples); they pay where outliers would rule ``l2``.
+hence a loss whose f' is linear in I has an unbiased gradient: ``l2`` and ``relative-l2``. The gradients of the others
+are biased by the noise in I (less with more samples); they pay where outliers would rule ``l2``. Losses in which pixels
+meet are in `picture_losses`.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError, shown
+from pathreplay.inverse.picture_losses import lpips, scale_invariant, ssim
 from pathreplay.scenes.descriptions import one_line
 
-Loss = Callable[[Any, Any], Any]
+Loss = Callable[..., Any]
 """loss(image, target) on tensors of one shape (height, width, channels) -> such a tensor (or one number)."""
 
 # Radiance below which relative-l2 stops amplifying: about 1 % of a display's white.
@@ -49,10 +51,36 @@ def log(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
     return dr.square(dr.log(1 + positive) - dr.log(1 + dr.maximum(target, 0)))
 
 
+def relative_l1(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+    """|I - T| / (|T| + floor). Gradient biased by noise in I."""
+    return dr.abs(image - target) / (dr.abs(target) + RELATIVE_FLOOR)
+
+
+def smape(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
+    """|I - T| / (|I| + |T| + floor), which is below 1 however bright a pixel is. Gradient biased by noise in I."""
+    return dr.abs(image - target) / (dr.abs(image) + dr.abs(target) + RELATIVE_FLOOR)
+
+
 #: Losses whose derivative by a pixel is a linear function of that pixel alone.
 QUADRATIC = frozenset({l2, relative_l2})
 
-LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "relative-l2": relative_l2, "log": log}
+#: Losses that want to know how much pixels count: a third argument, as `mean_loss` has it.
+WEIGHTED = frozenset({scale_invariant})
+
+#: Losses that Dr.Jit cannot record: what is not its own computes them.
+ELSEWHERE = frozenset({lpips})
+
+LOSSES: dict[str, Loss] = {
+    "l1": l1,
+    "l2": l2,
+    "relative-l1": relative_l1,
+    "relative-l2": relative_l2,
+    "smape": smape,
+    "log": log,
+    "scale-invariant": scale_invariant,
+    "ssim": ssim,
+    "lpips": lpips,
+}
 
 
 def mean_loss(loss: Loss, image: Any, target: Any, weight: Any = None) -> mi.TensorXf:
@@ -60,7 +88,7 @@ def mean_loss(loss: Loss, image: Any, target: Any, weight: Any = None) -> mi.Ten
 
     ``weight`` (height x width x 1, with mean 1) says how much pixels count; None: all the same.
     """
-    found = loss(image, target)
+    found = loss(image, target, weight) if loss in WEIGHTED else loss(image, target)
     return dr.mean(found if weight is None else found * weight, axis=None)
 
 

@@ -30,7 +30,10 @@ class State:
 
 
 class Optimiser(Protocol):
-    """Arrays are by key of the variable. A variable that comes in another shape than before begins anew."""
+    """Arrays are by key of the variable. A variable that comes in another shape than before begins anew.
+
+    One that does not come stays as it is, and so does what is remembered of it.
+    """
 
     def step(self, values: Arrays, gradients: Arrays, rates: Mapping[str, float]) -> dict[str, Array]:
         """The values after a step against the gradients; ``rates`` are about its length in each variable."""
@@ -81,9 +84,11 @@ class DrJitOptimiser:
             part[key] = mi.TensorXf(value)
             dr.set_grad(part[key], mi.TensorXf(gradients[key]))
         for even, part in self._parts.items():
+            held = {key: kept for key, kept in part.state.items() if key not in values}
             # As numbers: Dr.Jit 1.5.0 would multiply arrays in place, and AdamW's decay with them.
             part.set_learning_rate({key: rate for key, rate in rates.items() if self._is_uniform(key) == even})
             part.step()
+            part.state.update(held)
         return {key: np.array(dr.detach(self._of(key)[key])) for key in values}
 
     def _remembered(self, key: str) -> dict[str, Any]:

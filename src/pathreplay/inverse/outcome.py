@@ -41,6 +41,8 @@ class ViewPictures:
     weight: Image | None = None
     """How much pixels count, if not all the same."""
     held_out: bool = False
+    factors: tuple[float, ...] = ()
+    """What the result is multiplied with, where exposures were recovered: one number, or one for each colour."""
 
     def error(self, image: Image) -> float:
         """Root mean square difference from the target, of what counts."""
@@ -52,7 +54,7 @@ class ViewPictures:
         """Of 'start', 'result' and 'rival', where there is one: of what counts, at the exposure of the view."""
         images = {"result": self.result, "start": self.start, "rival": self.rival}
         return {
-            kind: Likeness.of(image, self.target, self.exposure, self.weight)
+            kind: Likeness.of(image, self.target, self.exposure, self.weight, flip=self.held_out)
             for kind, image in images.items()
             if image is not None
         }
@@ -60,8 +62,11 @@ class ViewPictures:
     def as_dict(self) -> dict[str, Any]:
         """For views.json."""
         table: dict[str, Any] = {"held_out": self.held_out, "exposure": self.exposure}
+        if self.factors:
+            table["recovered_exposure"] = list(self.factors)
         for kind, likeness in self.likenesses.items():
-            table[kind] = {"rmse": self.error(getattr(self, kind)), **asdict(likeness)}
+            known = {name: value for name, value in asdict(likeness).items() if value is not None}
+            table[kind] = {"rmse": self.error(getattr(self, kind)), **known}
         return table
 
     def pictures(self) -> dict[str, Image]:
@@ -212,6 +217,10 @@ class Outcome:
     def held_out(self) -> list[ViewPictures]:
         """The views that were not learned from."""
         return [view for view in self.views if view.held_out]
+
+    def has_flip(self) -> bool:
+        """Whether there is FLIP to be told of."""
+        return any(view.likenesses["result"].flip is not None for view in self.views)
 
     def command(self) -> str:
         """The command line that makes this run again, or goes on with it where it was stopped."""

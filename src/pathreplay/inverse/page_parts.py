@@ -142,7 +142,7 @@ def target_row(config: Config) -> Row:
     """Where the targets came from."""
     target = config.target
     if config.capture is not None:
-        return Row("targets", (config.capture.transforms,))
+        return Row("targets", (config.capture.source,))
     if target.images is not None:
-        return Row("targets", (", ".join(target.images),))
+        return Row("targets", (target.images if isinstance(target.images, str) else ", ".join(target.images),))
     return Row("targets", (f"rendered by {target.integrator.type}, {target.spp} samples per pixel",))

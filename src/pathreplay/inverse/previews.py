@@ -13,8 +13,6 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import PIL.Image
 from pydantic import TypeAdapter
@@ -22,9 +20,9 @@ from pydantic import TypeAdapter
 from pathreplay.errors import PathreplayError, plain_line
 from pathreplay.interrupts import Stop
 from pathreplay.inverse.checkpoint import Run
-from pathreplay.inverse.config import PICTURE, Config
+from pathreplay.inverse.config import Config
 from pathreplay.inverse.images import Image, displayed, exposure_for
-from pathreplay.inverse.loop import Event, Refined, Started, Stepped, Stopped
+from pathreplay.inverse.loop import Event, Refined, Started, Stepped, Stopped, picture_of
 from pathreplay.inverse.outcome import DIFFERENCE_GAIN, Recovered, ViewPictures, resume_command
 from pathreplay.inverse.page_parts import (
     about,
@@ -41,7 +39,7 @@ from pathreplay.inverse.page_parts import (
     target_row,
     uri,
 )
-from pathreplay.inverse.problem import Problem, View, put_values
+from pathreplay.inverse.problem import Problem, View
 from pathreplay.inverse.recovered import poses_of, recovered_of
 from pathreplay.inverse.run_folder import RunFolder
 from pathreplay.pages import page as pages
@@ -147,8 +145,8 @@ class Previews:
     def _look(self, done: int) -> dict[str, bytes]:
         """Pictures of the views as they are now."""
         try:
-            put_values(self.problem, self.run.values)
-            images = {view.name: self._rendered(view) for view in self._views}
+            spp = max(self.config.most_spp, min(LEAST_SPP, self.config.picture_spp))
+            images = {v.name: picture_of(self.problem, self.config, self.run.values, v, spp) for v in self._views}
         except RuntimeError as error:
             if self.stop.aborted:
                 raise
@@ -163,14 +161,6 @@ class Previews:
                 image = self._now[view.name].pictures()[kind]
                 files[f"{FOLDER}/{kind}-{view.name}.png"] = _encoded(image, self._stored(view), LARGEST, "png")
         return files
-
-    def _rendered(self, view: View) -> Image:
-        spp = max(self.config.spp, min(LEAST_SPP, self.config.picture_spp))
-        seed = mi.UInt32(self.config.seeds(PICTURE, view.sensor)[0])
-        problem = self.problem
-        with dr.suspend_grad():
-            image = mi.render(problem.scene, sensor=view.sensor, integrator=problem.integrator, spp=spp, seed=seed)
-        return np.array(image, dtype=np.float32)
 
     def _stored(self, view: View) -> float:
         return min(self._exposure, exposure_for(view.target))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,11 @@ import numpy as np
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import file_names
 from pathreplay.inverse import limits
-from pathreplay.inverse.capture import Shot, read_capture
+from pathreplay.inverse.background import require_known
+from pathreplay.inverse.capture import Shot, fingerprint, read_capture
 from pathreplay.inverse.config import Config, Parameter, Plugin
+from pathreplay.inverse.exposures import EXPOSURE, Factors, fixed_rows
+from pathreplay.inverse.exposures import start as start_of_exposures
 from pathreplay.inverse.grids import Levels, make_levels, resampled
 from pathreplay.inverse.images import Image, picture_size
 from pathreplay.inverse.losses import Loss, find_loss
@@ -27,6 +30,7 @@ from pathreplay.inverse.surface import Surface
 from pathreplay.inverse.targets import (
     Targets,
     by_view,
+    masked,
     read_masks,
     read_targets,
     rendered_targets,
@@ -82,6 +86,8 @@ class View:
     """How much pixels count (height x width x 1, with the mean 1); None: all the same."""
     held_out: bool = False
     """It is only looked at in the end, and never learned from."""
+    share: float = 1.0
+    """How much it counts; of the views that are learned from the mean is 1."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +107,8 @@ class Problem:
     loss: Loss
     notes: tuple[str, ...]
     """What was done to the scene that the user should know of."""
+    capture: str | None = None
+    """What tells its capture from others."""
 
     def trained(self) -> dict[int, View]:
         """The views that are learned from, by their place."""
@@ -151,7 +159,8 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     """
     loss = find_loss(config.loss, base)
     wanted = [entry.key for entry in config.parameters]
-    shots = {} if config.capture is None else read_capture(config.capture, base, picture_size)
+    film = "rgba" if config.target.alpha == "compare" else "rgb"
+    shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
     cameras = {name: shot.camera for name, shot in shots.items()}
     scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
     params = mi.traverse(scene)
@@ -169,7 +178,9 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     taken = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
     held_out = _held_out(scene, sensors, config, list(shots))
     limits.require_visible(scene, params, keys)
-    limits.require_films(scene, sensors, {"spp": config.spp, "picture_spp": config.picture_spp})
+    if config.target.alpha == "scene":
+        require_known(scene, params, keys)
+    limits.require_films(scene, sensors, {"spp": config.most_spp, "picture_spp": config.picture_spp})
     unsolved, moved = _variables(scene, params, keys, config, base)
 
     truth: dict[str, Array] = {}
@@ -187,17 +198,19 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
         targets, said = _pictures(config, taken, scene, sensors, base)
         notes += said
     if first and config.target.masks is not None:
-        masks = by_view("masks", config.target.masks, sensors)
-        targets = replace(targets, weights=read_masks(masks, scene, sensors, base))
+        masks = by_view("masks", config.target.masks, sensors, base)
+        targets = masked(targets, read_masks(masks, scene, sensors, base))
 
     if missing := set(sensors) - set(targets.images):
         raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
     given = config.target.masks is not None or config.target.alpha == "mask"
-    require_weights(targets, {name for name in sensors if given or (name in taken and taken[name].mask is not None)})
+    require_weights(targets, {n for n in sensors if given or (n in taken and (taken[n].mask or taken[n].lens))})
+    shares = _shares(scene, sensors, config, held_out)
     views = tuple(
-        View(name, index, targets.images[name], targets.weights.get(name), name in held_out)
+        View(name, index, targets.images[name], targets.weights.get(name), name in held_out, shares[name])
         for name, index in sensors.items()
     )
+    unsolved += _exposures(scene, config, views)
     for view in views:
         limits.require_finite_loss(loss, view.name, view.target, view.weight)
     variables = tuple(replace(variable, truth=truth.get(variable.key)) for variable in unsolved)
@@ -205,25 +218,68 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     # Traversed anew: an object from which values were read expects all its keys at the next update().
     params = mi.traverse(scene)
     parameters.keep_only(params, keys)
-    return Problem(scene, params, integrator, rival, judge, variables, poses, views, loss, notes)
+    known = fingerprint(taken.values()) if taken else None
+    return Problem(scene, params, integrator, rival, judge, variables, poses, views, loss, notes, known)
+
+
+def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list[Variable]:
+    """The factors on the pictures, where the job asks for them."""
+    if (asked := config.exposure) is None:
+        return []
+    value = start_of_exposures(len(views), min(view.target.shape[2] for view in views), asked.white_balance)
+    trained = [n for n, view in enumerate(views) if not view.held_out]
+    reference = None
+    if asked.reference is not None:
+        places = _named(scene, {view.name: view.sensor for view in views}, [asked.reference], "exposure.reference")
+        reference = places[0]
+        if views[[view.name for view in views].index(reference)].held_out:
+            raise PathreplayError(
+                f"exposure: the reference '{reference}' is held out; name a view that is learned from"
+            )
+    fixed = fixed_rows([view.name for view in views], trained, reference, asked.free)
+    rate = asked.learning_rate or config.learning_rate
+    return [Variable(EXPOSURE, mi.TensorXf(value), (-np.inf, np.inf), rate, value, None, coordinates=Factors(fixed))]
+
+
+def _shares(scene: mi.Scene, sensors: dict[str, int], config: Config, held_out: set[str]) -> dict[str, float]:
+    """How much each view counts, by name."""
+    names = _named(scene, sensors, list(config.view_weights), "view_weights")
+    if out := set(names) & held_out:
+        raise PathreplayError(f"view_weights: view '{min(out)}' is held out, and counts for nothing; leave it out here")
+    given = dict(zip(names, config.view_weights.values(), strict=True))
+    shares = {name: given.get(name, 1.0) for name in sensors}
+    mean = float(np.mean([share for name, share in shares.items() if name not in held_out]))
+    return {name: share / mean for name, share in shares.items()}
+
+
+def _named(scene: mi.Scene, sensors: dict[str, int], wanted: Sequence[int | str], key: str) -> list[str]:
+    """The names of views that a key asks for. Raises PathreplayError for what is no view of the job."""
+    everywhere, ids = list(_sensors(scene, None)), [sensor.id() for sensor in scene.sensors()]
+    names = {index: name for name, index in sensors.items()}
+    places = [_place(item, ids, everywhere) for item in wanted]
+    for place in places:
+        if place not in names:
+            raise PathreplayError(f"{key}: sensor '{everywhere[place]}' is not among 'sensors'; add it there")
+    return [names[place] for place in places]
 
 
 def _pictures(
     config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path
 ) -> tuple[Targets, tuple[str, ...]]:
     """Targets from the files of a capture, or from those that the job names, and what is to be said about them."""
-    alpha = config.target.alpha
+    alpha, hidden = config.target.alpha, bool((config.integrator.model_extra or {}).get("hide_emitters"))
     if config.capture is None:
-        files = by_view("target images", config.target.images or [], sensors)
-        return read_targets(files, alpha, scene, sensors, base)
+        files = by_view("target images", config.target.images or [], sensors, base)
+        return read_targets(files, alpha, scene, sensors, base, hidden=hidden)
     if other := set(sensors) - set(shots):
         raise PathreplayError(f"sensors: '{min(other)}' is no camera of the capture, and has no picture; leave it out")
     pictures = {name: str(shot.image.resolve()) for name, shot in shots.items()}
     masks = {name: str(shot.mask.resolve()) for name, shot in shots.items() if shot.mask is not None}
     if masks and alpha == "mask":
         raise PathreplayError("target: the capture has masks, and alpha = 'mask' is another; leave alpha out")
-    targets, notes = read_targets(pictures, alpha, scene, sensors, base, resize=True)
-    return replace(targets, weights=targets.weights | read_masks(masks, scene, sensors, base, resize=True)), notes
+    lenses = {name: shot.lens for name, shot in shots.items() if shot.lens is not None}
+    targets, notes = read_targets(pictures, alpha, scene, sensors, base, resize=True, lenses=lenses, hidden=hidden)
+    return masked(targets, read_masks(masks, scene, sensors, base, resize=True, lenses=lenses)), notes
 
 
 def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
@@ -277,7 +333,7 @@ def _variables(
                 limits.require_learning_rate(key, rate, coordinates.latent(start))
             else:
                 limits.require_learning_rate(key, rate, start, (entry.lower, entry.upper))
-            levels = _levels(key, entry, start)
+            levels = _levels(key, entry, config.refine_at(entry), start)
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
                 like = type(like)(start)
@@ -322,7 +378,7 @@ def _penalty(key: str, entry: Parameter, start: Array) -> Penalty | None:
     return Penalty(entry.total_variation or 0.0, entry.prior or 0.0, start)
 
 
-def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:
+def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> Levels | None:
     if entry.resolutions is None:
         return None
     if start.ndim < 3:
@@ -330,7 +386,7 @@ def _levels(key: str, entry: Parameter, start: Array) -> Levels | None:
             f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'resolutions' out"
         )
     limits.require_grid(key, start.shape, entry.resolutions)
-    return make_levels(start.shape, entry.resolutions, entry.refine_at or [])
+    return make_levels(start.shape, entry.resolutions, refine_at)
 
 
 def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path) -> Array:

@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.inverse.exposures import derivative, of_exposed
 from pathreplay.inverse.losses import Loss, mean_loss
 from pathreplay.render.facts import Tables
 from pathreplay.scenes.parameters import keep_only
@@ -25,6 +26,10 @@ _OF_MITSUBA = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})
 # What Dr.Jit says, whatever the cause, where a function cannot be frozen. Plugins do not show beforehand whether they
 # can: the arrays of some (Mitsuba 3.9.1: `orthographic`, `thinlens`) are hidden from it.
 _RECORDING = "while recording a frozen function"
+
+
+_OTHER = 0x5EED
+"""Makes another seed of one."""
 
 
 class NotRecordable(Exception):
@@ -66,7 +71,7 @@ class Recordings:
 def _recording(keys: list[str]) -> Callable[..., Any]:
     """`differentiate` as a frozen function, which holds neither scene nor problem when the run is over."""
 
-    def frozen(scene: Any, *args: Any) -> tuple[Any, Any]:
+    def frozen(scene: Any, *args: Any) -> tuple[Any, Any, Any]:
         params = mi.traverse(scene)
         keep_only(params, keys)
         return differentiate(params, scene, *args)
@@ -87,11 +92,16 @@ def differentiate(
     share: float,
     sweeps: bool,
     tables: Tables,
-) -> tuple[Any, Any]:
+    factor: mi.TensorXf | None = None,
+) -> tuple[Any, Any, Any]:
     """``share`` times the loss of a view, whose gradient is added to the parameters; ``sweeps``: in one pass.
 
-    Also how many paths lost a part of their gradient (None if nobody counts, or it has been told).
+    Also how many paths lost a part of their gradient (None if nobody counts, or it has been told), and the derivative
+    by the logarithm of the ``factor`` on the picture (see `exposures`) for each channel, if there is one.
     """
+    plain = loss
+    if factor is not None:
+        loss = of_exposed(plain, factor)
     with _handed(integrator, tables):
         if sweeps:
             offset, slope = (term * share for term in linear_derivative(loss, target, weight))
@@ -102,7 +112,13 @@ def differentiate(
             value = mean_loss(loss, image, target, weight).array * share
             if dr.grad_enabled(value):
                 dr.backward(value)
-    return dr.detach(value), integrator.take_lost() if hasattr(integrator, "take_lost") else None
+        by_factor = None
+        if factor is not None:
+            with dr.suspend_grad():
+                other: Any = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(_OTHER))[0]
+                again = mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=other)
+            by_factor = derivative(plain, image, again, factor, target, weight) * share
+    return dr.detach(value), integrator.take_lost() if hasattr(integrator, "take_lost") else None, by_factor
 
 
 @contextmanager

@@ -119,12 +119,18 @@ def _comparison(outcome: Outcome, contestants: Sequence[Contestant], drawing: st
 
 
 def _likeness(outcome: Outcome) -> Table:
-    heads = ("", "PSNR at the start", "in the result", "SSIM at the start", "in the result")
+    heads = ["", "PSNR at the start", "in the result", "SSIM at the start", "in the result"]
+    flips, exposed = outcome.has_flip(), any(view.factors for view in outcome.views)
+    heads += ["FLIP at the start", "in the result"] * flips + ["exposure found"] * exposed
     rows = []
     for view in outcome.views:
         before, after = view.likenesses["start"], view.likenesses["result"]
-        cells = (f"{before.psnr:.2f} dB", f"{after.psnr:.2f} dB", f"{before.ssim:.4f}", f"{after.ssim:.4f}")
-        rows.append(Row(view.name + " (held out)" * view.held_out, cells))
+        cells = [f"{before.psnr:.2f} dB", f"{after.psnr:.2f} dB", f"{before.ssim:.4f}", f"{after.ssim:.4f}"]
+        if flips:
+            cells += ["" if each.flip is None else f"{each.flip:.4f}" for each in (before, after)]
+        if exposed:
+            cells.append("× " + ", ".join(f"{factor:.3f}" for factor in view.factors))
+        rows.append(Row(view.name + " (held out)" * view.held_out, tuple(cells)))
     return Table(tuple(Head(text) for text in heads), tuple(rows))
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import safetensors.numpy
 
 from pathreplay.inverse.checkpoint import Entry, Run
+from pathreplay.inverse.exposures import EXPOSURE
 from pathreplay.inverse.images import Image, exposure_for, exr_bytes, png_bytes
 from pathreplay.inverse.likeness import Likeness
 from pathreplay.inverse.outcome import Outcome, ViewPictures, resume_command
@@ -34,7 +35,7 @@ class RunResult:
     stopped: bool
     """True when a signal ended the run early; it can be resumed."""
     stopped_by: str | None
-    """'Ctrl-C', 'SIGTERM', 'SIGHUP' or 'the stop button'."""
+    """'Ctrl-C', 'SIGTERM', 'SIGHUP', 'the stop button' or 'finish()'."""
     history: tuple[Entry, ...]
     parameters: dict[str, Array]
     errors: dict[str, float]
@@ -66,7 +67,9 @@ class RunResult:
         lines += [f"{key}: {error}" for key, error in self.poses.items()]
         if self.held_out:
             psnr, ssim = (np.mean([getattr(self.views[v], kind) for v in self.held_out]) for kind in ("psnr", "ssim"))
-            lines.append(f"held-out views ({len(self.held_out)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}")
+            flips = [flip for v in self.held_out if (flip := self.views[v].flip) is not None]
+            told = f", FLIP {np.mean(flips):.4f}" if flips else ""
+            lines.append(f"held-out views ({len(self.held_out)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}{told}")
         lines.append(f"report: {self.report}")
         if self.stopped:
             lines.append(f"stopped early by {self.stopped_by}; go on with: {resume_command(self.folder)}")
@@ -93,8 +96,9 @@ def outcome_of(
             rivals.get(v.name),
             v.weight,
             v.held_out,
+            tuple(run.values[EXPOSURE][n].tolist()) if EXPOSURE in run.values else (),
         )
-        for v in problem.views
+        for n, v in enumerate(problem.views)
     )
     recovered, poses = with_faces(problem, recovered_of(problem, run)), poses_of(problem, run)
     values = with_scene(problem, run.values)
@@ -126,7 +130,7 @@ def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, bytes
 
 
 def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
-    """What Python gets; ``stopped_by`` is the name of a signal, which may have come too late to stop anything."""
+    """What Python gets; ``stopped_by`` is the name of a signal, say, which may have come too late to stop anything."""
     stopped = len(outcome.run.history) < outcome.config.iterations
     return RunResult(
         folder=outcome.folder,

@@ -19,8 +19,10 @@ from pathreplay.files import file_problem
 from pathreplay.interrupts import undisturbed
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.folder_lock import FolderLock
+from pathreplay.inverse.texts import YAML
 
 PART = ".part"
+_CONFIGS = "config.toml", "config.yaml", "config.json"
 CHECKPOINT = "checkpoint.safetensors"
 RIVAL_CHECKPOINT = "rival/checkpoint.safetensors"
 
@@ -113,11 +115,12 @@ class RunFolder:
 def create_run_folder(output: Path, job: Job, files: Mapping[str, bytes]) -> RunFolder:
     """Make ``output``, or ``output-2``, ``-3``, … where that exists, and put the job and its first files into it.
 
-    The config is copied as it was written (``config.toml``), or as JSON where it came from Python or was changed. What
-    fails leaves no folder behind. Raises PathreplayError where the folder cannot be made or written.
+    The config is copied as it was written (``config.toml`` or ``.yaml``), or as JSON where it came from Python or was
+    changed. What fails leaves no folder behind. Raises PathreplayError where the folder cannot be made or written.
     """
     if job.source is not None and job.source.suffix != ".json" and not job.changes:
-        copy = {"config.toml": job.source.read_bytes()}
+        name = "config.yaml" if job.source.suffix.lower() in YAML else "config.toml"
+        copy = {name: job.source.read_bytes()}
     else:
         copy = {"config.json": job.config.model_dump_json(indent=2, exclude_unset=True).encode()}
     origin: dict[str, Any] = {
@@ -152,11 +155,25 @@ def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
     Raises PathreplayError if it is no run folder, holds no checkpoint to go on from, is damaged, or is in use.
     """
     require_writable_name(path, "--resume")
-    copy = next((path / name for name in ("config.toml", "config.json") if (path / name).is_file()), None)
-    if copy is None or not (path / "run.json").is_file():
-        raise PathreplayError(f"{path} is no run folder (no config, no run.json); give a folder that optimize has made")
+    copy = _config_in(path)
     if not (path / CHECKPOINT).is_file():
         raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start the job from its config")
+    return _job(path, copy), RunFolder(path)
+
+
+def read_job(path: Path) -> Job:
+    """The job of an existing run folder, which may be in use. Raises PathreplayError if it is none, or damaged."""
+    return _job(path, _config_in(path))
+
+
+def _config_in(path: Path) -> Path:
+    copy = next((path / name for name in _CONFIGS if (path / name).is_file()), None)
+    if copy is None or not (path / "run.json").is_file():
+        raise PathreplayError(f"{path} is no run folder (no config, no run.json); give a folder that optimize has made")
+    return copy
+
+
+def _job(path: Path, copy: Path) -> Job:
     try:
         if problem := file_problem(path / "run.json", 2**20):  # far above what two paths take
             raise ValueError(f"it {problem}")
@@ -167,8 +184,7 @@ def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
         what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
         raise PathreplayError(f"{path / 'run.json'} cannot be used ({what}); start the job from its config") from None
     source = None if origin.config is None else Path(origin.config)
-    job = Job(load_config(copy), source, Path(origin.base), tuple(origin.changes))
-    return job, RunFolder(path)
+    return Job(load_config(copy), source, Path(origin.base), tuple(origin.changes))
 
 
 def new_output(output: str | Path | None, source: Path | None) -> Path:

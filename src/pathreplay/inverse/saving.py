@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from pathreplay.errors import PathreplayError
@@ -16,6 +17,9 @@ from pathreplay.inverse.run_folder import CHECKPOINT, RIVAL_CHECKPOINT, RunFolde
 from pathreplay.inverse.targets import Targets
 from pathreplay.inverse.values import require_finite_array
 from pathreplay.render.film import picture_shape
+
+CAPTURE = "capture.sha256"
+"""What tells the cameras of a run from those of a capture that was changed since."""
 
 
 class Saving:
@@ -37,6 +41,22 @@ class Saving:
         elif isinstance(event, Stopped) and event.done > self.saved:
             self._write(event.done)
 
+    def close(self) -> None:
+        """Write what is not yet saved. Raises as `observe` does."""
+        if self._runs_are_whole() and len(self.run.history) > self.saved:
+            self._write(len(self.run.history))
+
+    def rescued(self) -> bool:
+        """Write what is not yet saved after an error of the run; whether all that was done is saved now."""
+        if not self._runs_are_whole() or not self.run.history:
+            return False
+        with contextlib.suppress(PathreplayError):  # the first error is the one to tell
+            self.close()
+        return self.saved == len(self.run.history)
+
+    def _runs_are_whole(self) -> bool:
+        return all(run.whole for run in _runs(self.run).values())
+
     def _write(self, done: int) -> None:
         self.folder.write(_checkpoints(self.run))
         self.saved = done
@@ -47,7 +67,8 @@ def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict
     pictures = {_picture("target", view.name): view.target for view in problem.views}
     pictures |= {_picture("weight", view.name): view.weight for view in problem.views if view.weight is not None}
     pictures |= {_picture("start", name): image for name, image in before.items()}
-    return {name: exr_bytes(image) for name, image in pictures.items()} | _checkpoints(run)
+    capture = {} if problem.capture is None else {CAPTURE: problem.capture.encode() + b"\n"}
+    return {name: exr_bytes(image) for name, image in pictures.items()} | capture | _checkpoints(run)
 
 
 def saved_targets(folder: Path) -> Targets:
@@ -59,11 +80,14 @@ def saved_targets(folder: Path) -> Targets:
     return Targets(images, weights)
 
 
-def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
+def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) -> dict[str, Image]:
     """Bring a run to where the folder's checkpoint was; returns the pictures of its start.
+
+    ``held`` are variables that some stages do not step.
 
     Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
     """
+    _require_capture(folder / CAPTURE, problem)
     before = {view.name: _read(folder / _picture("start", view.name)) for view in problem.views}
     for view in problem.views:
         wanted = picture_shape(problem.scene.sensors()[view.sensor])
@@ -76,8 +100,21 @@ def go_on(folder: Path, problem: Problem, run: Run) -> dict[str, Image]:
                 )
             require_finite_array(str(path), found)
     for name, each in _runs(run).items():
-        checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables})
+        checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables}, held)
     return before
+
+
+def _require_capture(path: Path, problem: Problem) -> None:
+    """Raise PathreplayError if the cameras of the capture are no longer those that the run was started with."""
+    if problem.capture is None:
+        return
+    try:
+        saved = "" if file_problem(path, 1024) else path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        saved = ""
+    if saved != problem.capture:
+        changed = "has other cameras than when this run was started" if saved else f"has no mark in {path}"
+        raise PathreplayError(f"The capture {changed}; put it back as it was, or start a new run")
 
 
 def _runs(run: Run) -> dict[str, Run]:

@@ -5,23 +5,29 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import limits
+from pathreplay.inverse.background import background
 from pathreplay.inverse.config import TARGET, Config
 from pathreplay.inverse.grids import comparable
 from pathreplay.inverse.images import (
     Image,
     find_image,
+    oddities,
+    over,
     over_black,
     read_image,
     resized,
     transparent_share,
     unpremultiplied,
 )
+from pathreplay.inverse.lens import Lens
+from pathreplay.inverse.patterns import matching
 from pathreplay.inverse.values import Array, adapted_image, make_value, require_finite_array, seen
 from pathreplay.render.film import picture_shape
 from pathreplay.scenes import parameters
@@ -84,49 +90,109 @@ def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -
 
 
 def read_targets(
-    files: Mapping[str, str], alpha: str, scene: mi.Scene, sensors: dict[str, int], base: Path, *, resize: bool = False
+    files: Mapping[str, str],
+    alpha: str,
+    scene: mi.Scene,
+    sensors: dict[str, int],
+    base: Path,
+    *,
+    resize: bool = False,
+    lenses: Mapping[str, Lens] = MappingProxyType({}),
+    hidden: bool = False,
 ) -> tuple[Targets, tuple[str, ...]]:
-    """Pictures by view (and weights, with ``alpha`` = 'mask') from files by view, and what is to be said about them.
+    """Pictures by view (and weights, with ``alpha`` = 'mask' or a lens) from files by view, and what is to be said.
 
-    ``resize``: to the size of the film, if they have another.
+    ``resize``: to the size of the film, if they have another. ``lenses`` are undone. ``hidden``: emitters are not seen.
     """
     targets: dict[str, Image] = {}
     weights: dict[str, Image] = {}
     notes: list[str] = []
+    odd: dict[str, list[str]] = {}
     for name, file in files.items():
-        path = find_image(file, base)
-        image = read_image(path)
-        _, _, channels = shape = picture_shape(scene.sensors()[sensors[name]])
-        if alpha == "mask":
-            if image.shape[2] not in (2, 4):
+        path, what = find_image(file, base), f"Target image '{file}'"
+        for oddity in oddities(path):
+            odd.setdefault(oddity, []).append(file)
+        image, shape = read_image(path), picture_shape(scene.sensors()[sensors[name]])
+        _require_alpha(what, image, alpha, name, shape)
+        # Undone and resized as it looks over black: colours of what is transparent are anything.
+        image = over_black(image, path)
+        if name in lenses:
+            image, there = lenses[name].undone(image)
+            if not there.any():
                 raise PathreplayError(
-                    f"Target image '{file}' has no alpha to be its mask; give masks, or leave alpha = 'mask' out"
+                    f"{what} has nothing of what a pinhole would see in place of its lens; correct k1, k2, ..."
                 )
-        # Resized as it looks over black: colours of what is transparent are anything.
-        image = _sized(f"Target image '{file}'", over_black(image, path), name, shape, resize)
+            weights[name] = _weight(f"what the lens leaves of '{file}'", resized(there, *shape[:2]).clip(0, 1), name)
+        image = _sized(what, image, name, shape, resize)
         if alpha == "mask":
-            weights[name] = _weight(f"the alpha of '{file}'", image[:, :, -1:], name)
+            opaque = image[:, :, -1:] * weights.get(name, np.float32(1))
+            weights[name] = _weight(f"the alpha of '{file}'", opaque, name)
             image = unpremultiplied(image)
-        targets[name] = adapted_image(f"Target image '{file}'", image, f"sensor '{name}' renders", channels)
+        elif alpha == "scene" and not hidden:
+            image = over(image, background(scene, sensors[name]))
+        targets[name] = adapted_image(what, image, f"sensor '{name}' renders", shape[2])
         share = transparent_share(image)
-        if share and channels in (1, 3) and alpha == "black":
+        if share and shape[2] in (1, 3) and alpha == "black":
             notes.append(
-                f"target image '{file}' is transparent in {share:.1%} of its pixels: black is fitted there; if "
-                "the background of your scene is not black, put it behind the picture first, or take alpha = 'mask'"
+                f"target image '{file}' is transparent in {share:.1%} of its pixels: black is fitted there; if the "
+                "background of your scene is not black, take alpha = 'scene', which puts it behind, or alpha = 'mask'"
             )
+    if lenses:
+        notes.append(f"{len(lenses)} pictures are resampled to what a pinhole sees: they come from {_kinds(lenses)}")
+    notes += [
+        f"target image '{files[0]}'{f' (and {len(files) - 1} others)' if len(files) > 1 else ''} {oddity}"
+        for oddity, files in odd.items()
+    ]
     return Targets(targets, weights), tuple(notes)
 
 
+def _kinds(lenses: Mapping[str, Lens]) -> str:
+    return ", ".join(sorted({lens.told() for lens in lenses.values()}))
+
+
+def _require_alpha(what: str, image: Image, alpha: str, name: str, shape: tuple[int, int, int]) -> None:
+    """Raise PathreplayError unless picture and film go with this ``alpha``."""
+    if alpha != "black" and image.shape[2] not in (2, 4):
+        use = "be its mask; give masks" if alpha == "mask" else f"go with alpha = '{alpha}'; give it one"
+        raise PathreplayError(f"{what} has no alpha to {use}, or leave alpha = '{alpha}' out")
+    if alpha == "compare" and shape[2] not in (2, 4):
+        raise PathreplayError(
+            f"target: alpha = 'compare', and the film of sensor '{name}' has none; write pixel_format = \"rgba\" there"
+        )
+    if alpha == "scene" and shape[2] in (2, 4):
+        raise PathreplayError(
+            f"target: alpha = 'scene' makes pictures opaque, and the film of sensor '{name}' has alpha; take 'compare'"
+        )
+
+
 def read_masks(
-    files: Mapping[str, str], scene: mi.Scene, sensors: dict[str, int], base: Path, *, resize: bool = False
+    files: Mapping[str, str],
+    scene: mi.Scene,
+    sensors: dict[str, int],
+    base: Path,
+    *,
+    resize: bool = False,
+    lenses: Mapping[str, Lens] = MappingProxyType({}),
 ) -> dict[str, Image]:
     """The weights that masks give, by view: white counts, black does not."""
     weights: dict[str, Image] = {}
     for name, file in files.items():
         mask = read_image(find_image(file, base), raw=True)
+        if name in lenses:
+            mask, _ = lenses[name].undone(mask)
         mask = _sized(f"Mask '{file}'", mask, name, picture_shape(scene.sensors()[sensors[name]]), resize)
         weights[name] = _weight(f"mask '{file}'", adapted_image(f"Mask '{file}'", mask, "a mask has", 1), name)
     return weights
+
+
+def masked(targets: Targets, masks: Mapping[str, Image]) -> Targets:
+    """The targets with these weights as well: what counts counts by all of them."""
+    both = {
+        name: _weight("what mask and picture leave", mask * targets.weights[name], name)
+        for name, mask in masks.items()
+        if name in targets.weights
+    }
+    return Targets(targets.images, {**targets.weights, **masks, **both})
 
 
 def require_weights(targets: Targets, masked: set[str]) -> None:
@@ -142,13 +208,14 @@ def require_weights(targets: Targets, masked: set[str]) -> None:
             )
 
 
-def by_view(what: str, files: list[str], sensors: dict[str, int]) -> dict[str, str]:
-    """A file for each view. Raises PathreplayError unless there are as many."""
-    if len(files) != len(sensors):
+def by_view(what: str, files: list[str] | str, sensors: dict[str, int], base: Path) -> dict[str, str]:
+    """A file for each view; patterns are expanded. Raises PathreplayError unless there are as many."""
+    found = list(matching([files] if isinstance(files, str) else files, base))
+    if len(found) != len(sensors):
         raise PathreplayError(
-            f"{len(files)} {what} for {len(sensors)} sensors ({', '.join(sensors)}); name one per sensor, in this order"
+            f"{len(found)} {what} for {len(sensors)} sensors ({', '.join(sensors)}); name one per sensor, in this order"
         )
-    return dict(zip(sensors, files, strict=True))
+    return dict(zip(sensors, found, strict=True))
 
 
 def _sized(what: str, image: Image, name: str, shape: tuple[int, int, int], resize: bool) -> Image:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -86,6 +86,15 @@ def require_film(sensor: mi.Sensor, name: str, spp: Mapping[str, int], also: int
             )
     thing = f"Rendering {name} of {width} x {height} pixels"
     memory.require(pixels * _A_PIXEL + also, thing, "take a smaller film or fewer sensors")
+
+
+def fit_film(sensor: mi.Sensor, shape: Sequence[int]) -> None:
+    """Give the film of a sensor the size of a picture (height, width, ...), if it has another and no crop window."""
+    size = mi.ScalarVector2u(int(shape[1]), int(shape[0]))
+    if tuple(sensor.film().crop_size()) != tuple(size):
+        params = mi.traverse(sensor)
+        params["film.size"] = size
+        params.update()
 
 
 def picture_shape(sensor: mi.Sensor) -> tuple[int, int, int]:

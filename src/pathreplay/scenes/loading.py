@@ -49,19 +49,23 @@ def load_scene_with(
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
     if str(spec) in BUILTINS:
         with told(f"Built-in scene '{spec}' cannot be made of {parameters}"):
-            return load_dict_with(_builtin_dict(str(spec), parameters), plugins, cameras)
+            return load_dict_with(builtin_dict(str(spec), parameters), plugins, cameras)
     path = Path(spec) if base is None else Path(base) / spec
     if (problem := file_problem(path)) == MISSING:
         raise PathreplayError(_unknown(str(spec), path))
     if problem:
         raise PathreplayError(f"Scene {path} {problem}; give the path of a Mitsuba XML file")
-    # As XML has them: true and not True.
-    arguments = {name: str(v).lower() if isinstance(v, bool) else str(v) for name, v in parameters.items()}
+    arguments = as_xml_has_them(parameters)
     with told(f"Scene {path} cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene, exchanged = load_file_with(path, plugins, arguments, cameras)
     if not isinstance(scene, mi.Scene):
         raise PathreplayError(f"{path} describes no <scene> but a {type(scene).__name__}; wrap it in <scene>")
     return scene, exchanged
+
+
+def as_xml_has_them(parameters: Mapping[str, Any]) -> dict[str, str]:
+    """Scene parameters as texts: true and not True."""
+    return {name: str(v).lower() if isinstance(v, bool) else str(v) for name, v in parameters.items()}
 
 
 def load_scene_for(
@@ -95,7 +99,8 @@ def load_scene_for(
     return scene, (f"replaced 'dielectric' by 'smoothdielectric' ({count} of them): its eta carries a derivative",)
 
 
-def _builtin_dict(name: str, parameters: dict[str, Any]) -> SceneDict:
+def builtin_dict(name: str, parameters: Mapping[str, Any]) -> SceneDict:
+    """The built-in scene of that name. Raises PathreplayError for a wrong parameter."""
     make = BUILTINS[name]
     known = inspect.signature(make).parameters
     for key, value in parameters.items():

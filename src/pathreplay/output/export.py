@@ -1,0 +1,152 @@
+"""The command `pathreplay export`: what a run has recovered, as files that other programs read, and the whole scene."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from pathreplay import backend
+from pathreplay.errors import PathreplayError
+from pathreplay.files import file_names
+from pathreplay.inverse.capture import FACING, read_capture
+from pathreplay.inverse.images import picture_size, png_bytes
+from pathreplay.inverse.run_folder import Job, read_job
+from pathreplay.inverse.values import Arrays
+from pathreplay.output.scene_folder import SCENE, Exported, Source, exported, require_same
+from pathreplay.output.whole_files import whole_folder
+from pathreplay.scenes.builtin_scenes import BUILTINS
+from pathreplay.scenes.loading import as_xml_has_them, builtin_dict
+from pathreplay.scenes.parameters import get_array
+
+_OPTION = "-o"
+
+
+def export_run(run: Path, output: Path | None = None) -> str:
+    """Write the scene of a run with the values that it ended with; returns what is to be said, in lines.
+
+    Into ``output``, or the folder ``export`` of the run, which must be new or empty: `scene.xml` with its files
+    (textures as EXR, grids as `.vol`, meshes as PLY), PNG and OBJ beside EXR and PLY of what was recovered, the cameras
+    as `transforms.json`, and numbers as `values.json`. The run's variant becomes the active one.
+
+    Raises PathreplayError for what is no run folder, holds no result, or cannot be exported; nothing is written then.
+    """
+    folder = run / "export" if output is None else output
+    job = read_job(run)
+    backend.set_variant(job.config.variant)
+    values = _result(run)
+    source = _source(job, values)
+    found = exported(source, values, job.config.integrator.model_dump())
+    with whole_folder(folder, _OPTION) as part:
+        write_files(found, part)
+        for name, data in _beside(found, values).items():
+            (part / name).write_bytes(data)
+        require_same(found.scene, part)
+    files = sorted([*found.files, *found.copies])
+    lines = [f"{folder / SCENE}: render it with `mitsuba -m {mi.variant()} {folder / SCENE}`"]
+    lines += [f"{folder / name}" for name in files if name != SCENE and not name.startswith("files/")]
+    return "\n".join([*lines, *(f"pathreplay: {note}" for note in found.notes)])
+
+
+def write_files(found: Exported, folder: Path) -> None:
+    """The scene and its files, into an existing folder."""
+    for name in [*found.files, *found.copies]:
+        (folder / name).parent.mkdir(exist_ok=True)
+    for name, data in found.files.items():
+        (folder / name).write_bytes(data)
+    for name, path in found.copies.items():
+        try:
+            shutil.copyfile(path, folder / name)
+        except OSError as error:
+            raise PathreplayError(f"File {path} of the scene cannot be copied ({error.strerror})") from error
+
+
+def _result(run: Path) -> dict[str, np.ndarray]:
+    """Values of the scene's parameters at the end of a run, as people see them."""
+    path = run / "parameters.safetensors"
+    if not path.is_file():
+        raise PathreplayError(
+            f"Run {run} has no result yet (no {path.name}); end it with Ctrl-C, which writes it, or go on with "
+            f"pathreplay optimize --resume {run}"
+        )
+    try:
+        found = safetensors.numpy.load_file(str(path))
+    except (safetensors.SafetensorError, OSError, ValueError) as error:
+        raise PathreplayError(f"Result {path} cannot be read ({error}); go on with the run, which writes it") from None
+    # Parts of poses; the transform or the vertices that they make are there by their own key.
+    return {k: v for k, v in found.items() if not k.endswith((":translation", ":rotation"))}
+
+
+def _source(job: Job, values: Arrays) -> Source:
+    config = job.config
+    shots = {} if config.capture is None else read_capture(config.capture, job.base, picture_size)
+    cameras = {name: shot.camera for name, shot in shots.items()}
+    plugins = {"dielectric": "smoothdielectric"} if any(key.endswith(".eta") for key in values) else {}
+    if config.scene in BUILTINS:
+        return Source(builtin_dict(config.scene, config.scene_parameters), {}, plugins, cameras)
+    path = job.base / config.scene
+    if not path.is_file():
+        raise PathreplayError(f"Scene {path} of the run is no longer there; put it back")
+    return Source(path, as_xml_has_them(config.scene_parameters), plugins, cameras)
+
+
+def _beside(found: Exported, values: Arrays) -> dict[str, bytes]:
+    """Files that the scene does not name: PNG, OBJ, cameras and numbers."""
+    params, files = mi.traverse(found.scene), {"transforms.json": _json(_cameras(found.scene))}
+    names = file_names([*params.keys(), *(shape.id() for shape in found.scene.shapes())])
+    numbers: dict[str, Any] = {}
+    for key, value in values.items():
+        if value.ndim == 3 and value.shape[2] <= 4:
+            files[f"textures/{names[key]}.png"] = png_bytes(value)
+        elif value.size <= 16:
+            numbers[key] = value.tolist()
+    files["values.json"] = _json(numbers)
+    for shape in found.scene.shapes():
+        if shape.is_mesh() and f"meshes/{names[shape.id()]}.ply" in found.files:
+            files[f"meshes/{names[shape.id()]}.obj"] = obj_bytes(shape)
+    return files
+
+
+def _json(table: Any) -> bytes:
+    return (json.dumps(table, indent=2) + "\n").encode()
+
+
+def obj_bytes(mesh: mi.Mesh) -> bytes:
+    """The mesh as a Wavefront OBJ file: vertices, texture coordinates, normals, faces."""
+    params = mi.traverse(mesh)
+    lines, has = [], []
+    for key, tag, width in (("positions", "v", 3), ("texcoords", "vt", 2), ("normals", "vn", 3)):
+        rows = get_array(params[f"vertex_{key}"]).reshape(-1, width)
+        has.append(len(rows) > 0)
+        lines += [f"{tag} " + " ".join(f"{x:.9g}" for x in row) for row in rows.tolist()]
+    for face in np.array(params["faces"]).reshape(-1, 3) + 1:
+        corners = (f"{i}/{i if has[1] else ''}/{i if has[2] else ''}".rstrip("/") for i in face)
+        lines.append("f " + " ".join(corners))
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _cameras(scene: mi.Scene) -> dict[str, Any]:
+    """The cameras that are pinholes, as a `transforms.json` of NeRF's has them."""
+    frames = []
+    for sensor in scene.sensors():
+        params = mi.traverse(sensor)
+        if sensor.class_name() != "PerspectiveCamera":
+            continue
+        width, height = (int(n) for n in sensor.film().size())
+        focal = width / (2 * math.tan(math.radians(float(params["x_fov"][0])) / 2))
+        shift = [float(params[f"principal_point_offset_{axis}"][0]) for axis in "xy"]
+        frames.append(
+            {
+                "file_path": f"{sensor.id()}.exr", "w": width, "h": height, "fl_x": focal, "fl_y": focal,
+                "cx": (0.5 - shift[0]) * width, "cy": (0.5 - shift[1]) * height,
+                "transform_matrix": (get_array(params["to_world"]).astype(np.float64) @ FACING).tolist(),
+            }
+        )  # fmt: skip
+    return {"camera_model": "PINHOLE", "frames": frames}

@@ -1,0 +1,165 @@
+"""A scene as Mitsuba's parser sees it, for writing: its objects one by one, and which parameter belongs to which.
+
+Parameters have the names of `mi.traverse(scene)`; the parser knows objects with their properties. Each object gets a
+name of its own, the scene is made once, and each parameter's owner tells by that name where it came from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from pathreplay.errors import PathreplayError
+from pathreplay.scenes.descriptions import require_values
+from pathreplay.scenes.scene_files import require_shallow, require_sound_files
+from pathreplay.threads import spare_thread
+
+Node = Any
+"""`mi.parser.SceneNode`."""
+
+
+@dataclass(frozen=True)
+class Owner:
+    """Of a parameter: the object in the scene's description, and where in it, as 'reflectance.value' or 'data'."""
+
+    node: Node
+    place: str
+
+
+class Described:
+    """The objects of a scene; the first is the scene itself."""
+
+    def __init__(self, state: Any, folder: Path | None) -> None:
+        self._state, self.nodes, self.folder = state, list(state.nodes), folder
+
+    def add(self, properties: mi.Properties, kind: mi.ObjectType) -> Any:
+        """Add an object; returns what refers to it, as the value of a property."""
+        node = mi.parser.SceneNode()
+        node.props, node.type = properties, kind
+        self.nodes.append(node)
+        return mi.Properties.ResolvedReference(len(self.nodes) - 1)
+
+    def children(self, node: Node) -> Iterator[tuple[str, Node]]:
+        """The objects in an object, and what they are called there."""
+        for name in node.props.keys():
+            if _is_reference(node, name):
+                yield name, self.nodes[node.props.get(name).index()]
+
+    def find_file(self, name: str) -> Path:
+        """The file that a property names; relative names start at the scene's own folder."""
+        with _resolving(self.folder):
+            return Path(str(mi.file_resolver().resolve(name)))
+
+
+def _is_reference(node: Node, name: str) -> bool:
+    return bool(node.props.type(name) == mi.Properties.Type.ResolvedReference)
+
+
+@contextmanager
+def _resolving(folder: Path | None) -> Iterator[None]:
+    outer = mi.file_resolver()
+    resolver = mi.FileResolver(outer)
+    if folder is not None:
+        resolver.prepend(mi.filesystem.path(str(folder)))
+    mi.set_file_resolver(resolver)
+    try:
+        yield
+    finally:
+        mi.set_file_resolver(outer)
+
+
+def describe(
+    scene: str | Path | Mapping[str, Any],
+    arguments: Mapping[str, str],
+    plugins: Mapping[str, str],
+    cameras: Mapping[str, Mapping[str, Any]],
+) -> tuple[Described, list[Owner]]:
+    """The objects of a scene (an XML file or a dictionary), and the owners of its parameters in their order.
+
+    ``arguments`` replace ``$name`` in the file; plugins are exchanged (old type -> new type), and cameras join, as in
+    `load_file_with`. Raises RuntimeError (Mitsuba's) where it cannot be read, and PathreplayError as that does.
+    """
+    config = mi.parser.ParserConfig(mi.variant())
+    config.merge_equivalent = config.merge_meshes = False
+    folder = None if isinstance(scene, Mapping) else Path(scene).parent.resolve()
+    with _resolving(folder):
+        if isinstance(scene, Mapping):
+            require_values(scene)
+            state = mi.parser.parse_dict(config, dict(scene))
+        else:
+            require_shallow(Path(scene))
+            state = mi.parser.parse_file(config, str(scene), **arguments)
+        for name, camera in cameras.items():
+            _join(state, name, mi.parser.parse_dict(config, dict(camera)))
+        for node in state.nodes:
+            if (new := plugins.get(node.props.plugin_name())) is not None:
+                node.props.set_plugin_name(new)
+        require_sound_files(state)
+        mi.parser.transform_all(config, state)
+        described = Described(state, folder)
+        owners = [_deepest(described, owner) for owner in _owners(config, state, described.nodes)]
+    return described, owners
+
+
+def _join(state: Any, name: str, camera: Any) -> None:
+    """Put the objects of a camera, which was parsed by itself, into the scene."""
+    offset = len(state.nodes)
+    for node in camera.nodes:
+        for key in node.props.keys():
+            if _is_reference(node, key):
+                node.props[key] = mi.Properties.ResolvedReference(node.props.get(key).index() + offset)
+        state.nodes.append(node)
+    state.nodes[offset].props.set_id(name)
+    state.root.props[name] = mi.Properties.ResolvedReference(offset)
+
+
+def _owners(config: Any, state: Any, nodes: list[Node]) -> list[Owner]:
+    """Of all parameters, by a scene in which each object is called otherwise."""
+    copy = mi.parser.ParserState(state)  # of which objects take the place of what is referred to
+    names = {f"object {i}": i for i in range(1, len(nodes))}
+    for name, i in names.items():
+        copy.nodes[i].props.set_id(name)
+    with spare_thread():
+        scene = mi.parser.instantiate(config, copy)
+    params = mi.traverse(scene)
+    owners = []
+    for key in params.keys():
+        node, depth = params.properties[key][2], 1
+        while node is not scene and node.id() not in names:
+            node, depth = params.hierarchy[node][0], depth + 1
+        place = ".".join(key.rsplit(".", depth)[-depth:])
+        owners.append(Owner(nodes[0 if node is scene else names[node.id()]], place))
+    return owners
+
+
+def _deepest(described: Described, owner: Owner) -> Owner:
+    """The owner of a parameter where objects on the way to it do not keep their names, as bitmaps do not."""
+    name, dot, rest = owner.place.partition(".")
+    if not dot:
+        return owner
+    children = dict(described.children(owner.node))
+    if name not in children:  # called otherwise in files, where it may be the only one of its kind
+        pictures = [child for child in children.values() if child.props.plugin_name() == "bitmap"]
+        if rest.split(".")[-1] != "data" or len(pictures) != 1:
+            return owner
+        return Owner(pictures[0], rest)
+    return _deepest(described, Owner(children[name], rest))
+
+
+def require_no_objects(described: Described) -> None:
+    """Raise PathreplayError for an object that was made before it came into the scene: nobody knows of what."""
+    for node in described.nodes:
+        for name in node.props.keys():
+            kind = node.props.type(name)
+            if kind in (mi.Properties.Type.Object, mi.Properties.Type.Any):
+                value = node.props.get(name)
+                what = value.class_name() if isinstance(value, mi.Object) else type(value).__name__
+                raise PathreplayError(
+                    f"'{name}' of {node.props.plugin_name()} '{node.props.id()}' is a {what} that was made before it "
+                    "came into the scene, and cannot be exported; describe it by a dictionary or a file"
+                )

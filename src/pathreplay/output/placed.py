@@ -1,0 +1,206 @@
+"""Puts values of a scene's parameters into its description: as properties, or as files that properties name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.images import exr_bytes
+from pathreplay.media.volume_files import UNIT_CUBE, Bounds, vol_bytes
+from pathreplay.output.nodes import Described, Node, Owner
+from pathreplay.scenes.parameters import get_array
+from pathreplay.scenes.stored import form_of
+
+_PICTURES = ("bitmap", "envmap")
+_OF_A_MESH = ("vertex_", "faces", "face_")
+_MADE_BY = ("filename", "bitmap", "grid", "data", "shape_index")
+"""Properties that say where values of a texture, a grid or a mesh come from."""
+_ALSO_PLACES = {
+    "sphere": ("center", "radius"),
+    "cylinder": ("p0", "p1", "radius"),
+    "point": ("position",),
+    "directional": ("direction",),
+}
+"""Properties that a `to_world` of `mi.traverse` has in it, by plugin."""
+
+# Classes of objects that may come in made, on a mesh: their plugin, and the properties of which they consist.
+_KNOWN = {"SmoothDiffuse": ("diffuse", "reflectance"), "AreaLight": ("area", "radiance")}
+_PLAIN_SPECTRA = ("SRGBReflectanceSpectrum", "UniformSpectrum")
+
+
+class Placing:
+    """Of the values that a scene has now, in its description; ``files`` (name -> bytes) is what it needs beside it.
+
+    ``names`` are names for files, by key.
+    """
+
+    def __init__(self, described: Described, scene: mi.Scene, names: dict[str, str]) -> None:
+        self.described, self.scene, self.names = described, scene, names
+        self.params = mi.traverse(scene)
+        self.files: dict[str, bytes] = {}
+        self._meshes: dict[str, str] = {}
+
+    def put(self, key: str, owner: Owner) -> None:
+        """Put the value of a parameter where it belongs. Raises PathreplayError where nothing can hold it."""
+        node, place = owner.node, owner.place
+        plugin = node.props.plugin_name()
+        if plugin in _PICTURES and place == "data":
+            self._texture(key, node)
+        elif plugin == "gridvolume" and place == "data":
+            self._volume(key, node)
+        elif place.startswith(_OF_A_MESH):
+            self._mesh(self.params.properties[key][2], node)
+        elif place == "to_world":
+            _remove(node.props, *_ALSO_PLACES.get(plugin, ()))
+            node.props["to_world"] = mi.ScalarTransform4f(get_array(self.params[key]).astype(np.float64))
+        else:
+            self._number(key, node, place)
+
+    def meshes(self) -> None:
+        """Give files to meshes that came into the scene made, and properties to what is on them."""
+        for parent in list(self.described.nodes):
+            for name in list(parent.props.keys()):
+                value = parent.props.get(name) if parent.props.type(name) == mi.Properties.Type.Object else None
+                if isinstance(value, mi.Mesh):
+                    self._made_mesh(parent, name, value)
+
+    def _texture(self, key: str, node: Node) -> None:
+        if mi.is_spectral:
+            raise PathreplayError(
+                f"Texture '{key}' is made of smooth spectra in variant {mi.variant()}, which no file of Mitsuba's "
+                "holds; recover it in an rgb variant"
+            )
+        value = self.params[key]
+        self._from_file(
+            node, f"textures/{self.names[key]}.exr", exr_bytes(get_array(form_of(self.params, key).see(value)))
+        )
+        if node.props.plugin_name() == "bitmap":
+            node.props["format"] = "fp16" if isinstance(value, mi.TensorXf16) else "variant"
+
+    def _volume(self, key: str, node: Node) -> None:
+        bounds = UNIT_CUBE
+        if node.props.get("use_grid_bbox", False):
+            bounds = self._box(node)
+        self._from_file(node, f"volumes/{self.names[key]}.vol", vol_bytes(get_array(self.params[key]), bounds))
+
+    def _box(self, node: Node) -> Bounds:
+        grid = node.props.get("grid") if "grid" in node.props else None
+        if grid is None:
+            grid = mi.VolumeGrid(str(self.described.find_file(node.props.get("filename"))))
+        box = grid.bbox()
+        low, high = ((float(p[0]), float(p[1]), float(p[2])) for p in (box.min, box.max))
+        return low, high
+
+    def _mesh(self, mesh: Any, node: Node) -> None:
+        _remove(node.props, *_MADE_BY, "to_world")
+        node.props.set_plugin_name("ply")
+        node.props["filename"] = self._ply(mesh, node.props.id())
+
+    def _ply(self, mesh: Any, name: str) -> str:
+        """The name of a mesh's file."""
+        if mesh.id() not in self._meshes:
+            stream = mi.MemoryStream()
+            mesh.write_ply(stream)
+            file = f"meshes/{self.names.get(mesh.id(), name or f'mesh-{len(self._meshes)}')}.ply"
+            self.files[file] = bytes(stream.raw_buffer())
+            self._meshes[mesh.id()] = file
+        return self._meshes[mesh.id()]
+
+    def _made_mesh(self, parent: Node, name: str, mesh: mi.Mesh) -> None:
+        properties = mi.Properties("ply")
+        properties.set_id(name)
+        shape = next((shape for shape in self.scene.shapes() if shape.id() == name), mesh)
+        properties["filename"] = self._ply(shape, name)
+        if not mesh.has_vertex_normals():
+            properties["face_normals"] = True
+        for part, made in (("bsdf", shape.bsdf()), ("emitter", shape.emitter())):
+            if made is not None:
+                kind = mi.ObjectType.BSDF if part == "bsdf" else mi.ObjectType.Emitter
+                properties[part] = self.described.add(self._known(made, f"{part} of '{name}'"), kind)
+        _remove(parent.props, name)
+        parent.props[name] = self.described.add(properties, mi.ObjectType.Shape)
+
+    def _known(self, made: Any, what: str) -> mi.Properties:
+        """The properties of an object that is simple enough for its parameters to tell them all."""
+        plugin, part = _KNOWN.get(made.class_name(), ("", ""))
+        params = mi.traverse(made)
+        owner = params.properties[f"{part}.value"][2] if f"{part}.value" in params else None
+        if owner is None or owner.class_name() not in _PLAIN_SPECTRA:
+            raise PathreplayError(
+                f"The {what} is a {made.class_name()} that was made before it came into the scene, and cannot be "
+                "exported; give the mesh by a file and its materials by dictionaries"
+            )
+        properties = mi.Properties(plugin)
+        _set_colour(properties, part, get_array(params[f"{part}.value"]))
+        return properties
+
+    def _number(self, key: str, node: Node, place: str) -> None:
+        value, plugin = get_array(self.params[key]), node.props.plugin_name()
+        if place == "x_fov":
+            _remove(node.props, "focal_length")
+            node.props["fov_axis"] = "x"
+            node.props["fov"] = float(value[0])
+        elif plugin == "smoothdielectric" and place == "eta":
+            node.props["int_ior"], node.props["ext_ior"] = float(value[0]), 1.0
+        elif place.endswith(".value") or place == "value":
+            name = place.split(".")[0]
+            if mi.is_spectral and value.size > 1:
+                raise PathreplayError(
+                    f"Parameter '{key}' is a smooth spectrum in variant {mi.variant()}, which no scene file holds; "
+                    "recover it in an rgb variant"
+                )
+            _set_colour(node.props, name, value)
+        elif value.size == 1 and "." not in place:
+            node.props[place] = float(value.ravel()[0])
+        elif value.size == 3 and "." not in place:
+            node.props[place] = mi.ScalarVector3d(*(float(x) for x in value.ravel()))
+        else:
+            raise PathreplayError(
+                f"Parameter '{key}' of {plugin} with {value.size} numbers cannot be written into a scene file; take "
+                "its value from parameters.safetensors in the run folder"
+            )
+
+    def _from_file(self, node: Node, name: str, data: bytes) -> None:
+        _remove(node.props, *_MADE_BY)
+        node.props["filename"] = name
+        self.files[name] = data
+
+
+def _remove(properties: mi.Properties, *names: str) -> None:
+    for name in names:
+        if name in properties:
+            del properties[name]
+
+
+def _set_colour(properties: mi.Properties, name: str, value: np.ndarray) -> None:
+    if value.size == 1:
+        properties[name] = float(value.ravel()[0])
+    else:
+        properties[name] = mi.ScalarColor3d(*(float(x) for x in value.ravel()))
+
+
+def made_otherwise(node: Node) -> bool:
+    """Whether the values of a texture or grid came into the scene as an object or an array, and not by a file."""
+    return any(name in node.props for name in ("bitmap", "grid", "data"))
+
+
+def copied_files(described: Described, placed: dict[str, bytes]) -> dict[str, Path]:
+    """Files that the scene names beside those ``placed``: new name -> where it is. The scene is given the new name."""
+    found: dict[str, Path] = {}
+    for node in described.nodes:
+        name = node.props.get("filename", None)
+        if not isinstance(name, str) or name in placed:
+            continue
+        path = described.find_file(name).resolve()
+        known = next((new for new, old in found.items() if old == path), None)
+        if known is None:
+            known = f"files/{path.name}"
+            if known in found:
+                known = f"files/{path.stem}-{len(found)}{path.suffix}"
+            found[known] = path
+        node.props["filename"] = known
+    return found

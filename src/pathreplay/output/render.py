@@ -1,0 +1,94 @@
+"""The command `pathreplay render`: checks what was asked for, renders with a bar on stderr, and writes one file."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from pathreplay.errors import PathreplayError, shown
+from pathreplay.inverse.definitions import defined
+from pathreplay.output.picture import Told, file_bytes, find_sensor, render, set_size
+from pathreplay.output.whole_files import require_writable, write_whole
+from pathreplay.scenes.descriptions import load_integrator
+from pathreplay.scenes.loading import load_scene
+
+_OPTION = "-o"
+_SECONDS = 10.0
+
+
+def render_to_file(
+    scene: str,
+    output: Path,
+    *,
+    integrator: str | None = None,
+    options: Sequence[str] = (),
+    sensor: str | None = None,
+    size: str | None = None,
+    spp: int | None = None,
+    seed: int = 0,
+    define: Sequence[str] = (),
+    progress: bool = True,
+) -> str:
+    """Render a scene into a file, and return a line about it. Needs an active variant.
+
+    ``options`` are NAME=VALUE of the integrator, ``define`` those of the scene; everything else is as on the command
+    line. Raises PathreplayError for what cannot be done; the file is then what it was.
+    """
+    ending = output.suffix.lower()
+    if ending not in (".exr", ".png"):
+        raise PathreplayError(f"{output} ends in {shown(ending)}; give {_OPTION} a name that ends in .exr or .png")
+    require_writable(output, _OPTION)
+    if spp is not None and not 1 <= spp < 2**32:
+        raise PathreplayError(f"--spp {spp} is no number of samples; give one from 1 to {2**32 - 1}")
+    if not 0 <= seed < 2**32:
+        raise PathreplayError(f"--seed {seed} is no seed; give one from 0 to {2**32 - 1}")
+    given = {} if integrator is None else {"type": integrator}
+    described = _flat("-I", given, options)
+    if integrator is None and options:
+        raise PathreplayError(f"-I {shown(options[0])} is an option of an integrator; name it with --integrator")
+    loaded = load_scene(scene, **_flat("-D", {}, define))
+    renderer = load_integrator(described) if given else loaded.integrator() or load_integrator({"type": "path"})
+    camera = find_sensor(loaded, sensor)
+    if size is not None:
+        set_size(camera, size)
+    samples = camera.sampler().sample_count() if spp is None else spp
+    begin = time.perf_counter()
+    with _bar(progress) as tell:
+        rendering = render(loaded, camera, renderer, samples, seed, tell)
+    height, width, _ = rendering.image.shape
+    write_whole(output, file_bytes(rendering, ending), _OPTION)
+    seconds = time.perf_counter() - begin
+    return f"{output}: {width} x {height}, {rendering.spp} samples per pixel, {seconds:.3g} s"
+
+
+def _flat(option: str, table: dict[str, Any], changes: Sequence[str]) -> dict[str, Any]:
+    """The table with each NAME=VALUE put into it."""
+    found: dict[str, Any] = defined(table, changes)
+    for name, value in found.items():
+        if isinstance(value, (dict, list)):
+            raise PathreplayError(f"{option} {name} is {shown(value)}; give a number, a text, true or false")
+    return found
+
+
+@contextmanager
+def _bar(shown: bool) -> Iterator[Told | None]:
+    """A bar on stderr that goes when all is done; lines now and then where that is no terminal."""
+    console = Console(stderr=True, force_jupyter=False)
+    columns = (TextColumn("rendering, pass"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not (shown and console.is_terminal)) as bar:
+        task = bar.add_task("", total=None)
+        last = [time.monotonic()]
+
+        def tell(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+            if not console.is_terminal and time.monotonic() - last[0] >= _SECONDS:
+                last[0] = time.monotonic()
+                console.print(f"pathreplay: pass {done} of {total}", soft_wrap=True, highlight=False)
+
+        yield tell if shown else None

@@ -1,0 +1,197 @@
+"""A scene as a folder: Mitsuba XML and the files that it names, which `mitsuba` renders to the same picture."""
+
+from __future__ import annotations
+
+import gc
+import re
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+from pathreplay.files import file_names
+from pathreplay.inverse.values import Arrays
+from pathreplay.output.nodes import Described, describe, require_no_objects
+from pathreplay.output.placed import Placing, copied_files, made_otherwise
+from pathreplay.output.xml import scene_xml
+from pathreplay.plugins import PLUGINS
+from pathreplay.scenes.descriptions import told
+from pathreplay.scenes.parameters import get_array, is_empty, to_value
+from pathreplay.scenes.stored import form_of
+from pathreplay.scenes.substitute import load_dict_with, load_file_with
+from pathreplay.threads import spare_thread
+
+SCENE = "scene.xml"
+
+_STANDS_IN = {"smoothdielectric": "dielectric"}
+"""What Mitsuba's own scenes have in the place of our plugins."""
+_NOT_FOR_MITSUBA = ("pathreplay", "prb", "prb_basic", "prb_projective", "direct_projective", "rb")
+_NOT_FOR_MITSUBA_IN_MEDIA = ("prbvolpath", "volprim_rf_basic")
+_KEPT = ("max_depth", "rr_depth", "hide_emitters")
+"""Options that `path` and `volpath` share with integrators made for gradients."""
+
+# An address in memory: what Mitsuba calls an object without id.
+_ADDRESS = re.compile(r"object_\d+")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A scene as it is asked for, before values are given to it."""
+
+    scene: str | Path | Mapping[str, Any]
+    """Path of an XML file, or a dictionary of Mitsuba's."""
+    arguments: Mapping[str, str]
+    """What replaces ``$name`` in the file."""
+    plugins: Mapping[str, str]
+    """Plugins that were exchanged, old type -> new type."""
+    cameras: Mapping[str, Mapping[str, Any]]
+    """Sensors that join the scene, by id."""
+
+    def load(self) -> mi.Scene:
+        """The scene. Raises what Mitsuba and `load_file_with` raise."""
+        if isinstance(self.scene, Mapping):
+            return load_dict_with(self.scene, self.plugins, self.cameras)[0]
+        return load_file_with(self.scene, self.plugins, self.arguments, self.cameras)[0]
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A scene with its values, and the files that hold it."""
+
+    scene: mi.Scene
+    files: dict[str, bytes]
+    """Name -> bytes."""
+    copies: dict[str, Path]
+    """Name -> the file that it is a copy of."""
+    notes: tuple[str, ...]
+    """What is not as it was."""
+
+
+def exported(source: Source, values: Arrays, integrator: Mapping[str, Any] | None = None) -> Exported:
+    """The files of a scene in which parameters have these values (as people see them), by their keys.
+
+    ``integrator`` is what shall render it, instead of the scene's own; of those made for gradients `path` or `volpath`
+    takes the place. Raises PathreplayError for what no scene file of Mitsuba's can hold.
+    """
+    with told("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
+        scene = source.load()
+        params = _set(scene, values)
+        described, owners = describe(source.scene, source.arguments, source.plugins, source.cameras)
+    keys = list(params.keys())
+    if len(keys) != len(owners):
+        raise PathreplayError("The scene is another one at every loading, and cannot be exported")
+    placing = Placing(described, scene, _file_names(keys, scene))
+    for key, owner in zip(keys, owners, strict=True):
+        if owner.node is described.nodes[0]:  # of a mesh that came in made; `meshes` sees to it
+            continue
+        if key in values or (owner.place == "data" and made_otherwise(owner.node)):
+            placing.put(key, owner)
+    placing.meshes()
+    notes = _plain_plugins(described) + _plain_integrator(described, integrator)
+    require_no_objects(described)
+    copies = copied_files(described, placing.files)
+    files = {**placing.files, SCENE: scene_xml(described, not isinstance(source.scene, Mapping))}
+    return Exported(scene, files, copies, tuple(notes))
+
+
+def require_same(original: mi.Scene, folder: Path) -> None:
+    """Raise PathreplayError unless the scene in a folder has the parameters of the original, up to rounding."""
+    gc.collect()
+    with told(f"The exported scene {folder / SCENE} cannot be loaded"), spare_thread():
+        copy = mi.load_file(str(folder / SCENE), optimize=False)
+    ours, theirs = mi.traverse(original), mi.traverse(copy)
+    # Those without a name come in the same order.
+    waiting: defaultdict[str, list[str]] = defaultdict(list)
+    for key in theirs.keys():
+        waiting[_ADDRESS.sub("object", key)].append(key)
+    for key in ours.keys():
+        others = waiting[_ADDRESS.sub("object", key)]
+        if not others or not _alike(ours[key], theirs[others.pop(0)]):
+            raise PathreplayError(
+                f"Parameter '{key}' of {ours.properties[key][2].class_name()} does not come back from the exported "
+                "scene; it cannot be exported"
+            )
+
+
+def _alike(value: Any, other: Any) -> bool:
+    if isinstance(value, (bool, int, str)) or isinstance(other, (bool, int, str)):
+        return bool(value == other)
+    try:
+        a, b = (_numbers(each) for each in (value, other))
+    except (TypeError, ValueError):
+        return True  # nothing that can be compared: scalar vectors and the like, which are never recovered
+    if a.size == 0 or b.size == 0:
+        return a.size == b.size
+    a, b = (x.astype(np.float64).ravel() for x in (a, b))
+    a, b = (np.full(max(a.size, b.size), x[0]) if x.size == 1 else x for x in (a, b))  # a grey colour is a number
+    return a.shape == b.shape and np.allclose(a, b, rtol=1e-5, atol=1e-6 * (1 + np.abs(a).max()))
+
+
+def _numbers(value: Any) -> np.ndarray:
+    if hasattr(value, "matrix") and not dr.is_jit_v(value.matrix):
+        return np.array(value.matrix, np.float64)
+    if dr.is_array_v(value) or isinstance(value, float) or hasattr(value, "matrix"):
+        return np.zeros(0) if not isinstance(value, float) and is_empty(value) else get_array(value)
+    return np.array(value, np.float64)
+
+
+def _set(scene: mi.Scene, values: Arrays) -> mi.SceneParameters:
+    params = mi.traverse(scene)
+    for key, value in values.items():
+        if key not in params:
+            raise PathreplayError(f"The scene has no parameter '{key}' any more; export with the scene of the run")
+        form = form_of(params, key)
+        seen = form.see(params[key])
+        array = np.ascontiguousarray(value, np.float32)
+        params[key] = form.store(type(seen)(array) if dr.is_tensor_v(seen) else to_value(seen, array))
+    params.update()
+    return mi.traverse(scene)
+
+
+def _file_names(keys: list[str], scene: mi.Scene) -> dict[str, str]:
+    return file_names([*keys, *(shape.id() for shape in scene.shapes())])
+
+
+def _plain_plugins(described: Described) -> list[str]:
+    """Mitsuba's own plugins in the place of ours; what is to be said of it."""
+    notes = []
+    for node in described.nodes:
+        name = node.props.plugin_name()
+        if name in _STANDS_IN:
+            node.props.set_plugin_name(_STANDS_IN[name])
+        elif name in PLUGINS and node.type != mi.ObjectType.Integrator:
+            notes.append(f"the scene needs '{name}' of this package: import pathreplay before it is loaded")
+    return notes
+
+
+def _plain_integrator(described: Described, wanted: Mapping[str, Any] | None) -> list[str]:
+    root = described.nodes[0]
+    own = next((n for n, node in described.children(root) if node.type == mi.ObjectType.Integrator), None)
+    media = any(node.type == mi.ObjectType.Medium for node in described.nodes)
+    node = None if own is None else dict(described.children(root))[own]
+    options = (
+        dict(wanted or {"type": "path"})
+        if wanted or node is None
+        else {"type": node.props.plugin_name(), **{name: node.props.get(name) for name in _KEPT if name in node.props}}
+    )
+    name = options["type"]
+    plain = {**dict.fromkeys(_NOT_FOR_MITSUBA, "volpath" if media else "path"),
+             **dict.fromkeys(_NOT_FOR_MITSUBA_IN_MEDIA, "volpath")}.get(name)  # fmt: skip
+    if wanted is None and node is not None and plain is None:
+        return []
+    properties = mi.Properties(plain or name)
+    for option, value in options.items():
+        if option != "type" and (plain is None or option in _KEPT):
+            properties[option] = value
+    if own is not None:
+        del root.props[own]
+    root.props["integrator"] = described.add(properties, mi.ObjectType.Integrator)
+    return (
+        [f"'{plain}' renders the exported scene in the place of '{name}', which is made for gradients"] if plain else []
+    )
