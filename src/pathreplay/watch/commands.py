@@ -23,7 +23,8 @@ def add_to(app: typer.Typer) -> None:
 def compare(
     runs: Runs,
     output: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="Also write a page with curves and pictures.")
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE.html", help="Also write a page with curves and pictures."),
     ] = None,
 ) -> None:
     """Print what runs came to, and where their jobs differ; --output writes a page with curves and pictures."""
@@ -44,7 +45,10 @@ def compare(
 def timelapse(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
     output: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A .webp or .mp4 file (default: timelapse.webp in the run).")
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="A .webp or .mp4 file (default: timelapse.webp in the run)."
+        ),
     ] = None,
     view: Annotated[str | None, typer.Option(help="Name of the view (default: the first).")] = None,
     seconds: Annotated[float, typer.Option(min=0.1, max=600, help="How long it takes.")] = 6.0,
@@ -60,7 +64,9 @@ def timelapse(
 
 def tensorboard(
     runs: Runs,
-    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the event files.")] = Path("tensorboard"),
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder for the event files.")
+    ] = Path("tensorboard"),
 ) -> None:
     """Write loss, errors and gradients of runs as event files; then: tensorboard --logdir FOLDER."""
     with interrupts.undisturbed():

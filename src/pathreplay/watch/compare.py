@@ -95,7 +95,7 @@ def _differences(runs: list[Past]) -> list[Row]:
     for key in _keys(flat):
         values = [each.get(key) for each in flat]
         if any(value != values[0] for value in values):
-            rows.append(Row(key, tuple("" if value is None else shown(value, 60) for value in values)))
+            rows.append(Row(f"job: {key}", tuple("" if value is None else shown(value, 60) for value in values)))
     return rows
 
 
