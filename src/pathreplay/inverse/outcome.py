@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config
@@ -92,6 +93,8 @@ class Recovered:
     result: Array
     truth: Array | None
     rival: Array | None = None
+    faces: NDArray[np.integer] | None = None
+    """Of a mesh whose vertices these are (3 m numbers)."""
 
     def known(self, *kinds: str) -> dict[str, Array]:
         """What there is of these kinds: 'start', 'result', 'rival', 'truth'."""

@@ -23,6 +23,7 @@ from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.events import Event, Notes, Started, Stepped, Stopped
 from pathreplay.inverse.images import Image, displayed, exposure_for
+from pathreplay.inverse.likeness import Likeness
 from pathreplay.inverse.loop import answer_of, picture_of
 from pathreplay.inverse.outcome import DIFFERENCE_GAIN, Recovered, ViewPictures, resume_command
 from pathreplay.inverse.page_parts import (
@@ -79,6 +80,7 @@ class Previews:
         self._spent = self._cost = 0.0
         self._resumed, self._stride = 0, 1.0
         self._kept = [0]
+        self._likenesses = self._alike()
         self._shown_at = 0
         self._stale = (folder.path / STOP).exists()  # a wish to stop an earlier part of the run
         self._log: list[str] = list(problem.notes)
@@ -157,13 +159,16 @@ class Previews:
             self._log.append(f"no more pictures: {plain_line(str(error))}")
             return {}
         self._now = {v.name: _pictures_of(v, self._before[v.name], images[v.name]) for v in self._views}
-        self._shown_at = done
+        self._likenesses, self._shown_at = self._alike(), done
         files = self._frames(done, images)
         for view in self._views:
             for kind in ("result", "difference"):
                 image = self._now[view.name].pictures()[kind]
                 files[f"{FOLDER}/{kind}-{view.name}.png"] = _encoded(image, self._stored(view), LARGEST, "png")
         return files
+
+    def _alike(self) -> dict[str, Likeness]:
+        return {name: Likeness.of(it.result, it.target, it.exposure, it.weight) for name, it in self._now.items()}
 
     def _stored(self, view: View) -> float:
         return min(self._exposure, exposure_for(view.target))
@@ -248,7 +253,7 @@ class Previews:
             Picture(kind, captions.get(kind, kind), f"{FOLDER}/{kind}-{view.name}.png?{self._shown_at}")
             for kind in it.pictures()
         )
-        likeness = it.likenesses["result"]
+        likeness = self._likenesses[view.name]
         note = (
             f"Root mean square difference from the target {it.error(it.result):.4g}, PSNR {likeness.psnr:.2f} dB, "
             f"SSIM {likeness.ssim:.4f}, noise included."
