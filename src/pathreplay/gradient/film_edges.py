@@ -170,14 +170,24 @@ def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sigh
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
     kind = dr.select(dr.dot(si.sh_frame.n, at.ray.d) > 0, mi.UInt32(1), 0)
     if walk.traits.coarse_meshes:
-        kind |= dr.select(_in_own_shadow(walk, at, key, path.depth, active), mi.UInt32(2), 0)
+        kind |= _below(walk, path, key, active)
     return Sight(mixed(place_met(walk, at.hit, active), kind), si.p, si.n)
 
 
-def _in_own_shadow(walk: Walk, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Bool) -> mi.Bool:
-    """Whether the triangle of the k-th vertex hides the light that is sampled there, which its shading would see."""
-    light, si, lit = _light(walk, at, Numbers.draw(Counted.at_vertex(key, k)).light, k, active)
-    return lit & (dr.dot(si.n, light.d) * dr.dot(si.sh_frame.n, light.d) < 0)
+def _below(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+    """Bits for the directions of light and lobe that are sampled there: their own triangle is in the way of them.
+
+    It is where shading and triangle are on different sides of a direction; their shape hides what is there.
+    """
+    u = Numbers.draw(Counted.at_vertex(key, path.depth))
+    light, si, lit = _light(walk, path.at, u.light, path.depth, active)
+    lobe, _ = si.bsdf().sample(mi.BSDFContext(), si, u.lobe, u.direction, active & si.is_valid())
+
+    def blocked(d: mi.Vector3f) -> mi.Bool:
+        return dr.dot(si.n, d) * dr.dot(si.sh_frame.n, d) < 0
+
+    to_light = dr.select(lit & blocked(light.d), mi.UInt32(2), 0)
+    return to_light | dr.select((lobe.pdf > 0) & blocked(si.to_world(lobe.wo)), mi.UInt32(4), 0)
 
 
 def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
