@@ -23,7 +23,7 @@ DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
 INSTANCE = "Instance"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
-COARSE = 4.0
+COARSE = 1.0
 """Degrees between triangles and shading normals from which on it matters that they are not the same."""
 
 T = TypeVar("T")
