@@ -32,7 +32,7 @@ SMALL, LARGE = 32, 128
 
 
 def jobs(quick: bool) -> list[Job]:
-    """Inner edges, edges on the film, and steps that are recorded; guided rivals and large films in jobs of their own."""
+    """Inner edges, edges on the film, recorded steps; guided rivals and large films have jobs of their own."""
     inner = ("prb", "inner edges alone", "film edges alone", "edges alone", "unguided inner")
     film = ("prb", "film edges alone", "edge list")
     wanted = [(scene, inner, 0.0, SMALL) for scene in INNER] + [(scene, film, 0.0, SMALL) for scene in FILM]
