@@ -29,14 +29,14 @@ from pathreplay.inverse.run_folder import CHECKPOINT
 WALLS = [f"{wall}.reflectance.value" for wall in ("red", "green", "white")]
 JOB: dict[str, Any] = {
     "scene": "cornell-box-photo",
-    "scene_parameters": {"resolution": 16, "texture": 8},
+    "scene_parameters": {"resolution": 8, "texture": 8},
     "integrator": {"type": "pathreplay", "max_depth": 4},
     "parameters": [
         {"key": "back.bsdf.reflectance.data", "initial": 0.5, "lower": 0.0, "upper": 1.0, "resolutions": [4, 8]},
         *({"key": key, "initial": 0.5, "lower": 0.0, "upper": 1.0} for key in WALLS[:2]),
     ],
     "target": {"spp": 64, "values": {WALLS[0]: [0.6, 0.1, 0.1], WALLS[1]: [0.1, 0.5, 0.1]}},
-    "stages": [{"iterations": 10, "downscale": 2, "spp": 16}, {"iterations": 10, "max_depth": 3}],
+    "stages": [{"iterations": 20, "downscale": 2, "spp": 16}, {"iterations": 20, "max_depth": 3}],
     "spp": 8,
     "signal_to_noise": True,
     "picture_spp": 16,
@@ -56,7 +56,7 @@ def main(
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         whole, made, length = _undisturbed(folder / "whole")
-        print(f"undisturbed: {length:.1f} s, of which {made:.1f} s before there is a run folder")
+        print(f"undisturbed: {length:.1f} s, of which {made:.1f} s before there is a run folder", flush=True)
         counts: Counter[tuple[str, str]] = Counter()
         for k in range(kills):
             place = folder / f"kill-{k}"

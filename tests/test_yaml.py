@@ -93,6 +93,12 @@ def test_what_a_program_writes_comes_back() -> None:
     assert load_config(Path("job.yaml")) == make_config(values)
 
 
+def test_a_file_that_would_take_long_to_read_is_no_job() -> None:
+    Path("job.yaml").write_text("- [1, 2]\n" * 40_000)
+    with pytest.raises(PathreplayError, match="has 360000 bytes, more than the 262144 that are read"):
+        load_config(Path("job.yaml"))
+
+
 @pytest.mark.parametrize("text", ["", "- a", "3", "null"])
 def test_a_file_without_a_table_is_no_job(text: str) -> None:
     Path("job.yaml").write_text(text)

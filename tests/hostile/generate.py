@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-from . import of_capture, of_command, of_config, of_mesh, of_picture, of_process, of_python, of_run, of_scene, of_volume
+from . import (
+    of_capture,
+    of_command,
+    of_config,
+    of_mesh,
+    of_picture,
+    of_process,
+    of_python,
+    of_run,
+    of_scene,
+    of_stages,
+    of_volume,
+)
 from .case import RECIPES, Case
 
 KINDS = tuple(
     module.KIND
     for module in (
         of_config,
+        of_stages,
         of_command,
         of_scene,
         of_mesh,

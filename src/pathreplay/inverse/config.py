@@ -22,7 +22,7 @@ from pathreplay.inverse.preview_options import Preview
 from pathreplay.inverse.schedules import Schedule
 from pathreplay.inverse.stage_options import Stage, begins
 from pathreplay.inverse.tables import Count, Finite, Positive, Switch, Table, Whole
-from pathreplay.inverse.texts import YAML, parsed
+from pathreplay.inverse.texts import YAML, most_bytes, parsed
 
 
 class Picture(Table):
@@ -358,7 +358,7 @@ def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
 
     Raises PathreplayError for an unreadable file, an unknown key (names the nearest), a value out of its range.
     """
-    problem = file_problem(path, 64 * 2**20)  # no job is as long: what is larger is some other file
+    problem = file_problem(path, most_bytes(path))
     if problem == MISSING:
         found = path.parent.glob("*") if path.parent.is_dir() else []
         near = [str(p) for p in found if p.suffix in (".toml", *YAML)]

@@ -21,8 +21,16 @@ else:
 YAML = (".yaml", ".yml")
 """Endings of files that are YAML; `.json` is JSON, all others are TOML."""
 
+_LONGEST, _LONGEST_YAML = 64 * 2**20, 2**18
+"""Bytes: no job is as long, and what is larger is some other file. PyYAML takes seconds for as many."""
+
 _DEEPEST = 64
 """Lists and tables of YAML inside each other: its reader needs several frames for each."""
+
+
+def most_bytes(path: Path) -> int:
+    """The size of a file, beyond which it is no job."""
+    return _LONGEST_YAML if path.suffix.lower() in YAML else _LONGEST
 
 
 def parsed(path: Path, text: str) -> Any:
