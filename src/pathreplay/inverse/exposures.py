@@ -39,8 +39,11 @@ class Factors:
         return self._log.latent(values)
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """See `Coordinates`."""
-        return self._log.gradient(values, by_values)
+        """See `Coordinates`; also of what `values` takes off all factors."""
+        found = self._log.gradient(values, by_values)
+        if self.fixed:
+            found[self.fixed] -= found.sum(axis=0) / len(self.fixed)
+        return found
 
     def values(self, latent: Array) -> Array:
         """See `Coordinates`."""
