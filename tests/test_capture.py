@@ -307,7 +307,7 @@ def test_the_example_finds_texture_roughness_and_sky(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_exposures_of_a_capture_are_found(folder: Path) -> None:
-    """Of the example's pictures at exposures of half to twice; texture, roughness and sky are given, and noise is there."""
+    """Of the example's pictures at exposures of half to twice, with noise; texture, roughness and sky are given."""
     example = Path(__file__).parents[1] / "examples" / "capture"
     pictures = folder / "small"
     script = [sys.executable, str(example / "make_capture.py"), str(pictures)]
