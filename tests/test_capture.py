@@ -19,7 +19,7 @@ from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.capture import read_capture
 from pathreplay.inverse.config import Capture
 from pathreplay.inverse.exposures import exposed
-from pathreplay.inverse.images import exr_bytes, picture_size, png_bytes
+from pathreplay.inverse.images import exr_bytes, picture_size, png_bytes, read_image
 from pathreplay.inverse.problem import build_problem
 from pathreplay.scenes.loading import load_scene_for
 
@@ -303,6 +303,34 @@ def test_the_example_finds_texture_roughness_and_sky(folder: Path) -> None:
     paint = runpy.run_path(str(example / "make_capture.py"))["paint"]()
     found = result.parameters["ball.bsdf.base_color.data"]
     assert np.corrcoef(found[4:12].ravel(), paint[4:12].ravel())[0, 1] > 0.8
+
+
+@pytest.mark.slow
+def test_exposures_of_a_capture_are_found(folder: Path) -> None:
+    """Of the example's pictures at exposures of half to twice, with noise; texture, roughness and sky are given."""
+    example = Path(__file__).parents[1] / "examples" / "capture"
+    pictures = folder / "small"
+    script = [sys.executable, str(example / "make_capture.py"), str(pictures)]
+    subprocess.run([*script, "--views", "12", "--width", "24", "--spp", "256"], check=True, capture_output=True)
+    logs = np.random.default_rng(3).uniform(-0.7, 0.7, 12)
+    factors = np.exp(logs - logs[[k for k in range(12) if k % 6]].mean())
+    for k, factor in enumerate(factors):
+        path = pictures / f"{k:02d}.exr"
+        path.write_bytes(exr_bytes(read_image(path) * np.float32(factor)))
+    truth = runpy.run_path(str(example / "make_capture.py"))
+    for name in ("paint", "sky"):
+        (folder / f"{name}.exr").write_bytes(exr_bytes(truth[name]()))
+    known = [folder / "paint.exr", truth["ROUGHNESS"], folder / "sky.exr"]
+    changes = [f"parameters.{n}.initial={value}" for n, value in enumerate(known)]
+    changes += [f"parameters.{n}.learning_rate=1e-9" for n in range(3)]
+    changes += [f"capture.transforms={pictures / 'transforms.json'}", "exposure.learning_rate=0.1", "iterations=60"]
+    result = optimize(
+        example / "config.toml",
+        output="found",
+        progress=False,
+        define=[*changes, "views_per_step=10", "picture_spp=64"],
+    )
+    assert result.parameters["exposure"].ravel() == pytest.approx(factors, rel=0.03)
 
 
 def test_pictures_go_with_their_cameras_whatever_views_are_called(folder: Path) -> None:

@@ -15,7 +15,6 @@ from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.evaluate import Evaluator, Shard
 from pathreplay.inverse.exposures import EXPOSURE, Factors, fitted
 from pathreplay.inverse.images import exr_bytes
-from pathreplay.inverse.losses import LOSSES
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.values import Arrays
 
@@ -68,16 +67,16 @@ def start_of(problem: Problem) -> dict[str, np.ndarray]:
 
 
 SLOW = pytest.mark.slow
-# One needs a network, and the other has a factor of its own for each view.
-COMPARABLE = [name for name in LOSSES if name not in ("lpips", "scale-invariant")]
+# Of each pixel for itself; what losses of neighbourhoods are of flat pictures is not what is asked here.
+PLAIN = ("l2", "relative-l2", "l1", "log")
 
 
 @pytest.mark.parametrize(
     ("white_balance", "loss", "filter"),
     [
         (True, "l2", "box"),
-        *(pytest.param(*each, marks=SLOW) for each in itertools.product([False], COMPARABLE, ["box", "gaussian"])),
-        *(pytest.param(True, loss, "gaussian", marks=SLOW) for loss in COMPARABLE),
+        *(pytest.param(*each, marks=SLOW) for each in itertools.product([False], PLAIN, ["box", "gaussian"])),
+        *(pytest.param(True, loss, "gaussian", marks=SLOW) for loss in PLAIN),
     ],
 )
 def test_gradients_are_those_of_finite_differences(white_balance: bool, loss: str, filter: str, folder: Path) -> None:

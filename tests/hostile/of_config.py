@@ -15,6 +15,11 @@ from .values import ESCAPE, TEXTS, VALUES, pick, spoiled
 
 KIND = "config"
 
+# A job in stages.
+STAGED: dict[str, Any] = {key: value for key, value in RENDERED.items() if key != "iterations"} | {
+    "stages": [{"iterations": 1, "downscale": 2}, {"iterations": 1, "spp": 4}]
+}
+
 # Every key of a job, with a job that has the key's table.
 KEYS: dict[str, Mapping[str, Any]] = {
     **dict.fromkeys(
@@ -28,7 +33,9 @@ KEYS: dict[str, Mapping[str, Any]] = {
             "exposure.white_balance exposure.free view_weights view_weights.eye target.masks target.alpha "
             "learning_rate_schedule warm_up "
             " optimizer optimizer.type optimizer.beta_1 optimizer.epsilon "
-            "parameters.0.transform parameters.0.total_variation parameters.0.prior checkpoint_every unknown"
+            "parameters.0.transform parameters.0.total_variation parameters.0.prior checkpoint_every unknown "
+            "auto_spp auto_spp.ratio auto_spp.lowest auto_spp.highest signal_to_noise non_finite_in_a_row "
+            "preview preview.share preview.views preview.frames"
         ).split(),
         JOB,
     ),
@@ -45,6 +52,13 @@ KEYS: dict[str, Mapping[str, Any]] = {
             "parameters.0.distance parameters.0.rotation_learning_rate parameters.0.learning_rate"
         ).split(),
         POSED,
+    ),
+    **dict.fromkeys(
+        (
+            "stages stages.0 stages.0.iterations stages.0.downscale stages.0.spp stages.0.max_depth stages.0.sensors "
+            "stages.0.views_per_step stages.0.parameters stages.0.learning_rate_factor iterations warm_up"
+        ).split(),
+        STAGED,
     ),
 }
 
@@ -122,6 +136,33 @@ _valued("variant", "llvm_ad_rgb_polarized")
 _valued("variant", "cuda_ad_rgb", refused=False)
 _valued("output", "runs/\x00")
 _valued("output", "n" * 300)
+_valued("stages", [], job=STAGED)
+_valued("stages", {"iterations": 2}, job=STAGED)
+_valued("stages.0", {}, job=STAGED)
+_valued("stages.0.iterations", 0, job=STAGED)
+_valued("stages.0.downscale", 5, job=STAGED)
+_valued("stages.0.downscale", 65536, job=STAGED)
+_valued("stages.0.downscale", 2**40, job=STAGED)
+_valued("stages.0.spp", 10**9, job=STAGED)
+_valued("stages.0.max_depth", 10**12, job=STAGED)
+_valued("stages.0.sensors", ["nobody"], job=STAGED)
+_valued("stages.0.sensors", [10**30], job=STAGED)
+_valued("stages.0.parameters", ["nothing.*"], job=STAGED)
+_valued("stages.0.parameters", ["*a" * 40 + "b"], job=STAGED)
+_valued("stages.0.learning_rate_factor", 1e30, job=STAGED, refused=False)
+_valued("stages.1.learning_rate_factor", -1, job=STAGED)
+_valued("stages", [{"iterations": 1, "unknown": ESCAPE}], job=STAGED)
+_valued("iterations", 5, job=STAGED)
+_valued("signal_to_noise", True, job={**JOB, "spp": 3})
+_valued("auto_spp", {"lowest": 3}, job={**JOB, "spp": "auto"})
+_valued("auto_spp", {"lowest": 64, "highest": 8}, job={**JOB, "spp": "auto"})
+_valued("auto_spp", {"highest": 2**30}, job={**JOB, "spp": "auto"})
+_valued("auto_spp", {"ratio": 1e38, "highest": 8}, job={**JOB, "spp": "auto"}, refused=False)
+_valued("spp", "automatic")
+_valued("preview", {"share": 1.0})
+_valued("preview", {"views": 10**6})
+_valued("preview", {"share": 0.5, "frames": 1000, "views": 64}, refused=False)
+_valued("non_finite_in_a_row", 0)
 _valued("iterations", 0)
 _valued("iterations", Raw("1979-05-27T07:32:00Z"))
 
