@@ -290,3 +290,28 @@ def test_a_run_is_followed_and_stopped(browser: Any, tmp_path: Path) -> None:
         for each in (process, watch):
             if each.poll() is None:
                 each.kill()
+
+
+def test_a_mesh_is_shown_and_turns(show: Any) -> None:
+    seen = show(sample())
+    canvas = seen.tab.locator("canvas.mesh")
+    if canvas.count() == 0:
+        pytest.skip("this browser has no WebGL")
+
+    def painted() -> tuple[float, bytes]:
+        canvas.scroll_into_view_if_needed()
+        data = canvas.screenshot()
+        pixels = np.asarray(PIL.Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
+        return float((np.abs(pixels - pixels[2, 2]).sum(axis=2) > 30).mean()), data
+
+    share, before = painted()
+    assert 0.02 < share < 0.9  # a body on its ground
+    box = canvas.bounding_box()
+    seen.tab.mouse.move(box["x"] + 200, box["y"] + 200)
+    seen.tab.mouse.down()
+    seen.tab.mouse.move(box["x"] + 330, box["y"] + 260, steps=3)
+    seen.tab.mouse.up()
+    assert painted()[1] != before
+    turned = painted()[1]
+    seen.tab.get_by_label("mesh", exact=True).select_option("start")
+    assert painted()[1] != turned

@@ -23,6 +23,7 @@ import typer.core
 
 from pathreplay import interrupts
 from pathreplay.errors import PathreplayError, plain_line
+from pathreplay.watch import commands
 
 _UsageError: Any = typer.BadParameter.__base__
 """What typer raises for a command line that is none; it exports one kind only, whose base they share."""
@@ -182,6 +183,9 @@ def watch(
     except interrupts.Interrupted as ended:
         if ended.number != signal.SIGINT:
             raise
+
+
+commands.add_to(app)
 
 
 @app.command(short_help="Render a scene into a picture.")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config
@@ -92,6 +93,8 @@ class Recovered:
     result: Array
     truth: Array | None
     rival: Array | None = None
+    faces: NDArray[np.integer] | None = None
+    """Of a mesh whose vertices these are (3 m numbers)."""
 
     def known(self, *kinds: str) -> dict[str, Array]:
         """What there is of these kinds: 'start', 'result', 'rival', 'truth'."""
@@ -211,6 +214,11 @@ class Outcome:
     """Variables as people see them, and what poses make of the scene, by key."""
     notes: tuple[str, ...]
 
+    @property
+    def complete(self) -> bool:
+        """Whether all iterations are done, or the optimiser takes no more."""
+        return len(self.run.history) >= self.config.iterations or bool(self.run.optimiser.finished)
+
     def held_out(self) -> list[ViewPictures]:
         """The views that were not learned from."""
         return [view for view in self.views if view.held_out]
@@ -221,7 +229,7 @@ class Outcome:
 
     def command(self) -> str:
         """The command line that makes this run again, or goes on with it where it was stopped."""
-        if len(self.run.history) < self.config.iterations:
+        if not self.complete:
             return resume_command(self.folder)
         job = self.folder / "config.json" if self.source is None else self.source
         changes = "".join(f" -D {shlex.quote(change)}" for change in self.changes)

@@ -52,24 +52,31 @@ def facts(config: Config, history: Sequence[Entry]) -> tuple[tuple[str, str], ..
 
 
 def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
-    """Loss and, of every parameter, error (where the truth is known) and norm of the gradient, by iteration."""
+    """Loss and, of every parameter, error (where the truth is known), norm of the gradient and of its noise."""
     taken = [history[i] for i in thinned(len(history))]
     x = tuple(float(entry.iteration) for entry in taken)
 
-    def plot(title: str, code: str, values: Iterable[float | None]) -> Plot:
-        return Plot(title, (Series("", x, tuple(_rounded(v) for v in values)),), code=code)
+    def plot(title: str, code: str, **lines: Iterable[float | None]) -> Plot:
+        """Lines are named where there are several."""
+        series = (Series(name * (len(lines) > 1), x, tuple(_rounded(v) for v in y)) for name, y in lines.items())
+        return Plot(title, tuple(series), code=code)
 
-    found = [plot("loss", "", (entry.loss for entry in taken))]
+    found = [plot("loss", "", loss=(entry.loss for entry in taken))]
     if any(entry.penalty for entry in taken):
-        found.append(plot("penalty", "", (entry.penalty for entry in taken)))
+        found.append(plot("penalty", "", penalty=(entry.penalty for entry in taken)))
+    if len({entry.spp for entry in taken}) > 1:
+        found.append(plot("samples per pixel", "", spp=(entry.spp for entry in taken)))
     if not history:
         return tuple(found)
     errors, norms = history[-1].errors, history[-1].gradient_norms
     for key in dict.fromkeys([*norms, *errors]):  # of a pose errors have other names than gradients
         if key in errors:
-            found.append(plot("error of", key, (entry.errors.get(key) for entry in taken)))
+            found.append(plot("error of", key, error=(entry.errors.get(key) for entry in taken)))
         if key in norms:
-            found.append(plot("gradient norm of", key, (entry.gradient_norms.get(key) for entry in taken)))
+            lines = {"gradient": (entry.gradient_norms.get(key) for entry in taken)}
+            if any(key in entry.noise_norms for entry in taken):
+                lines["noise"] = (entry.noise_norms.get(key) for entry in taken)
+            found.append(plot("gradient norm of", key, **lines))
     return tuple(found)
 
 

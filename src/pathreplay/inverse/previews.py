@@ -21,8 +21,10 @@ from pathreplay.errors import PathreplayError, plain_line
 from pathreplay.interrupts import Stop
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config
+from pathreplay.inverse.events import Event, Notes, Started, Stepped, Stopped
 from pathreplay.inverse.images import Image, displayed, exposure_for
-from pathreplay.inverse.loop import Event, Refined, Started, Stepped, Stopped, picture_of
+from pathreplay.inverse.likeness import Likeness
+from pathreplay.inverse.loop import answer_of, picture_of
 from pathreplay.inverse.outcome import DIFFERENCE_GAIN, Recovered, ViewPictures, resume_command
 from pathreplay.inverse.page_parts import (
     about,
@@ -78,19 +80,21 @@ class Previews:
         self._spent = self._cost = 0.0
         self._resumed, self._stride = 0, 1.0
         self._kept = [0]
+        self._likenesses = self._alike()
         self._shown_at = 0
         self._stale = (folder.path / STOP).exists()  # a wish to stop an earlier part of the run
         self._log: list[str] = list(problem.notes)
+        self._notes = Notes()
 
     def observe(self, event: Event) -> None:
         """Raises nothing but what ends the process."""
+        if note := self._notes.of(event):
+            self._log.append(note)
         if isinstance(event, Started):
             self._log.append(f"iterations {event.done} to {event.wanted}")
             self._resumed = event.done
             if event.done == 0:
                 self._write(self._begun() | (self._frames(0, self._before) if self._share else {}))
-        elif isinstance(event, Refined):
-            self._log.append(f"{event.key} goes on with the shape {event.shape}")
         elif isinstance(event, Stepped):
             if event.entry.iteration == self._resumed:
                 self._went_on()
@@ -146,7 +150,8 @@ class Previews:
         """Pictures of the views as they are now."""
         try:
             spp = max(self.config.most_spp, min(LEAST_SPP, self.config.picture_spp))
-            images = {v.name: picture_of(self.problem, self.config, self.run.values, v, spp) for v in self._views}
+            values = answer_of(self.problem, self.run)
+            images = {v.name: picture_of(self.problem, self.config, values, v, spp) for v in self._views}
         except RuntimeError as error:
             if self.stop.aborted:
                 raise
@@ -154,13 +159,16 @@ class Previews:
             self._log.append(f"no more pictures: {plain_line(str(error))}")
             return {}
         self._now = {v.name: _pictures_of(v, self._before[v.name], images[v.name]) for v in self._views}
-        self._shown_at = done
+        self._likenesses, self._shown_at = self._alike(), done
         files = self._frames(done, images)
         for view in self._views:
             for kind in ("result", "difference"):
                 image = self._now[view.name].pictures()[kind]
                 files[f"{FOLDER}/{kind}-{view.name}.png"] = _encoded(image, self._stored(view), LARGEST, "png")
         return files
+
+    def _alike(self) -> dict[str, Likeness]:
+        return {name: Likeness.of(it.result, it.target, it.exposure, it.weight) for name, it in self._now.items()}
 
     def _stored(self, view: View) -> float:
         return min(self._exposure, exposure_for(view.target))
@@ -245,7 +253,7 @@ class Previews:
             Picture(kind, captions.get(kind, kind), f"{FOLDER}/{kind}-{view.name}.png?{self._shown_at}")
             for kind in it.pictures()
         )
-        likeness = it.likenesses["result"]
+        likeness = self._likenesses[view.name]
         note = (
             f"Root mean square difference from the target {it.error(it.result):.4g}, PSNR {likeness.psnr:.2f} dB, "
             f"SSIM {likeness.ssim:.4f}, noise included."

@@ -11,7 +11,7 @@ import rich.progress
 from rich.console import Console
 
 from pathreplay.errors import plain_line
-from pathreplay.inverse.loop import Entered, Event, Faint, NonFinite, Refined, Started, Stepped, Stopped
+from pathreplay.inverse.events import Event, Notes, Started, Stepped
 
 # Between two lines, where there is no bar: a log of a long run stays readable.
 _SECONDS = 10.0
@@ -49,7 +49,7 @@ class Progress:
         self._stream = cast(IO[str], _Forgiving())
         console = Console(file=self._stream, force_jupyter=False)
         self._shown, self._lines = shown, shown and not console.is_terminal
-        self._notes: set[tuple[type, str]] = set()
+        self._notes = Notes()
         self._told, self._begin, self._before = time.monotonic(), time.monotonic(), 0
         self._bar = rich.progress.Progress(
             rich.progress.TextColumn("{task.description}"),
@@ -89,28 +89,8 @@ class Progress:
             self.start(event.done, event.wanted)
         elif isinstance(event, Stepped):
             self.advance(event.entry.loss)
-        elif self._shown and not isinstance(event, Stopped) and (note := self._note_of(event)):
+        elif self._shown and (note := self._notes.of(event)):
             self.note(note)
-
-    def _note_of(self, event: Entered | Refined | NonFinite | Faint) -> str:
-        """What is said of an event; nothing of what has been said of the same parameter."""
-        if isinstance(event, Entered):
-            return f"stage {event.number} of {event.of}"
-        if isinstance(event, Refined):
-            return f"{event.key} goes on with the shape {event.shape}"
-        told = type(event), event.key
-        if told in self._notes:
-            return ""
-        self._notes.add(told)
-        if isinstance(event, NonFinite):
-            return (
-                f"{event.entries} gradient entries of '{event.key}' were NaN or infinite in view '{event.view}' at "
-                f"iteration {event.iteration}, and count as zero; more of it is only counted"
-            )
-        return (
-            f"the gradient of '{event.key}' is lost in noise since about iteration {event.iteration}: signal to noise "
-            f"{event.ratio:.2g} with spp = {event.spp}; take more, or it has arrived"
-        )
 
     def start(self, done: int, total: int) -> None:
         """Begin to count iterations."""

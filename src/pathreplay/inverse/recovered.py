@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import mitsuba as mi
 import numpy as np
 
 from pathreplay.files import file_names
@@ -11,6 +14,8 @@ from pathreplay.inverse.pose import Pose
 from pathreplay.inverse.problem import Problem, scene_values, variables_of
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.scenes.parameters import get_array
+
+VERTICES = ".vertex_positions"
 
 
 def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
@@ -22,6 +27,14 @@ def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
         for v in problem.variables
         if v.key in problem.params
     )
+
+
+def with_faces(problem: Problem, items: tuple[Recovered, ...]) -> tuple[Recovered, ...]:
+    """The vertices of a mesh among these are given its faces."""
+    params = mi.traverse(problem.scene) if any(item.key.endswith(VERTICES) for item in items) else {}
+    faces = {item.key: item.key.removesuffix(VERTICES) + ".faces" for item in items if item.key.endswith(VERTICES)}
+    found = {key: np.array(params[name]) for key, name in faces.items() if name in params}
+    return tuple(replace(item, faces=found.get(item.key)) for item in items)
 
 
 def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:

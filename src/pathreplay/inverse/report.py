@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import os
 import platform
@@ -16,7 +17,7 @@ from matplotlib.figure import Figure
 
 from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.images import Image, displayed, png_bytes, resized
-from pathreplay.inverse.outcome import Contestant, Outcome, ViewPictures
+from pathreplay.inverse.outcome import Contestant, Outcome, Recovered, ViewPictures
 from pathreplay.inverse.page_parts import (
     about,
     common_exposure,
@@ -34,7 +35,7 @@ from pathreplay.inverse.page_parts import (
 )
 from pathreplay.inverse.pose import error_names
 from pathreplay.pages.document import document
-from pathreplay.pages.page import Comparison, Head, Page, Parameter, Picture, Row, Still, Table, View
+from pathreplay.pages.page import Comparison, Head, Mesh, Page, Parameter, Picture, Row, Still, Table, View
 
 # Colours that read on light and dark ground alike.
 OURS, RIVAL, GREY = "#3b82f6", "#e07b39", "#808080"
@@ -42,6 +43,8 @@ OURS, RIVAL, GREY = "#3b82f6", "#e07b39", "#808080"
 # A report is opened in a mail, too: pictures of so many views, of so many pixels in all (a noisy one takes about four
 # bytes of the page). The others, and the whole ones, are files in the run folder.
 MOST_VIEWS, MOST_PIXELS = 24, 6_000_000
+# Of a mesh that can be turned about: some 3 MB of the page.
+MOST_FACES = 50_000
 
 Film = tuple[Still, ...]
 
@@ -66,19 +69,20 @@ def report_page(
 ) -> Page:
     """What the report says; ``drawings`` are the addresses of the curves by name."""
     config, history = outcome.config, outcome.run.history
-    stopped = f"Stopped after {len(history)} of {config.iterations} iterations."
+    ended = f"Stopped after {len(history)} of {config.iterations} iterations."
+    if why := outcome.run.optimiser.finished:
+        ended = f"No more steps after {len(history)} of {config.iterations} iterations: {why}."
     held_out, count = len(outcome.held_out()), len(outcome.recovered) + len(outcome.poses)
     exposure = common_exposure(view.target for view in outcome.views)
     return Page(
         title=outcome.folder.name,
         lead=lead(config, count, len(outcome.views) - held_out, held_out),
-        notices=((stopped,) if len(history) < config.iterations else ()) + dropped_notice(history),
+        notices=((ended,) if len(history) < config.iterations else ()) + dropped_notice(history),
         facts=facts(config, history),
         comparison=_comparison(outcome, contestants, drawings["comparison"]) if contestants else None,
         views=_views(outcome, exposure, films),
         likeness=_likeness(outcome),
-        likeness_note="Of what a display shows of each view at an exposure of its own, noise included"
-        + (". Nothing was learned from views that are held out." if held_out else "."),
+        likeness_note=_likeness_note(outcome),
         views_note="Difference: red where the result is brighter than the target, blue where it is darker."
         + _left_out(outcome),
         exposure=exposure,
@@ -131,6 +135,15 @@ def _likeness(outcome: Outcome) -> Table:
     return Table(tuple(Head(text) for text in heads), tuple(rows))
 
 
+def _likeness_note(outcome: Outcome) -> str:
+    said = "Of what a display shows of each view at an exposure of its own, noise included."
+    if outcome.held_out():
+        said += " Nothing was learned from views that are held out"
+        said += "; their exposures are fitted to their pictures at the end." if outcome.config.exposure else "."
+        said += "" if outcome.has_flip() else " FLIP of them comes with: pip install 'pathreplay[flip]'."
+    return said
+
+
 def _shown(outcome: Outcome) -> tuple[list[ViewPictures], float]:
     """The views whose pictures are in the report, and by how much these are made smaller, for it to stay a page."""
     views = list(outcome.views)
@@ -169,6 +182,17 @@ def _views(outcome: Outcome, exposure: float, films: Mapping[str, Film]) -> tupl
     return tuple(found)
 
 
+def _mesh(item: Recovered) -> Mesh | None:
+    """The meshes of start, result and truth to turn about, where there are not too many faces for a page."""
+    if item.faces is None or item.faces.size > 3 * MOST_FACES:
+        return None
+    known = {
+        kind: value for kind, value in item.known("start", "result", "truth").items() if value.size == item.result.size
+    }
+    packed = {kind: base64.b64encode(value.astype("<f4").tobytes()).decode() for kind, value in known.items()}
+    return Mesh(packed, base64.b64encode(item.faces.astype("<u4").tobytes()).decode())
+
+
 def _smaller(image: Image, scale: float) -> Image:
     if scale == 1:
         return image
@@ -194,7 +218,7 @@ def _parameters(outcome: Outcome, films: Mapping[str, Film]) -> tuple[Parameter,
         elif rows := numbers(item):
             kinds[2].append(Parameter(item.key, rows=rows))
         else:
-            kinds[3].append(Parameter(item.key, note=about(item)))
+            kinds[3].append(Parameter(item.key, note=about(item), mesh=_mesh(item)))
     poses = [Parameter(item.pose.key, rows=pose_rows(item), note=pose_note(item)) for item in outcome.poses]
     return (*kinds[0], *kinds[1], *kinds[2], *poses, *kinds[3])
 

@@ -17,7 +17,7 @@ from pathreplay.inverse.likeness import Likeness
 from pathreplay.inverse.outcome import Outcome, ViewPictures, resume_command
 from pathreplay.inverse.pose import PoseError
 from pathreplay.inverse.problem import Problem
-from pathreplay.inverse.recovered import poses_of, recovered_of, with_scene
+from pathreplay.inverse.recovered import poses_of, recovered_of, with_faces, with_scene
 from pathreplay.inverse.report import Film, report_files
 from pathreplay.inverse.run_folder import Job
 from pathreplay.inverse.values import Array
@@ -100,7 +100,7 @@ def outcome_of(
         )
         for n, v in enumerate(problem.views)
     )
-    recovered, poses = recovered_of(problem, run), poses_of(problem, run)
+    recovered, poses = with_faces(problem, recovered_of(problem, run)), poses_of(problem, run)
     values = with_scene(problem, run.values)
     return Outcome(job.config, job.source, job.changes, folder, views, recovered, poses, run, values, problem.notes)
 
@@ -131,7 +131,7 @@ def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, bytes
 
 def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
     """What Python gets; ``stopped_by`` is the name of a signal, say, which may have come too late to stop anything."""
-    stopped = len(outcome.run.history) < outcome.config.iterations
+    stopped = not outcome.complete
     return RunResult(
         folder=outcome.folder,
         report=outcome.folder / "report.html",

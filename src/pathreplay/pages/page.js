@@ -234,10 +234,10 @@ function plot(spec, first) {
     const parts = spec.series.map((series, s) => {
       const near = points[s].length && at !== null ? points[s].reduce((a, b) => (Math.abs(b[0] - at) < Math.abs(a[0] - at) ? b : a)) : null;
       const name = series.name ? `${series.name} ` : "";
-      const value = near ? `${spec.series.length > 1 ? "" : `iteration ${near[0]}: `}${short(near[1])}` : "";
+      const value = near ? `${spec.series.length > 1 ? "" : `${spec.along} ${short(near[0])}: `}${short(near[1])}` : "";
       return name || value ? make("span", {}, ...(series.name ? [make("b", { class: `c${s % 8}` }, "● ")] : []), `${name}${value}  `) : "";
     });
-    const where = at !== null && spec.series.length > 1 ? [`iteration ${Math.round(at)}: `] : [];
+    const where = at !== null && spec.series.length > 1 ? [`${spec.along} ${short(Math.round(at))}: `] : [];
     told.replaceChildren(...where, ...parts);
   }
   function draw() {
@@ -245,7 +245,7 @@ function plot(spec, first) {
     const X = (x) => left + ((x - lowX) / (highX - lowX)) * (width - left - right);
     const share = log ? (y) => Math.log(y / lowY) / Math.log(highY / lowY) : (y) => (y - lowY) / (highY - lowY);
     const Y = (y) => height - bottom - share(y) * (height - top - bottom);
-    const svg = make("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img", "aria-label": `${spec.title} ${spec.code} against iterations` });
+    const svg = make("svg", { viewBox: `0 0 ${width} ${height}`, height, role: "img", "aria-label": `${spec.title} ${spec.code} by ${spec.along}` });
     for (const y of ticks(lowY, highY, log)) {
       svg.append(make("line", { class: "grid", x1: left, x2: width - right, y1: Y(y), y2: Y(y) }),
         make("text", { x: left - 6, y: Y(y) + 4, "text-anchor": "end" }, short(y)));
@@ -305,7 +305,96 @@ function extras() {
   run.parameters.forEach((parameter, i) => {
     if (films[i]) films[i](parameter.film);
     else if (parameter.film.length > 1) films[i] = film(places[i], parameter.film);
+    if (parameter.mesh && !places[i].querySelector(".mesh")) mesh(places[i], parameter.mesh);
   });
+}
+
+// ---------- Meshes: triangles under a light at the eye, turned by dragging ----------
+
+const VERTEX = `attribute vec3 place, normal; uniform mat3 turn; uniform vec3 middle; uniform float scale; varying vec3 n;
+void main() { n = turn * normal; vec3 p = turn * (place - middle) * scale; gl_Position = vec4(0.75 * p.x, p.y, -0.01 * p.z, 1.0); }`;
+const FRAGMENT = `precision mediump float; varying vec3 n; uniform vec3 paint;
+void main() { vec3 m = normalize(n); gl_FragColor = vec4(paint * (0.25 + 0.75 * abs(m.z)) * (m.z < 0.0 ? 0.5 : 1.0), 1.0); }`;
+
+function numbers(text, Kind) {
+  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  return new Kind(bytes.buffer);
+}
+
+function mesh(place, data) {
+  const canvas = make("canvas", { class: "mesh", width: 800, height: 600, tabindex: 0, role: "img", "aria-label": "mesh; drag to turn it" });
+  const kinds = Object.keys(data.vertices);
+  const choice = make("select", { onchange: () => { fill(); draw(); } }, ...kinds.map((kind) => make("option", { value: kind }, kind)));
+  choice.value = kinds.includes("result") ? "result" : kinds[0];
+  place.append(make("div", { class: "tools" }, make("label", {}, "mesh", choice), "drag turns it, the wheel with Ctrl zooms"), canvas);
+  const gl = canvas.getContext("webgl", { antialias: true });
+  if (!gl) return canvas.replaceWith(make("p", { class: "soft" }, "This browser shows no WebGL, and so no mesh."));
+  const program = gl.createProgram();
+  for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+  }
+  gl.linkProgram(program);
+  gl.useProgram(program);
+  gl.enable(gl.DEPTH_TEST);
+  const faces = numbers(data.faces, Uint32Array);
+  const bounds = kinds.map((kind) => numbers(data.vertices[kind], Float32Array)).reduce(([low, high], all) => {
+    all.forEach((x, i) => { low[i % 3] = Math.min(low[i % 3], x); high[i % 3] = Math.max(high[i % 3], x); });
+    return [low, high];
+  }, [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]]);
+  const middle = [0, 1, 2].map((k) => (bounds[0][k] + bounds[1][k]) / 2);
+  const extent = Math.hypot(...[0, 1, 2].map((k) => bounds[1][k] - bounds[0][k])) || 1;
+  let around = 0.6, up = 0.4, zoom = 1;
+
+  function fill() { // corners one by one, each with the normal of its face
+    const all = numbers(data.vertices[choice.value], Float32Array), places = new Float32Array(3 * faces.length), normals = new Float32Array(3 * faces.length);
+    for (let f = 0; f < faces.length; f += 3) {
+      const [a, b, c] = [0, 1, 2].map((k) => all.subarray(3 * faces[f + k], 3 * faces[f + k] + 3));
+      const u = [0, 1, 2].map((k) => b[k] - a[k]), v = [0, 1, 2].map((k) => c[k] - a[k]);
+      const n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]], length = Math.hypot(...n) || 1;
+      [a, b, c].forEach((p, k) => { places.set(p, 3 * (f + k)); normals.set(n.map((x) => x / length), 3 * (f + k)); });
+    }
+    [["place", places], ["normal", normals]].forEach(([name, values]) => {
+      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+      const at = gl.getAttribLocation(program, name);
+      gl.enableVertexAttribArray(at);
+      gl.vertexAttribPointer(at, 3, gl.FLOAT, false, 0, 0);
+    });
+  }
+  function draw() {
+    const [ca, sa, cu, su] = [Math.cos(around), Math.sin(around), Math.cos(up), Math.sin(up)];
+    const uniform = (name) => gl.getUniformLocation(program, name);
+    // Columns: about y, then about x; the eye looks along -z.
+    gl.uniformMatrix3fv(uniform("turn"), false, [ca, su * sa, -cu * sa, 0, cu, su, sa, -su * ca, cu * ca]);
+    gl.uniform3fv(uniform("middle"), middle);
+    gl.uniform1f(uniform("scale"), (1.8 * zoom) / extent);
+    gl.uniform3f(uniform("paint"), 0.55, 0.68, 0.85);
+    gl.viewport(0, 0, canvas.width, canvas.height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.drawArrays(gl.TRIANGLES, 0, faces.length);
+  }
+  let last = null;
+  canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); last = [event.clientX, event.clientY]; });
+  canvas.addEventListener("pointermove", (event) => {
+    if (!last) return;
+    around += (event.clientX - last[0]) / 150;
+    up = clamp(up + (event.clientY - last[1]) / 150, -1.5, 1.5);
+    last = [event.clientX, event.clientY];
+    draw();
+  });
+  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, () => { last = null; });
+  canvas.addEventListener("wheel", (event) => {
+    if (!event.ctrlKey && !event.metaKey) return;
+    event.preventDefault();
+    zoom = clamp(zoom * 2 ** (-event.deltaY / 200), 0.2, 50);
+    draw();
+  }, { passive: false });
+  fill();
+  draw();
 }
 
 // ---------- News of a run that is under way ----------

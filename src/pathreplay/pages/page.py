@@ -99,13 +99,15 @@ class Series:
 
 @dataclass(frozen=True)
 class Plot:
-    """Curves over iterations, on a logarithmic scale where all are above zero and ``log`` says so."""
+    """Curves, over iterations as a rule, on a logarithmic scale where all are above zero and ``log`` says so."""
 
     title: str
     series: tuple[Series, ...]
     log: bool = True
     code: str = ""
     """A key that ends the title."""
+    along: str = "iteration"
+    """What x counts."""
 
 
 @dataclass(frozen=True)
