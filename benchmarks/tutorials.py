@@ -42,7 +42,7 @@ from pathreplay.scenes.parameters import get_array, to_value  # noqa: E402
 from .tutorial_loops import LOOPS  # noqa: E402
 
 EXAMPLES = Path(__file__).parent.parent / "examples/tutorials"
-JUDGED_SPP = 256
+JUDGED_SPP = 1024
 WAYS = ("plain loop", "pathreplay")
 #: Files of the tutorials, by tutorial: what replaces the scene's own.
 THEIRS = {
@@ -175,7 +175,14 @@ def main() -> None:
                 print(done.stderr, file=sys.stderr)
                 sys.exit(f"{name} by {way} failed")
             row = json.loads(done.stdout.splitlines()[-1])
-            cells = [name, way, row["parameter"], f"{row['picture']:.5f}", f"{row['seconds']:.1f}", str(count)]
+            cells = [
+                name,
+                way,
+                row["parameter"],
+                f"{row['picture']:.2g}" if row["picture"] else "below noise",
+                f"{row['seconds']:.1f}",
+                str(count),
+            ]
             print(f"| {' | '.join(cells)} |", flush=True)
 
 

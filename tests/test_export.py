@@ -7,6 +7,7 @@ import json
 import shutil
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -193,6 +194,25 @@ def test_a_value_that_does_not_come_back_is_told(tmp_path: Path) -> None:
     params.update()
     with pytest.raises(PathreplayError, match=r"'red\.emitter\.radiance\.value' of SRGB.* does not come back"):
         require_same(found.scene, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "plain"),
+    [
+        ({"type": "pathreplay"}, {"type": "path", "max_depth": 6}),
+        ({"type": "pathreplay", "max_depth": 3, "edges": "all"}, {"type": "path", "max_depth": 3}),
+        ({"type": "direct_projective", "sppi": 0}, {"type": "path", "max_depth": 2}),
+        ({"type": "direct", "emitter_samples": 2}, {"type": "direct", "emitter_samples": 2}),
+        (None, {"type": "path", "max_depth": 8}),
+    ],
+)
+def test_integrators_for_gradients_have_one_for_pictures_in_their_place(wanted: Any, plain: dict[str, Any]) -> None:
+    """With the depth that they have, where none is said: `path` would go on for ever."""
+    found = exported(Source(BUILTINS["cornell-box"](resolution=4), {}, {}, {}), {}, wanted)
+    (element,) = ElementTree.fromstring(found.files["scene.xml"]).iter("integrator")
+    options = {each.get("name"): int(str(each.get("value"))) for each in element}
+    assert {"type": element.get("type"), **options} == plain
+    assert bool(found.notes) == (wanted is not None and wanted["type"] != "direct")
 
 
 # ------------------------------ A run ------------------------------

@@ -121,6 +121,7 @@ def test_passes_add_up_to_one_picture(monkeypatch: pytest.MonkeyPatch) -> None:
         ("image.exr", {"size": "12x"}, "--size '12x' is no size"),
         ("image.exr", {"size": "99999999"}, "is no size"),
         ("image.exr", {"spp": 0}, "--spp 0 is no number of samples"),
+        ("image.exr", {"spp": 10**7}, "give one from 1 to 1000000"),
         ("image.exr", {"seed": -1}, "--seed -1 is no seed"),
         ("image.exr", {"integrator": "paht"}, "Integrator 'paht' cannot be made"),
         ("image.exr", {"integrator": "path", "options": ["max_depth=deep"]}, "max_depth"),

@@ -14,11 +14,11 @@ from pathreplay.backend import set_variant
 
 FOLDER = Path(__file__).parent
 TRUTH = {
-    "wood.reflectance.value": [0.55, 0.35, 0.2],
-    "plaster.reflectance.value": [0.75, 0.72, 0.65],
-    "paint.reflectance.value": [0.2, 0.45, 0.6],
-    "glaze.base_color.value": [0.6, 0.12, 0.1],
-    "glaze.roughness.value": [0.3],
+    "floor.bsdf.reflectance.value": [0.55, 0.35, 0.2],
+    "back.bsdf.reflectance.value": [0.75, 0.72, 0.65],
+    "side.bsdf.reflectance.value": [0.2, 0.45, 0.6],
+    "ball.bsdf.base_color.value": [0.6, 0.12, 0.1],
+    "ball.bsdf.roughness.value": [0.3],
     "lamp.emitter.radiance.value": [16.0, 13.0, 9.0],
 }
 

@@ -19,7 +19,7 @@ from pathreplay.files import file_names
 from pathreplay.inverse.capture import FACING, read_capture
 from pathreplay.inverse.exposures import EXPOSURE
 from pathreplay.inverse.images import picture_size, png_bytes
-from pathreplay.inverse.run_folder import Job, read_job
+from pathreplay.inverse.run_folder import Job, read_job, require_writable_name
 from pathreplay.inverse.values import Arrays
 from pathreplay.output.scene_folder import SCENE, Exported, Source, exported, require_same
 from pathreplay.output.whole_files import whole_folder
@@ -40,6 +40,8 @@ def export_run(run: Path, output: Path | None = None) -> str:
     Raises PathreplayError for what is no run folder, holds no result, or cannot be exported; nothing is written then.
     """
     folder = run / "export" if output is None else output
+    require_writable_name(run, "RUN")
+    require_writable_name(folder, _OPTION)
     job = read_job(run)
     backend.set_variant(job.config.variant)
     values = _result(run)

@@ -20,6 +20,8 @@ from pathreplay.scenes.loading import load_scene
 
 _OPTION = "-o"
 _SECONDS = 10.0
+# A slip of the keyboard beyond: the noise of a picture is then below what single precision tells apart.
+_MOST_SPP = 10**6
 
 
 def render_to_file(
@@ -44,8 +46,8 @@ def render_to_file(
     if ending not in (".exr", ".png"):
         raise PathreplayError(f"{output} ends in {shown(ending)}; give {_OPTION} a name that ends in .exr or .png")
     require_writable(output, _OPTION)
-    if spp is not None and not 1 <= spp < 2**32:
-        raise PathreplayError(f"--spp {spp} is no number of samples; give one from 1 to {2**32 - 1}")
+    if spp is not None and not 1 <= spp <= _MOST_SPP:
+        raise PathreplayError(f"--spp {spp} is no number of samples; give one from 1 to {_MOST_SPP}")
     if not 0 <= seed < 2**32:
         raise PathreplayError(f"--seed {seed} is no seed; give one from 0 to {2**32 - 1}")
     given = {} if integrator is None else {"type": integrator}

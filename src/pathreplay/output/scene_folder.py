@@ -31,8 +31,10 @@ SCENE = "scene.xml"
 
 _STANDS_IN = {"smoothdielectric": "dielectric"}
 """What Mitsuba's own scenes have in the place of our plugins."""
-_NOT_FOR_MITSUBA = ("pathreplay", "prb", "prb_basic", "prb_projective", "direct_projective", "rb")
-_NOT_FOR_MITSUBA_IN_MEDIA = ("prbvolpath", "volprim_rf_basic")
+_DEPTHS = {"direct_projective": 2} | dict.fromkeys(
+    ("pathreplay", "prb", "prb_basic", "prb_projective", "rb", "prbvolpath"), 6
+)
+"""Integrators made for gradients, in whose place `path` or `volpath` renders, and their depth where none is said."""
 _KEPT = ("max_depth", "rr_depth", "hide_emitters")
 """Options that `path` and `volpath` share with integrators made for gradients."""
 
@@ -171,27 +173,31 @@ def _plain_plugins(described: Described) -> list[str]:
 
 
 def _plain_integrator(described: Described, wanted: Mapping[str, Any] | None) -> list[str]:
+    """The integrator that is wanted, else the scene's own, as one for pictures; what is to be said of it."""
     root = described.nodes[0]
-    own = next((n for n, node in described.children(root) if node.type == mi.ObjectType.Integrator), None)
-    media = any(node.type == mi.ObjectType.Medium for node in described.nodes)
-    node = None if own is None else dict(described.children(root))[own]
-    options = (
-        dict(wanted or {"type": "path"})
-        if wanted or node is None
-        else {"type": node.props.plugin_name(), **{name: node.props.get(name) for name in _KEPT if name in node.props}}
-    )
-    name = options["type"]
-    plain = {**dict.fromkeys(_NOT_FOR_MITSUBA, "volpath" if media else "path"),
-             **dict.fromkeys(_NOT_FOR_MITSUBA_IN_MEDIA, "volpath")}.get(name)  # fmt: skip
-    if wanted is None and node is not None and plain is None:
+    children = dict(described.children(root))
+    own = next((name for name, node in children.items() if node.type == mi.ObjectType.Integrator), None)
+    if wanted is not None:
+        options = dict(wanted)
+    elif own is None:
+        options = {"type": "path"}
+    else:
+        props = children[own].props
+        options = {"type": props.plugin_name(), **{name: props.get(name) for name in _KEPT if name in props}}
+    name = options.pop("type")
+    depth = _DEPTHS.get(name)
+    if wanted is None and own is not None and depth is None:
         return []
-    properties = mi.Properties(plain or name)
+    media = any(node.type == mi.ObjectType.Medium for node in described.nodes)
+    properties = mi.Properties(name if depth is None else "volpath" if media else "path")
+    if depth is not None:
+        options = {"max_depth": depth, **{option: value for option, value in options.items() if option in _KEPT}}
     for option, value in options.items():
-        if option != "type" and (plain is None or option in _KEPT):
-            properties[option] = value
+        properties[option] = value
     if own is not None:
         del root.props[own]
     root.props["integrator"] = described.add(properties, mi.ObjectType.Integrator)
-    return (
-        [f"'{plain}' renders the exported scene in the place of '{name}', which is made for gradients"] if plain else []
-    )
+    if depth is None:
+        return []
+    stands_in = properties.plugin_name()
+    return [f"'{stands_in}' renders the exported scene in the place of '{name}', which is made for gradients"]
