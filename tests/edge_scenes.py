@@ -122,6 +122,11 @@ def can_lit_from_the_front() -> dict:
     return scene(wall=shape(BACK, patterned()), lamp=lamp(place), object=can(BOX, paint(0.5, 0.5, 0.2)))
 
 
+def hexagon_lit(**more: Any) -> Callable[[], dict]:
+    """Its triangles hide a lamp that their smooth shading would see."""
+    return lambda: scene(lamp=lamp(OVERHEAD), object=can(BOX, paint(0.5, 0.5, 0.2), 6), **more)
+
+
 def lamp_seen() -> dict:
     place = T().translate([0.2, 0.1, 0.3]).rotate([0, 1, 0], 200).scale([0.5, 0.4, 1])
     return scene(wall=shape(BACK, patterned()), lamp=lamp(place, 3), other=lamp(OVERHEAD, 6))
@@ -286,6 +291,9 @@ SEEN = [
     cell("cube8_lit", lit_box(cube8), VERTICES, TURN),
     cell("cube24_lit", lit_box(cube24), VERTICES, TURN),
     cell("can_moves", can_lit_from_the_front, VERTICES, translate_vertices(0, 1, 0), seeds=32),
+    cell("hexagon_moves", hexagon_lit(), VERTICES, translate_vertices(*ASIDE), seeds=32),
+    cell("hexagon_seen", hexagon_lit(), "camera.to_world", translate(*ASIDE), seeds=32),
+    cell("hexagon_bounced", hexagon_lit(wall=shape(BACK, paint(0.9))), VERTICES, translate_vertices(*ASIDE), 3),
     cell("camera_moves", before_a_glow(lambda: shape(CARD, BLACK)), "camera.to_world", translate(*ASIDE)),
     cell("lamp_seen", lamp_seen, "lamp.to_world", translate(*ASIDE)),
 ]  # fmt: skip

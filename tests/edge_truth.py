@@ -66,20 +66,21 @@ def measured(name: str) -> Measured:
         return Measured(g, backwards(bench, edges="none"), differences, transpose)
 
 
-def backwards(bench: Bench, seeds: int = 0, **options: Any) -> np.ndarray:
-    """The gradient at places all along the interval of a central difference: their mean is what that measures.
+def backwards(bench: Bench, seeds: int = 0, first: int = 0, **options: Any) -> np.ndarray:
+    """The gradient at places all along the interval of a central difference, whose mean is what that measures.
 
+    Of so many seeds from ``first`` on.
     So steps may be large, which makes differences of images less noisy, and curves as bent as they like. A straight
     line through the gradients is taken out, since its mean is zero.
     """
     case, move, integrator = bench.case, bench.move, ours(bench, **options)
     seeds = seeds or case.seeds
-    places = case.step * (2 * (np.arange(seeds) + np.random.default_rng(0).random(seeds)) / seeds - 1)
+    places = case.step * (2 * (np.arange(seeds) + np.random.default_rng(first).random(seeds)) / seeds - 1)
     found = []
     try:
         for k, place in enumerate(places):
             bench.move = lambda value, t, place=place: move(value, t + mi.Float(place))
-            found.append(bench.backward(integrator, k + 1, case.spp))
+            found.append(bench.backward(integrator, first + k + 1, case.spp))
     finally:
         bench.move = move
         bench.put(dr.opaque(mi.Float, 0))

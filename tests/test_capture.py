@@ -18,6 +18,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.capture import read_capture
 from pathreplay.inverse.config import Capture
+from pathreplay.inverse.exposures import exposed
 from pathreplay.inverse.images import exr_bytes, picture_size, png_bytes
 from pathreplay.inverse.problem import build_problem
 from pathreplay.scenes.loading import load_scene_for
@@ -178,6 +179,40 @@ def test_masks_and_intrinsics_of_a_frame_are_its_own(folder: Path) -> None:
     assert fovs == pytest.approx([math.degrees(0.6), 2 * math.degrees(math.atan(0.3))])
     result = optimize(make_config({**JOB, "capture": {"transforms": "capture/transforms.json"}}), progress=False)
     assert result.parameters[KEY] == pytest.approx([0.8] * 3, abs=1e-3)
+
+
+def test_a_folder_has_a_mask_for_each_picture(folder: Path) -> None:
+    """Called like the picture with .png behind, or in place of its ending; it counts with what alpha leaves."""
+    (folder / "masks").mkdir()
+    left, top = np.zeros((2, HEIGHT, WIDTH, 1), np.float32)
+    left[:, :6], top[:4] = 1, 1
+    for k in range(4):
+        name = f"shot {k}.exr.png" if k % 2 else f"shot {k}.png"
+        (folder / "masks" / name).write_bytes(png_bytes(left))
+        see_through = np.concatenate([np.full((HEIGHT, WIDTH, 3), 0.8, np.float32) * top, top], axis=2)
+        (folder / "capture" / "pictures" / f"shot {k}.exr").write_bytes(exr_bytes(see_through))
+    capture = {"transforms": "capture/transforms.json", "masks": "masks"}
+    for view in build_problem(make_config({**JOB, "capture": capture}), folder).views:
+        assert view.weight is not None and (view.weight == 2 * left).all()
+    lens = {**PLAIN, "k1": 1e-9, "camera_model": "OPENCV"}  # bends nothing that could be seen, and yet is undone
+    write(lens)
+    for view in build_problem(make_config({**JOB, "capture": capture}), folder).views:
+        assert view.weight is not None and view.weight == pytest.approx(2 * left, abs=1e-5)
+    with pytest.raises(PathreplayError, match="the capture has masks, and alpha = 'mask' is another"):
+        build_problem(make_config({**JOB, "capture": capture, "target": {"alpha": "mask"}}), folder)
+    both = {"capture": {"transforms": "capture/transforms.json"}, "target": {"alpha": "mask"}}
+    for view in build_problem(make_config({**JOB, **both}), folder).views:
+        assert view.weight is not None and view.weight == pytest.approx(2 * top, abs=1e-5)
+
+
+def test_films_of_a_capture_have_alpha_to_be_compared(folder: Path) -> None:
+    see_through = np.full((HEIGHT, WIDTH, 4), 0.25, np.float32)
+    for k in range(4):
+        (folder / "capture" / "pictures" / f"shot {k}.exr").write_bytes(exr_bytes(see_through))
+    problem = build_problem(make_config({**JOB, "target": {"alpha": "compare"}, "exposure": {}}), folder)
+    assert all(view.target == pytest.approx(see_through) for view in problem.views)
+    factors = {variable.key: variable.start * 3 for variable in problem.variables}
+    assert exposed(factors, 0, see_through)[2, 3].tolist() == [0.75, 0.75, 0.75, 0.25]
 
 
 def with_frame(**changes: Any) -> dict[str, Any]:

@@ -12,7 +12,8 @@ import pytest
 from pathreplay.interrupts import Stop
 from pathreplay.inverse import make_config
 from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard, total
-from pathreplay.inverse.loop import Refined, Started, Stepped, Stopped, iterate, new_run, take_step
+from pathreplay.inverse.events import Refined, Started, Stepped, Stopped
+from pathreplay.inverse.loop import iterate, new_run, take_step
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.threads import one_thread
 from test_deterministic import CLOUD

@@ -68,14 +68,16 @@ def start_of(problem: Problem) -> dict[str, np.ndarray]:
 
 
 SLOW = pytest.mark.slow
+# One needs a network, and the other has a factor of its own for each view.
+COMPARABLE = [name for name in LOSSES if name not in ("lpips", "scale-invariant")]
 
 
 @pytest.mark.parametrize(
     ("white_balance", "loss", "filter"),
     [
         (True, "l2", "box"),
-        *(pytest.param(*each, marks=SLOW) for each in itertools.product([False], LOSSES, ["box", "gaussian"])),
-        *(pytest.param(True, loss, "gaussian", marks=SLOW) for loss in LOSSES),
+        *(pytest.param(*each, marks=SLOW) for each in itertools.product([False], COMPARABLE, ["box", "gaussian"])),
+        *(pytest.param(True, loss, "gaussian", marks=SLOW) for loss in COMPARABLE),
     ],
 )
 def test_gradients_are_those_of_finite_differences(white_balance: bool, loss: str, filter: str, folder: Path) -> None:

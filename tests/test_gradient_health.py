@@ -17,7 +17,8 @@ from pathreplay.interrupts import Stop
 from pathreplay.inverse import load_config, make_config, optimize
 from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.evaluate import Evaluation, Local, Shard
-from pathreplay.inverse.loop import Faint, iterate, new_run
+from pathreplay.inverse.events import Faint
+from pathreplay.inverse.loop import iterate, new_run
 from pathreplay.inverse.noise import WINDOW, next_spp, ratios
 from pathreplay.inverse.noise_options import AutoSpp
 from pathreplay.inverse.problem import build_problem

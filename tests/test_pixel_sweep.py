@@ -193,7 +193,7 @@ def steps(problem, config, passes: str) -> np.ndarray:
     for i in range(4):
         take_step(problem, config, run, i)
     # The first step is traced in any case; the others launch what the second recorded, view by view.
-    frozen = run.executor.evaluate._recordings._frozen.values()
+    frozen = run.executor.evaluate._recordings[config.spp]._frozen.values()
     assert [each.n_recordings for each in frozen] == [1] * len(problem.views) * (passes == "recorded")
     return np.array([[entry.loss, *entry.gradient_norms.values()] for entry in run.history])
 

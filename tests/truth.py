@@ -152,12 +152,12 @@ class Bench(Objective):
             made.rr_depth = dr.opaque(mi.UInt32, made.rr_depth)  # with roulette and without it: the same kernels
         return made
 
-    def reference(self, count: int, spp: int = 0, **options: Any) -> np.ndarray:
-        """Finite differences of the weighted image by the case's reference, for so many seeds."""
+    def reference(self, count: int, spp: int = 0, first: int = 0, **options: Any) -> np.ndarray:
+        """Finite differences of the weighted image by the case's reference, for so many seeds from ``first`` on."""
         case = self.case
         plain = self.integrator(case.reference, rr_depth=case.rr_depth, **options)
         spp = spp or case.reference_spp or case.spp
-        images = (self.difference(plain, case.stencil, case.step, 1000 + k, spp) for k in range(1, count + 1))
+        images = (self.difference(plain, case.stencil, case.step, 1000 + first + k, spp) for k in range(1, count + 1))
         return np.array([self.dot(image) for image in images])
 
     def backwards(self, integrator: mi.Integrator, count: int = 0) -> np.ndarray:

@@ -38,7 +38,7 @@ class Watched(DrJitOptimiser):
 
     seen: Mapping[str, np.ndarray]
 
-    def step(self, values: Any, gradients: Any, rates: Any) -> dict[str, np.ndarray]:
+    def step(self, values: Any, gradients: Any, rates: Any, loss: float = 0.0) -> dict[str, np.ndarray]:
         """Take the step of Adam."""
         self.seen = gradients
         return super().step(values, gradients, rates)

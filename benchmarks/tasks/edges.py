@@ -27,15 +27,18 @@ VERSUS = (
 STEPS = tuple(f"{name}, {way}" for name in ("prb", "all edges") for way in (TRACED, RECORDED))
 GUIDED = 120
 """Seconds after which `prb_projective` sits out, whose guiding takes most of them."""
+SMALL, LARGE = 32, 128
+"""Pixels along a side. On few the several kernels of edges do not fill the cores, as the one of `prb` does."""
 
 
 def jobs(quick: bool) -> list[Job]:
-    """Inner edges, edges on the film, and steps that are recorded; the guided rival in jobs of its own."""
+    """Inner edges, edges on the film, recorded steps; guided rivals and large films have jobs of their own."""
     inner = ("prb", "inner edges alone", "film edges alone", "edges alone", "unguided inner")
     film = ("prb", "film edges alone", "edge list")
-    wanted = [(scene, inner, 0.0) for scene in INNER] + [(scene, film, 0.0) for scene in FILM]
-    wanted += [(scene, ("prb", "projective inner"), GUIDED) for scene in INNER]
-    wanted += [("ears", STEPS, 0.0)]
+    wanted = [(scene, inner, 0.0, SMALL) for scene in INNER] + [(scene, film, 0.0, SMALL) for scene in FILM]
+    wanted += [(scene, ("prb", "projective inner"), GUIDED, SMALL) for scene in INNER]
+    wanted += [(scene, ("prb", "edges alone"), 0.0, LARGE) for scene in INNER]
+    wanted += [("ears", STEPS, 0.0, SMALL)]
     return [
         Job(
             scene=scene,
@@ -43,14 +46,14 @@ def jobs(quick: bool) -> list[Job]:
             methods=methods,
             max_depth=2,
             rr_depth=100,
-            resolution=32,
+            resolution=side,
             spp=16 if quick else 64,
             rounds=4 if quick else 12 if patience else 24,
             warm_up=1 if patience else 2,
             patience=patience,
             measure="edges",
         )
-        for scene, methods, patience in wanted
+        for scene, methods, patience, side in wanted
     ]
 
 
@@ -76,12 +79,16 @@ def by_job(points: list[Point]) -> list[dict[str, Point]]:
 def costs(found: list[dict[str, Point]]) -> str:
     """A row for each scene: times next to `prb`, and time x variance next to rivals."""
     timed = ("film edges alone", "inner edges alone", "edges alone", "projective inner")
-    header = ["scene", *(f"{name} / prb" for name in timed), *(f"time x variance of {a} / {b}" for a, b in VERSUS)]
+    header = ["scene", *(f"{name} / prb" for name in timed), f"edges alone / prb, {LARGE} x {LARGE}"]
+    header += [f"time x variance of {a} / {b}" for a, b in VERSUS]
     rows = []
     for scene in (*INNER, *FILM):
         jobs = [job for job in found if any(point.scene == scene for point in job.values())]
-        at = {name: job for job in jobs for name in job}
+        least = min((point.paths for job in jobs for point in job.values()), default=0)
+        large = {name: job for job in jobs for name, point in job.items() if point.paths > least}
+        at = {name: job for job in jobs for name, point in job.items() if point.paths == least}
         times = [_versus(at[name][name], at[name].get("prb"))[1] if name in at else "" for name in timed]
+        times.append(_versus(large["edges alone"]["edges alone"], large["edges alone"]["prb"])[1] if large else "")
         rows.append([scene, *times, *(_cost(at.get(ours), ours, at.get(rival), rival) for ours, rival in VERSUS)])
     return markdown(header, rows)
 

@@ -20,8 +20,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-BISECTIONS = 14
-"""How often a line is halved: what is left of it is 2^-14 as long."""
+BISECTIONS = 12
+"""How often a line is halved: what is left of it is 2^-12 as long."""
 OFF_PLANE = 0.1
 """Share of their distance by which two points leave each other's tangent planes, where a surface hides itself."""
 ROUNDING = 1e-5
@@ -137,7 +137,7 @@ class Picked:
 
 @dr.syntax
 def bisect(look: Look, line: Any, weight: mi.Float, pick: mi.PCG32) -> Crossed:
-    """A piece of each line with an edge, 2^-14 as long as the line, where ``weight`` is not zero.
+    """A piece of each line with an edge, 2^-12 as long as the line, where ``weight`` is not zero.
 
     Of several crossings one is chosen, by how likely they are edges; what only the middle found counts twice in each
     half. None, where a surface was merely bent, weighs 0.

@@ -141,8 +141,8 @@ def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> S
     """What a path meets from the camera to the first vertex where it is scattered; until something moves, nothing."""
     if walk.traits.mirrors or walk.traits.hard_lights or walk.media is not None:
         return _chain_sight(walk, ray, key, active)
-    at = PathState.begin(walk, CameraStart(ray, Counted.of(key), active)).at
-    return dr.select(may_move(walk, at.hit), _sight(walk, at, active), Sight.nothing())
+    path = PathState.begin(walk, CameraStart(ray, Counted.of(key), active))
+    return dr.select(may_move(walk, path.at.hit), _sight(walk, path, key, active), Sight.nothing())
 
 
 @dr.syntax
@@ -152,7 +152,7 @@ def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> 
     sight, moves = Sight.nothing(), mi.Bool(False)
     while dr.hint(path.active, exclude=[walk], label="pathreplay: chain"):
         moves |= may_move(walk, path.at.hit)
-        here = dr.select(moves, _sight(walk, path.at, path.active), Sight.nothing())
+        here = dr.select(moves, _sight(walk, path, key, path.active), Sight.nothing())
         if dr.hint(walk.traits.hard_lights, mode="scalar"):
             hidden = _shade(walk, path.at, key, path.depth, path.active).hidden
             here.signature = mixed(here.signature, dr.select(hidden, mi.UInt32(1), 0))
@@ -165,10 +165,29 @@ def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> 
     return sight
 
 
-def _sight(walk: Walk, at: Arrival, active: mi.Bool) -> Sight:
+def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sight:
+    at = path.at
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
-    turned = dr.dot(si.sh_frame.n, at.ray.d) > 0
-    return Sight(mixed(place_met(walk, at.hit, active), dr.select(turned, mi.UInt32(1), 0)), si.p, si.n)
+    kind = dr.select(dr.dot(si.sh_frame.n, at.ray.d) > 0, mi.UInt32(1), 0)
+    if walk.traits.coarse_meshes:
+        kind |= _below(walk, path, key, active)
+    return Sight(mixed(place_met(walk, at.hit, active), kind), si.p, si.n)
+
+
+def _below(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+    """Bits for the directions of light and lobe that are sampled there: their own triangle is in the way of them.
+
+    It is where shading and triangle are on different sides of a direction; their shape hides what is there.
+    """
+    u = Numbers.draw(Counted.at_vertex(key, path.depth))
+    light, si, lit = _light(walk, path.at, u.light, path.depth, active)
+    lobe, _ = si.bsdf().sample(mi.BSDFContext(), si, u.lobe, u.direction, active & si.is_valid())
+
+    def blocked(d: mi.Vector3f) -> mi.Bool:
+        return dr.dot(si.n, d) * dr.dot(si.sh_frame.n, d) < 0
+
+    to_light = dr.select(lit & blocked(light.d), mi.UInt32(2), 0)
+    return to_light | dr.select((lobe.pdf > 0) & blocked(si.to_world(lobe.wo)), mi.UInt32(4), 0)
 
 
 def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
@@ -179,14 +198,22 @@ def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
 def _shade(walk: Walk, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Bool) -> Shade:
     """What is between the k-th vertex and the light that is sampled there, if that has no extent."""
     u = Numbers.draw(Counted.at_vertex(key, k)).light
-    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
-    lit = active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < walk.max_depth)
-    light, _ = draw_emitter(walk.scene, si, u, lit, visible=False)
+    light, si, lit = _light(walk, at, u, k, active)
     ray = si.spawn_ray_to(light.p)
-    hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, active=lit & light.delta & (light.pdf != 0))
+    hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, active=lit & light.delta)
     if walk.clear:
         hit = beyond_null(walk.scene, ray, hit, lit)
     return Shade(u, ray, hit, hit.is_valid())
+
+
+def _light(
+    walk: Walk, at: Arrival, u: mi.Point2f, k: mi.UInt32, active: mi.Bool
+) -> tuple[mi.DirectionSample3f, mi.SurfaceInteraction3f, mi.Bool]:
+    """The emitter sample of the k-th vertex, where that is, and whether there is any."""
+    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+    lit = active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < walk.max_depth)
+    light, _ = draw_emitter(walk.scene, si, u, lit, visible=False)
+    return light, si, lit & (light.pdf != 0)
 
 
 @dr.syntax
@@ -195,7 +222,7 @@ def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: m
     numbers_a, numbers_b = Counted.of(key), Counted.of(key)
     a = PathState.begin(walk, CameraStart(rays[0], numbers_a, active))
     b = PathState.begin(walk, CameraStart(rays[1], numbers_b, active))
-    found = active & _sight(walk, a.at, active).differs(_sight(walk, b.at, active))
+    found = active & _sight(walk, a, key, active).differs(_sight(walk, b, key, active))
     go_on = active & ~found
     while dr.hint(go_on, exclude=[walk], label="pathreplay: fork"):
         go_on &= _slides(a.at.hit)
@@ -208,7 +235,7 @@ def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: m
         next_a, next_b = a.advance(walk, u_a, step_a)[0], b.advance(walk, u_b, step_b)[0]
         go_on &= next_a.active & next_b.active
         a, b = dr.select(go_on, next_a, a), dr.select(go_on, next_b, b)
-        found |= go_on & _sight(walk, a.at, go_on).differs(_sight(walk, b.at, go_on))
+        found |= go_on & _sight(walk, a, key, go_on).differs(_sight(walk, b, key, go_on))
         go_on &= ~found
     fork = Fork(a.depth, a.at, b.at, a.β, found)
     if dr.hint(walk.traits.hard_lights, mode="scalar"):

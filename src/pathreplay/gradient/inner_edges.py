@@ -145,6 +145,7 @@ class Shaded:
     hit: mi.PreliminaryIntersection3f  # of what casts it
     ray: mi.Ray3f
     n: mi.Vector3f
+    own: mi.Bool  # what hides the lamp is the plane of the seer's own triangle
     K: mi.Spectrum
     active: mi.Bool
 
@@ -188,7 +189,8 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a.hidden, -1, 1)
     active &= dr.any(K != 0) & dr.all(dr.isfinite(K))
     u, u_lit = (line.at(dr.select(a.hidden, *ends)) for ends in ((found.a, found.b), (found.b, found.a)))
-    return Shaded(line, u, u_lit, lit, hit, dark.ray, edge_normal(hit, dark.ray, active), K, active)
+    own = active & seer.parts(light.d, dark.ray.d)
+    return Shaded(line, u, u_lit, lit, hit, dark.ray, edge_normal(hit, dark.ray, active), own, K, active)
 
 
 def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
@@ -204,7 +206,7 @@ def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
     """B: distance of the line to the emitter sample from the edge; differentiable in all that moves."""
     origin = seer.moved(at)
     d = followed(seer.walk, c.line.lamp, origin, u, c.lit, c.active)
-    return outline_gap(c.n, origin.p, d, c.hit, c.ray, c.active)
+    return dr.select(c.own, dr.dot(origin.n, d), outline_gap(c.n, origin.p, d, c.hit, c.ray, c.active))
 
 
 def shadow_weight(seer: Seer, c: Shaded) -> mi.Spectrum:
@@ -227,6 +229,7 @@ class Hiding:
     d_far: mi.Vector3f
     n: mi.Vector3f  # from near to far
     bend: Bend
+    own: mi.Bool  # it is the plane of the seer's own triangle
     slope: mi.Float  # of its B, along n
     K_near: mi.Spectrum
     K_far: mi.Spectrum
@@ -284,8 +287,10 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
 
     bend = Bend.of(walk, ((edge, ray_near), (dr.select(near_a, *edges[::-1]), ray_far)), active)
     slope = derivative_by_ray(ray_near, lambda ray: bend.gap(ray, active)).d
+    own = active & seer.parts(ray_near.d, ray_far.d)
+    slope = dr.select(own, seer.si.n, slope)
     slope -= dr.dot(slope, ray_near.d) * ray_near.d
-    bent = (bend.meets | bend.turns) & (dr.squared_norm(slope) > 0)
+    bent = (own | bend.meets | bend.turns) & (dr.squared_norm(slope) > 0)
     n = dr.select(bent, dr.normalize(slope), edge_normal(edge, ray_near, active))
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
     steep = dr.select(bent, dr.dot(slope, n), 1)
@@ -299,7 +304,7 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
         path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < walk.max_depth))
         L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
         K.append(dr.select(active, common * T * L, 0))
-    return Hiding(edge, near, far, ray_near.d, ray_far.d, n, bend, steep, K[0], K[1], active)
+    return Hiding(edge, near, far, ray_near.d, ray_far.d, n, bend, own, steep, K[0], K[1], active)
 
 
 def _counts(walk: Walk, x: Chosen, seen: mi.PreliminaryIntersection3f) -> mi.Bool:
@@ -317,12 +322,13 @@ def hiding_motion(walk: Walk, seer: Seer, c: Hiding, at: mi.Ray3f) -> mi.Spectru
     edge = held_direction(origin, c.d_near, c.edge, c.active)
     d_near, _ = moved_direction(lengths, origin, c.d_near, c.near, seer.holds(c.near, c.active))
     d_far, _ = moved_direction(lengths, origin, c.d_far, c.far, seer.holds(c.far, c.active))
-    bends = c.bend.meets | c.bend.turns
+    bends = c.own | c.bend.meets | c.bend.turns
 
     def gap(d: mi.Vector3f) -> mi.Float:
         """How far a direction is from the edge, along n."""
         ray = mi.Ray3f(origin.spawn_ray(dr.detach(d)).o, d)
-        return dr.select(bends, -c.bend.gap(ray, c.active) / c.slope, dr.dot(c.n, edge - d))
+        B = dr.select(c.own, dr.dot(origin.n, d), c.bend.gap(ray, c.active & ~c.own))
+        return dr.select(bends, -B / c.slope, dr.dot(c.n, edge - d))
 
     swept = c.K_near * gap(d_near) - c.K_far * gap(d_far)
     return dr.select(c.active, swept, 0)

@@ -48,7 +48,7 @@ class Seer:
         a, b = span(self.at.medium, ray, dr.select(si.is_valid(), si.t, dr.inf), self.event)
         t, _ = carried(self.flight.t, a, b, self.event)
         origin = mi.Interaction3f(self.origin)
-        origin.p = dr.select(self.event, ray.o + t * ray.d, si.p)
+        origin.p, origin.n = dr.select(self.event, ray.o + t * ray.d, si.p), si.n
         return origin
 
     def towards(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
@@ -75,6 +75,16 @@ class Seer:
         above = mi.Frame3f.cos_theta(self.si.to_local(d)) * mi.Frame3f.cos_theta(self.si.wi) > 0
         both = above | mi.has_flag(self.si.bsdf().flags(), mi.BSDFFlags.Transmission)
         return both if self.walk.media is None else both | self.event
+
+    def parts(self, a: mi.Vector3f, b: mi.Vector3f) -> mi.Bool:
+        """Whether the plane of its own surface lies between two directions.
+
+        Where shading normals are interpolated, a vertex scatters light from below that plane, where its own shape
+        hides all lamps.
+        """
+        n = self.si.n
+        between = dr.dot(n, a) * dr.dot(n, b) < 0
+        return between if self.walk.media is None else between & ~self.event
 
     def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
         """Whether a direction follows what it hits: from particles only what scatters or emits, see `scatter`."""

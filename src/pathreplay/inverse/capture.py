@@ -6,6 +6,7 @@ left, and have a field of view.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 import re
@@ -49,6 +50,7 @@ def read_capture(
     Raises PathreplayError for what cannot be read, for lenses that cannot be undone, and for cameras that are no rigid
     motions.
     """
+    size_of = functools.cache(size_of)
     masks = None if capture.masks is None else base / capture.masks
     if capture.colmap is not None:
         images = None if capture.images is None else base / capture.images

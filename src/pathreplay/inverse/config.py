@@ -307,6 +307,31 @@ class Config(Table):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _one_factor(self) -> Config:
+        if self.exposure is not None and self.loss == "scale-invariant":
+            raise ValueError(
+                "exposure: loss = 'scale-invariant' has a factor of its own for each view; leave 'exposure' out, or "
+                "take another loss"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _searched(self) -> Config:
+        if not self.optimizer.searches:
+            return self
+        rates = {"learning_rate_schedule", "learning_rate_decay", "warm_up"} & self.model_fields_set
+        wrong = sorted(rates | ({"stages", "rival", "views_per_step"} & self.model_fields_set))
+        if self.spp == AUTO:
+            wrong.append("spp = 'auto'")
+        wrong += ["refine_at" for entry in self.parameters if len(entry.resolutions or []) > 1]
+        if wrong:
+            raise ValueError(
+                f"optimizer: type = '{self.optimizer.type}' compares losses of one function, and has no schedule; "
+                f"leave '{wrong[0]}' out, or take another type"
+            )
+        return self
+
     def seeds(self, stream: int, sensor: int, iteration: int = 0) -> tuple[int, int]:
         """Two independent 32-bit seeds; none is used for another stream, sensor or iteration."""
         first, second = np.random.SeedSequence([self.seed, stream, iteration, sensor]).generate_state(2)

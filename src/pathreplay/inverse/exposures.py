@@ -39,8 +39,11 @@ class Factors:
         return self._log.latent(values)
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """See `Coordinates`."""
-        return self._log.gradient(values, by_values)
+        """See `Coordinates`; also of what `values` takes off all factors."""
+        found = self._log.gradient(values, by_values)
+        if self.fixed:
+            found[self.fixed] -= found.sum(axis=0) / len(self.fixed)
+        return found
 
     def values(self, latent: Array) -> Array:
         """See `Coordinates`."""
@@ -69,11 +72,6 @@ def exposed(values: Arrays, view: int, picture: Image) -> Image:
     """The picture of a view at its exposure."""
     factor = factor_of(values, view, picture.shape[2])
     return picture if factor is None else picture * factor
-
-
-def of_exposed(loss: Loss, factor: Any) -> Loss:
-    """The loss of a rendering that is multiplied with the factor before."""
-    return lambda image, target: loss(image * factor, target)
 
 
 def derivative(loss: Loss, a: Any, b: Any, factor: Any, target: Any, weight: Any) -> Any:

@@ -1,10 +1,10 @@
-"""The optimisation loop: evaluate, step, project; interruptible and resumable, and what it tells of itself."""
+"""The optimisation loop: evaluate, step, project; interruptible and resumable."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -17,10 +17,12 @@ from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
 from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Local, Shard, total
+from pathreplay.inverse.events import Entered, Event, Faint, Finished, NonFinite, Refined, Started, Stepped, Stopped
 from pathreplay.inverse.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.grids import resampled, rmse
 from pathreplay.inverse.images import Image
-from pathreplay.inverse.optimiser import DrJitOptimiser
+from pathreplay.inverse.line_search import LineSearch
+from pathreplay.inverse.optimiser import DrJitOptimiser, Optimiser
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.problem import Problem, View, pose_errors, put_values
 from pathreplay.inverse.schedules import rate
@@ -37,67 +39,6 @@ JUDGEMENTS = 10
 HALF = 0.5
 
 
-@dataclass(frozen=True)
-class Started:
-    """Iterations begin: so many are done, of so many."""
-
-    done: int
-    wanted: int
-
-
-@dataclass(frozen=True)
-class Refined:
-    """A grid goes on in another resolution."""
-
-    key: str
-    shape: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class Entered:
-    """A stage (from 1) of so many begins, or is gone on with."""
-
-    number: int
-    of: int
-
-
-@dataclass(frozen=True)
-class NonFinite:
-    """So many entries of the gradient of a view were NaN or infinite, and count as zero."""
-
-    key: str
-    view: str
-    iteration: int
-    entries: int
-
-
-@dataclass(frozen=True)
-class Faint:
-    """The gradient of a variable is lost in noise: signal to noise, over the last iterations."""
-
-    key: str
-    ratio: float
-    iteration: int
-    spp: int
-
-
-@dataclass(frozen=True)
-class Stepped:
-    """An iteration is done."""
-
-    entry: Entry
-
-
-@dataclass(frozen=True)
-class Stopped:
-    """No more iterations: so many are done."""
-
-    done: int
-
-
-Event = Started | Entered | Refined | NonFinite | Faint | Stepped | Stopped
-
-
 def new_run(
     problem: Problem,
     integrator: mi.Integrator,
@@ -109,11 +50,27 @@ def new_run(
     values = {v.key: get_array(to_value(v.like, v.start)) for v in problem.variables}
     return Run(
         Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
-        DrJitOptimiser(
-            values, optimizer, [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
-        ),
+        _optimiser(problem, values, optimizer or Optimizer()),
         values,
     )
+
+
+def _optimiser(problem: Problem, values: Arrays, options: Optimizer) -> Optimiser:
+    if options.searches:
+        free = -np.inf, np.inf  # other coordinates have their own ways to hold bounds
+        bounds = {v.key: free if v.coordinates else v.bounds for v in problem.variables}
+        return LineSearch(values, options, bounds)
+    uniform = [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
+    return DrJitOptimiser(values, options, uniform)
+
+
+def answer_of(problem: Problem, run: Run) -> dict[str, Array]:
+    """The values that a run has come to: after its last step, or at the best one of a line search."""
+    found = run.optimiser.answer()
+    for v in problem.variables:
+        if v.coordinates and v.key in found:
+            found[v.key] = v.coordinates.values(found[v.key])
+    return {v.key: np.clip(found.get(v.key, run.values[v.key]), *v.bounds) for v in problem.variables}
 
 
 def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
@@ -128,6 +85,9 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
     faint: set[str] = set()
     stage, stages = None, config.stages or []
     for i in range(len(run.history), config.iterations):
+        if run.optimiser.finished:
+            yield Finished(run.optimiser.finished)
+            break
         if stages and place(stages, i) != stage:
             stage = place(stages, i)
             yield Entered(stage + 1, len(stages))
@@ -195,8 +155,9 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     gradients = {
         key: gradient + penalties[key][1] if key in penalties else gradient for key, gradient in found.gradients.items()
     }
+    penalty = sum(value for value, _ in penalties.values())
     run.whole = False
-    run.values = _stepped(part, run, values, gradients, position)
+    run.values = _stepped(part, run, values, gradients, position, found.loss + penalty)
     run.learned = found.learned
     seconds = time.perf_counter() - begin
     errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
@@ -207,7 +168,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
         _norms(gradients),
         sum(found.dropped.values()),
         errors | pose_errors(problem, run.values),
-        penalty=sum(value for value, _ in penalties.values()),
+        penalty=penalty,
         spp=spp,
         noise_norms=_noise_norms(evaluations, share) if halves else {},
         dropped_shares={key: n / (gradients[key].size * len(shards)) for key, n in found.dropped.items()},
@@ -228,11 +189,12 @@ def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array
 
 def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
     """What an iteration evaluates: its views, one after the other, each whole or in two halves."""
+    same = 0 if part.config.optimizer.searches else iteration
     halves, config, views = 2 if part.config.halves_samples else 1, part.config, part.problem.views
     return [
         Shard((n,), spp // halves, (seed,), part.number)
         for n in batch(part.problem, config, iteration)
-        for seed in config.seeds(ITERATION, views[n].sensor, iteration)[:halves]
+        for seed in config.seeds(ITERATION, views[n].sensor, same)[:halves]
     ]
 
 
@@ -246,7 +208,7 @@ def _noise_norms(evaluations: Sequence[Evaluation], share: float) -> dict[str, f
     return {key: norm / 2 for key, norm in _norms({key: a[key] - b[key] for key in a}).items()}
 
 
-def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int) -> dict[str, Array]:
+def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int, loss: float) -> dict[str, Array]:
     """The values after a step of the optimiser, taken in the coordinates of each variable, and held within bounds."""
     config = part.config
     decay, iterations = config.learning_rate_decay, config.iterations
@@ -257,7 +219,7 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
     latent = {key: other.latent(values[key]) for key, other in others.items()}
     slopes = {key: other.gradient(values[key], gradients[key]) for key, other in others.items()}
     now = {v.key: values[v.key] for v in moving}
-    stepped = run.optimiser.step({**now, **latent}, {**gradients, **slopes}, rates)
+    stepped = run.optimiser.step({**now, **latent}, {**gradients, **slopes}, rates, loss)
     stepped |= {key: other.values(stepped[key]) for key, other in others.items()}
     for key, value in stepped.items():
         if not np.isfinite(value).all():

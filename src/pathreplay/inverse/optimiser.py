@@ -35,8 +35,19 @@ class Optimiser(Protocol):
     One that does not come stays as it is, and so does what is remembered of it.
     """
 
-    def step(self, values: Arrays, gradients: Arrays, rates: Mapping[str, float]) -> dict[str, Array]:
-        """The values after a step against the gradients; ``rates`` are about its length in each variable."""
+    finished: str
+    """Why it takes no more steps; "" while it does."""
+
+    def step(
+        self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
+    ) -> dict[str, Array]:
+        """The values after a step against the gradients; ``rates`` are about its length in each variable.
+
+        ``loss`` is that at ``values``, for those that look at it.
+        """
+
+    def answer(self) -> dict[str, Array]:
+        """The values that the steps so far have come to, where they are not those after the last one; else nothing."""
 
     def state(self) -> State:
         """All that later steps depend on, besides the values."""
@@ -51,6 +62,8 @@ class DrJitOptimiser:
     With Adam and AdamW all entries of those that are ``uniform`` are measured by the largest mean of squares, so that
     entries with little gradient stay where they are (UniformAdam). The lengths of SGD's steps are rate x gradient.
     """
+
+    finished = ""
 
     def __init__(self, values: Arrays, options: Optimizer | None = None, uniform: Collection[str] = ()) -> None:
         wanted = Optimizer() if options is None else options
@@ -75,7 +88,9 @@ class DrJitOptimiser:
     def _of(self, key: str) -> drjit.opt.Optimizer:
         return self._parts[self._is_uniform(key)]
 
-    def step(self, values: Arrays, gradients: Arrays, rates: Mapping[str, float]) -> dict[str, Array]:
+    def step(
+        self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
+    ) -> dict[str, Array]:
         """See `Optimiser`."""
         for key, value in values.items():
             part = self._of(key)
@@ -90,6 +105,10 @@ class DrJitOptimiser:
             part.step()
             part.state.update(held)
         return {key: np.array(dr.detach(self._of(key)[key])) for key in values}
+
+    def answer(self) -> dict[str, Array]:
+        """See `Optimiser`."""
+        return {}
 
     def _remembered(self, key: str) -> dict[str, Any]:
         """What the optimiser remembers of a variable, by name: Dr.Jit's arrays."""

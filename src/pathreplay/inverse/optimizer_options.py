@@ -6,16 +6,17 @@ from typing import Any, Literal
 
 from pydantic import model_validator
 
-from pathreplay.inverse.tables import Positive, Share, Switch, Table
+from pathreplay.inverse.tables import Count, Positive, Share, Switch, Table
 
 
 class Optimizer(Table):
-    """An optimiser of Dr.Jit's by ``type``, with its options as Dr.Jit names them; None: as `DEFAULTS` has it.
+    """An optimiser of Dr.Jit's by ``type``, or SciPy's L-BFGS-B, with its options; None: as `DEFAULTS` has it.
 
-    ``weight_decay`` pulls towards zero what is stepped (with a transform, that is not the value itself).
+    Those of Dr.Jit's have its names. ``weight_decay`` pulls towards zero what is stepped (with a transform, that is not
+    the value itself).
     """
 
-    type: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
+    type: Literal["adam", "adamw", "sgd", "rmsprop", "l-bfgs-b"] = "adam"
     beta_1: Share | None = None
     beta_2: Share | None = None
     epsilon: Positive | None = None
@@ -25,6 +26,8 @@ class Optimizer(Table):
     momentum: Share | None = None
     nesterov: Switch | None = None
     alpha: Share | None = None
+    memory: Count | None = None
+    tolerance: Positive | None = None
 
     @model_validator(mode="after")
     def _of_its_type(self) -> Optimizer:
@@ -37,6 +40,11 @@ class Optimizer(Table):
         if self.nesterov and not self.momentum:
             raise ValueError("optimizer: 'nesterov' wants momentum; add momentum = 0.9, or leave it out")
         return self
+
+    @property
+    def searches(self) -> bool:
+        """Whether it compares losses of iterations, which all see the same noise then."""
+        return self.type == "l-bfgs-b"
 
     def options(self) -> dict[str, Any]:
         """All of its type, those that were not given included."""
@@ -56,4 +64,6 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "adamw": {**_ADAM, "weight_decay": 0.01},
     "sgd": {"momentum": 0.0, "nesterov": False},
     "rmsprop": {"alpha": 0.99, "epsilon": 1e-8},
+    # The tolerance is a share of the first loss. Below, falls are lost in the rounding of single precision.
+    "l-bfgs-b": {"memory": 10, "tolerance": 1e-6},
 }

@@ -214,6 +214,11 @@ class Outcome:
     """Variables as people see them, and what poses make of the scene, by key."""
     notes: tuple[str, ...]
 
+    @property
+    def complete(self) -> bool:
+        """Whether all iterations are done, or the optimiser takes no more."""
+        return len(self.run.history) >= self.config.iterations or bool(self.run.optimiser.finished)
+
     def held_out(self) -> list[ViewPictures]:
         """The views that were not learned from."""
         return [view for view in self.views if view.held_out]
@@ -224,7 +229,7 @@ class Outcome:
 
     def command(self) -> str:
         """The command line that makes this run again, or goes on with it where it was stopped."""
-        if len(self.run.history) < self.config.iterations:
+        if not self.complete:
             return resume_command(self.folder)
         job = self.folder / "config.json" if self.source is None else self.source
         changes = "".join(f" -D {shlex.quote(change)}" for change in self.changes)

@@ -21,10 +21,10 @@ from pathreplay.errors import PathreplayError, plain_line
 from pathreplay.interrupts import Stop
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config
-from pathreplay.inverse.event_words import EventWords
+from pathreplay.inverse.events import Event, Notes, Started, Stepped, Stopped
 from pathreplay.inverse.images import Image, displayed, exposure_for
 from pathreplay.inverse.likeness import Likeness
-from pathreplay.inverse.loop import Event, Started, Stepped, Stopped, picture_of
+from pathreplay.inverse.loop import answer_of, picture_of
 from pathreplay.inverse.outcome import DIFFERENCE_GAIN, Recovered, ViewPictures, resume_command
 from pathreplay.inverse.page_parts import (
     about,
@@ -83,10 +83,13 @@ class Previews:
         self._likenesses = self._alike()
         self._shown_at = 0
         self._stale = (folder.path / STOP).exists()  # a wish to stop an earlier part of the run
-        self._log, self._words = list(problem.notes), EventWords()
+        self._log: list[str] = list(problem.notes)
+        self._notes = Notes()
 
     def observe(self, event: Event) -> None:
         """Raises nothing but what ends the process."""
+        if note := self._notes.of(event):
+            self._log.append(note)
         if isinstance(event, Started):
             self._log.append(f"iterations {event.done} to {event.wanted}")
             self._resumed = event.done
@@ -102,8 +105,6 @@ class Previews:
             self._take_wish()
             self._log.append(f"ended after {event.done} iterations" + (f" by {self.stop.by}" if self.stop.by else ""))
             self._write({})
-        elif line := self._words.of(event):
-            self._log.append(line)
 
     def _take_wish(self) -> None:
         with contextlib.suppress(OSError):
@@ -149,7 +150,8 @@ class Previews:
         """Pictures of the views as they are now."""
         try:
             spp = max(self.config.most_spp, min(LEAST_SPP, self.config.picture_spp))
-            images = {v.name: picture_of(self.problem, self.config, self.run.values, v, spp) for v in self._views}
+            values = answer_of(self.problem, self.run)
+            images = {v.name: picture_of(self.problem, self.config, values, v, spp) for v in self._views}
         except RuntimeError as error:
             if self.stop.aborted:
                 raise

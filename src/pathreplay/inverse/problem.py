@@ -323,6 +323,8 @@ def _variables(
     poses: list[Pose] = []
     for key, entry in keys.items():
         rate = entry.learning_rate or config.learning_rate
+        # A step of SGD is the rate times the gradient, which may be anything.
+        bounded = limits.require_learning_rate if config.optimizer.type != "sgd" else lambda *_: None
         if entry.pose is None:
             form = form_of(params, key)
             like = seen(params, key)
@@ -330,9 +332,9 @@ def _variables(
             bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
             coordinates = _coordinates(params, key, entry, start)
             if isinstance(coordinates, Transform):
-                limits.require_learning_rate(key, rate, coordinates.latent(start))
+                bounded(key, rate, coordinates.latent(start))
             else:
-                limits.require_learning_rate(key, rate, start, (entry.lower, entry.upper))
+                bounded(key, rate, start, (entry.lower, entry.upper))
             levels = _levels(key, entry, config.refine_at(entry), start)
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
@@ -350,7 +352,7 @@ def _variables(
                 start = np.radians(start)
                 degrees = entry.rotation_learning_rate
                 rate = rate if degrees is None else float(np.radians(degrees))
-            limits.require_learning_rate(name, rate, start)
+            bounded(name, rate, start)
             variables.append(Variable(name, mi.Vector3f(0), (-np.inf, np.inf), rate, start, None))
     return variables, poses
 

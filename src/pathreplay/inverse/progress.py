@@ -11,8 +11,7 @@ import rich.progress
 from rich.console import Console
 
 from pathreplay.errors import plain_line
-from pathreplay.inverse.event_words import EventWords
-from pathreplay.inverse.loop import Event, Started, Stepped
+from pathreplay.inverse.events import Event, Notes, Started, Stepped
 
 # Between two lines, where there is no bar: a log of a long run stays readable.
 _SECONDS = 10.0
@@ -50,7 +49,7 @@ class Progress:
         self._stream = cast(IO[str], _Forgiving())
         console = Console(file=self._stream, force_jupyter=False)
         self._shown, self._lines = shown, shown and not console.is_terminal
-        self._words = EventWords()
+        self._notes = Notes()
         self._told, self._begin, self._before = time.monotonic(), time.monotonic(), 0
         self._bar = rich.progress.Progress(
             rich.progress.TextColumn("{task.description}"),
@@ -90,7 +89,7 @@ class Progress:
             self.start(event.done, event.wanted)
         elif isinstance(event, Stepped):
             self.advance(event.entry.loss)
-        elif self._shown and (note := self._words.of(event)):
+        elif self._shown and (note := self._notes.of(event)):
             self.note(note)
 
     def start(self, done: int, total: int) -> None:

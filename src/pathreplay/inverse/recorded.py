@@ -15,7 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.inverse.exposures import derivative, of_exposed
+from pathreplay.inverse.exposures import derivative
 from pathreplay.inverse.losses import Loss, mean_loss
 from pathreplay.render.facts import Tables
 from pathreplay.scenes.parameters import keep_only
@@ -99,17 +99,16 @@ def differentiate(
     Also how many paths lost a part of their gradient (None if nobody counts, or it has been told), and the derivative
     by the logarithm of the ``factor`` on the picture (see `exposures`) for each channel, if there is one.
     """
-    plain = loss
-    if factor is not None:
-        loss = of_exposed(plain, factor)
     with _handed(integrator, tables):
         if sweeps:
             offset, slope = (term * share for term in linear_derivative(loss, target, weight))
+            # By the chain rule, of what is linear in the factor times the image.
+            offset, slope = _times(offset, factor), _times(_times(slope, factor), factor)
             image = integrator.render_and_backward(scene, offset, slope, scene.sensors()[sensor], seed, spp)
-            value = mean_loss(loss, image, target, weight).array * share
+            value = mean_loss(loss, _times(image, factor), target, weight).array * share
         else:
             image = mi.render(scene, params, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
-            value = mean_loss(loss, image, target, weight).array * share
+            value = mean_loss(loss, _times(image, factor), target, weight).array * share
             if dr.grad_enabled(value):
                 dr.backward(value)
         by_factor = None
@@ -117,8 +116,12 @@ def differentiate(
             with dr.suspend_grad():
                 other: Any = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(_OTHER))[0]
                 again = mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=other)
-            by_factor = derivative(plain, image, again, factor, target, weight) * share
+            by_factor = derivative(loss, image, again, factor, target, weight) * share
     return dr.detach(value), integrator.take_lost() if hasattr(integrator, "take_lost") else None, by_factor
+
+
+def _times(tensor: Any, factor: Any) -> Any:
+    return tensor if factor is None else tensor * factor
 
 
 @contextmanager

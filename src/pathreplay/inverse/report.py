@@ -69,19 +69,20 @@ def report_page(
 ) -> Page:
     """What the report says; ``drawings`` are the addresses of the curves by name."""
     config, history = outcome.config, outcome.run.history
-    stopped = f"Stopped after {len(history)} of {config.iterations} iterations."
+    ended = f"Stopped after {len(history)} of {config.iterations} iterations."
+    if why := outcome.run.optimiser.finished:
+        ended = f"No more steps after {len(history)} of {config.iterations} iterations: {why}."
     held_out, count = len(outcome.held_out()), len(outcome.recovered) + len(outcome.poses)
     exposure = common_exposure(view.target for view in outcome.views)
     return Page(
         title=outcome.folder.name,
         lead=lead(config, count, len(outcome.views) - held_out, held_out),
-        notices=((stopped,) if len(history) < config.iterations else ()) + dropped_notice(history),
+        notices=((ended,) if len(history) < config.iterations else ()) + dropped_notice(history),
         facts=facts(config, history),
         comparison=_comparison(outcome, contestants, drawings["comparison"]) if contestants else None,
         views=_views(outcome, exposure, films),
         likeness=_likeness(outcome),
-        likeness_note="Of what a display shows of each view at an exposure of its own, noise included"
-        + (". Nothing was learned from views that are held out." if held_out else "."),
+        likeness_note=_likeness_note(outcome),
         views_note="Difference: red where the result is brighter than the target, blue where it is darker."
         + _left_out(outcome),
         exposure=exposure,
@@ -132,6 +133,15 @@ def _likeness(outcome: Outcome) -> Table:
             cells.append("× " + ", ".join(f"{factor:.3f}" for factor in view.factors))
         rows.append(Row(view.name + " (held out)" * view.held_out, tuple(cells)))
     return Table(tuple(Head(text) for text in heads), tuple(rows))
+
+
+def _likeness_note(outcome: Outcome) -> str:
+    said = "Of what a display shows of each view at an exposure of its own, noise included."
+    if outcome.held_out():
+        said += " Nothing was learned from views that are held out"
+        said += "; their exposures are fitted to their pictures at the end." if outcome.config.exposure else "."
+        said += "" if outcome.has_flip() else " FLIP of them comes with: pip install 'pathreplay[flip]'."
+    return said
 
 
 def _shown(outcome: Outcome) -> tuple[list[ViewPictures], float]:

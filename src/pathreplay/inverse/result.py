@@ -131,7 +131,7 @@ def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, bytes
 
 def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
     """What Python gets; ``stopped_by`` is the name of a signal, say, which may have come too late to stop anything."""
-    stopped = len(outcome.run.history) < outcome.config.iterations
+    stopped = not outcome.complete
     return RunResult(
         folder=outcome.folder,
         report=outcome.folder / "report.html",

@@ -10,8 +10,8 @@ from pathreplay.errors import PathreplayError
 from pathreplay.files import file_problem
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.checkpoint import Run
+from pathreplay.inverse.events import Event, Started, Stepped, Stopped
 from pathreplay.inverse.images import Image, exr_bytes, read_image
-from pathreplay.inverse.loop import Event, Started, Stepped, Stopped
 from pathreplay.inverse.problem import Problem
 from pathreplay.inverse.run_folder import CHECKPOINT, RIVAL_CHECKPOINT, RunFolder
 from pathreplay.inverse.targets import Targets

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 
@@ -15,9 +15,10 @@ from pathreplay.errors import PathreplayError
 from pathreplay.interrupts import Stop, stopping, undisturbed
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config, Plugin
+from pathreplay.inverse.events import Event, Stepped
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
-from pathreplay.inverse.loop import Event, Stepped, iterate, new_run, picture_of, render_views, with_exposures
+from pathreplay.inverse.loop import answer_of, iterate, new_run, picture_of, render_views, with_exposures
 from pathreplay.inverse.outcome import resume_command
 from pathreplay.inverse.previews import Previews
 from pathreplay.inverse.problem import Problem, build_problem
@@ -162,7 +163,7 @@ def _states(
                     previews.observe(event)
                 if isinstance(event, Stepped):
                     views = tuple(view.name for view in problem.views)
-                    yield State(event.entry, dict(run.values), views, folder.path, look)
+                    yield State(event.entry, answer_of(problem, run), views, folder.path, look)
         except GeneratorExit:
             saving.close()
             raise
@@ -175,6 +176,7 @@ def _states(
                 raise PathreplayError(f"{error}; {way_out}") from error
             raise
         bar.say("writing")
+        run = replace(run, values=answer_of(problem, run))
         with computing(config):
             for each in filter(None, (run, run.rival)):
                 each.values = dict(with_exposures(problem, config, each.values))
@@ -242,7 +244,13 @@ def _went_on(folder: RunFolder, config: Config, problem: Problem, run: Run) -> d
     held = {v.key for v in problem.variables} if config.stages else set()  # some of them, in some stages
     before = go_on(folder.path, problem, run, held)
     # All iterations but no report: the disk was full at the end. Then only the end is done again.
-    if len(run.history) >= config.iterations and (folder.path / "report.html").exists():
+    if not (folder.path / "report.html").exists():
+        return before
+    if run.optimiser.finished:
+        raise PathreplayError(
+            f"Run {folder.path} has ended by itself ({run.optimiser.finished}); lower 'tolerance' in its config"
+        )
+    if len(run.history) >= config.iterations:
         raise PathreplayError(
             f"Run {folder.path} has all its {len(run.history)} iterations; raise 'iterations' in its config"
         )

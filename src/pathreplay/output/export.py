@@ -17,6 +17,7 @@ from pathreplay import backend
 from pathreplay.errors import PathreplayError
 from pathreplay.files import file_names
 from pathreplay.inverse.capture import FACING, read_capture
+from pathreplay.inverse.exposures import EXPOSURE
 from pathreplay.inverse.images import picture_size, png_bytes
 from pathreplay.inverse.run_folder import Job, read_job
 from pathreplay.inverse.values import Arrays
@@ -43,10 +44,11 @@ def export_run(run: Path, output: Path | None = None) -> str:
     backend.set_variant(job.config.variant)
     values = _result(run)
     source = _source(job, values)
+    of_pictures = {EXPOSURE: values.pop(EXPOSURE)} if EXPOSURE in values else {}
     found = exported(source, values, job.config.integrator.model_dump())
     with whole_folder(folder, _OPTION) as part:
         write_files(found, part)
-        for name, data in _beside(found, values).items():
+        for name, data in _beside(found, values | of_pictures).items():
             (part / name).write_bytes(data)
         require_same(found.scene, part)
     files = sorted([*found.files, *found.copies])
@@ -86,7 +88,8 @@ def _result(run: Path) -> dict[str, np.ndarray]:
 
 def _source(job: Job, values: Arrays) -> Source:
     config = job.config
-    shots = {} if config.capture is None else read_capture(config.capture, job.base, picture_size)
+    film = "rgba" if config.target.alpha == "compare" else "rgb"
+    shots = {} if config.capture is None else read_capture(config.capture, job.base, picture_size, film)
     cameras = {name: shot.camera for name, shot in shots.items()}
     plugins = {"dielectric": "smoothdielectric"} if any(key.endswith(".eta") for key in values) else {}
     if config.scene in BUILTINS:
@@ -105,7 +108,7 @@ def _beside(found: Exported, values: Arrays) -> dict[str, bytes]:
     for key, value in values.items():
         if value.ndim == 3 and value.shape[2] <= 4:
             files[f"textures/{names[key]}.png"] = png_bytes(value)
-        elif value.size <= 16:
+        elif value.size <= 16 or key == EXPOSURE:
             numbers[key] = value.tolist()
     files["values.json"] = _json(numbers)
     for shape in found.scene.shapes():

@@ -24,7 +24,7 @@ from .camera_pass import Pass
 from .places import FilmPlaces
 from .term import Found
 
-FILM_CLOSER, INNER_CLOSER = 4, 16
+FILM_CLOSER, INNER_CLOSER = 5, 16
 """For so many lines one is looked at closer, of those with an edge."""
 BATCH = "BatchSensor"
 """By class: Dr.Jit ends the process where its rays are differentiated by their place."""

@@ -23,6 +23,8 @@ DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
 INSTANCE = "Instance"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
+COARSE = 1.0
+"""Degrees between triangles and shading normals from which on it matters that they are not the same."""
 
 T = TypeVar("T")
 V = TypeVar("V")
@@ -53,6 +55,7 @@ class Traits:
     area_lights: bool  # there are emitters with an edge
     hard_lights: bool  # there are emitters whose shadows are hard
     mesh_lights: bool  # there are meshes that emit
+    coarse_meshes: bool  # there are meshes that are shaded as if they were smooth, and are not: see `is_coarse`
     painted_meshes: bool  # there are meshes that emit, with a texture
     two_sides: bool  # a surface may have another BSDF on its back
     masks_mirrors: bool  # a mask lies over delta lobes
@@ -86,6 +89,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         mesh_lights=any(_ball(lamp)[3] > 0 for lamp in _mesh_lamps(shapes)),
+        coarse_meshes=any(is_coarse(shape) for shape in shapes if shape.is_mesh()),
         painted_meshes=any(is_painted(lamp.emitter()) for lamp in _mesh_lamps(shapes)),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
@@ -122,6 +126,23 @@ def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
 
     begins = _by_index(mi.ShapePtr, shapes, begin, WHOLE)
     return mi.UInt32(begins), mi.UInt32(np.concatenate(found).astype(np.uint32))
+
+
+def is_coarse(mesh: mi.Mesh) -> bool:
+    """Whether triangles of a mesh leave the normals at their corners by `COARSE` degrees, on average.
+
+    Along their sides, where the shading is smooth, lamps are then hidden that the shading would see.
+    """
+    params = mi.traverse(mesh)
+    if mesh.has_face_normals() or not mesh.has_vertex_normals() or "faces" not in params:
+        return False
+    faces, at, normals = (
+        np.array(params[key]).reshape(-1, 3) for key in ("faces", "vertex_positions", "vertex_normals")
+    )
+    a, b, c = (at[faces[:, i]].astype(np.float64) for i in range(3))
+    n = np.cross(b - a, c - a)
+    cosines = np.einsum("fk,fik->fi", n, normals[faces]) / np.maximum(np.linalg.norm(n, axis=1), 1e-30)[:, None]
+    return bool(np.degrees(np.arccos(np.clip(cosines, -1, 1))).mean() > COARSE)
 
 
 def lamp_balls(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:

@@ -1,0 +1,50 @@
+"""Take the photo: render the room with what is to be found in it, as a PNG of 8 bits: python make_photo.py
+
+`TRUTH` is what the job has to find. It sees nothing of it but the picture.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from pathreplay.backend import set_variant
+
+FOLDER = Path(__file__).parent
+TRUTH = {
+    "wood.reflectance.value": [0.55, 0.35, 0.2],
+    "plaster.reflectance.value": [0.75, 0.72, 0.65],
+    "paint.reflectance.value": [0.2, 0.45, 0.6],
+    "glaze.base_color.value": [0.6, 0.12, 0.1],
+    "glaze.roughness.value": [0.3],
+    "lamp.emitter.radiance.value": [16.0, 13.0, 9.0],
+}
+
+
+def main(resolution: int = 96, spp: int = 1024, into: Path = FOLDER) -> None:
+    """Render the room into ``into``/photo.png."""
+    set_variant()
+    import mitsuba as mi
+
+    from pathreplay.inverse.images import png_bytes
+    from pathreplay.scenes.loading import load_scene
+    from pathreplay.scenes.parameters import to_value
+
+    scene = load_scene(FOLDER / "scene.xml", res=resolution)
+    params = mi.traverse(scene)
+    for key, value in TRUTH.items():
+        params[key] = to_value(params[key], np.float32(value))
+    params.update()
+    image = np.array(mi.render(scene, spp=spp, seed=7))
+    (into / "photo.png").write_bytes(png_bytes(image))
+    print(
+        f"{into / 'photo.png'}: {resolution} x {resolution}, {100 * (image > 1).any(axis=2).mean():.1f} % overexposed"
+    )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--resolution", type=int, default=96)
+    main(parser.parse_args().resolution)

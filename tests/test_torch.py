@@ -1,0 +1,157 @@
+"""The bridge to PyTorch: pictures and gradients are Mitsuba's own, calls do not mix, and nothing is left behind."""
+
+from __future__ import annotations
+
+import gc
+import runpy
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import psutil
+import pytest
+
+from pathreplay.errors import PathreplayError
+from pathreplay.scenes.loading import load_scene
+from pathreplay.scenes.parameters import get_array
+
+torch = pytest.importorskip("torch")
+
+from pathreplay.bridge.torch import Render  # noqa: E402
+
+TEXTURE, WALL = "back.bsdf.reflectance.data", "red.reflectance.value"
+SMALL = {"resolution": 6, "texture": 3}
+PLAIN = {"type": "pathreplay", "max_depth": 3}
+
+
+@pytest.fixture
+def render() -> Any:
+    return Render("cornell-box-photo", [TEXTURE, WALL], integrator=PLAIN, spp=16, arguments=SMALL)
+
+
+def test_the_picture_is_that_of_mitsuba(render: Any) -> None:
+    scene = load_scene("cornell-box-photo", **SMALL)
+    expected = np.array(mi.render(scene, sensor=1, integrator=mi.load_dict(PLAIN), spp=16, seed=4))
+    image = render(render.start(), 1, seed=4)
+    assert image.shape == (6, 6, 3) and image.dtype == torch.float32
+    np.testing.assert_allclose(image.numpy(), expected, rtol=1e-5, atol=1e-6)
+
+
+def mitsubas(values: dict[str, Any], sensor: int, seed: int, weights: np.ndarray) -> dict[str, np.ndarray]:
+    """The gradient of sum(weights * picture) by Mitsuba alone, with many samples."""
+    scene = load_scene("cornell-box-photo", **SMALL)
+    params = mi.traverse(scene)
+    params[TEXTURE], params[WALL] = mi.TensorXf(values[TEXTURE].numpy()), mi.Color3f(*values[WALL].tolist())
+    for key in (TEXTURE, WALL):
+        dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(scene, params, sensor=sensor, integrator=mi.load_dict(PLAIN), spp=2048, seed=seed)
+    dr.backward(dr.sum(image * mi.TensorXf(weights), axis=None))
+    return {key: get_array(dr.grad(params[key])) for key in (TEXTURE, WALL)}
+
+
+def test_gradients_of_several_calls_are_each_their_own(render: Any) -> None:
+    """Two views with different values before one backward: the sum of both gradients, by Mitsuba alone."""
+    first, second = render.start(), render.start()
+    second = {TEXTURE: second[TEXTURE] * 0.2, WALL: second[WALL] * 0 + 0.9}
+    for values in (first, second):
+        for tensor in values.values():
+            tensor.requires_grad_()
+    weights = [np.random.default_rng(i).uniform(0.5, 1, (6, 6, 3)).astype(np.float32) for i in (0, 1)]
+    loss = (render(first, 0, seed=1, spp=2048) * torch.tensor(weights[0])).sum()
+    loss = loss + (render(second, 1, seed=2, spp=2048) * torch.tensor(weights[1])).sum()
+    loss.backward()
+    for values, sensor, weight in ((first, 0, weights[0]), (second, 1, weights[1])):
+        expected = mitsubas({k: v.detach() for k, v in values.items()}, sensor, 3, weight)
+        for key, gradient in expected.items():
+            found = values[key].grad.numpy()
+            assert found.shape == gradient.shape
+            np.testing.assert_allclose(found.mean(), gradient.mean(), rtol=0.05)
+            assert np.abs(found - gradient).mean() < 0.15 * np.abs(gradient).mean()
+
+
+def test_transforms_vectors_and_numbers_have_gradients() -> None:
+    """That of the camera's shift against the same by Mitsuba: x of `camera.to_world` is entry (0, 3)."""
+    render = Render("mirror-camera", ["camera.to_world"], integrator=PLAIN, spp=512, arguments={"resolution": 8})
+    values = render.start()
+    values["camera.to_world"].requires_grad_()
+    assert values["camera.to_world"].shape == (4, 4)
+    ramp = np.broadcast_to(np.linspace(-1, 1, 8, dtype=np.float32)[:, None], (8, 8, 3)).copy()  # else shifts cancel
+    (render(values, 0, seed=1) * torch.tensor(ramp)).sum().backward()
+    found = values["camera.to_world"].grad.numpy()
+    scene = load_scene("mirror-camera", resolution=8)
+    params, x = mi.traverse(scene), mi.Float(0)
+    dr.enable_grad(x)
+    params["camera.to_world"] = mi.Transform4f().translate([x, 0, 0]) @ params["camera.to_world"]
+    params.update()
+    image = mi.render(scene, params, sensor=0, integrator=mi.load_dict(PLAIN), spp=512, seed=2)
+    dr.backward(dr.sum(image * mi.TensorXf(ramp), axis=None))
+    assert found[0, 3] == pytest.approx(dr.grad(x)[0], rel=0.1) and abs(found[0, 3]) > 0.5
+
+
+def test_colours_keep_their_order() -> None:
+    render = Render("cornell-box", WALL, integrator=PLAIN, arguments={"resolution": 4})
+    render({WALL: torch.tensor([0.1, 0.2, 0.3])})
+    np.testing.assert_allclose(get_array(mi.traverse(render.scene)[WALL]), [0.1, 0.2, 0.3], rtol=1e-6)
+
+
+def test_a_texture_may_have_another_size(render: Any) -> None:
+    values = {**render.start(), TEXTURE: torch.full((5, 7, 3), 0.5, requires_grad=True)}
+    render(values).sum().backward()
+    assert values[TEXTURE].grad.shape == (5, 7, 3) and values[TEXTURE].grad.abs().sum() > 0
+
+
+def test_what_does_not_fit_is_told(render: Any) -> None:
+    values = render.start()
+    with pytest.raises(PathreplayError, match=r"there is a difference: 'red\.reflectance\.value'"):
+        render({TEXTURE: values[TEXTURE]})
+    with pytest.raises(PathreplayError, match="there is a difference: 'blue'"):
+        render({**values, "blue": values[WALL]})
+    with pytest.raises(PathreplayError, match=r"shape \(4,\) given for the parameter 'red.*' of shape \(3,\)"):
+        render({**values, WALL: torch.zeros(4)})
+    with pytest.raises(PathreplayError, match="Integrator 'path' computes no gradients"):
+        Render("cornell-box", WALL, integrator={"type": "path"})
+    with pytest.raises(PathreplayError, match="No parameter 'blue'"):
+        Render("cornell-box", "blue")
+
+
+def test_without_torch_one_line_says_so(run_python: Any) -> None:
+    code = """
+import sys
+sys.modules["torch"] = None
+import mitsuba as mi, pathreplay
+mi.set_variant("llvm_ad_rgb")
+try:
+    import pathreplay.bridge.torch
+except pathreplay.PathreplayError as error:
+    print(error)
+"""
+    assert run_python(code).stdout == "PyTorch is not installed: pip install torch, or 'pathreplay[torch]'\n"
+
+
+@pytest.mark.slow
+def test_five_hundred_iterations_leave_nothing_behind() -> None:
+    """Neither memory of the process nor variables of Dr.Jit's."""
+    render = Render("cornell-box-photo", [TEXTURE, WALL], integrator=PLAIN, spp=1, arguments=SMALL)
+    values = {key: torch.nn.Parameter(value) for key, value in render.start().items()}
+    optimiser = torch.optim.Adam(values.values(), lr=1e-3)
+    marks = []
+    for i in range(500):
+        optimiser.zero_grad()
+        render(values, i % 2, seed=i).square().mean().backward()
+        optimiser.step()
+        if i in (99, 499):
+            gc.collect()
+            marks.append((psutil.Process().memory_info().rss, dr.whos(as_string=True).count("\n")))
+    (before, held), (after, still) = marks
+    assert still == held
+    assert after - before < 20e6
+
+
+@pytest.mark.slow
+def test_the_example_recovers_a_small_texture_by_a_network(tmp_path: Path) -> None:
+    example = Path(__file__).parents[1] / "examples/torch-network/recover.py"
+    found = runpy.run_path(str(example))["recover"](resolution=12, texture=8, steps=60, picture=tmp_path / "found.png")
+    assert found.error < 0.5 * found.start and (tmp_path / "found.png").is_file()
