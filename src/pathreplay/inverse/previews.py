@@ -52,7 +52,7 @@ BUTTON = "the stop button"
 FRAME = re.compile(r"(\d{6,})-((?:view|texture|volume)-.+)\.webp")
 
 # Seconds between two states of the page at least, and how many times longer than writing one took.
-PAUSE_S, PAUSE = 1.0, 40
+PAUSE_S, PAUSE = 1.0, 100
 # Pixels along the longer side: of pictures to compare, and of frames.
 LARGEST, FRAME_SIDE = 1024, 384
 # Of all frames in a report: enough for a film of each picture, and no burden to a page.
