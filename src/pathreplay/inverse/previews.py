@@ -72,7 +72,7 @@ class Previews:
         self.folder, self.config, self.problem, self.run, self.stop = folder, config, problem, run, stop
         self._share = config.preview.share
         self._began = self._written = time.perf_counter()
-        self._exposure = common_exposure(view.target for view in problem.views)
+        self._exposure = common_exposure([view.target for view in problem.views])
         self._views = _chosen(problem, config.preview.views) if self._share else []
         self._before = {view.name: before[view.name] for view in self._views}
         self._now = {v.name: _pictures_of(v, self._before[v.name], self._before[v.name]) for v in self._views}
