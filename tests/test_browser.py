@@ -313,5 +313,5 @@ def test_a_mesh_is_shown_and_turns(show: Any) -> None:
     seen.tab.mouse.up()
     assert painted()[1] != before
     turned = painted()[1]
-    seen.tab.get_by_label("mesh", exact=True).select_option("start")
+    seen.tab.locator(".extra select").select_option("start")
     assert painted()[1] != turned

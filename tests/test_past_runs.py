@@ -37,7 +37,7 @@ def a_run(folder: Path, losses: tuple[float, ...] = (1.0, 0.5, 0.25), **changes:
     for name in ("images", FOLDER):
         (folder / name).mkdir(parents=True)
     (folder / "config.json").write_text(make_config({**JOB, **changes}).model_dump_json(exclude_unset=True))
-    (folder / "run.json").write_text("{}")
+    (folder / "run.json").write_text(json.dumps({"base": str(folder), "config": None}))
     history = [Entry(i, loss, 0.5, {TEXTURE: loss}, errors={TEXTURE: 2 * loss}) for i, loss in enumerate(losses)]
     metadata = {"history": _HISTORY.dump_json(history).decode()}
     (folder / "checkpoint.safetensors").write_bytes(safetensors.numpy.save({"x": np.zeros(1, np.float32)}, metadata))

@@ -52,7 +52,7 @@ BUTTON = "the stop button"
 FRAME = re.compile(r"(\d{6,})-((?:view|texture|volume)-.+)\.webp")
 
 # Seconds between two states of the page at least, and how many times longer than writing one took.
-PAUSE_S, PAUSE = 1.0, 40
+PAUSE_S, PAUSE = 1.0, 100
 # Pixels along the longer side: of pictures to compare, and of frames.
 LARGEST, FRAME_SIDE = 1024, 384
 # Of all frames in a report: enough for a film of each picture, and no burden to a page.
@@ -71,11 +71,11 @@ class Previews:
     ) -> None:
         self.folder, self.config, self.problem, self.run, self.stop = folder, config, problem, run, stop
         self._share = config.preview.share
-        self._exposure = common_exposure(view.target for view in problem.views)
-        self._views = _chosen(problem, config.preview.views)
+        self._began = self._written = time.perf_counter()
+        self._exposure = common_exposure([view.target for view in problem.views])
+        self._views = _chosen(problem, config.preview.views) if self._share else []
         self._before = {view.name: before[view.name] for view in self._views}
         self._now = {v.name: _pictures_of(v, self._before[v.name], self._before[v.name]) for v in self._views}
-        self._began = self._written = time.perf_counter()
         self._pause = PAUSE_S
         self._spent = self._cost = 0.0
         self._resumed, self._stride = 0, 1.0
@@ -103,7 +103,9 @@ class Previews:
             self._stepped(event.entry.iteration + 1, event.entry.seconds)
         elif isinstance(event, Stopped):
             self._take_wish()
-            self._log.append(f"ended after {event.done} iterations" + (f" by {self.stop.by}" if self.stop.by else ""))
+            by, took = f" by {self.stop.by}" if self.stop.by else "", time.perf_counter() - self._began
+            self._log.append(f"ended after {event.done} iterations{by}")
+            self._log.append(f"pictures while it ran took {self._spent:.1f} of {took:.1f} s")
             self._write({})
 
     def _take_wish(self) -> None:
@@ -234,8 +236,8 @@ class Previews:
             notices=stopping + dropped_notice(history),
             facts=((f"{done} of {wanted}", first), *others),
             views=tuple(self._view(view, shown) for view in self._views),
-            views_note=f"{len(self._views)} of {len(self.problem.views)} views, the last time after iteration "
-            f"{self._shown_at}. Difference: red where it is brighter than the target, blue where it is darker.",
+            views_note=f"{len(self._views)} of {len(self.problem.views)} views, the last time after {self._shown_at} "
+            "iterations. Difference: red where it is brighter than the target, blue where it is darker.",
             exposure=self._exposure,
             plots=plots(history),
             plots_note=plots_note(history),

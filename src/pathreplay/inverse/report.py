@@ -73,7 +73,7 @@ def report_page(
     if why := outcome.run.optimiser.finished:
         ended = f"No more steps after {len(history)} of {config.iterations} iterations: {why}."
     held_out, count = len(outcome.held_out()), len(outcome.recovered) + len(outcome.poses)
-    exposure = common_exposure(view.target for view in outcome.views)
+    exposure = common_exposure([view.target for view in outcome.views])
     return Page(
         title=outcome.folder.name,
         lead=lead(config, count, len(outcome.views) - held_out, held_out),

@@ -13,8 +13,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.checkpoint import Entry
-from pathreplay.inverse.config import Config, load_config
-from pathreplay.inverse.run_folder import CHECKPOINT
+from pathreplay.inverse.config import Config
+from pathreplay.inverse.run_folder import CHECKPOINT, read_job
 from pathreplay.watch.run_files import read_own
 
 _HISTORY = TypeAdapter(list[Entry])
@@ -30,10 +30,7 @@ class Past:
     @cached_property
     def config(self) -> Config:
         """Raises PathreplayError where it cannot be read."""
-        copy = next((p for n in ("config.toml", "config.json") if (p := self.folder / n).is_file()), None)
-        if copy is None:
-            raise PathreplayError(f"{self.folder} is no run folder (no config); give a folder that optimize has made")
-        return load_config(copy)
+        return read_job(self.folder).config
 
     @cached_property
     def history(self) -> list[Entry]:

@@ -19,7 +19,7 @@ from pathreplay.pages.page import Page
 
 REPORT = "report.html"
 # Far above what any of these takes.
-MOST_BYTES = 512 * 2**20
+MOST_BYTES = 256 * 2**20
 PICTURES = {".png": "image/png", ".webp": "image/webp"}
 
 

@@ -45,7 +45,8 @@ class RunServer(ThreadingHTTPServer):
                 f"Nothing can be served at {host}, port {port} ({why}); give another --port or --host"
             ) from None
         self.names = {"localhost", host.lower(), socket.gethostname().lower(), socket.getfqdn().lower()}
-        shown = f"[{host}]" if ":" in host else host
+        everywhere = host in ("", "0.0.0.0", "::")
+        shown = socket.gethostname() if everywhere else f"[{host}]" if ":" in host else host
         self.address = f"http://{shown}:{self.server_address[1]}/{self.token}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
