@@ -15,6 +15,7 @@ import pytest
 
 from pathreplay.render.facts import SceneFacts
 from pathreplay.transport import velocity
+from pathreplay.transport.surface import met
 from truth import (
     RES,
     Bench,
@@ -307,3 +308,16 @@ def test_narrow_lobes_hold_where_something_ends() -> None:
     assert outlines(under_sky(texture))
     assert outlines(under_sky({"type": "roughconductor"}, "cube"))
     assert outlines(under_sky({"type": "roughconductor"}, "disk") | {"other": {"type": "sphere"}})
+
+
+@pytest.mark.parametrize(("height", "slope"), [(0.9, 0.9 / 0.19**0.5), (float(np.nextafter(np.float32(1), 0)), 0.0)])
+def test_what_rounding_has_put_on_the_limb_of_a_ball_does_not_move(height: float, slope: float) -> None:
+    """A ray along z at this height meets the unit ball at z = -√(1 - height²)."""
+    ball = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})
+    y = mi.Float(height)
+    dr.enable_grad(y)
+    ray = mi.Ray3f(mi.Point3f(0, y, -3), mi.Vector3f(0, 0, 1))
+    hit = ball.ray_intersect_preliminary(dr.detach(ray))
+    assert dr.all(hit.is_valid())
+    dr.backward(met(hit, ray, mi.Bool(True)).t)
+    assert np.isclose(dr.grad(y)[0], slope, rtol=1e-4)

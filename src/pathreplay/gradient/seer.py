@@ -11,6 +11,7 @@ from ..transport import arrive, scatter
 from ..transport.media import carried, span
 from ..transport.passage import beyond_null, passage, past
 from ..transport.signature import place_met
+from ..transport.surface import met
 from ..transport.traits import is_null
 from ..transport.vertex import Arrival, Chosen, Flight, Walk, is_smooth
 from .counted import Counted
@@ -42,7 +43,7 @@ class Seer:
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
         """The vertex, differentiable in the ``ray`` that arrives and in what moves it: see `fly_again`."""
-        si = self.at.hit.compute_surface_interaction(ray, mi.RayFlags.All, self.active)
+        si = met(self.at.hit, ray, self.active)
         if self.flight is None:
             return si
         a, b = span(self.at.medium, ray, dr.select(si.is_valid(), si.t, dr.inf), self.event)

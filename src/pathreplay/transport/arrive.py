@@ -14,6 +14,7 @@ import mitsuba as mi
 from .emitters import emission
 from .flight import Flown, fly, fly_again
 from .media import interaction
+from .surface import met
 from .traits import is_null
 from .vertex import Arrival, Flight, Replayed, Walk
 
@@ -68,7 +69,11 @@ def repeat(walk: Walk, again: Replayed, attached: bool, active: mi.Bool) -> Vert
     """
     at, kept = again.at, again.kept
     with dr.suspend_grad(when=not attached):
-        si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+        si = (
+            met(at.hit, at.ray, active)
+            if attached
+            else at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+        )
     if kept.media is None:
         known = None if kept.known is None or attached else kept.known.glow
         return _on_surface(walk, at, si, attached, active, known)

@@ -1,4 +1,4 @@
-"""Points that are held on a surface while it moves: where they go, and how the area around them grows."""
+"""Points of surfaces while rays and shapes move: those that a ray slides to, and those that are held where they are."""
 
 from __future__ import annotations
 
@@ -9,6 +9,22 @@ import mitsuba as mi
 
 # Share by which a surface may differ from a sphere (derivatives of its normal) and still be taken for one.
 UMBILIC = 1e-4
+# Cosine between a ray and a sphere or cylinder below which it is rounding where the ray meets it.
+GRAZES = 1e-3
+
+
+def met(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
+    """What a ray met, differentiable in the ray and the shape.
+
+    Distances to spheres and cylinders are roots of which the derivative is 1 / cos of the angle to the normal: where it
+    means something, some hundreds at most, and where rounding has put a ray on the limb itself, many millions. There
+    nothing follows, which is right but for some `GRAZES` of all that a ball's motion does.
+    """
+    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+    kind = si.shape.shape_type()
+    rounded = (kind == int(mi.ShapeType.Sphere)) | (kind == int(mi.ShapeType.Cylinder))
+    grazes = active & rounded & (dr.abs(dr.dot(dr.detach(si.n), dr.detach(ray.d))) < GRAZES)
+    return dr.select(grazes, dr.detach(si), si)
 
 
 @dataclass
