@@ -1,6 +1,7 @@
 """Take the photo: render the room with what is to be found in it, as a PNG of 8 bits: python make_photo.py
 
-`TRUTH` is what the job has to find. It sees nothing of it but the picture.
+`TRUTH` is what the job has to find. It sees nothing of it but the picture. With ``--compare RUN`` prints what a run has found
+over that.
 """
 
 from __future__ import annotations
@@ -44,7 +45,21 @@ def main(resolution: int = 96, spp: int = 1024, into: Path = FOLDER) -> None:
     )
 
 
+def compare(run: Path) -> None:
+    """Print by what factor each number of a run is off."""
+    from safetensors.numpy import load_file
+
+    found = load_file(run / "parameters.safetensors")
+    for key, value in TRUTH.items():
+        print(f"{key:30s}", *(f"{factor:.3f}" for factor in found[key].ravel() / np.float32(value)))
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--resolution", type=int, default=96)
-    main(parser.parse_args().resolution)
+    parser.add_argument("--compare", type=Path, metavar="RUN")
+    asked = parser.parse_args()
+    if asked.compare is None:
+        main(asked.resolution)
+    else:
+        compare(asked.compare)
