@@ -11,7 +11,7 @@ import pytest
 
 import edge_scenes as scenes
 from pathreplay.gradient.centres import Centres
-from pathreplay.gradient.counted import quasi_random
+from pathreplay.gradient.counted import key_of, quasi_random
 from pathreplay.gradient.crofton import Picked, PlaneLine, Sight, bisect, glance
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.facts import SceneFacts
@@ -212,3 +212,11 @@ def test_the_cone_around_a_mesh_lamp_follows_it() -> None:
     params[key] = mi.Float((vertices + 1).ravel())
     params.update()
     assert np.array(facts.tables().lamp_balls) == pytest.approx([*(centre + 1), radius], rel=1e-4)
+
+
+def test_passes_share_no_random_numbers() -> None:
+    """With keys of i ^ seed, lines of all passes would be the same, in another order."""
+    lanes = 2**14
+    keys = [set(np.array(key_of(dr.arange(mi.UInt32, lanes), mi.UInt32(seed))).tolist()) for seed in (1, 2, 3)]
+    assert all(len(each) > lanes - 4 for each in keys)
+    assert len(set.union(*keys)) > 3 * lanes - 12

@@ -113,7 +113,8 @@ def test_material_and_light_are_found_in_one_photo(tmp_path: Path) -> None:
     made["main"](resolution=24, spp=512, into=tmp_path)
     job = load_config(example / "config.toml").model_dump(exclude_unset=True)
     job |= {
-        "scene": str(example / "scene.xml"), "scene_parameters": {"res": 24}, "iterations": 200, "picture_spp": 4, "target": {"images": [str(tmp_path / "photo.png")]},
+        "scene": str(example / "scene.xml"), "scene_parameters": {"res": 24}, "iterations": 200, "picture_spp": 4,
+        "target": {"images": [str(tmp_path / "photo.png")]},
     }  # fmt: skip
     found = optimize(make_config(job), output=tmp_path / "run", progress=False).parameters
     before = mi.traverse(mi.load_file(str(example / "scene.xml"), optimize=False))

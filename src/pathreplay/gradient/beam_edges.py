@@ -21,13 +21,13 @@ from ..transport.emitters import draw_emitter
 from ..transport.media import interaction
 from ..transport.passage import beyond_null, passage, past
 from ..transport.path import PathState
-from ..transport.signature import edge_normal, mixed, outline_gap
+from ..transport.signature import edge_normal, outline_gap
 from ..transport.start import CameraStart
 from ..transport.step import choose_step
 from ..transport.vertex import Arrival, Flight, Numbers, Walk
 from .adjoint import derivative_by_place
 from .centres import Centres
-from .counted import Counted, quasi_random
+from .counted import Counted, key_of, quasi_random
 from .crofton import Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places
 from .record import Layout, deepest, record, record_type, room_for
@@ -61,7 +61,7 @@ def beam_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
     centres = Centres.even(places.size, l)
 
     def draw(i: mi.UInt32) -> tuple[BeamLine, mi.Bool]:
-        key = mixed(mixed(i, seed), mi.UInt32(0x3C6EF372))
+        key = key_of(i, seed ^ 0x3C6EF372)
         numbers = Counted(key, mi.UInt32(0x30000))
         turn = dr.two_pi * numbers.next_1d()
         w = mi.Vector2f(dr.cos(turn), dr.sin(turn))

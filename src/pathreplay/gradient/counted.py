@@ -37,6 +37,15 @@ class Counted:
         return mi.Point2f(x, self.next_1d())
 
 
+def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
+    """The key of the i-th line of a pass.
+
+    No function of i ^ seed: with that, passes would deal out the same keys to other lines, and their mean would keep
+    the error of one.
+    """
+    return mi.sample_tea_32(i, seed)[0]
+
+
 def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32) -> mi.Point2f:
     """The i-th of n points that fill the unit square evenly, from left to right (Fibonacci's lattice), shifted."""
     x = i * dr.opaque(mi.UInt32, 2**32 // n) + mi.sample_tea_32(seed, mi.UInt32(1))[0]

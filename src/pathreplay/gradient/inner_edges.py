@@ -31,7 +31,7 @@ from ..transport.vertex import Arrival, Flight, Walk, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
 from .bends import Bend
 from .centres import LOOKS, Centres
-from .counted import Counted, quasi_random
+from .counted import Counted, key_of, quasi_random
 from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places
 from .lamps import Glimpse, Lamp, followed, glimpse
@@ -352,7 +352,7 @@ def inner_edges(
     square, arc = lengths
 
     def path(centres: Centres, i: mi.UInt32, n: int, seed: mi.UInt32, records: Any) -> tuple[Any, ...]:
-        key = mixed(mixed(i, seed), mi.UInt32(0x2545F491))
+        key = key_of(i, seed ^ 0x2545F491)
         s, density = centres.draw(quasi_random(i, n, seed))
         ray, weight = dr.detach(places.ray(s, key))
         records, x = choose_vertex(walk, Counted.of(key), ray, layout, records)
