@@ -1,7 +1,7 @@
 """Take the photo: render the room with what is to be found in it, as a PNG of 8 bits: python make_photo.py
 
-`TRUTH` is what the job has to find. It sees nothing of it but the picture. With ``--compare RUN`` prints what a run has found
-over that.
+`TRUTH` is what the job has to find. It sees nothing of it but the picture. With ``--compare RUN`` prints what a run has
+found over that.
 """
 
 from __future__ import annotations
