@@ -150,7 +150,7 @@ def test_an_interrupt_leaves_the_file(tmp_path: Path, monkeypatch: pytest.Monkey
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pathreplay.output.whole_files.os.replace", interrupted)
+    monkeypatch.setattr("pathreplay.whole_files.os.replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         render_to_file("cornell-box", path, **SIZE)
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

@@ -22,10 +22,10 @@ from pathreplay.inverse.images import picture_size, png_bytes
 from pathreplay.inverse.run_folder import Job, read_job, require_writable_name
 from pathreplay.inverse.values import Arrays
 from pathreplay.output.scene_folder import SCENE, Exported, Source, exported, require_same
-from pathreplay.output.whole_files import whole_folder
 from pathreplay.scenes.builtin_scenes import BUILTINS
 from pathreplay.scenes.loading import as_xml_has_them, builtin_dict
 from pathreplay.scenes.parameters import get_array
+from pathreplay.whole_files import whole_folder
 
 _OPTION = "-o"
 

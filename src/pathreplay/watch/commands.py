@@ -32,13 +32,14 @@ def compare(
         from pathreplay.pages.document import document
         from pathreplay.watch import compare as comparing
         from pathreplay.watch.past import pasts
+        from pathreplay.whole_files import write_whole
 
     if len(runs) < 2:
         raise PathreplayError("compare needs two runs or more; name another")
     found = pasts(runs)
     comparing.print_table(comparing.table(found))
     if output is not None:
-        comparing.write_new(output, document(comparing.page(found)))
+        write_whole(output, document(comparing.page(found)), "--output")
         typer.echo(f"page: {output}")
 
 

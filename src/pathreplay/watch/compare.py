@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import itertools
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -205,14 +204,3 @@ def print_table(it: Table) -> None:
     for row in it.rows:
         drawn.add_row(*(Text(cell) for cell in (row.name, *row.cells)))
     Console().print(drawn)
-
-
-def write_new(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all. Raises PathreplayError where it cannot be."""
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_bytes(data)
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise PathreplayError(f"{path} cannot be written ({error.strerror}); give another --output") from None
