@@ -33,8 +33,9 @@ class SceneMeasure:
         """Give the parameters leaves of their own, with gradients."""
         for key in keys:
             value = dr.detach(self.params[key])
-            self.leaves[key] = self.params[key] = type(value)(value)
-            dr.enable_grad(self.leaves[key])
+            self.leaves[key] = type(value)(value)
+            dr.enable_grad(self.leaves[key])  # first: the scene takes a copy
+            self.params[key] = self.leaves[key]
         self.params.update()
 
     def renew(self) -> None:
