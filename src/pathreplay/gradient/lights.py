@@ -1,9 +1,9 @@
 """The lights driver: where only what lights emit has gradients, one walk is enough, and nothing is recorded.
 
 L = Σ β_i e_i is linear in what lights emit, and β knows nothing of it. So δL β_i de_i is back-propagated on the way.
-The derivative knows nothing of how bright lights are, either. Where a picture draws emitter samples to where the
-environment is bright, by its pixels the derivative is looked for best where paths go by themselves: they find it in
-proportion to what is to be found. Then no emitter sample is drawn, and a path counts where it leaves the scene.
+The derivative knows nothing of how bright lights are, either. A picture draws emitter samples to where the environment
+is bright. Paths that go on as surfaces scatter come by its pixels in proportion to the derivative by them, for half of
+the work: so by those no emitter sample is drawn, and a path counts where it leaves the scene.
 """
 
 from __future__ import annotations
