@@ -177,17 +177,19 @@ def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sigh
 def _below(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> mi.UInt32:
     """Bits for the directions of light and lobe that are sampled there: their own triangle is in the way of them.
 
-    It is where shading and triangle are on different sides of a direction; their shape hides what is there.
+    It is where shading and triangle are on different sides of a direction; their shape hides what is there. What the
+    surface scatters nothing from changes nothing.
     """
-    u = Numbers.draw(Counted.at_vertex(key, path.depth))
+    u, ctx = Numbers.draw(Counted.at_vertex(key, path.depth)), mi.BSDFContext()
     light, si, lit = _light(walk, path.at, u.light, path.depth, active)
-    lobe, _ = si.bsdf().sample(mi.BSDFContext(), si, u.lobe, u.direction, active & si.is_valid())
+    lobe, weight = si.bsdf().sample(ctx, si, u.lobe, u.direction, active & si.is_valid())
 
     def blocked(d: mi.Vector3f) -> mi.Bool:
         return dr.dot(si.n, d) * dr.dot(si.sh_frame.n, d) < 0
 
-    to_light = dr.select(lit & blocked(light.d), mi.UInt32(2), 0)
-    return to_light | dr.select((lobe.pdf > 0) & blocked(si.to_world(lobe.wo)), mi.UInt32(4), 0)
+    f = si.bsdf().eval(ctx, si, si.to_local(light.d), lit)
+    to_light = dr.select(lit & dr.any(f != 0) & blocked(light.d), mi.UInt32(2), 0)
+    return to_light | dr.select(dr.any(weight != 0) & blocked(si.to_world(lobe.wo)), mi.UInt32(4), 0)
 
 
 def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
