@@ -193,7 +193,7 @@ scene = mi.load_dict({
     "type": "scene",
     "camera": {"type": "perspective", "fov": 40, "to_world": look_at([0, 3, 5], [0, 0, 0], [0, 1, 0]),
         "film": {"type": "hdrfilm", "width": 12, "height": 10, "rfilter": {"type": "box"}}},
-    "ball": {"type": "sphere", "center": [0.1, 0.3, 0], "radius": 0.6,
+    "ball": {"type": "sphere", "to_world": mi.ScalarTransform4f().translate([0.1, 0.3, 0]).scale(0.6),
         "bsdf": {"type": "diffuse", "reflectance": colour(0.7, 0.3, 0.2)}},
     "floor": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": colour(0.3, 0.5, 0.6)},
         "to_world": mi.ScalarTransform4f().translate([0, -0.5, 0]).rotate([1, 0, 0], -90).scale(3)},
@@ -203,7 +203,7 @@ scene = mi.load_dict({
 }, optimize=False)
 for edges in ("all", "none"):
     tested = {"type": "pathreplay", "max_depth": 3, "edges": edges}
-    check = pathreplay.check_gradient(scene, "ball.center", integrator=tested, seeds=8, spp=512, step=0.02)
+    check = pathreplay.check_gradient(scene, "ball.to_world", integrator=tested, seeds=16, spp=2048, step=0.02)
     print()
     print(json.dumps([edges, check.verdict, str(check)]))
 """
