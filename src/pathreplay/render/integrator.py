@@ -128,7 +128,9 @@ class PathReplayIntegrator(PathIntegrator):
         Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
         number of samples does not, or a tensor has another shape.
         """
-        with self._passing(scene, sensor, seed, spp) as view, dr.isolate_grad():
+        self._require_active(scene)
+        view = Pass.of(scene, sensor, seed, spp)
+        with self._passing(), dr.isolate_grad():
             loss = pixel_loss(view, self.max_depth, offset, slope)
             walk = self._walk(scene, view.sensor)
             self._learned(view, walk)
