@@ -142,7 +142,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
         """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
-        for doubt in doubts(walk):
+        for doubt in filter(None, (*doubts(walk), self.interior.note(walk))):
             self._tell_once(doubt)
         if walk.media is None:
             return None
