@@ -48,7 +48,7 @@ def new_run(
 ) -> Run:
     """A run at the problem's start values, in this process; ``evaluate`` is what does it, if not an `Evaluator`."""
     values = {
-        v.key: np.array(v.start) if dr.is_tensor_v(v.like) else get_array(to_value(v.like, v.start))
+        v.key: np.array(v.start, np.float32) if dr.is_tensor_v(v.like) else get_array(to_value(v.like, v.start))
         for v in problem.variables
     }
     return Run(

@@ -83,6 +83,7 @@ class DrJitOptimiser:
         }
         self._steps = dict.fromkeys(values, 0)
         self._shapes: dict[str, tuple[int, ...]] = {}
+        self._piece = PIECE
         for key, value in values.items():
             self._begin(key, value)
 
@@ -95,7 +96,7 @@ class DrJitOptimiser:
     def _pieces(self, key: str) -> dict[str, slice]:
         """The pieces of a variable, by the names that Dr.Jit's optimiser has for them."""
         size = prod(self._shapes[key])
-        length = max(size, 1) if self._is_uniform(key) else PIECE
+        length = max(size, 1) if self._is_uniform(key) else self._piece
         return {f"{key}:{begin}": slice(begin, min(begin + length, size)) for begin in range(0, size, length)}
 
     def _begin(self, key: str, value: Array) -> None:
@@ -124,7 +125,7 @@ class DrJitOptimiser:
             # As numbers: Dr.Jit 1.5.0 would multiply arrays in place, and AdamW's decay with them.
             part.set_learning_rate({name: rates[key] for name, (key, _) in pieces.items()})
             known = part.state
-            for names in _together(pieces):
+            for names in _together(pieces, self._piece):
                 part.state = {name: known[name] for name in names}
                 for name in names:
                     key, piece = pieces[name]
@@ -198,12 +199,12 @@ def _let_go(part: drjit.opt.Optimizer, name: str) -> None:
     part.state[name] = (dr.zeros(type(value), value.shape), *rest)
 
 
-def _together(pieces: Mapping[str, tuple[str, slice]]) -> Iterator[list[str]]:
-    """The pieces in groups that are stepped at once: as many as have the size of one."""
+def _together(pieces: Mapping[str, tuple[str, slice]], most: int) -> Iterator[list[str]]:
+    """The pieces in groups that are stepped at once, of up to ``most`` entries."""
     group: list[str] = []
     size = 0
     for name, (_, piece) in pieces.items():
-        if group and size + piece.stop - piece.start > PIECE:
+        if group and size + piece.stop - piece.start > most:
             yield group
             group, size = [], 0
         group.append(name)

@@ -185,7 +185,9 @@ def _states(
             after = render_views(problem, config, run.values)
             theirs = render_views(problem, config, run.rival.values) if run.rival else {}
         outcome = outcome_of(job, folder.path, problem, run, before, after, theirs)
-        folder.write(result_files(outcome, previews.finished(after)))
+        files = result_files(outcome, previews.finished(after))
+        problem.album.rest()
+        folder.write(files)
         return result_of(outcome, stop.by)
 
 
