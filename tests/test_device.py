@@ -13,7 +13,7 @@ from media_scenes import cloud, heterogeneous, smooth
 from pathreplay import PathreplayError, device
 from pathreplay.device import Device
 from pathreplay.gradient import record
-from pathreplay.gradient.record import FIELDS, LARGEST_RECORD, Layout, deepest, footprint, largest_record, record_type
+from pathreplay.gradient.record import LARGEST_RECORD, Layout, deepest, footprint, largest_record, record_type
 from pathreplay.render import interior, pixels
 
 H100 = Device("cuda", "NVIDIA H100 80GB HBM3", 2048 * 132, 80 * 10**9)
@@ -54,29 +54,32 @@ def pretend(monkeypatch: pytest.MonkeyPatch) -> Any:
 @pytest.mark.parametrize("media", [False, True])
 def test_the_size_of_a_record_is_that_of_its_type(media: bool) -> None:
     walk = walk_of(mi.load_dict(cloud(heterogeneous(smooth(0.5, 3), 0.8))) if media else room())
-    kind = record_type(Layout.of(walk, moves=True))
-    size = sum(4 * dr.size_v(field.type) for field in kind.__dataclass_fields__.values())
-    assert largest_record(walk) == size <= (210 if media else LARGEST_RECORD)
-    still = record_type(Layout.of(walk, moves=False))
-    assert sum(4 * dr.size_v(field.type) for field in still.__dataclass_fields__.values()) <= size
-    assert len(FIELDS) > 0
+    sizes = []
+    for moves in (False, True):
+        kind = record_type(Layout.of(walk, moves))
+        blank = {name: dr.zeros(field.type) for name, field in kind.__dataclass_fields__.items()}
+        sizes.append(sum(4 * len(np.ravel(np.array(value))) for value in blank.values()))
+    print(f"{sizes} bytes a vertex")
+    assert largest_record(walk) == max(sizes) <= (210 if media else LARGEST_RECORD)
 
 
 def test_footprints_are_those_of_all_resident_threads() -> None:
-    """The figures of the docs: 0.3 GB at depth 8, 75 GB at depth 2048, on 132 multiprocessors."""
+    """The figures of the docs: 0.27 GB at depth 8, 69 GB at depth 2048, on 132 multiprocessors."""
     walk = walk_of(room(), 2048)
     assert footprint(walk, H100) == largest_record(walk) * 2048 * H100.lanes
-    assert 60e9 < footprint(walk, H100) < 80e9 and footprint(walk_of(room(), 8), H100) < 0.35e9
+    assert round(footprint(walk, H100) / 1e9) == 69 and round(footprint(walk_of(room(), 8), H100) / 1e9, 2) == 0.27
     assert footprint(walk, PROCESSOR) == 0
 
 
-@pytest.mark.parametrize("made_up", [H100, LAPTOP])
-@pytest.mark.parametrize("media", [False, True])
-def test_the_deepest_sweep_is_the_last_that_keeps_its_share(made_up: Device, media: bool) -> None:
+@pytest.mark.parametrize(
+    ("made_up", "media", "told"), [(H100, False, 596), (H100, True, 173), (LAPTOP, False, 262), (LAPTOP, True, 74)]
+)
+def test_the_deepest_sweep_is_the_last_that_keeps_its_share(made_up: Device, media: bool, told: int) -> None:
+    """Depths that the docs tell."""
     scene = mi.load_dict(cloud(heterogeneous(smooth(0.5, 3), 0.8))) if media else room()
     most = deepest(walk_of(scene), made_up)
     share = device.SHARE * made_up.memory
-    assert 8 < most < deepest(walk_of(scene), PROCESSOR)
+    assert most == told < deepest(walk_of(scene), PROCESSOR)
     assert footprint(walk_of(scene, most), made_up) <= share < footprint(walk_of(scene, most + 1), made_up)
 
 

@@ -2,7 +2,7 @@
 
 On LLVM a kernel has as many lanes under way as threads have places in a packet, and local memory is a part of each
 thread's stack. A GPU sets local memory aside for every thread that can be resident, whatever is launched: a record of
-136 bytes x depth 2048 x 2048 threads x 132 multiprocessors is 75 GB. So deep records are for processors.
+124 bytes x depth 2048 x 2048 threads x 132 multiprocessors is 69 GB. So deep records are for processors.
 
 No GPU has been at hand: what stands here about them follows from NVIDIA's and Dr.Jit's documentation, is tested with
 devices that are made up, and is measured by `pathreplay doctor --gpu` where there is one.

@@ -39,10 +39,13 @@ def deepest(walk: Walk, device: Device | None = None) -> int:
 
 
 def largest_record(walk: Walk) -> int:
-    """Bytes of a vertex where the path moves, which is when most is remembered."""
-    layout = Layout.of(walk, moves=True)
-    kinds = [kind for _, kind, remembered in FIELDS if getattr(layout, remembered)]
-    return 4 * sum(1 if kind.endswith("Ptr") else dr.size_v(getattr(mi, kind)) for kind in kinds) + 4
+    """Bytes of a vertex, whether the path moves or not: in the one case light is remembered, in the other numbers."""
+    return max(_bytes(Layout.of(walk, moves)) for moves in (False, True))
+
+
+def _bytes(layout: Layout) -> int:
+    kinds = [_plain(kind) for _, kind, remembered in FIELDS if getattr(layout, remembered)]
+    return 4 * sum(dr.size_v(kind) if dr.depth_v(kind) > 1 else 1 for kind in kinds) + 4  # and the word
 
 
 def footprint(walk: Walk, device: Device) -> int:
