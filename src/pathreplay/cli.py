@@ -78,10 +78,21 @@ def _global_options(
 
 
 @app.command(short_help="Say what runs on this machine.")
-def doctor() -> None:
+def doctor(
+    gpu: Annotated[bool, typer.Option("--gpu", help="Run truths and timings on the GPU, and write a file.")] = False,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="With --gpu: the file to write.")
+    ] = Path("pathreplay-gpu.json"),
+    variant: Annotated[str | None, typer.Option(help="With --gpu: Mitsuba variant (default: cuda_ad_rgb).")] = None,
+) -> None:
     """Say what runs on this machine, and the way out for what does not."""
     from rich.console import Console
 
+    if gpu:
+        from pathreplay.check.gpu import examine as examine_gpu
+
+        typer.echo(examine_gpu(variant, output, tell=typer.echo))
+        return
     with interrupts.undisturbed():  # as in `optimize`
         from pathreplay.doctor import examine
 

@@ -15,6 +15,7 @@ from pathreplay.files import MISSING, file_problem
 from pathreplay.inverse.capture_options import Capture, Exposure
 from pathreplay.inverse.config_errors import first_error
 from pathreplay.inverse.definitions import defined
+from pathreplay.inverse.memory_options import Memory, bytes_of
 from pathreplay.inverse.noise_options import AUTO, AutoSpp, Spp
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.pose import PARTS, PoseKind
@@ -224,6 +225,7 @@ class Config(Table):
     checkpoint_every: Count = 25
     preview: Preview = Preview()
     deterministic: Switch = False
+    memory: Memory | None = None
     output: str | None = None
 
     @property
@@ -236,6 +238,11 @@ class Config(Table):
         """Samples per pixel that an iteration may have."""
         most = self.spp if isinstance(self.spp, int) else self.auto_spp.highest
         return max([most, *(stage.spp for stage in self.stages or [] if stage.spp is not None)])
+
+    @property
+    def budget(self) -> int | None:
+        """Bytes that the run may take; None: what there is."""
+        return None if self.memory is None else bytes_of(self.memory)
 
     @property
     def halves_samples(self) -> bool:

@@ -10,7 +10,8 @@ from types import TracebackType
 
 import mitsuba as mi
 
-from pathreplay import backend
+from pathreplay import backend, memory
+from pathreplay.device import device_of
 from pathreplay.errors import PathreplayError
 from pathreplay.interrupts import Stop, stopping, undisturbed
 from pathreplay.inverse.checkpoint import Entry, Run
@@ -135,6 +136,7 @@ def _states(
     with ExitStack() as stack:
         if resumed is not None:
             stack.callback(resumed.lock.close)
+        stack.enter_context(memory.within(config.budget))
         _set_variant(config)
         bar = stack.enter_context(Progress(progress))
         bar.say("preparing")
@@ -183,7 +185,9 @@ def _states(
             after = render_views(problem, config, run.values)
             theirs = render_views(problem, config, run.rival.values) if run.rival else {}
         outcome = outcome_of(job, folder.path, problem, run, before, after, theirs)
-        folder.write(result_files(outcome, previews.finished(after)))
+        files = result_files(outcome, previews.finished(after))
+        problem.album.rest()
+        folder.write(files)
         return result_of(outcome, stop.by)
 
 
@@ -224,7 +228,7 @@ def computing(config: Config) -> Iterator[None]:
 def _set_variant(config: Config) -> None:
     with undisturbed():
         variant = backend.set_variant(config.variant)
-    if config.deterministic and not variant.startswith("llvm"):
+    if config.deterministic and not device_of(variant).keeps_order:
         raise PathreplayError(
             f"deterministic = true needs an LLVM variant, this is '{variant}': on a GPU the order of additions "
             "is random; set variant = 'llvm_ad_rgb', or leave 'deterministic' out"
