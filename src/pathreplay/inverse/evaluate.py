@@ -66,12 +66,21 @@ The values are those of all variables, as people see them; ``learned`` is what e
 
 
 def total(evaluations: Sequence[Evaluation]) -> Evaluation:
-    """The sum, added up in the order given; what is known is what the last one knows."""
+    """The sum, added up in the order given; what is known is the mean of what each of them knows.
+
+    They began with the same knowledge, so that none had to wait for another.
+    """
+    if len(evaluations) == 1:
+        return evaluations[0]
+    known = {
+        name: reduce(np.add, [each.learned[name] for each in evaluations]) / np.float32(len(evaluations))
+        for name in evaluations[0].learned
+    }
     return Evaluation(
         sum(each.loss for each in evaluations),
         {key: reduce(np.add, [each.gradients[key] for each in evaluations]) for key in evaluations[0].gradients},
         dict(sum((Counter(each.dropped) for each in evaluations), Counter())),
-        evaluations[-1].learned,
+        known,
     )
 
 
@@ -79,22 +88,18 @@ class Executor(Protocol):
     """Evaluates the shards of an iteration. Results come in the order of the shards, whoever was ready first."""
 
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
-        """One evaluation for each shard, in their order; the last one has learned from all of them."""
+        """One evaluation for each shard, in their order; each begins with what was ``learned`` before all of them."""
 
 
 class Local:
-    """In this process, one after the other; each knows what those before it have learned."""
+    """In this process, one after the other."""
 
     def __init__(self, evaluate: Evaluate) -> None:
         self.evaluate = evaluate
 
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
         """See `Executor`."""
-        found: list[Evaluation] = []
-        for shard in shards:
-            found.append(self.evaluate(values, shard, learned))
-            learned = found[-1].learned
-        return found
+        return [self.evaluate(values, shard, learned) for shard in shards]
 
 
 class Evaluator:
@@ -126,8 +131,10 @@ class Evaluator:
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`. Raises what the integrator raises; warns as it does."""
-        self._know(learned)
-        found = [self._view(values, *each, shard.samples) for each in zip(shard.views, shard.seeds, strict=True)]
+        found = []
+        for view, seed in zip(shard.views, shard.seeds, strict=True):
+            self._know(learned)
+            found.append(self._view(values, view, seed, shard.samples))
         return total(found)
 
     def _know(self, learned: Arrays) -> None:

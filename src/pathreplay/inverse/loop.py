@@ -16,7 +16,7 @@ from pathreplay.inverse import noise
 from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
-from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Local, Shard, total
+from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Executor, Local, Shard, total
 from pathreplay.inverse.events import Entered, Event, Faint, Finished, NonFinite, Refined, Started, Stepped, Stopped
 from pathreplay.inverse.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.grids import resampled, rmse
@@ -45,11 +45,15 @@ def new_run(
     record: bool = True,
     optimizer: Optimizer | None = None,
     evaluate: Evaluate | None = None,
+    executor: Executor | None = None,
 ) -> Run:
-    """A run at the problem's start values, in this process; ``evaluate`` is what does it, if not an `Evaluator`."""
+    """A run at the problem's start values, in this process; ``evaluate`` is what does it, if not an `Evaluator`.
+
+    Or ``executor``, in others.
+    """
     values = {v.key: get_array(to_value(v.like, v.start)) for v in problem.variables}
     return Run(
-        Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
+        executor or Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
         _optimiser(problem, values, optimizer or Optimizer()),
         values,
     )
@@ -127,8 +131,8 @@ def _require_gradients(config: Config, run: Run) -> None:
 def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Event]:
     """One step, with the learning rates and resolutions of iteration ``position``; adds an entry to the history.
 
-    Evaluate the views of its `batch`, a shard with a seed of its own for each (or two halves, see `noise`), and sum in
-    their order; step with the learning rate of that iteration (see `schedules`), project every variable into its
+    Evaluate the views of its `batch`, a shard with a seed of its own for each (or parts of it, see `Config.parts`), and
+    sum in their order; step with the learning rate of that iteration (see `schedules`), project every variable into its
     bounds. A grid that moves, and whose next resolution is due, is interpolated before that; the optimiser starts anew
     on it. What is differentiated is decided by the integrator; targets, bounds and the seeds' choice of paths are not.
 
@@ -142,7 +146,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     shards = _shards(part, i, spp)
     evaluations = run.executor.run(values, shards, run.learned)
     share = len(part.problem.trained()) / len({shard.views for shard in shards})
-    found = total(evaluations).of(share / 2 if halves else share)
+    found = total(evaluations).of(share / part.config.parts)
     if not np.isfinite(found.loss):
         raise PathreplayError(
             f"The loss is {found.loss} at iteration {i}; lower the learning rates, or bound the parameters that ran "
@@ -170,7 +174,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
         errors | pose_errors(problem, run.values),
         penalty=penalty,
         spp=spp,
-        noise_norms=_noise_norms(evaluations, share) if halves else {},
+        noise_norms=_noise_norms(evaluations, 2 * share / part.config.parts) if halves else {},
         dropped_shares={key: n / (gradients[key].size * len(shards)) for key, n in found.dropped.items()},
     )
     run.history.append(entry)
@@ -188,13 +192,13 @@ def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array
 
 
 def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
-    """What an iteration evaluates: its views, one after the other, each whole or in two halves."""
+    """What an iteration evaluates: its views, one after the other, each whole or in parts (see `Config.parts`)."""
     same = 0 if part.config.optimizer.searches else iteration
-    halves, config, views = 2 if part.config.halves_samples else 1, part.config, part.problem.views
+    config, views = part.config, part.problem.views
     return [
-        Shard((n,), spp // halves, (seed,), part.number)
+        Shard((n,), spp // config.parts, (seed,), part.number)
         for n in batch(part.problem, config, iteration)
-        for seed in config.seeds(ITERATION, views[n].sensor, same)[:halves]
+        for seed in config.seeds(ITERATION, views[n].sensor, same, config.parts)
     ]
 
 
