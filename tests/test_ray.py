@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import threading
 import time
@@ -188,7 +189,7 @@ def test_actors_that_are_killed_change_nothing(capfd: pytest.CaptureFixture[str]
     def kill() -> None:
         while not over.wait(1.5) and len(killed) < 3:
             if there := [p for p in actors() if "evaluate" in p.name()]:
-                there[len(killed) % len(there)].kill()
+                there[0].kill()
                 killed.append(there[0].pid)
 
     killer = threading.Thread(target=kill)
@@ -202,7 +203,8 @@ def test_actors_that_are_killed_change_nothing(capfd: pytest.CaptureFixture[str]
     told = capfd.readouterr().err
     assert killed and found == expected
     assert "was lost and is started again; its shard is computed again" in told
-    assert f"{len(killed)} restarts" in told
+    (restarts,) = re.findall(r"(\d+) restarts", told)
+    assert 1 <= int(restarts) <= len(killed), "one that is killed while it starts is started without a word"
 
 
 @SLOW
