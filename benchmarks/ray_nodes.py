@@ -1,11 +1,11 @@
-"""The example for clusters on a cluster of three nodes that are all on this machine: whether it comes to the same bytes.
+"""The example for clusters on three nodes that are all on this machine: whether it comes to the same bytes.
 
     python -m benchmarks.ray_nodes [--nodes 3] [--iterations 6]
 
 starts the nodes as processes of their own (`ray start`, own ports, own folders, one core each, a token that only they
-know), runs examples/cluster there with an actor on each, and once more in a process of its own, and compares what
-came out. Ends with status 1 if that differs. Nodes listen at this machine's address while it runs. Takes about two minutes on two
-quiet cores. Wants `pip install 'pathreplay[ray]'`.
+know), runs examples/cluster there with an actor on each, and once more in a process of its own, and compares what came
+out. Ends with status 1 if that differs. Nodes listen at this machine's address while it runs. Takes about a minute on
+two quiet cores. Wants `pip install 'pathreplay[ray]'`.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
 import sys
 import threading
 import time
@@ -16,8 +17,13 @@ import psutil
 import pytest
 import safetensors.numpy
 
+if sys.version_info < (3, 11):
+    import tomli as tomllib
+else:
+    import tomllib
+
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
+from pathreplay.inverse import load_config, make_config, optimize
 from pathreplay.inverse.config import AUTO
 from pathreplay.inverse.loop import new_run, take_step
 from pathreplay.inverse.problem import build_problem
@@ -74,6 +80,22 @@ def test_an_executor_that_is_none_is_refused() -> None:
         make_config({**JOB, "executor": "dask"})
     with pytest.raises(PathreplayError, match=r"unknown key 'ray\.actor'; did you mean 'actors'"):
         make_config({**JOB, "ray": {"actor": 2}})
+
+
+def test_the_page_shows_a_job_that_can_be() -> None:
+    page = (Path(__file__).parents[1] / "docs/scale.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    config = make_config({**JOB, **tomllib.loads(block)})
+    assert config.executor == "ray" and set(config.ray.model_fields_set) == set(type(config.ray).model_fields)
+
+
+def test_the_example_has_many_views_and_the_token_is_for_its_owner() -> None:
+    example = Path(__file__).parents[1] / "examples/cluster"
+    config = load_config(example / "config.toml")
+    assert config.executor == "ray" and config.deterministic
+    script = (example / "slurm.sh").read_text(encoding="utf-8")
+    assert subprocess.run(["bash", "-n", str(example / "slurm.sh")], check=False).returncode == 0
+    assert "umask 077" in script and "symmetric-run" in script
 
 
 def test_ranges_must_divide_the_samples() -> None:
