@@ -30,9 +30,9 @@ def played(sharing: Sharing, shards: list[Shard], speeds: dict[int, float], cost
                 begun[actor].append(index)
                 seconds = costs[index] / speeds[actor]
                 heapq.heappush(events, (now + seconds, actor, index, seconds))
-        late = step.patience(now)
-        if waiting and late is not None and (not events or now + late < events[0][0]):
-            now, idle = now + late + 1e-9, waiting
+        late = step.patience()
+        if waiting and late is not None and (not events or late < events[0][0]):
+            now, idle = max(now, late), waiting
             continue
         now, actor, index, seconds = heapq.heappop(events)
         step.finished(index, actor, seconds)
@@ -80,16 +80,16 @@ def test_what_is_late_is_given_to_an_idle_actor_as_well() -> None:
     assert {first, second} == {0, 1}
     assert step.finished(first, 0, 1.0)
     assert step.next(0, 1.0) is None
-    assert step.patience(1.0) == pytest.approx(LATE - 1.0)
-    assert step.next(0, LATE + 0.01) == second
-    assert step.patience(LATE + 0.01) is None, "a third one is not asked"
+    assert step.patience() == pytest.approx(LATE)
+    assert step.next(0, LATE) == second
+    assert step.patience() is None and step.next(2, 10 * LATE) is None, "a third one is not asked"
     assert step.finished(second, 0, 1.0) and not step.finished(second, 1, 3.0), "the first result counts"
 
 
 def test_what_was_never_done_is_not_late() -> None:
     step = Step(Sharing(), shards_of(1))
     assert step.next(0, 0.0) == 0
-    assert step.patience(100.0) is None and step.next(1, 100.0) is None
+    assert step.patience() is None and step.next(1, 100.0) is None
 
 
 def test_what_is_lost_waits_again() -> None:
@@ -99,7 +99,7 @@ def test_what_is_lost_waits_again() -> None:
     assert index is not None
     sharing.forget(0)
     step.lost(index, 0)
-    assert index in step.waiting
+    assert index in step.waiting[None]
     assert sorted(step.next(1, now) for now in (1.0, 2.0, 3.0)) == [0, 1, 2]  # type: ignore[type-var]
 
 
@@ -109,10 +109,10 @@ def test_a_loss_after_another_has_taken_over_is_none() -> None:
     step = Step(sharing, shards)
     assert step.next(0, 0.0) == 0 and step.next(1, 10.0) == 0
     step.lost(0, 0)
-    assert not step.waiting
+    assert not any(step.waiting.values())
     step.finished(0, 1, 1.0)
     step.lost(0, 0)
-    assert not step.waiting
+    assert not any(step.waiting.values())
 
 
 def test_the_views_of_a_lost_actor_are_nobodys() -> None:

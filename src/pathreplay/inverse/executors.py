@@ -20,7 +20,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.evaluate import Evaluation, Shard
 from pathreplay.inverse.problem import Problem
-from pathreplay.inverse.ray_actor import Hello, Parcel, RayActor, versions
+from pathreplay.inverse.ray_actor import Answer, Hello, Parcel, RayActor, versions
 from pathreplay.inverse.ray_cluster import connected, load_ray
 from pathreplay.inverse.sharing import Sharing, Step
 from pathreplay.inverse.targets import Targets
@@ -95,25 +95,28 @@ class Crew:
         """Have an actor evaluate a shard."""
         self.calls[self.actors[number].evaluate.options(max_task_retries=0).remote(*question)] = call
 
-    def answers(self, patience: float | None) -> Iterator[tuple[_Call, Any]]:
-        """Wait for the next answers, at most so many seconds; those of actors that were lost are None.
+    def answered(self, patience: float) -> list[tuple[_Call, Any]]:
+        """Calls that have been answered, and the references to fetch the answers by; waits at most so many seconds."""
+        # Where the answer is does not matter yet: whoever gave it can go on while it is on its way.
+        ready, _ = self.ray.wait(list(self.calls), num_returns=1, timeout=patience, fetch_local=False)
+        return [(self.calls.pop(reference), reference) for reference in ready]
+
+    def fetch(self, call: _Call, reference: Any) -> Answer | None:
+        """What was answered to a shard; None where there is nothing, since the actor was lost, or to a greeting.
 
         Raises PathreplayError where no actor is left; what an evaluation raised.
         """
-        ready, _ = self.ray.wait(list(self.calls), num_returns=1, timeout=patience)
-        for reference in ready:
-            call = self.calls.pop(reference)
-            try:
-                answer = self.ray.get(reference)
-            except self.ray.exceptions.RayTaskError as error:
-                raise _cause(error) from None
-            except self.ray.exceptions.RayError as error:
-                answer = None
-                self._lost(call, error)
-            if isinstance(answer, Hello):
-                self._there(call.actor, answer)
-            elif call.step is not None:
-                yield call, answer
+        try:
+            answer = self.ray.get(reference)
+        except self.ray.exceptions.RayTaskError as error:
+            raise _cause(error) from None
+        except self.ray.exceptions.RayError as error:
+            self._lost(call, error)
+            return None
+        if isinstance(answer, Hello):
+            self._there(call.actor, answer)
+            return None
+        return answer
 
     def _greet(self, number: int) -> None:
         self.calls[self.actors[number].hello.remote(self.parcel)] = _Call(number)
@@ -144,6 +147,8 @@ class Crew:
                 )
             self.say_once(f"ray: actor {number + 1} is lost for good; {len(self.actors)} are left")
             return
+        if any(other.actor == number and other.step is None for other in self.calls.values()):
+            return  # known: it was given another shard meanwhile
         self.counts.restarts += 1
         self.tell(f"ray: actor {number + 1} on {host} was lost and is started again; its shard is computed again")
         self._greet(number)
@@ -174,9 +179,14 @@ class RayExecutor:
         begin = time.monotonic()
         while len(found) < len(shards):
             self._hand_out(step, shards, *sent)
-            patience = min(SOON_S, SOON_S if (late := step.patience(time.monotonic())) is None else late)
-            for call, answer in crew.answers(patience):
-                self._heard(call, answer, step, shards, found, losses)
+            late = step.patience()
+            patience = SOON_S if late is None else min(SOON_S, max(0.0, late - time.monotonic()))
+            answered = crew.answered(patience)
+            self._hand_out(step, shards, *sent)
+            for call, reference in answered:
+                answer = crew.fetch(call, reference)
+                if call.step is not None:
+                    self._heard(call, answer, step, shards, found, losses)
             if not crew.ready and time.monotonic() - begin > SOON_S:
                 crew.say_once("ray: no actor is ready yet; is there room for them? 'ray status' tells")
         crew.counts.shards += len(shards)
@@ -184,19 +194,18 @@ class RayExecutor:
 
     def _hand_out(self, step: Step, shards: Sequence[Shard], values: Any, learned: Any) -> None:
         for number in self.crew.idle():
-            waited = set(step.waiting)
+            late = len(step.again)
             index = step.next(number, time.monotonic())
             if index is None:
-                continue
-            if index not in waited:
-                self.crew.counts.twice += 1
+                break  # what is nothing for one is nothing for the others
+            self.crew.counts.twice += len(step.again) - late
             call = _Call(number, step, index, self.sharing)
             self.crew.ask(number, call, self.rival, values, shards[index], learned)
 
     def _heard(
         self,
         call: _Call,
-        answer: Any,
+        answer: Answer | None,
         step: Step,
         shards: Sequence[Shard],
         found: dict[int, Evaluation],

@@ -129,9 +129,8 @@ def _connect(ray: Any, address: str) -> None:
 
 
 def _require_authentication(ray: Any, which: str) -> None:
-    from ray._raylet import AuthenticationMode, get_authentication_mode
-
-    if get_authentication_mode() != AuthenticationMode.TOKEN:
+    core = ray._raylet
+    if core.get_authentication_mode() != core.AuthenticationMode.TOKEN:
         raise PathreplayError(
             f"ray: the cluster {which} has no authentication, and who reaches it can run programs there; start it with "
             f"{_MODE}=token"
@@ -166,11 +165,8 @@ def _private_environment(ray: Any) -> Iterator[None]:
     many = constants.ENABLE_RAY_CLUSTER
     os.environ.update(ours)
     constants.ENABLE_RAY_CLUSTER = False
-    with contextlib.suppress(ImportError, AttributeError):
-        from ray._raylet import AuthenticationTokenLoader, Config
-
-        Config.initialize("")  # both may have been read before
-        AuthenticationTokenLoader.instance().reset_cache()
+    ray._raylet.Config.initialize("")  # both may have been read before
+    ray._raylet.AuthenticationTokenLoader.instance().reset_cache()
     try:
         yield
     finally:

@@ -7,7 +7,7 @@ a shard that takes much longer than expected is computed by an idle actor as wel
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from pathreplay.inverse.evaluate import Shard
@@ -77,96 +77,103 @@ class Sharing:
 
 
 class Step:
-    """The shards of one step: which wait, who is at which, which are done."""
+    """The shards of one step: which wait, who is at which, which are done. Costs little for each, however many."""
 
     def __init__(self, sharing: Sharing, shards: Sequence[Shard]) -> None:
         self.sharing = sharing
         self.kinds = [kind_of(shard) for shard in shards]
-        self.waiting = set(range(len(shards)))
-        self.begun: dict[int, dict[Actor, float]] = {i: {} for i in self.waiting}
-        """Of each shard, who is at it since when."""
+        self.waiting: dict[Actor | None, list[int]] = {}
+        """By who had them last, if that is known: the longest comes last, of some that are alike the first."""
+        self.left: dict[Actor | None, float] = {}
+        """Seconds that each will take for those."""
+        self.running: dict[Actor, tuple[int, float]] = {}
+        """Who is at which shard, since when."""
         self.done: set[int] = set()
+        self.again: set[int] = set()
+        """Begun by a second actor, since they were late."""
+        self._wait(range(len(shards)))
 
     def next(self, actor: Actor, now: float) -> int | None:
         """The shard that an idle actor begins; None if it has nothing to do for now."""
-        chosen = self._own(actor)
-        if chosen is None:
-            chosen = self._taken(actor, now)
-        if chosen is None:
-            chosen = self._late(actor, now)
-        if chosen is not None:
-            self.waiting.discard(chosen)
-            self.begun[chosen][actor] = now
-        return chosen
+        for owner in (actor, None):
+            if self.waiting.get(owner):
+                return self._begin(actor, owner, -1, now)
+        most = self._busiest(now)
+        if most is not None:
+            other, left = most
+            # It goes without help where it would be ready sooner by itself, as long as it is there.
+            for place in reversed(range(len(self.waiting[other]))):
+                kind = self.kinds[self.waiting[other][place]]
+                if other not in self.running or (self.sharing.expected(actor, kind) or 0.0) < left:
+                    return self._begin(actor, other, place, now)
+        late = self._latest()
+        if late is None or late[0] > now:
+            return None
+        self.again.add(late[1])
+        self.running[actor] = late[1], now
+        return late[1]
 
     def finished(self, index: int, actor: Actor, seconds: float) -> bool:
         """A result is there; whether it is the first of its shard."""
-        self.begun[index].pop(actor, None)
+        self.running.pop(actor, None)
         self.sharing.measured(actor, self.kinds[index], seconds)
         first = index not in self.done
         self.done.add(index)
         return first
 
     def lost(self, index: int, actor: Actor) -> None:
-        """An actor has gone without a result; if no other is at the shard, it waits again."""
-        self.begun[index].pop(actor, None)
-        if index not in self.done and not self.begun[index]:
-            self.waiting.add(index)
+        """An actor has gone without a result; if no other is at the shard, it waits again. Its others are nobody's."""
+        self.running.pop(actor, None)
+        self.left.pop(actor, None)
+        theirs = self.waiting.pop(actor, [])
+        if index not in self.done and all(index != other for other, _ in self.running.values()):
+            self.again.discard(index)
+            theirs.append(index)
+        self._wait(theirs)
 
-    def patience(self, now: float) -> float | None:
-        """Seconds until the next shard is late; None if none will be."""
-        if self.waiting:
-            return None
-        times = [late - now for late in self._lateness().values()]
-        return max(0.0, min(times)) if times else None
+    def patience(self) -> float | None:
+        """When the next shard is late, for whoever waits; None if none will be."""
+        late = None if any(self.waiting.values()) else self._latest()
+        return None if late is None else late[0]
 
-    def _own(self, actor: Actor) -> int | None:
-        """The longest of the actor's own shards, else of those that are nobody's."""
-        owner = self.sharing.owner
-        own = [i for i in self.waiting if owner.get(self.kinds[i]) == actor]
-        return self._longest(own or [i for i in self.waiting if self.kinds[i] not in owner])
+    def _wait(self, indices: Iterable[int]) -> None:
+        seconds, touched = self.sharing.seconds, set()
+        for i in indices:
+            owner = self.sharing.owner.get(self.kinds[i])
+            touched.add(owner)
+            self.waiting.setdefault(owner, []).append(i)
+            self.left[owner] = self.left.get(owner, 0.0) + self._seconds(owner, i)
+        for owner in touched:
+            self.waiting[owner].sort(key=lambda i: (seconds.get(self.kinds[i], 0.0), -i))
 
-    def _taken(self, actor: Actor, now: float) -> int | None:
-        """A shard of the actor that has most left to do, unless that would be ready sooner by itself."""
-        left: dict[Actor, float] = {}
-        theirs: dict[Actor, list[int]] = {}
-        for i in self.waiting:
-            other = self.sharing.owner[self.kinds[i]]
-            left[other] = left.get(other, 0.0) + (self.sharing.expected(other, self.kinds[i]) or 0.0)
-            theirs.setdefault(other, []).append(i)
-        for i, actors in self.begun.items():
-            for other, since in actors.items():
-                if other in left and i not in self.done:
-                    rest = (self.sharing.expected(other, self.kinds[i]) or 0.0) - (now - since)
-                    left[other] += max(0.0, rest)
-        if not left:
-            return None
-        most = max(sorted(left), key=left.__getitem__)
-        busy = {other for actors in self.begun.values() for other in actors}
-        fitting = [
-            i
-            for i in theirs[most]
-            if most not in busy or (self.sharing.expected(actor, self.kinds[i]) or 0.0) < left[most]
-        ]
-        return self._longest(fitting)
+    def _begin(self, actor: Actor, owner: Actor | None, place: int, now: float) -> int:
+        index = self.waiting[owner].pop(place)
+        self.left[owner] -= self._seconds(owner, index)
+        self.running[actor] = index, now
+        return index
 
-    def _late(self, actor: Actor, now: float) -> int | None:
-        """The shard that is most overdue, if it is not at this actor already."""
-        late = {i: at for i, at in self._lateness().items() if at <= now and actor not in self.begun[i]}
-        return min(sorted(late), key=late.__getitem__) if late else None
+    def _seconds(self, owner: Actor | None, index: int) -> float:
+        return 0.0 if owner is None else self.sharing.expected(owner, self.kinds[index]) or 0.0
 
-    def _lateness(self) -> dict[int, float]:
-        """When each shard that is at one actor alone is late."""
-        found = {}
-        for i, actors in self.begun.items():
-            if i in self.done or len(actors) != 1:
+    def _busiest(self, now: float) -> tuple[Actor, float] | None:
+        """Who has most left to do, of those for whom shards wait, and how many seconds."""
+        found: tuple[Actor, float] | None = None
+        for owner, indices in self.waiting.items():
+            if owner is None or not indices:
                 continue
-            ((actor, since),) = actors.items()
-            expected = self.sharing.expected(actor, self.kinds[i])
-            if expected is not None:
-                found[i] = since + LATE * expected
+            left = self.left[owner]
+            if owner in self.running:
+                index, since = self.running[owner]
+                left += max(0.0, self._seconds(owner, index) - (now - since))
+            if found is None or (left, -owner) > (found[1], -found[0]):
+                found = owner, left
         return found
 
-    def _longest(self, indices: Sequence[int]) -> int | None:
-        seconds = self.sharing.seconds
-        return max(sorted(indices, reverse=True), key=lambda i: seconds.get(self.kinds[i], 0.0), default=None)
+    def _latest(self) -> tuple[float, int] | None:
+        """When the first of the shards that are at one actor alone is late, and which that is."""
+        late = []
+        for actor, (index, since) in self.running.items():
+            expected = self.sharing.expected(actor, self.kinds[index])
+            if expected is not None and index not in self.again and index not in self.done:
+                late.append((since + LATE * expected, index))
+        return min(late, default=None)
