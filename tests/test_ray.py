@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -28,7 +29,7 @@ from pathreplay.inverse.config import AUTO
 from pathreplay.inverse.loop import new_run, take_step
 from pathreplay.inverse.problem import build_problem
 from pathreplay.threads import one_thread
-from small_job import ERROR, ended, start, write_job
+from small_job import ERROR, TIMEOUT_S, ended, hear_signals, start, wait_for, write_job
 from test_deterministic import CLOUD
 from test_inverse_run import JOB, room  # noqa: F401 (room: its folder, for every test)
 
@@ -227,6 +228,29 @@ def test_actors_that_are_killed_change_nothing(capfd: pytest.CaptureFixture[str]
     assert "was lost and is started again; its shard is computed again" in told
     (restarts,) = re.findall(r"(\d+) restarts", told)
     assert 1 <= int(restarts) <= len(killed), "one that is killed while it starts is started without a word"
+
+
+@SLOW
+@with_ray
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
+def test_a_signal_for_all_processes_ends_the_run_in_peace(name: str, tmp_path: Path) -> None:
+    """As a terminal, a scheduler or `timeout` sends it: actors stay until all is written."""
+    write_job(tmp_path, **{**job_of("surfaces"), "iterations": 2000, "checkpoint_every": 1})
+    command = [sys.executable, "-m", "pathreplay.cli", "optimize", "job.json", "--quiet", "--executor", "ray"]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=hear_signals,
+    )  # fmt: skip
+    checkpoint = tmp_path / "run/checkpoint.safetensors"
+    wait_for(checkpoint, process)
+    wait_for(checkpoint, process, newer_than=checkpoint.stat().st_mtime)
+    children = psutil.Process(process.pid).children(recursive=True)
+    os.killpg(process.pid, getattr(signal, name))
+    out, err = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 0 and "stopped early" in out, err
+    assert (tmp_path / "run/report.html").exists()
+    _, alive = psutil.wait_procs(children, timeout=20)
+    assert not alive
 
 
 @SLOW

@@ -275,10 +275,12 @@ def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Te
         where = "this machine" if own else f"a cluster of {len(ray.nodes())} nodes"
         tell(f"ray: {count} actors with {threads} {'thread' if threads == 1 else 'threads'} each on {where}")
         crew = Crew(ray, actors, parcel, config.ray.max_task_retries, tell, status)
-        yield crew
-        tell(f"ray: {crew.counts.line()}")
-        for actor in crew.actors.values():
-            ray.kill(actor)  # a cluster that others use goes on without them
+        try:
+            yield crew
+            tell(f"ray: {crew.counts.line()}")
+        finally:
+            for actor in crew.actors.values():
+                ray.kill(actor)  # a cluster that others use goes on without them
 
 
 def _needs(threads: int) -> dict[str, float]:

@@ -11,11 +11,9 @@ import contextlib
 import os
 import secrets
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -83,7 +81,7 @@ def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> None:
     # Which only this user may enter; Ray's is open to all. Names of sockets may have 107 characters.
     folder = tempfile.mkdtemp(prefix="pathreplay-", dir=usual if len(usual) <= _LONGEST_FOLDER else "/tmp")
     stack.callback(shutil.rmtree, folder, ignore_errors=True)
-    with _private_environment(ray), _deaf_to_hangup():
+    with _private_environment(ray), _apart(ray):
         try:
             ray.init(
                 address="local",
@@ -160,6 +158,7 @@ def _require_closed(ray: Any, address: str) -> None:
 def _private_environment(ray: Any) -> Iterator[None]:
     """Within this block Ray starts a cluster that uses loopback and our token, and tells nobody of it."""
     ours = {_MANY_MACHINES: "0", _MODE: "token", _TOKEN: _SECRET, "RAY_USAGE_STATS_ENABLED": "0"}
+    ours["RAY_worker_niceness"] = "0"  # actors are the run, and no less urgent than it would be by itself
     before = {name: os.environ.get(name) for name in ours}
     constants = ray._private.ray_constants
     many = constants.ENABLE_RAY_CLUSTER
@@ -178,16 +177,25 @@ def _private_environment(ray: Any) -> Iterator[None]:
 
 
 @contextmanager
-def _deaf_to_hangup() -> Iterator[None]:
-    """Processes that are started within this block stay when the terminal goes, as the run does, to end in peace."""
-    if not hasattr(signal, "SIGHUP") or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+def _apart(ray: Any) -> Iterator[None]:
+    """Within this block Ray's processes are started in sessions of their own, where the kernel ends them with this one.
+
+    A terminal or a scheduler sends its signals to all processes of a job. This one ends a run in peace then, and needs
+    its actors for that.
+    """
+    services = ray._private.services
+    plain = services.ConsolePopen
+
+    class Apart(plain):  # type: ignore[misc, valid-type]
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options, start_new_session=True)
+
+    if sys.platform.startswith("linux"):
+        services.ConsolePopen = Apart
     try:
         yield
     finally:
-        signal.signal(signal.SIGHUP, before)
+        services.ConsolePopen = plain
 
 
 def _beyond_loopback() -> list[str]:
