@@ -31,7 +31,7 @@ STEPS, COUNTED = 12, 8
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds. Compute and network are assumptions that options change, the others were measured (`--measure`)."""
+    """Seconds. Compute and network are assumptions, which options change; the others were measured (`--measure`)."""
 
     shard: float = 1.0
     """Compute of a shard."""
@@ -169,6 +169,26 @@ def measured(costs: Costs, size: int = 2 * 10**7) -> Costs:
     return replace(costs, add=add, step=step)
 
 
+def measured_ray(costs: Costs, size: int = 10**7) -> Costs:
+    """The latency of a call of an actor here; prints how fast gradients come back from one on this machine, too."""
+    from pathreplay.inverse.executor_options import RayOptions
+    from pathreplay.inverse.ray_cluster import connected
+
+    class Echo:
+        def gradient(self, size: int) -> np.ndarray:
+            return np.ones(size, np.float32)
+
+    with connected(RayOptions(), 2) as (ray, _):
+        actor = ray.remote(Echo).remote()
+        ray.get(actor.gradient.remote(1))
+        latency = min(_timed(lambda: ray.get(actor.gradient.remote(1))) for _ in range(50))
+        back = min(_timed(lambda: ray.get(actor.gradient.remote(size))) for _ in range(5))
+    print(
+        f"Ray here: {latency * 1e3:.2g} ms for a call, {BYTES * size / (back - latency) / 1e9:.2g} GB/s for gradients"
+    )
+    return replace(costs, latency=latency)
+
+
 def _timed(work: object) -> float:
     begin = time.perf_counter()
     work()  # type: ignore[operator]
@@ -193,7 +213,7 @@ def main(
     """Print the tables."""
     costs = Costs(shard=seconds, network=gigabits * 1e9 / 8)
     if measure:
-        costs = measured(costs)
+        costs = measured_ray(measured(costs))
     print(f"{shards} shards of {seconds:g} s, {gigabits:g} gigabit a second, {costs.add:.1e} s to add an entry, "
           f"{costs.step:.1e} s to step a parameter\n")  # fmt: skip
     ways = {"as built": built, "sums in a ring": summed, "and a sharded optimiser": sharded}
