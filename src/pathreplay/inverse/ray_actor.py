@@ -65,7 +65,7 @@ class RayActor:
     """Evaluates shards of one job; nothing that is sent changes it, but for kernels, which it keeps."""
 
     def __init__(self) -> None:
-        self.problem: Problem
+        self.problem: Problem | None = None
         self.config: Config
         self.evaluators: dict[bool, Evaluate] = {}
         self.log: Any = None
@@ -80,8 +80,10 @@ class RayActor:
         machine = f"{_processor()}, LLVM {'.'.join(map(str, backend.loaded_version()))}"
         return Hello(platform.node(), os.getpid(), versions(), machine)
 
-    def evaluate(self, rival: bool, values: Arrays, shard: Shard, learned: Arrays) -> Answer:
-        """A shard by the job's integrator, or by that of its rival."""
+    def evaluate(self, rival: bool, values: Arrays, shard: Shard, learned: Arrays) -> Answer | None:
+        """A shard by the job's integrator, or by that of its rival; None where this actor was started again since."""
+        if self.problem is None:
+            return None
         config = self.config
         plugin = config.rival if rival and config.rival is not None else config.integrator
         self.log.lines.clear()
@@ -93,6 +95,7 @@ class RayActor:
     def _evaluator(self, rival: bool) -> Evaluate:
         if rival not in self.evaluators:
             config, problem = self.config, self.problem
+            assert problem is not None
             plugin, integrator = config.integrator, problem.integrator
             if rival and config.rival is not None and problem.rival is not None:
                 plugin, integrator = config.rival, problem.rival
