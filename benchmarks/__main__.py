@@ -29,6 +29,7 @@ from .tasks import (
     iteration,
     media,
     noise,
+    scale,
     startup,
     supergrid,
     surface,
@@ -36,7 +37,21 @@ from .tasks import (
 )
 
 # Quick ones first, so that a run that is cut short has most of the answers.
-_TASKS = (startup, surface, iteration, attached, edges, truth, noise, depth, events, supergrid, gridmedium, media)
+_TASKS = (
+    startup,
+    surface,
+    iteration,
+    attached,
+    edges,
+    truth,
+    noise,
+    depth,
+    events,
+    supergrid,
+    gridmedium,
+    media,
+    scale,
+)
 TASKS: dict[str, ModuleType] = {task.TITLE: task for task in _TASKS}
 
 

@@ -19,6 +19,7 @@ from pathreplay.inverse import RunResult, make_config, optimize, session
 from pathreplay.inverse import run_folder as folders
 from pathreplay.inverse.images import read_image
 from pathreplay.inverse.progress import Progress
+from pathreplay.whole_files import Content, chunks
 
 # A textured wall and a coloured one under a light, seen by two sensors: small enough for 0.1 s per iteration.
 CAMERA = """<sensor type="perspective" id="{name}"><float name="fov" value="55"/>
@@ -168,8 +169,9 @@ def full_disk_at(write: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The given write (from 1) and all later ones find the disk full, after half of their bytes."""
     real, count = folders._write_through, []
 
-    def write_through(path: Path, data: bytes) -> None:
+    def write_through(path: Path, content: Content) -> None:
         count.append(path)
+        data = b"".join(chunks(content))
         if len(count) >= write:
             path.write_bytes(data[: len(data) // 2])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))

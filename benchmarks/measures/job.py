@@ -21,6 +21,8 @@ Kind = Literal[
     "warm start",  # and with them
     "flight",  # way to the first real collision in a grid
     "transmittance",  # and through it, with its squared error
+    "whole run",  # an optimisation from beginning to end
+    "sum",  # a backward pass, and the error of its sum over samples
 ]
 
 

@@ -36,6 +36,8 @@ MEASURES: dict[Kind, tuple[str, str]] = {
     "warm start": ("start", "Start"),
     "flight": ("grids", "Flight"),
     "transmittance": ("grids", "Transmittance"),
+    "whole run": ("scale", "WholeRun"),
+    "sum": ("scale", "Sum"),
 }
 
 #: What a process may allocate: a method whose memory grows without bound dies of it before the machine swaps.

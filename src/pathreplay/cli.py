@@ -78,10 +78,21 @@ def _global_options(
 
 
 @app.command(short_help="Say what runs on this machine.")
-def doctor() -> None:
+def doctor(
+    gpu: Annotated[bool, typer.Option("--gpu", help="Run truths and timings on the GPU, and write a file.")] = False,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="With --gpu: the file to write.")
+    ] = Path("pathreplay-gpu.json"),
+    variant: Annotated[str | None, typer.Option(help="With --gpu: Mitsuba variant (default: cuda_ad_rgb).")] = None,
+) -> None:
     """Say what runs on this machine, and the way out for what does not."""
     from rich.console import Console
 
+    if gpu:
+        from pathreplay.check.gpu import examine as examine_gpu
+
+        typer.echo(examine_gpu(variant, output, tell=typer.echo))
+        return
     with interrupts.undisturbed():  # as in `optimize`
         from pathreplay.doctor import examine
 
@@ -151,13 +162,17 @@ def optimize(
         list[str] | None,
         typer.Option("--define", "-D", metavar="KEY=VALUE", help="Change the job, as in -D spp=32; may be repeated."),
     ] = None,
+    executor: Annotated[
+        Literal["local", "ray"] | None,
+        typer.Option(help="Who computes: this process, or actors of Ray (default: as the job says)."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on the screen.")] = False,
 ) -> None:
     """Recover scene parameters from pictures; Ctrl-C or SIGTERM ends early with everything written."""
     with interrupts.undisturbed():  # what is half imported can bring the process down at its end
         from pathreplay.inverse import optimize as run_job
 
-    result = run_job(config, resume=resume, output=output, progress=not quiet, define=define or ())
+    result = run_job(config, resume=resume, output=output, progress=not quiet, define=define or (), executor=executor)
     typer.echo(result.describe())
 
 

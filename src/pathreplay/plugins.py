@@ -11,6 +11,7 @@ import importlib
 from functools import partial
 from typing import Any
 
+from pathreplay.device import backend_of
 from pathreplay.errors import PathreplayError
 
 #: Each by name: what it is to Mitsuba, and the template of its class (see `on_base`).
@@ -31,7 +32,7 @@ def register(variant: str) -> None:
     if "_ad_" not in variant:
         _register_stand_ins(variant)
         return
-    if variant.startswith("llvm"):
+    if backend_of(variant) == "llvm":
         from pathreplay.backend import warn_of_bad_llvm
 
         warn_of_bad_llvm()

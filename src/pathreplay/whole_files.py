@@ -7,13 +7,28 @@ import errno
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeAlias
 
 from pathreplay.errors import PathreplayError
 from pathreplay.files import file_problem
 from pathreplay.interrupts import undisturbed
+
+Chunk: TypeAlias = "bytes | memoryview"
+Content: TypeAlias = "bytes | Callable[[], Iterable[Chunk]]"
+"""What is written into a file: bytes, or what makes them, chunk by chunk, when it is called."""
+
+
+def chunks(content: Content) -> Iterable[Chunk]:
+    """What a file shall hold, a chunk after the other."""
+    return (content,) if isinstance(content, bytes) else content()
+
+
+def made(make: Callable[..., bytes], *arguments: object) -> Content:
+    """The bytes that a function makes of the arguments, when they are written and not before."""
+    return lambda: (make(*arguments),)
 
 
 def require_writable(path: Path, option: str) -> None:

@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from pathreplay.device import backend_of
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.descriptions import load_integrator, told
 from pathreplay.scenes.loading import load_scene_for
@@ -63,7 +64,7 @@ class Render:
             )
         self.scene, self.spp, self.params = scene, spp, mi.traverse(scene)
         self.keys = tuple(resolve_differentiable(self.params, patterns, self.integrator))
-        self.device = torch.device("cuda" if str(mi.variant()).startswith("cuda") else "cpu")
+        self.device = torch.device("cuda" if backend_of(mi.variant()) == "cuda" else "cpu")
         self._forms = {key: form_of(self.params, key) for key in self.keys}
         seen = {key: self._forms[key].see(self.params[key]) for key in self.keys}
         self._types = {key: type(value) for key, value in seen.items()}

@@ -12,19 +12,45 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..device import Device, device_of
 from ..transport.vertex import Arrival, Flight, Kept, KeptInMedia, KnownLight, Numbers, Replayed, Shadow, Walk
 
 # Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x up to 136 bytes are 4.5 MB, and a
 # thread's stack is 8 MB. Beyond the stack the process would die without a word.
 MAX_DEPTH = 2048
+LARGEST_RECORD = 136
+"""Bytes of a vertex without media, in rgb variants."""
 # With media a vertex takes up to 210 bytes, and null boundaries have records of their own.
 MAX_DEPTH_MEDIA = 1024
 MAX_RECORDS_MEDIA = 2000
 
 
-def deepest(walk: Walk) -> int:
-    """The largest ``max_depth`` that the sweep driver can hold in this scene."""
-    return MAX_DEPTH if walk.media is None else MAX_DEPTH_MEDIA
+def deepest(walk: Walk, device: Device | None = None) -> int:
+    """The largest ``max_depth`` that the sweep driver can hold in this scene, on the device of the active variant.
+
+    On a GPU that is a share of its memory: see `pathreplay.device`.
+    """
+    device = device_of(mi.variant()) if device is None else device
+    if not device.is_gpu:
+        return MAX_DEPTH if walk.media is None else MAX_DEPTH_MEDIA
+    if walk.media is None:
+        return device.most_records(largest_record(walk), MAX_DEPTH)
+    return min(MAX_DEPTH_MEDIA, max((device.most_records(largest_record(walk), 2**30) - 8) // 3, 0))
+
+
+def largest_record(walk: Walk) -> int:
+    """Bytes of a vertex, whether the path moves or not: in the one case light is remembered, in the other numbers."""
+    return max(_bytes(Layout.of(walk, moves)) for moves in (False, True))
+
+
+def _bytes(layout: Layout) -> int:
+    kinds = [_plain(kind) for _, kind, remembered in FIELDS if getattr(layout, remembered)]
+    return 4 * sum(dr.size_v(kind) if dr.depth_v(kind) > 1 else 1 for kind in kinds) + 4  # and the word
+
+
+def footprint(walk: Walk, device: Device) -> int:
+    """Bytes of local memory that a GPU sets aside for the records of the sweep driver; 0 on a processor."""
+    return device.footprint(largest_record(walk), room_for(walk))
 
 
 def room_for(walk: Walk) -> int:

@@ -5,19 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
 import numpy as np
 import safetensors
-import safetensors.numpy
 from pydantic import ConfigDict, Field, FiniteFloat, NonNegativeInt, TypeAdapter, ValidationError
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.evaluate import Executor
 from pathreplay.inverse.grids import Levels
-from pathreplay.inverse.optimiser import Optimiser, State
+from pathreplay.inverse.optimiser import Optimiser, State, WhenAsked
+from pathreplay.inverse.tensor_files import safetensors_chunks
 from pathreplay.inverse.values import Array, Arrays
+from pathreplay.whole_files import Content
 
 
 @dataclass(frozen=True)
@@ -77,16 +79,16 @@ _STEPS = TypeAdapter(dict[str, NonNegativeInt])
 _VALUE, _LEARNED = "value:", "learned:"
 
 
-def save(run: Run) -> bytes:
-    """All that is known after the iterations so far, as the bytes of a safetensors file."""
+def save(run: Run) -> Content:
+    """All that is known after the iterations so far, as a safetensors file that is made while it is written."""
     state = run.optimiser.state()
-    tensors = {
+    plain: dict[str, Array] = {
         **{_LEARNED + name: value for name, value in run.learned.items()},
         **{_VALUE + key: value for key, value in run.values.items()},
-        **state.arrays,
     }
     metadata = {"steps": json.dumps(state.steps), "history": json.dumps([asdict(entry) for entry in run.history])}
-    return safetensors.numpy.save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata)
+    arrays = {name: partial(each.__getitem__, name) for each in (plain, state.arrays) for name in each}
+    return partial(safetensors_chunks, WhenAsked(arrays), metadata)
 
 
 def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Collection[str] = ()) -> None:

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
-from functools import reduce
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from pathreplay import memory
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.exposures import EXPOSURE, factor_of
 from pathreplay.inverse.exposures import gradient as exposure_gradient
 from pathreplay.inverse.losses import ELSEWHERE, QUADRATIC
-from pathreplay.inverse.problem import Problem, scene_values, variables_of
+from pathreplay.inverse.problem import Problem, scene_values
 from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.render.facts import SceneFacts
 from pathreplay.render.film import fit_film
 from pathreplay.render.path_integrator import plain_errors
 from pathreplay.scenes.parameters import get_array
+
+LARGE = 2**22
+"""Entries of a variable from which on its memory is looked after."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +53,6 @@ class Evaluation:
     """By key, how many entries of its gradient were NaN or infinite in a view, and count as zero there."""
     learned: Arrays
 
-    def of(self, share: float) -> Evaluation:
-        """So many times the loss and the gradient, as if so many more views had been evaluated that are like these."""
-        if share == 1:
-            return self
-        gradients = {key: gradient * np.float32(share) for key, gradient in self.gradients.items()}
-        return replace(self, loss=self.loss * share, gradients=gradients)
-
 
 Evaluate = Callable[[Arrays, Shard, Arrays], Evaluation]
 """evaluate(values, shard, learned): a pure function, but for rounding where threads add.
@@ -65,36 +61,101 @@ The values are those of all variables, as people see them; ``learned`` is what e
 """
 
 
-def total(evaluations: Sequence[Evaluation]) -> Evaluation:
-    """The sum, added up in the order given; what is known is what the last one knows."""
-    return Evaluation(
-        sum(each.loss for each in evaluations),
-        {key: reduce(np.add, [each.gradients[key] for each in evaluations]) for key in evaluations[0].gradients},
-        dict(sum((Counter(each.dropped) for each in evaluations), Counter())),
-        evaluations[-1].learned,
-    )
+class Total:
+    """A sum of evaluations as they come, of which only the sum is held."""
+
+    def __init__(self, owned: bool = False) -> None:
+        self._owned, self._count, self._loss = owned, 0, 0.0
+        self._sums: dict[str, Array] = {}
+        self._known: dict[str, Array] = {}
+        self._dropped: Counter[str] = Counter()
+
+    def add(self, each: Evaluation) -> None:
+        """Add gradients in place, to those of the first evaluation, too, where these are ``owned`` by nobody else."""
+        for key, gradient in each.gradients.items():
+            if self._count:
+                gradient = np.add(self._sums[key], gradient, out=self._sums[key] if self._owned else None)
+            self._sums[key] = gradient
+        for name, value in each.learned.items():
+            self._known[name] = np.add(self._known[name], value) if self._count else value
+        self._loss += each.loss
+        self._dropped += Counter(each.dropped)
+        self._owned |= self._count > 0
+        self._count += 1
+
+    def of(self, share: float = 1.0) -> Evaluation:
+        """The sum times ``share``; what is known is the mean of what each of them knows.
+
+        They began with the same knowledge, so that none had to wait for another.
+        """
+        sums, known = self._sums, self._known
+        if share != 1:
+            sums = {k: np.multiply(v, np.float32(share), out=v if self._owned else None) for k, v in sums.items()}
+        if self._count > 1:
+            known = {name: value / np.float32(self._count) for name, value in known.items()}
+        return Evaluation(self._loss * share, sums, dict(self._dropped), known)
+
+
+def total(evaluations: Iterable[Evaluation], share: float = 1.0, owned: bool = False) -> Evaluation:
+    """The sum, added up in the order given, times ``share``: see `Total`."""
+    found = Total(owned)
+    for each in evaluations:
+        found.add(each)
+        del each
+    return found.of(share)
 
 
 class Executor(Protocol):
-    """Evaluates the shards of an iteration. Results come in the order of the shards, whoever was ready first."""
+    """Evaluates the shards of an iteration. Results come in the order of the shards, whoever was ready first.
+
+    One that also has ``each``, with the same arguments, gives them one by one, and wants none of them back.
+    """
 
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
-        """One evaluation for each shard, in their order; the last one has learned from all of them."""
+        """One evaluation for each shard, in their order; each begins with what was ``learned`` before all of them."""
 
 
 class Local:
-    """In this process, one after the other; each knows what those before it have learned."""
+    """In this process, one after the other.
+
+    Who asks for `each` has them as they come, and memory holds one gradient, however many shards there are.
+    """
 
     def __init__(self, evaluate: Evaluate) -> None:
         self.evaluate = evaluate
 
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
         """See `Executor`."""
-        found: list[Evaluation] = []
+        return list(self.each(values, shards, learned))
+
+    def each(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
+        """One after the other."""
         for shard in shards:
-            found.append(self.evaluate(values, shard, learned))
-            learned = found[-1].learned
-        return found
+            yield self.evaluate(values, shard, learned)
+
+
+def _taken(gradient: Any) -> Array:
+    """A gradient as NumPy's; one of a large grid in the memory that Dr.Jit has made it in."""
+    if dr.is_tensor_v(gradient) and dr.width(gradient) >= LARGE and dr.type_v(gradient) == dr.VarType.Float32:
+        return gradient.numpy()
+    return get_array(gradient)
+
+
+def release(values: Arrays) -> None:
+    """Give memory back that Dr.Jit has done with and keeps for later, where it is much; hold the run to its budget.
+
+    Raises PathreplayError where that is not kept.
+    """
+    if any(value.size >= LARGE for value in values.values()) or memory.is_crowded():
+        dr.flush_malloc_cache()
+    memory.require_kept()
+
+
+def held_tensor(picture: Array) -> Any:
+    """A picture in memory of Dr.Jit's own: see `variables_of`."""
+    tensor = mi.TensorXf(np.ascontiguousarray(picture)) * dr.opaque(mi.Float, 1)
+    dr.eval(tensor)
+    return tensor
 
 
 class Evaluator:
@@ -117,8 +178,6 @@ class Evaluator:
         self._facts = facts = SceneFacts(problem.scene)
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
         self.freezes = record and is_recordable(integrator, facts.has_media) and problem.loss not in ELSEWHERE
-        self._targets = [mi.TensorXf(view.target) for view in problem.views]
-        self._weights = [None if view.weight is None else mi.TensorXf(view.weight) for view in problem.views]
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
         # Of each view and number of samples that was seen: whether pixels can be swept.
         self._sweeps: dict[tuple[int, int], bool] = {}
@@ -126,9 +185,13 @@ class Evaluator:
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`. Raises what the integrator raises; warns as it does."""
-        self._know(learned)
-        found = [self._view(values, *each, shard.samples) for each in zip(shard.views, shard.seeds, strict=True)]
-        return total(found)
+
+        def each() -> Iterator[Evaluation]:
+            for view, seed in zip(shard.views, shard.seeds, strict=True):
+                self._know(learned)
+                yield self._view(values, view, seed, shard.samples)
+
+        return total(each(), owned=True)
 
     def _know(self, learned: Arrays) -> None:
         """Go on with what an evaluation has learned. Raises PathreplayError if it is none of this integrator's."""
@@ -143,33 +206,39 @@ class Evaluator:
         self._learned = learned
 
     def _view(self, values: Arrays, view: int, seed: int, spp: int) -> Evaluation:
-        fit_film(self.problem.scene.sensors()[self.problem.views[view].sensor], self._targets[view].shape)
-        variables = variables_of(self.problem, values)
+        about = self.problem.views[view]
+        fit_film(self.problem.scene.sensors()[about.sensor], about.target.shape)
+        variables = self.problem.held.variables(self.problem, values)
         moving = {key: value for key, value in variables.items() if key in self._moving}
         dr.enable_grad(moving)
         self.problem.params.update(scene_values(self.problem, variables))
         try:
-            factor = factor_of(values, view, self._targets[view].shape[2])
+            factor = factor_of(values, view, about.target.shape[2])
             loss, by_factor = self._differentiated(view, seed, spp, None if factor is None else mi.TensorXf(factor))
         except NotRecordable:  # a part of the gradient may be there: once more, with variables of its own
             self.freezes = False
             return self._view(values, view, seed, spp)
-        gradients = {key: get_array(dr.grad(value)) for key, value in moving.items()}
+        gradients = {}
+        for key, value in moving.items():
+            gradients[key] = _taken(dr.grad(value))
+            dr.clear_grad(value)  # which the scene holds
+        release(values)
         if by_factor is not None and EXPOSURE in gradients:
             gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
-        fine = {key: np.isfinite(gradient) for key, gradient in gradients.items()}
-        # One bad path does not end a long run.
-        dropped = {key: int((~each).sum()) for key, each in fine.items() if not each.all()}
-        if dropped:
-            gradients = {key: np.where(fine[key], gradient, 0) for key, gradient in gradients.items()}
+        # One bad path does not end a long run. (A sum is finite where all is: it takes no memory.)
+        broken = [key for key, gradient in gradients.items() if not np.isfinite(gradient.sum(dtype=np.float64))]
+        dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
+        for key in broken:
+            gradients[key] = np.where(np.isfinite(gradients[key]), gradients[key], 0)
         if hasattr(self.integrator, "learned"):
             self._learned = self.integrator.learned()
         return Evaluation(loss, gradients, dropped, self._learned)
 
     def _differentiated(self, view: int, seed: int, spp: int, factor: Any = None) -> tuple[float, Any]:
         """What the view adds to the loss, and the derivative by its ``factor``; the rest is added to the parameters."""
-        problem, target = self.problem, self._targets[view]
-        sensor = problem.views[view].sensor
+        problem, about = self.problem, self.problem.views[view]
+        sensor, target = about.sensor, held_tensor(about.target)
+        weight = None if about.weight is None else held_tensor(about.weight)
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
         which = view, spp
         records = self.freezes and which in self._sweeps
@@ -179,10 +248,11 @@ class Evaluator:
             self._sweeps[which] = may and bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
-        share = problem.views[view].share / len(problem.trained())
+        share = about.share / len(problem.trained())
+        problem.album.rest()
         with plain_errors():
             value, lost, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
-                problem.params, problem.scene, sensor, self.integrator, target, self._weights[view], number, spp,
+                problem.params, problem.scene, sensor, self.integrator, target, weight, number, spp,
                 problem.loss, share, self._sweeps[which], self._facts.tables(), factor,
             )  # fmt: skip
         if lost is not None:

@@ -16,6 +16,10 @@ from pathreplay.inverse.images import Image
 
 Array = NDArray[np.float32]
 
+LARGEST_SHOWN = 2048
+"""Pixels along a side of a texture that is looked at: more than a screen has, and no burden to a page."""
+_PIECE = 2**22
+
 
 @dataclass(frozen=True)
 class Levels:
@@ -60,7 +64,25 @@ def matched(grid: Array, other: Array) -> Array:
 
 def rmse(value: Array, truth: Array) -> float:
     """Root mean square error; grids of different resolutions are compared at that of the truth."""
-    return float(np.sqrt(np.mean(np.square(matched(value, truth).astype(np.float64) - truth))))
+    a, b = matched(value, truth).reshape(-1), truth.reshape(-1)
+    # In pieces: differences in double precision would take four times what the values do.
+    squares = [
+        float(np.square(a[i : i + _PIECE].astype(np.float64) - b[i : i + _PIECE]).sum())
+        for i in range(0, b.size, _PIECE)
+    ]
+    return float(np.sqrt(sum(squares) / b.size))
+
+
+def shown(image: Image, side: int = LARGEST_SHOWN) -> Image:
+    """A picture of at most ``side`` pixels along each side: means of squares of pixels, where it has more."""
+    n = -(-max(image.shape[:2]) // side)
+    if n == 1:
+        return image
+    height, width = (length // n for length in image.shape[:2])
+    if not height or not width:
+        return np.ascontiguousarray(image[::n, ::n])
+    squares = image[: height * n, : width * n].reshape(height, n, width, n, -1)
+    return squares.mean(axis=(1, 3), dtype=np.float32)
 
 
 def slices(volume: Array) -> Image:

@@ -13,16 +13,17 @@ import numpy as np
 
 from pathreplay import memory
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.album import ROOM
 from pathreplay.inverse.config import Displacement, Parameter
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.losses import Loss, mean_loss
 from pathreplay.inverse.values import Array
 from pathreplay.render.film import MOST_SAMPLES, film_size, require_film
 
-# Bytes for each pixel of each view: its target, start and result stay.
+# Bytes for each pixel of each view: its target, start and result stay, but go to the disk where they are many.
 _A_VIEW = 36
-# A value of a grid: as NumPy and as Dr.Jit hold it, gradient, Adam's moments, interpolation in double precision.
-_A_VALUE = 64
+# A value: old and new, as Dr.Jit holds it; its gradient and their sum; Adam's two moments; once more on the way.
+_A_VALUE = 32
 # A step of Adam's is about the learning rate: nothing is found by steps a million times the value.
 _LONGEST_STEP = 1e6
 _FARTHEST = 1e4
@@ -33,7 +34,7 @@ def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str,
     pixels = 0
     for name, index in sensors.items():
         pixels += prod(film_size(scene.sensors()[index]))
-        require_film(scene.sensors()[index], f"sensor '{name}'", spp, pixels * _A_VIEW)
+        require_film(scene.sensors()[index], f"sensor '{name}'", spp, min(pixels * _A_VIEW, ROOM))
 
 
 def require_visible(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:
@@ -70,6 +71,13 @@ def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> 
         f"Parameter '{key}' has the resolution {wanted}: {cells(wanted)} values, of which {most} fit the memory "
         f"that is left; {way_out}"
     )
+
+
+def require_values(sizes: Mapping[str, int]) -> None:
+    """Raise PathreplayError unless parameters of these ``sizes`` (numbers, by key) fit the memory, and their steps."""
+    largest = max(sizes, key=lambda key: sizes[key])
+    thing = f"Optimising {sum(sizes.values())} numbers ('{largest}' has {sizes[largest]})"
+    memory.require(sum(sizes.values()) * _A_VALUE, thing, "take fewer, or coarser textures and grids")
 
 
 def require_learning_rate(key: str, rate: float, start: np.ndarray, bounds: Sequence[float | None] = ()) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import drjit as dr
@@ -16,7 +16,7 @@ from pathreplay.inverse import noise
 from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
-from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Local, Shard, total
+from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Executor, Local, Shard, Total, release, total
 from pathreplay.inverse.events import Entered, Event, Faint, Finished, NonFinite, Refined, Started, Stepped, Stopped
 from pathreplay.inverse.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.grids import resampled, rmse
@@ -45,11 +45,18 @@ def new_run(
     record: bool = True,
     optimizer: Optimizer | None = None,
     evaluate: Evaluate | None = None,
+    executor: Executor | None = None,
 ) -> Run:
-    """A run at the problem's start values, in this process; ``evaluate`` is what does it, if not an `Evaluator`."""
-    values = {v.key: get_array(to_value(v.like, v.start)) for v in problem.variables}
+    """A run at the problem's start values, in this process; ``evaluate`` is what does it, if not an `Evaluator`.
+
+    Or ``executor``, in others.
+    """
+    values = {
+        v.key: np.array(v.start, np.float32) if dr.is_tensor_v(v.like) else get_array(to_value(v.like, v.start))
+        for v in problem.variables
+    }
     return Run(
-        Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
+        executor or Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
         _optimiser(problem, values, optimizer or Optimizer()),
         values,
     )
@@ -70,7 +77,8 @@ def answer_of(problem: Problem, run: Run) -> dict[str, Array]:
     for v in problem.variables:
         if v.coordinates and v.key in found:
             found[v.key] = v.coordinates.values(found[v.key])
-    return {v.key: np.clip(found.get(v.key, run.values[v.key]), *v.bounds) for v in problem.variables}
+    # Values of a run are within their bounds.
+    return {v.key: np.clip(found[v.key], *v.bounds) if v.key in found else run.values[v.key] for v in problem.variables}
 
 
 def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
@@ -127,8 +135,8 @@ def _require_gradients(config: Config, run: Run) -> None:
 def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Event]:
     """One step, with the learning rates and resolutions of iteration ``position``; adds an entry to the history.
 
-    Evaluate the views of its `batch`, a shard with a seed of its own for each (or two halves, see `noise`), and sum in
-    their order; step with the learning rate of that iteration (see `schedules`), project every variable into its
+    Evaluate the views of its `batch`, a shard with a seed of its own for each (or parts of it, see `Config.parts`), and
+    sum in their order; step with the learning rate of that iteration (see `schedules`), project every variable into its
     bounds. A grid that moves, and whose next resolution is due, is interpolated before that; the optimiser starts anew
     on it. What is differentiated is decided by the integrator; targets, bounds and the seeds' choice of paths are not.
 
@@ -140,22 +148,28 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     asked, halves = part.config.spp, part.config.halves_samples
     spp = asked if isinstance(asked, int) else noise.next_spp(config.auto_spp, run.history)
     shards = _shards(part, i, spp)
-    evaluations = run.executor.run(values, shards, run.learned)
     share = len(part.problem.trained()) / len({shard.views for shard in shards})
-    found = total(evaluations).of(share / 2 if halves else share)
+    # As they come, where the executor has them one by one: none is held that has been added.
+    each = getattr(run.executor, "each", None)
+    evaluations = iter((each or run.executor.run)(values, shards, run.learned))
+    dropped: list[dict[str, int]] = []
+    found, noise_norms = _summed(_seen(evaluations, dropped), share / part.config.parts, halves, each is not None)
     if not np.isfinite(found.loss):
         raise PathreplayError(
             f"The loss is {found.loss} at iteration {i}; lower the learning rates, or bound the parameters that ran "
             "away"
         )
-    for shard, each in zip(shards, evaluations, strict=True):
+    for shard, counts in zip(shards, dropped, strict=True):
         view = problem.views[shard.views[0]].name
-        told += [NonFinite(key, view, i, count) for key, count in each.dropped.items()]
+        told += [NonFinite(key, view, i, count) for key, count in counts.items()]
     penalties = {v.key: v.penalty.of(values[v.key]) for v in problem.variables if v.penalty}
-    gradients = {
-        key: gradient + penalties[key][1] if key in penalties else gradient for key, gradient in found.gradients.items()
-    }
+    gradients = found.gradients
+    for key, (_, slope) in penalties.items():
+        if key in gradients:
+            gradients[key] = gradients[key] + slope
     penalty = sum(value for value, _ in penalties.values())
+    norms, sizes = _norms(gradients), {key: gradient.size for key, gradient in gradients.items()}
+    release(values)
     run.whole = False
     run.values = _stepped(part, run, values, gradients, position, found.loss + penalty)
     run.learned = found.learned
@@ -165,13 +179,13 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
         i,
         found.loss,
         seconds,
-        _norms(gradients),
+        norms,
         sum(found.dropped.values()),
         errors | pose_errors(problem, run.values),
         penalty=penalty,
         spp=spp,
-        noise_norms=_noise_norms(evaluations, share) if halves else {},
-        dropped_shares={key: n / (gradients[key].size * len(shards)) for key, n in found.dropped.items()},
+        noise_norms=noise_norms,
+        dropped_shares={key: n / (sizes[key] * len(shards)) for key, n in found.dropped.items()},
     )
     run.history.append(entry)
     run.whole = True
@@ -188,13 +202,13 @@ def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array
 
 
 def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
-    """What an iteration evaluates: its views, one after the other, each whole or in two halves."""
+    """What an iteration evaluates: its views, one after the other, each whole or in parts (see `Config.parts`)."""
     same = 0 if part.config.optimizer.searches else iteration
-    halves, config, views = 2 if part.config.halves_samples else 1, part.config, part.problem.views
+    config, views = part.config, part.problem.views
     return [
-        Shard((n,), spp // halves, (seed,), part.number)
+        Shard((n,), spp // config.parts, (seed,), part.number)
         for n in batch(part.problem, config, iteration)
-        for seed in config.seeds(ITERATION, views[n].sensor, same)[:halves]
+        for seed in config.seeds(ITERATION, views[n].sensor, same, config.parts)
     ]
 
 
@@ -202,10 +216,30 @@ def _norms(gradients: Arrays) -> dict[str, float]:
     return {key: float(np.linalg.norm(gradient)) for key, gradient in gradients.items()}
 
 
-def _noise_norms(evaluations: Sequence[Evaluation], share: float) -> dict[str, float]:
-    """|a - b|/2 of the two halves of each gradient, which are the even and the odd ones, added up over views."""
-    a, b = (total(evaluations[half::2]).of(share).gradients for half in (0, 1))
-    return {key: norm / 2 for key, norm in _norms({key: a[key] - b[key] for key in a}).items()}
+def _seen(evaluations: Iterable[Evaluation], dropped: list[dict[str, int]]) -> Iterator[Evaluation]:
+    """The evaluations, while what they dropped is noted."""
+    for each in evaluations:
+        dropped.append(each.dropped)
+        yield each
+        del each
+
+
+def _summed(
+    evaluations: Iterator[Evaluation], share: float, halves: bool, owned: bool
+) -> tuple[Evaluation, dict[str, float]]:
+    """The sum times ``share``; and where they are of two halves, in turn, |a - b| of their sums, of each gradient.
+
+    ``owned``: nobody else wants them (see `Total`).
+    """
+    if not halves:
+        return total(evaluations, share, owned), {}
+    sums = Total(owned), Total(owned)
+    for n, each in enumerate(evaluations):
+        sums[n % 2].add(each)
+        del each
+    a, b = (each.of() for each in sums)
+    norms = _norms({key: a.gradients[key] - b.gradients[key] for key in a.gradients})
+    return total([a, b], share), {key: share * norm for key, norm in norms.items()}
 
 
 def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int, loss: float) -> dict[str, Array]:
@@ -222,16 +256,19 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
     stepped = run.optimiser.step({**now, **latent}, {**gradients, **slopes}, rates, loss)
     stepped |= {key: other.values(stepped[key]) for key, other in others.items()}
     for key, value in stepped.items():
-        if not np.isfinite(value).all():
+        if not np.isfinite(value.sum(dtype=np.float64)):  # which is where all is
             raise PathreplayError(
                 f"'{key}' is no finite number after iteration {len(run.history)}; lower its learning rate, or bound it"
             )
-    return {**values, **{v.key: np.clip(stepped[v.key], *v.bounds) for v in moving}}
+    for v in moving:
+        if v.bounds != (-np.inf, np.inf):
+            np.clip(stepped[v.key], *v.bounds, out=stepped[v.key])
+    return {**values, **{v.key: stepped[v.key] for v in moving}}
 
 
 def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:
     """Pictures of all views with these values in the scene, by the job's integrator; same noise at every call."""
-    return {view.name: picture_of(problem, config, values, view) for view in problem.views}
+    return {view.name: problem.album.keep(picture_of(problem, config, values, view)) for view in problem.views}
 
 
 def picture_of(problem: Problem, config: Config, values: Arrays, view: View, spp: int | None = None) -> Image:

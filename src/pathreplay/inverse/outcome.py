@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config
-from pathreplay.inverse.grids import matched, rmse, slices
+from pathreplay.inverse.grids import matched, rmse, shown, slices
 from pathreplay.inverse.images import Image, difference
 from pathreplay.inverse.likeness import Likeness
 from pathreplay.inverse.pose import Pose, PoseError, error_names
@@ -21,6 +21,7 @@ from pathreplay.inverse.values import Array
 
 # Differences are shown brighter than the pictures: a converged one would be black otherwise.
 DIFFERENCE_GAIN = 4.0
+_KINDS = "target", "start", "result", "difference"
 
 
 def resume_command(folder: Path) -> str:
@@ -69,13 +70,21 @@ class ViewPictures:
             table[kind] = {"rmse": self.error(getattr(self, kind)), **known}
         return table
 
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of pictures to show; a difference is result - target, red above, blue below, DIFFERENCE_GAIN times."""
+        return (*_KINDS, *(() if self.rival is None else ("rival", "rival-difference")))
+
+    def picture(self, kind: str) -> Image:
+        """The picture of a kind."""
+        if kind in ("difference", "rival-difference"):
+            image = self.result if kind == "difference" else self.rival
+            assert image is not None
+            return self._difference(image)
+        return getattr(self, kind)
+
     def pictures(self) -> dict[str, Image]:
-        """The pictures to show; a difference is result - target, red above and blue below, DIFFERENCE_GAIN times."""
-        found = {"target": self.target, "start": self.start, "result": self.result}
-        found["difference"] = self._difference(self.result)
-        if self.rival is None:
-            return found
-        return {**found, "rival": self.rival, "rival-difference": self._difference(self.rival)}
+        """All pictures to show, by kind."""
+        return {kind: self.picture(kind) for kind in self.kinds()}
 
     def _difference(self, image: Image) -> Image:
         gap = difference(image, self.target) * DIFFERENCE_GAIN
@@ -101,10 +110,11 @@ class Recovered:
         return {kind: value for kind in kinds if (value := getattr(self, kind)) is not None}
 
     def textures(self) -> dict[str, Image]:
-        """Start, result and truth as images; empty for what is no texture of one to four channels."""
+        """Start, result and truth as images to look at (see `shown`); empty for what is no texture of one to four
+        channels."""
         if self.result.ndim != 3 or self.result.shape[2] > 4:
             return {}
-        return self.known("start", "result", "truth")
+        return {kind: shown(image) for kind, image in self.known("start", "result", "truth").items()}
 
     def volumes(self) -> dict[str, Image]:
         """Middle slices of start, result, rival's result and truth, white at the largest value of the last of them.

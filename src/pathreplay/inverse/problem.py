@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import gc
 import re
+import weakref
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import file_names
 from pathreplay.inverse import limits
+from pathreplay.inverse.album import Album
 from pathreplay.inverse.background import require_known
 from pathreplay.inverse.capture import Shot, fingerprint, read_capture
 from pathreplay.inverse.config import Config, Parameter, Plugin
@@ -90,6 +92,25 @@ class View:
     """How much it counts; of the views that are learned from the mean is 1."""
 
 
+class Held:
+    """The values that were asked for last, as Dr.Jit holds them: there are none beside them."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, tuple[weakref.ref[Array], Any]] = {}
+
+    def variables(self, problem: Problem, values: Arrays) -> dict[str, Any]:
+        """As `variables_of`, without derivatives; the same arrays as before, where the values are."""
+        keys = [v.key for v in problem.variables]
+        if any(key not in self._known or self._known[key][0]() is not values[key] for key in keys):
+            self._known = {}  # before there is more
+            made = variables_of(problem, values)
+            # Values may go when nobody else wants them, and their places in memory may be those of others.
+            self._known = {key: (weakref.ref(values[key]), value) for key, value in made.items()}
+        found = {key: self._known[key][1] for key in keys}
+        dr.disable_grad(found)
+        return found
+
+
 @dataclass(frozen=True)
 class Problem:
     """min over the variables of the mean over views of loss(render(scene, view), target of the view)."""
@@ -109,6 +130,9 @@ class Problem:
     """What was done to the scene that the user should know of."""
     capture: str | None = None
     """What tells its capture from others."""
+    album: Album = field(default_factory=Album)
+    """Where its pictures are kept, and starts and truths."""
+    held: Held = field(default_factory=Held)
 
     def trained(self) -> dict[int, View]:
         """The views that are learned from, by their place."""
@@ -137,13 +161,13 @@ def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, An
 
 def put_values(problem: Problem, values: Arrays) -> None:
     """Give the scene these values of the variables, without derivatives."""
-    problem.params.update(scene_values(problem, variables_of(problem, values)))
+    problem.params.update(scene_values(problem, problem.held.variables(problem, values)))
 
 
 def pose_errors(problem: Problem, values: Arrays) -> dict[str, float]:
     """How far the poses whose truth is known are from it, by name: see `PoseError.of`."""
     known = [pose for pose in problem.poses if pose.truth is not None]
-    placed = scene_values(problem, variables_of(problem, values)) if known else {}
+    placed = scene_values(problem, problem.held.variables(problem, values)) if known else {}
     found: dict[str, float] = {}
     for pose in known:
         if error := pose.error(parameters.get_array(placed[pose.key])):
@@ -157,6 +181,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     ``targets`` are those of an earlier part of the same run; otherwise they are read or rendered.
     Raises PathreplayError for whatever in the job cannot work.
     """
+    album = Album.of(config.budget)
     loss = find_loss(config.loss, base)
     wanted = [entry.key for entry in config.parameters]
     film = "rgba" if config.target.alpha == "compare" else "rgb"
@@ -182,6 +207,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
         require_known(scene, params, keys)
     limits.require_films(scene, sensors, {"spp": config.most_spp, "picture_spp": config.picture_spp})
     unsolved, moved = _variables(scene, params, keys, config, base)
+    limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
     truth: dict[str, Array] = {}
     first = targets is None
@@ -190,12 +216,12 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
         truth = truth_of(other, params, keys)
         if targets is None:
             with one_thread(config.deterministic):
-                targets = Targets(rendered_targets(config, other, sensors), {})
+                targets = Targets(rendered_targets(config, other, sensors, album), {})
         # Dr.Jit traces calls through every instance alive: the target scene would be in all our kernels.
         del other
         gc.collect()
     elif targets is None:
-        targets, said = _pictures(config, taken, scene, sensors, base)
+        targets, said = _pictures(config, taken, scene, sensors, base, album)
         notes += said
     if first and config.target.masks is not None:
         masks = by_view("masks", config.target.masks, sensors, base)
@@ -213,13 +239,19 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     unsolved += _exposures(scene, config, views)
     for view in views:
         limits.require_finite_loss(loss, view.name, view.target, view.weight)
-    variables = tuple(replace(variable, truth=truth.get(variable.key)) for variable in unsolved)
+        album.rest()
+    variables = tuple(_kept(album, replace(variable, truth=truth.get(variable.key))) for variable in unsolved)
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in moved)
     # Traversed anew: an object from which values were read expects all its keys at the next update().
     params = mi.traverse(scene)
     parameters.keep_only(params, keys)
     known = fingerprint(taken.values()) if taken else None
-    return Problem(scene, params, integrator, rival, judge, variables, poses, views, loss, notes, known)
+    return Problem(scene, params, integrator, rival, judge, variables, poses, views, loss, notes, known, album)
+
+
+def _kept(album: Album, variable: Variable) -> Variable:
+    truth = None if variable.truth is None else album.keep(variable.truth)
+    return replace(variable, start=album.keep(variable.start), truth=truth)
 
 
 def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list[Variable]:
@@ -264,13 +296,13 @@ def _named(scene: mi.Scene, sensors: dict[str, int], wanted: Sequence[int | str]
 
 
 def _pictures(
-    config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path
+    config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path, album: Album
 ) -> tuple[Targets, tuple[str, ...]]:
     """Targets from the files of a capture, or from those that the job names, and what is to be said about them."""
     alpha, hidden = config.target.alpha, bool((config.integrator.model_extra or {}).get("hide_emitters"))
     if config.capture is None:
         files = by_view("target images", config.target.images or [], sensors, base)
-        return read_targets(files, alpha, scene, sensors, base, hidden=hidden)
+        return read_targets(files, alpha, scene, sensors, base, hidden=hidden, album=album)
     if other := set(sensors) - set(shots):
         raise PathreplayError(f"sensors: '{min(other)}' is no camera of the capture, and has no picture; leave it out")
     pictures = {name: str(shot.image.resolve()) for name, shot in shots.items()}
@@ -278,7 +310,9 @@ def _pictures(
     if masks and alpha == "mask":
         raise PathreplayError("target: the capture has masks, and alpha = 'mask' is another; leave alpha out")
     lenses = {name: shot.lens for name, shot in shots.items() if shot.lens is not None}
-    targets, notes = read_targets(pictures, alpha, scene, sensors, base, resize=True, lenses=lenses, hidden=hidden)
+    targets, notes = read_targets(
+        pictures, alpha, scene, sensors, base, resize=True, lenses=lenses, hidden=hidden, album=album
+    )
     return masked(targets, read_masks(masks, scene, sensors, base, resize=True, lenses=lenses)), notes
 
 
@@ -338,7 +372,8 @@ def _variables(
             levels = _levels(key, entry, config.refine_at(entry), start)
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
-                like = type(like)(start)
+            if dr.is_tensor_v(like):
+                like = dr.zeros(type(like), start.shape)  # which nobody writes down
             penalty = _penalty(key, entry, start)
             variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
             continue

@@ -50,9 +50,13 @@ def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:
 
 
 def with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
-    """The values of the variables, and what they make of the scene's parameters."""
-    stored = scene_values(problem, variables_of(problem, values))
-    return {key: get_array(value) for key, value in stored.items()} | dict(values)
+    """The values of the variables, and what they make of the poses."""
+    if not problem.poses:
+        return dict(values)
+    moved = {name for pose in problem.poses for name in pose.parts().values()}
+    few = replace(problem, variables=tuple(v for v in problem.variables if v.key in moved))
+    placed = scene_values(few, variables_of(few, values))
+    return {key: get_array(value) for key, value in placed.items()} | dict(values)
 
 
 def _parts(pose: Pose, values: Arrays) -> dict[str, Array]:

@@ -16,6 +16,7 @@ import PIL.Image
 from matplotlib.figure import Figure
 
 from pathreplay.inverse.checkpoint import Entry
+from pathreplay.inverse.grids import shown
 from pathreplay.inverse.images import Image, displayed, png_bytes, resized
 from pathreplay.inverse.outcome import Contestant, Outcome, Recovered, ViewPictures
 from pathreplay.inverse.page_parts import (
@@ -281,13 +282,15 @@ def _plain(axes: Any, along: str) -> None:
 
 # At most so many views and textures in summary.png: it is an overview, the report has them all.
 SUMMARY_ROWS = 3
+SUMMARY_SIDE = 512
+"""Pixels along a side of one of them, which is 210 wide: more would only take memory."""
 
 
 def summary(outcome: Outcome) -> bytes:
     """One PNG with everything side by side: a row per view (target, start, result, difference), texture and volume."""
     rows = [(v.name, v.pictures(), v.exposure) for v in outcome.views[:SUMMARY_ROWS]]
-    shown = [(r.key, r.textures() or r.volumes()) for r in outcome.recovered]
-    rows += [(key, images, 1.0) for key, images in [row for row in shown if row[1]][:SUMMARY_ROWS]]
+    grids = [(r.key, r.textures() or r.volumes()) for r in outcome.recovered]
+    rows += [(key, images, 1.0) for key, images in [row for row in grids if row[1]][:SUMMARY_ROWS]]
     columns = max(len(images) for _, images, _ in rows)
     # As high as its picture, which is 2.1 wide, and 0.2 for the title.
     heights = [0.2 + 2.1 * image.shape[0] / image.shape[1] for _, images, _ in rows for image in [images["start"]]]
@@ -297,7 +300,8 @@ def summary(outcome: Outcome) -> bytes:
         for axes in line:
             axes.axis("off")
         for column, (kind, image) in enumerate(pictures.items()):
-            line[column].imshow(displayed(image, exposure), interpolation="nearest", vmin=0, vmax=1, cmap="gray")
+            pixels = displayed(shown(image, SUMMARY_SIDE), exposure)
+            line[column].imshow(pixels, interpolation="nearest", vmin=0, vmax=1, cmap="gray")
             label = outcome.caption(kind)
             short = name if len(name) <= 24 else f"…{name[-23:]}"  # what fits over a picture
             line[column].set_title(label if column else f"{short}: {label}", fontsize=8)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-import safetensors.numpy
 
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.exposures import EXPOSURE
@@ -20,8 +20,10 @@ from pathreplay.inverse.problem import Problem
 from pathreplay.inverse.recovered import poses_of, recovered_of, with_faces, with_scene
 from pathreplay.inverse.report import Film, report_files
 from pathreplay.inverse.run_folder import Job
+from pathreplay.inverse.tensor_files import safetensors_chunks
 from pathreplay.inverse.values import Array
 from pathreplay.media.volume_files import vol_bytes
+from pathreplay.whole_files import Content, made
 
 
 @dataclass(frozen=True, repr=False)
@@ -105,27 +107,27 @@ def outcome_of(
     return Outcome(job.config, job.source, job.changes, folder, views, recovered, poses, run, values, problem.notes)
 
 
-def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, bytes]:
+def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Content]:
     """All files of the end of a run, the report with its ``films`` among them, by name in the run folder."""
     table = {item.key: item.as_dict() for item in outcome.recovered}
     table |= {item.pose.key: item.as_dict() for item in outcome.poses}
-    files = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}
+    files: dict[str, Content] = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}
     views = {view.name: view.as_dict() for view in outcome.views}
     files["views.json"] = (json.dumps(views, indent=2) + "\n").encode()
     files |= _run_files("", outcome.run.history, outcome.values)
     if rival := outcome.run.rival:
         files |= _run_files("rival/", rival.history, rival.values)
     for view in outcome.views:
-        files[f"images/result-{view.name}.exr"] = exr_bytes(view.result)
-        for kind, image in view.pictures().items():
-            files[f"images/{kind}-{view.name}.png"] = png_bytes(image, view.exposure)
+        files[f"images/result-{view.name}.exr"] = made(exr_bytes, view.result)
+        for kind in view.kinds():
+            files[f"images/{kind}-{view.name}.png"] = made(_png, view, kind)
     for item in outcome.recovered:
         for kind, image in item.textures().items():
             files[f"images/texture-{kind}-{item.file_name}.png"] = png_bytes(image)
         for kind, image in item.volumes().items():
             files[f"images/volume-{kind}-{item.file_name}.png"] = png_bytes(image)
         if item.result.ndim == 4:
-            files[f"volumes/{item.file_name}.vol"] = vol_bytes(item.result)
+            files[f"volumes/{item.file_name}.vol"] = made(vol_bytes, item.result)
     return {**files, **report_files(outcome, films)}
 
 
@@ -147,9 +149,12 @@ def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
     )
 
 
-def _run_files(folder: str, history: Sequence[Entry], values: Mapping[str, Array]) -> dict[str, bytes]:
-    arrays = {key: np.ascontiguousarray(value) for key, value in values.items()}
+def _png(view: ViewPictures, kind: str) -> bytes:
+    return png_bytes(view.picture(kind), view.exposure)
+
+
+def _run_files(folder: str, history: Sequence[Entry], values: Mapping[str, Array]) -> dict[str, Content]:
     return {
-        f"{folder}parameters.safetensors": safetensors.numpy.save(arrays),
+        f"{folder}parameters.safetensors": partial(safetensors_chunks, values, {}),
         f"{folder}history.jsonl": "".join(json.dumps(asdict(entry)) + "\n" for entry in history).encode(),
     }

@@ -20,6 +20,7 @@ from pathreplay.interrupts import undisturbed
 from pathreplay.inverse.config import Config, load_config
 from pathreplay.inverse.folder_lock import FolderLock
 from pathreplay.inverse.texts import YAML
+from pathreplay.whole_files import Content, chunks
 
 PART = ".part"
 _CONFIGS = "config.toml", "config.yaml", "config.json"
@@ -61,10 +62,12 @@ class RunFolder:
                 "was renamed, go on with: pathreplay optimize --resume NEW_NAME, else start the job again"
             )
 
-    def write(self, files: Mapping[str, bytes]) -> None:
+    def write(self, files: Mapping[str, Content]) -> None:
         """Write all files or none: each goes to a temporary name first, and all are renamed once all are on the disk.
 
         Links are not followed: a link in the place of a file is replaced.
+
+        What is made while it is written is not held before, and not after.
 
         Raises:
             PathreplayError: the disk is full, the folder is gone or cannot be written, or a folder in it is a link that
@@ -74,12 +77,12 @@ class RunFolder:
         made: list[Path] = []
         self.require_in_place("what was not yet written is")
         try:
-            for name, data in files.items():
+            for name, content in files.items():
                 final = self.path / name
                 self._make_parent(final.parent, made)
                 part = final.with_name(final.name + PART)
                 parts.append((part, final))
-                _write_through(part, data)
+                _write_through(part, content)
             with undisturbed():  # all or none: a second Ctrl-C waits
                 for part, final in parts:
                     os.replace(part, final)
@@ -112,7 +115,7 @@ class RunFolder:
         return f"Run folder {self.path} cannot be written ({error.strerror}): mend that, {rescue}"
 
 
-def create_run_folder(output: Path, job: Job, files: Mapping[str, bytes]) -> RunFolder:
+def create_run_folder(output: Path, job: Job, files: Mapping[str, Content]) -> RunFolder:
     """Make ``output``, or ``output-2``, ``-3``, … where that exists, and put the job and its first files into it.
 
     The config is copied as it was written (``config.toml`` or ``.yaml``), or as JSON where it came from Python or was
@@ -120,7 +123,7 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, bytes]) -> Run
     """
     if job.source is not None and job.source.suffix != ".json" and not job.changes:
         name = "config.yaml" if job.source.suffix.lower() in YAML else "config.toml"
-        copy = {name: job.source.read_bytes()}
+        copy: dict[str, Content] = {name: job.source.read_bytes()}
     else:
         copy = {"config.json": job.config.model_dump_json(indent=2, exclude_unset=True).encode()}
     origin: dict[str, Any] = {
@@ -241,11 +244,13 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return about.st_dev, about.st_ino
 
 
-def _write_through(path: Path, data: bytes) -> None:
+def _write_through(path: Path, content: Content) -> None:
     # What a killed run has left is removed, and a link by that name is not followed.
     with contextlib.suppress(FileNotFoundError):
         path.unlink()
     with open(path, "xb") as file:
-        file.write(data)
+        for chunk in chunks(content):
+            file.write(chunk)
+            del chunk
         file.flush()
         os.fsync(file.fileno())  # some file systems report a full disk only when the data are written out

@@ -17,6 +17,7 @@ from pathreplay.inverse.run_folder import CHECKPOINT, RIVAL_CHECKPOINT, RunFolde
 from pathreplay.inverse.targets import Targets
 from pathreplay.inverse.values import require_finite_array
 from pathreplay.render.film import picture_shape
+from pathreplay.whole_files import Content, made
 
 CAPTURE = "capture.sha256"
 """What tells the cameras of a run from those of a capture that was changed since."""
@@ -62,13 +63,15 @@ class Saving:
         self.saved = done
 
 
-def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict[str, bytes]:
+def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict[str, Content]:
     """What a run goes on from, by name: targets, pictures of its start (by view), checkpoints."""
     pictures = {_picture("target", view.name): view.target for view in problem.views}
     pictures |= {_picture("weight", view.name): view.weight for view in problem.views if view.weight is not None}
     pictures |= {_picture("start", name): image for name, image in before.items()}
-    capture = {} if problem.capture is None else {CAPTURE: problem.capture.encode() + b"\n"}
-    return {name: exr_bytes(image) for name, image in pictures.items()} | capture | _checkpoints(run)
+    files: dict[str, Content] = {name: made(exr_bytes, image) for name, image in pictures.items()}
+    if problem.capture is not None:
+        files[CAPTURE] = problem.capture.encode() + b"\n"
+    return files | _checkpoints(run)
 
 
 def saved_targets(folder: Path) -> Targets:
@@ -88,7 +91,8 @@ def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) 
     Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
     """
     _require_capture(folder / CAPTURE, problem)
-    before = {view.name: _read(folder / _picture("start", view.name)) for view in problem.views}
+    keep = problem.album.keep
+    before = {view.name: keep(_read(folder / _picture("start", view.name))) for view in problem.views}
     for view in problem.views:
         wanted = picture_shape(problem.scene.sensors()[view.sensor])
         for kind, found in (("target", view.target), ("start", before[view.name])):
@@ -121,7 +125,7 @@ def _runs(run: Run) -> dict[str, Run]:
     return {CHECKPOINT: run} if run.rival is None else {CHECKPOINT: run, RIVAL_CHECKPOINT: run.rival}
 
 
-def _checkpoints(run: Run) -> dict[str, bytes]:
+def _checkpoints(run: Run) -> dict[str, Content]:
     return {name: checkpoint.save(each) for name, each in _runs(run).items()}
 
 

@@ -10,12 +10,14 @@ from types import TracebackType
 
 import mitsuba as mi
 
-from pathreplay import backend
+from pathreplay import backend, memory
+from pathreplay.device import device_of
 from pathreplay.errors import PathreplayError
 from pathreplay.interrupts import Stop, stopping, undisturbed
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config, Plugin
 from pathreplay.inverse.events import Event, Stepped
+from pathreplay.inverse.executors import Crew, RayExecutor, crew_of, require_executor
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
 from pathreplay.inverse.loop import answer_of, iterate, new_run, picture_of, render_views, with_exposures
@@ -135,6 +137,8 @@ def _states(
     with ExitStack() as stack:
         if resumed is not None:
             stack.callback(resumed.lock.close)
+        stack.enter_context(memory.within(config.budget))
+        require_executor(config)
         _set_variant(config)
         bar = stack.enter_context(Progress(progress))
         bar.say("preparing")
@@ -142,9 +146,10 @@ def _states(
         require_stages(problem, config)
         for note in problem.notes:
             bar.note(note)
-        run = _run(problem, config, problem.integrator, config.integrator)
+        crew = stack.enter_context(crew_of(config, job.base, problem, bar.remark, bar.status))
+        run = _run(problem, config, problem.integrator, config.integrator, crew)
         if problem.rival is not None and config.rival is not None:
-            run.rival = _run(problem, config, problem.rival, config.rival)
+            run.rival = _run(problem, config, problem.rival, config.rival, crew, rival=True)
         if resumed is None:
             folder, before = _begun(output, job, problem, run)
             stack.callback(folder.lock.close)
@@ -183,13 +188,20 @@ def _states(
             after = render_views(problem, config, run.values)
             theirs = render_views(problem, config, run.rival.values) if run.rival else {}
         outcome = outcome_of(job, folder.path, problem, run, before, after, theirs)
-        folder.write(result_files(outcome, previews.finished(after)))
+        files = result_files(outcome, previews.finished(after))
+        problem.album.rest()
+        folder.write(files)
         return result_of(outcome, stop.by)
 
 
-def _run(problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin) -> Run:
-    """A run that begins, by an integrator, which is made of that plugin."""
+def _run(
+    problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin, crew: Crew | None, rival: bool = False
+) -> Run:
+    """A run that begins, by an integrator, which is made of that plugin; in this process, if there is no crew."""
     record = not config.deterministic
+    if crew is not None:
+        executor = RayExecutor(crew, [view.name for view in problem.views], rival)
+        return new_run(problem, integrator, record, config.optimizer, executor=executor)
     staged = None if config.stages is None else Staged(problem, config, integrator, plugin, record)
     return new_run(problem, integrator, record, config.optimizer, staged)
 
@@ -224,7 +236,7 @@ def computing(config: Config) -> Iterator[None]:
 def _set_variant(config: Config) -> None:
     with undisturbed():
         variant = backend.set_variant(config.variant)
-    if config.deterministic and not variant.startswith("llvm"):
+    if config.deterministic and not device_of(variant).keeps_order:
         raise PathreplayError(
             f"deterministic = true needs an LLVM variant, this is '{variant}': on a GPU the order of additions "
             "is random; set variant = 'llvm_ad_rgb', or leave 'deterministic' out"

@@ -12,6 +12,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import limits
+from pathreplay.inverse.album import Album
 from pathreplay.inverse.background import background
 from pathreplay.inverse.config import TARGET, Config
 from pathreplay.inverse.grids import comparable
@@ -72,7 +73,7 @@ def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> d
     return {k: value for k, value in found.items() if comparable(value.shape, parameters.get_array(seen(own, k)).shape)}
 
 
-def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -> dict[str, Image]:
+def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], album: Album) -> dict[str, Image]:
     integrator = load_integrator(config.target.integrator.model_dump())
     if len(scene.sensors()) <= max(sensors.values()):
         raise PathreplayError(
@@ -85,7 +86,9 @@ def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int]) -
         with told(f"Integrator '{config.target.integrator.type}' cannot render the target of sensor '{name}'"):
             image = mi.render(scene, sensor=index, integrator=integrator, spp=config.target.spp, seed=mi.UInt32(seed))
             targets[name] = np.array(image, dtype=np.float32)
+            del image
         require_finite_array(f"Target picture of sensor '{name}'", targets[name])
+        targets[name] = album.keep(targets[name])
     return targets
 
 
@@ -99,6 +102,7 @@ def read_targets(
     resize: bool = False,
     lenses: Mapping[str, Lens] = MappingProxyType({}),
     hidden: bool = False,
+    album: Album,
 ) -> tuple[Targets, tuple[str, ...]]:
     """Pictures by view (and weights, with ``alpha`` = 'mask' or a lens) from files by view, and what is to be said.
 
@@ -130,7 +134,9 @@ def read_targets(
             image = unpremultiplied(image)
         elif alpha == "scene" and not hidden:
             image = over(image, background(scene, sensors[name]))
-        targets[name] = adapted_image(what, image, f"sensor '{name}' renders", shape[2])
+        targets[name] = album.keep(adapted_image(what, image, f"sensor '{name}' renders", shape[2]))
+        if name in weights:
+            weights[name] = album.keep(weights[name])
         share = transparent_share(image)
         if share and shape[2] in (1, 3) and alpha == "black":
             notes.append(

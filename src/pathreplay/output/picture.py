@@ -18,6 +18,7 @@ from pathreplay import memory
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.images import Image, png_bytes
 from pathreplay.render.film import MOST_SAMPLES, require_film
+from pathreplay.render.parts import rounded, split
 from pathreplay.scenes.descriptions import told
 
 # Samples of a pass: some seconds, so that a bar moves and a Ctrl-C is heard. Only where samples do not know each other.
@@ -91,14 +92,9 @@ def passes(sensor: mi.Sensor, spp: int) -> list[int]:
     require_film(sensor, f"sensor '{sensor.id()}'", {})
     pixels = math.prod(int(n) for n in sensor.film().crop_size())
     most = max(1, min(MOST_SAMPLES, memory.available() // 2 // _A_SAMPLE) // pixels)
-    if sensor.sampler().class_name() == "IndependentSampler":
-        most = min(most, max(1, _A_PASS // pixels))
-        count = math.ceil(spp / most)
-        return [spp // count + (i < spp % count) for i in range(count)]
-    if spp <= most:
-        return [spp]
-    each = 4 ** int(math.log(most, 4))
-    return [each] * math.ceil(spp / each)
+    sampler = sensor.sampler()
+    alone = sampler.class_name() == "IndependentSampler"
+    return split(sampler, spp, min(most, max(1, _A_PASS // pixels)) if alone else most)
 
 
 def render(
@@ -115,7 +111,7 @@ def render(
         number = seed if i == 0 else int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
         with dr.suspend_grad(), told("The scene cannot be rendered"):
             image = mi.render(scene, sensor=sensor, integrator=integrator, spp=count, seed=number)
-            taken = _rounded(sensor.sampler(), count)
+            taken = rounded(sensor.sampler(), count)
             total = total + np.array(image, np.float64) * taken
         done += taken
         if tell:
@@ -125,13 +121,6 @@ def render(
     picture = picture[:, :, None] if picture.ndim == 2 else picture
     # Of integrators that give AOVs alone the picture has no colours, and the film has.
     return Rendering(picture, names[len(names) - picture.shape[2] :], done)
-
-
-def _rounded(sampler: mi.Sampler, count: int) -> int:
-    """The samples per pixel that a sampler takes where it is asked for so many."""
-    copy = sampler.clone()  # integrators differ in whether they tell the sensor's own
-    copy.set_sample_count(count)
-    return int(copy.sample_count())
 
 
 def file_bytes(rendering: Rendering, ending: str) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -21,6 +22,7 @@ from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 from .camera_pass import Pass
+from .film import MOST_SAMPLES
 from .places import FilmPlaces
 from .term import Found
 
@@ -80,7 +82,7 @@ class Boundary:
             )
         if walk.media is None:  # there boundaries that move are no vertices, and paths pass them unseen
             walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
-        lines = max(int(places.size.x) * int(places.size.y) * (self.spp or view.spp), 1)
+        lines = lines_of(view, places, self.spp)
         seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
         if self.film:
             yield film_edges(walk, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
@@ -88,6 +90,18 @@ class Boundary:
                 yield beam_edges(walk, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
         if self.inner:
             yield inner_edges(walk, places, lines, max(lines // INNER_CLOSER, 1), seed ^ 0x5EED, INNER_LENGTHS)
+
+
+def lines_of(view: Pass, places: FilmPlaces, spp: int) -> int:
+    """How many lines look for edges: ``spp`` per pixel in the whole pass, or as many as samples (0)."""
+    pixels = int(places.size.x) * int(places.size.y)
+    lines = pixels * (math.ceil(spp * view.share) if spp else view.spp)
+    if lines > MOST_SAMPLES:
+        raise PathreplayError(
+            f"edge_spp = {spp} with a film of {pixels} pixels are {lines} lines, beyond the {MOST_SAMPLES} that Dr.Jit "
+            f"takes at once; take edge_spp up to {MOST_SAMPLES // pixels}, or 0"
+        )
+    return max(lines, 1)
 
 
 def _moves(walk: Walk, places: FilmPlaces) -> bool:

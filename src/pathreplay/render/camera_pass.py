@@ -42,6 +42,7 @@ class Pass:
     sensor: mi.Sensor
     seed: Seed
     spp: int = 0
+    share: float = 1.0  # of a larger pass, whose part this is: see `parts`
 
     @staticmethod
     def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Pass:

@@ -129,7 +129,9 @@ class PathReplayIntegrator(PathIntegrator):
         Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
         number of samples does not, or a tensor has another shape.
         """
-        with self._passing(scene, sensor, seed, spp) as view, dr.isolate_grad():
+        self._require_active(scene)
+        view = Pass.of(scene, sensor, seed, spp)
+        with self._passing(), dr.isolate_grad():
             loss = pixel_loss(view, self.max_depth, offset, slope)
             walk = self._walk(scene, view.sensor)
             self._learned(view, walk)
@@ -141,7 +143,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
         """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
-        for doubt in doubts(walk):
+        for doubt in filter(None, (*doubts(walk), self.interior.note(walk))):
             self._tell_once(doubt)
         if walk.media is None:
             return None

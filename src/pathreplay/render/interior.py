@@ -8,6 +8,7 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
+from ..device import device_of
 from ..gradient.adjoint import LostPaths
 from ..gradient.baseline import FIRST_BRANCHING, Baseline, Seen
 from ..gradient.driver import Driver, ForwardDriver
@@ -16,7 +17,7 @@ from ..gradient.lights import lights_or
 from ..gradient.pixel_sweep import PixelLoss, pixel_sweep
 from ..gradient.primal import primal
 from ..gradient.ray_jacobian import Recovery
-from ..gradient.record import deepest
+from ..gradient.record import deepest, footprint
 from ..gradient.replay import replay
 from ..gradient.sweep import sweep
 from ..transport.vertex import Walk
@@ -92,6 +93,17 @@ class PathReplay:
     def _or_lights(self, driver: Driver) -> Driver:
         """The driver, where one was asked for; else one of its own where only lights have gradients."""
         return lights_or(driver) if self.auto else driver
+
+    def note(self, walk: Walk) -> str:
+        """What is to be said of the driver that was chosen; "" if it is nothing."""
+        device = device_of(mi.variant())
+        if self._sweeps(walk) or self.driver == "replay" or not device.is_gpu:
+            return ""
+        size, most, name = footprint(walk, device) / 1e9, deepest(walk, device), device.name or "the GPU"
+        return (
+            f"records of {walk.max_depth} vertices would take {size:.3g} GB of the memory of {name}: paths are "
+            f"walked twice instead (driver = 'replay'); up to max_depth = {most} they are recorded"
+        )
 
     def _sweeps(self, walk: Walk) -> bool:
         return self.driver == "sweep" and not (self.auto and walk.max_depth > deepest(walk))

@@ -22,10 +22,20 @@ from ..transport.vertex import Walk
 from .camera_pass import Pass, Seed, Which
 from .facts import SceneFacts
 from .interior import image
+from .parts import Sums, parts
 from .properties import flag, whole_number
 from .term import Found, Term
 
 UNBOUNDED = 0xFFFFFFFF
+
+
+def _sum(total: Any, image: Any, share: float) -> Any:
+    """Images added up by the shares of their passes, each computed before the next begins; one alone as it is."""
+    if share == 1:
+        return image
+    total = image * share if total is None else total + image * share
+    dr.eval(total)
+    return total
 
 
 @contextmanager
@@ -106,8 +116,11 @@ class PathIntegrator:
         """Render an image: see Mitsuba's ADIntegrator. Nothing is differentiated: use `mi.render` for that."""
         if not develop:
             raise PathreplayError(f"{self.name}: develop = False is not supported: leave it out")
-        with self._passing(scene, sensor, seed, spp) as view:
-            return image(view, self._walk(scene, view.sensor))
+        made = None
+        for part in self._parts(scene, sensor, seed, spp):
+            with self._passing():
+                made = _sum(made, image(part, self._walk(scene, part.sensor)), part.share)
+        return made
 
     def render_forward(
         self, scene: mi.Scene, params: object, sensor: Which = 0, seed: Seed = 0, spp: int = 0
@@ -117,12 +130,15 @@ class PathIntegrator:
         The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
         from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
         """
-        with self._passing(scene, sensor, seed, spp) as view:
-            walk = self._walk(scene, view.sensor)
-            learned = self._learned(view, walk)
-            found = reduce(add, [term.forward(view, walk, learned) for term in self.terms])
-        self._told(view, walk, found)
-        return found.image
+        tangent = None
+        for part in self._parts(scene, sensor, seed, spp):
+            with self._passing():
+                walk = self._walk(scene, part.sensor)
+                learned = self._learned(part, walk)
+                found = reduce(add, [term.forward(part, walk, learned) for term in self.terms])
+                tangent = _sum(tangent, found.image, part.share)
+            self._told(part, walk, found)
+        return tangent
 
     def render_backward(
         self, scene: mi.Scene, params: object, grad_in: mi.TensorXf, sensor: Which = 0, seed: Seed = 0, spp: int = 0
@@ -132,11 +148,19 @@ class PathIntegrator:
         Warns of what terms tell: a part of the gradient was not finite and had to be left out, edges move.
         """
         # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
-        with self._passing(scene, sensor, seed, spp) as view, dr.isolate_grad():
-            walk = self._walk(scene, view.sensor)
-            learned = self._learned(view, walk)
-            found = reduce(add, [term.backward(view, walk, grad_in, learned) for term in self.terms])
-        self._told(view, walk, found)
+        of_parts = self._parts(scene, sensor, seed, spp)
+        sums = Sums(scene) if len(of_parts) > 1 else None
+        for part in of_parts:
+            with self._passing(), dr.isolate_grad():
+                walk = self._walk(scene, part.sensor)
+                learned = self._learned(part, walk)
+                wanted = grad_in if part.share == 1 else grad_in * part.share
+                found = reduce(add, [term.backward(part, walk, wanted, learned) for term in self.terms])
+            self._told(part, walk, found)
+            if sums is not None:
+                sums.take()
+        if sums is not None:
+            sums.give()
 
     def sample(
         self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool = True, **_: Any
@@ -156,16 +180,24 @@ class PathIntegrator:
     def _told(self, view: Pass, walk: Walk, found: Found) -> None:
         """What is done with what terms have found."""
 
-    @contextmanager
-    def _passing(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Iterator[Pass]:
-        """The pass under way, in which nothing is differentiated but what asks for it: see `careful`, too."""
+    def _parts(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> list[Pass]:
+        """The pass that is asked for, in parts where its samples are too many for one: see `parts`."""
+        self._require_active(scene)
+        return parts(Pass.of(scene, sensor, seed, spp))
+
+    def _require_active(self, scene: mi.Scene) -> None:
+        """Raise PathreplayError if scene or integrator are none of the active variant."""
         if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
             raise PathreplayError(
                 f"{self.name}: scene or integrator belongs to another variant than the active one, "
                 f"{mi.variant()!r}: load it anew, or set its variant"
             )
+
+    @contextmanager
+    def _passing(self) -> Iterator[None]:
+        """A pass is under way, in which nothing is differentiated but what asks for it: see `careful`, too."""
         with careful(), dr.suspend_grad():
-            yield Pass.of(scene, sensor, seed, spp)
+            yield
 
     def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> Walk:
         """How the scene is walked through; the sensor may be in a medium."""

@@ -7,15 +7,16 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
+from ..device import device_of
 from ..errors import PathreplayError
 from ..gradient.pixel_sweep import PixelLoss
-from ..gradient.record import MAX_DEPTH
+from ..gradient.record import LARGEST_RECORD, MAX_DEPTH
 from .camera_pass import Pass
 
 
 def _fits(max_depth: int, spp: int) -> bool:
     """Whether there are two paths or more, and the record of a lane can hold all of them."""
-    return 1 < spp <= MAX_DEPTH // max(max_depth, 1)
+    return 1 < spp <= device_of(mi.variant()).most_records(LARGEST_RECORD, MAX_DEPTH) // max(max_depth, 1)
 
 
 def sweepable(sensor: mi.Sensor, max_depth: int, spp: int) -> bool:

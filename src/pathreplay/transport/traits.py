@@ -63,6 +63,7 @@ class Traits:
     area_lights: bool  # there are emitters with an edge
     hard_lights: bool  # there are emitters whose shadows are hard
     mesh_lights: bool  # there are meshes that emit
+    ball_lights: bool  # there are spheres that emit
     coarse_meshes: bool  # there are meshes that are shaded as if they were smooth, and are not: see `is_coarse`
     painted_meshes: bool  # there are meshes that emit, with a texture
     two_sides: bool  # a surface may have another BSDF on its back
@@ -99,6 +100,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         mesh_lights=any(_ball(lamp)[3] > 0 for lamp in _mesh_lamps(shapes)),
+        ball_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
         coarse_meshes=any(is_coarse(shape) for shape in shapes if shape.is_mesh()),
         painted_meshes=any(is_painted(lamp.emitter()) for lamp in _mesh_lamps(shapes)),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),

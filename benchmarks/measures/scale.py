@@ -1,0 +1,96 @@
+"""What grows with a job: the memory of whole runs of many views and large textures, and sums of very many samples."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pathreplay.inverse import iterate, make_config
+from pathreplay.inverse.images import exr_bytes
+
+from .job import Job, Measure
+from .passes import Pass
+
+_NAME = re.compile(r"(\d+) views?, (\d+) x (\d+) texels(?:, memory (.*))?")
+ITERATIONS = 3
+_VIEW = """<sensor type="perspective" id="v{i}"><float name="fov" value="40"/>
+<transform name="to_world"><lookat origin="{x}, 0.1, 4" target="0, 0, 0" up="0, 1, 0"/></transform>
+<film type="hdrfilm"><integer name="width" value="{side}"/><integer name="height" value="{side}"/>
+<rfilter type="box"/><string name="pixel_format" value="rgb"/></film></sensor>"""
+_SCENE = """<scene version="3.0.0">{views}<emitter type="constant"/><shape type="rectangle" id="wall">
+<bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="start.exr"/>
+<boolean name="raw" value="true"/></texture></bsdf></shape></scene>"""
+
+
+def name_of(views: int, texels: int, memory: str = "") -> str:
+    """The name of a job of so many views and texels along each side of a grey texture, with that budget."""
+    return f"{views} view{'s' if views > 1 else ''}, {texels} x {texels} texels" + (f", memory {memory}" * bool(memory))
+
+
+def _peak_since() -> float:
+    """Largest resident size (MiB) since this was asked for the last time; on Linux, elsewhere nothing is known."""
+    status, refs = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    if not status.exists():
+        return float("nan")
+    peak = int(status.read_text().split("VmHWM:")[1].split()[0]) / 1024
+    refs.write_text("5")
+    return peak
+
+
+class WholeRun(Measure):
+    """`pathreplay optimize` from beginning to end, previews, checkpoint and report included."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        found = _NAME.fullmatch(job.scene)
+        assert found is not None
+        self.views, self.texels, self.memory = int(found[1]), int(found[2]), found[4]
+        self.peaks: list[float] = []
+
+    def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
+        """Seconds, and the last loss."""
+        begun = time.perf_counter()
+        with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR") or "/var/tmp") as folder:
+            session = iterate(make_config(self._written(Path(folder))), output=Path(folder) / "run")
+            for state in session:
+                self.peaks.append(_peak_since())
+                loss = state.loss
+            self.peaks.append(_peak_since())
+            return time.perf_counter() - begun, np.array([loss])
+
+    def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
+        """The peaks (MiB) until the first step was done, of each later one, and while the end was written."""
+        return {name: {"values": tuple(self.peaks)} for name in kept}
+
+    def _written(self, folder: Path) -> dict[str, Any]:
+        """Scene, pictures and the job itself. The texture is refined to its size at once, so that none is read."""
+        side = self.job.resolution
+        views = "".join(_VIEW.format(i=i, x=0.02 * i - 1, side=side) for i in range(self.views))
+        (folder / "scene.xml").write_text(_SCENE.format(views=views))
+        (folder / "start.exr").write_bytes(exr_bytes(np.full((16, 16, 1), 0.5, np.float32)))
+        (folder / "target.exr").write_bytes(exr_bytes(np.full((side, side, 3), 0.3, np.float32)))
+        wall = {"key": "wall.bsdf.reflectance.data", "lower": 0.0, "upper": 1.0, "resolutions": [self.texels]}
+        return {
+            "scene": str(folder / "scene.xml"),
+            "iterations": ITERATIONS,
+            "spp": self.job.spp,
+            "picture_spp": self.job.spp,
+            "integrator": {"type": "pathreplay", **self.job.limits},
+            "parameters": [wall],
+            "target": {"images": [str(folder / "target.exr")] * self.views},
+            **({"memory": self.memory} if self.memory else {}),
+        }
+
+
+class Sum(Pass):
+    """Gradient passes under an even sky: how far the sum over all samples is off."""
+
+    def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
+        """The largest error of a channel, relative to what is right: a third of the image's mean by each."""
+        return {name: {"mean": float(np.abs(np.stack(rows) * 3 - 1).max())} for name, rows in kept.items() if rows}

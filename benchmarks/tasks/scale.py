@@ -1,0 +1,119 @@
+"""Task `scale`: memory against views, parameters and samples, and time against shapes."""
+
+from __future__ import annotations
+
+import statistics as st
+from dataclasses import replace
+
+from ..measures.job import Job, Point, Record
+from ..measures.scale import name_of
+from ..scenes.wide import COLOUR, SHAPES, SKY, shapes_name
+from ..tables import comparison, groups, markdown, method_cell
+
+TITLE = "scale"
+TAKES = (60, 900)
+VIEWS, TEXELS = (1, 50, 200), (100, 1000, 3162, 10000)
+QUICK_VIEWS, QUICK_TEXELS = (1, 4), (100, 500)
+BUDGET = "4 GiB"
+SAMPLES = (20, 24, 28, 32, 33)
+BYTES = 12
+"""Of a parameter and what Adam remembers of it."""
+
+
+def jobs(quick: bool) -> list[Job]:
+    """Each whole run in a process of its own; shapes by `prb` and by us in turn."""
+    run = Job(
+        scene="",
+        parameters=("wall.bsdf.reflectance.data",),
+        methods=("optimize",),
+        max_depth=2,
+        rr_depth=5,
+        resolution=32 if quick else 128,
+        spp=4,
+        rounds=1,
+        warm_up=0,
+        measure="whole run",
+    )
+    views = [replace(run, scene=name_of(n, 100)) for n in (QUICK_VIEWS if quick else VIEWS)]
+    texels = [replace(run, scene=name_of(2, n), resolution=32) for n in (QUICK_TEXELS if quick else TEXELS)]
+    both = [] if quick else [replace(run, scene=name_of(200, 10000, BUDGET), resolution=128)]
+    sums = [
+        replace(
+            run, scene="even sky", parameters=(SKY,), methods=(method,), resolution=64, spp=2 ** (n - 12), measure="sum"
+        )
+        for n in (SAMPLES[:2] if quick else SAMPLES)
+        for method in ("prb", "sweep")
+    ]
+    shapes = [
+        replace(
+            run, scene=shapes_name(n), parameters=(COLOUR,), methods=("prb", "sweep"), max_depth=4, resolution=32,
+            spp=16, rounds=2 if n == SHAPES[-1] or quick else 5, warm_up=1, measure="gradient",
+        )
+        for n in (SHAPES[:2] if quick else SHAPES)
+    ]  # fmt: skip
+    return [*views, *texels, *both, *sums, *shapes]
+
+
+def table(record: Record) -> str:
+    """Memory of whole runs, of passes of many samples with the error of their sum, and time of many shapes."""
+    runs = [p for p in record.points if p.measure == "whole run"]
+    sums = [p for p in record.points if p.measure == "sum"]
+    shapes = [p for p in record.points if p.measure == "gradient"]
+    return "\n\n".join(part for part in (_runs(runs), _sums(sums), _shapes(shapes)) if part)
+
+
+def _runs(points: list[Point]) -> str:
+    if not points:
+        return ""
+    least = min((max(p.values) for p in points if p.values), default=0.0)
+    rows = []
+    for point in points:
+        if point.error or not point.values:
+            rows.append([point.scene, str(point.paths), point.error or "", "", "", ""])
+            continue
+        texels = int(point.scene.split(", ")[1].split(" ")[0]) ** 2
+        views = int(point.scene.split(" ")[0])
+        pixels = point.paths // 4 * views
+        more = (max(point.values) - least) * 2**20
+        rows.append(
+            [
+                point.scene,
+                f"{pixels / 1e6:.2f}",
+                f"{st.median(point.seconds):.0f}",
+                " ".join(f"{peak:.0f}" for peak in point.values),
+                f"{more / pixels:.0f}" if views > 2 else "",
+                f"{more / texels / BYTES:.2f}" if texels >= 10**6 else "",
+            ]
+        )
+    head = [
+        "job",
+        "million pixels of all views",
+        "seconds",
+        "peak MiB: first step, later ones, end",
+        "bytes a pixel",
+        "x (values + Adam's state)",
+    ]
+    return markdown(head, rows)
+
+
+def _sums(points: list[Point]) -> str:
+    rows = []
+    for point in points:
+        samples = f"2^{point.paths.bit_length() - 1}"
+        if point.error:
+            rows.append([samples, point.method, point.error[:90], "", ""])
+            continue
+        rows.append(
+            [samples, point.method, f"{point.seconds[0]:.1f}", f"{point.peak_mib or 0:.0f}", f"{point.mean or 0:.1e}"]
+        )
+    head = ["samples of one gradient pass", "method", "seconds", "peak MiB", "error of the sum"]
+    return markdown(head, rows) if rows else ""
+
+
+def _shapes(points: list[Point]) -> str:
+    rows = [
+        [point.scene, method_cell(point), *comparison(point, methods.get("prb"))[:2]]
+        for methods in groups(points).values()
+        for point in methods.values()
+    ]
+    return markdown(["shapes and BSDFs", "method", "seconds (median)", "time / prb"], rows) if rows else ""

@@ -1,0 +1,131 @@
+"""What is decided by the device that kernels run on, held against devices that are made up: no GPU is needed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from media_scenes import cloud, heterogeneous, smooth
+from pathreplay import PathreplayError, device
+from pathreplay.device import Device
+from pathreplay.gradient import record
+from pathreplay.gradient.record import LARGEST_RECORD, Layout, deepest, footprint, largest_record, record_type
+from pathreplay.render import interior, pixels
+
+H100 = Device("cuda", "NVIDIA H100 80GB HBM3", 2048 * 132, 80 * 10**9)
+LAPTOP = Device("cuda", "GeForce", 1536 * 20, 4 * 10**9)
+UNKNOWN, PROCESSOR = Device("cuda"), Device("llvm")
+KEY = "ball.bsdf.reflectance.value"
+
+
+def room() -> mi.Scene:
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    look = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "light": {"type": "constant"},
+            "sensor": {"type": "perspective", "to_world": look, "film": film},
+            "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}},
+        }
+    )
+
+
+def walk_of(scene: mi.Scene, max_depth: int = 6) -> Any:
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": max_depth})
+    return integrator._walk(scene, scene.sensors()[0])
+
+
+@pytest.fixture
+def pretend(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Makes the kernels' device one that is made up."""
+
+    def be(made_up: Device) -> None:
+        for module in (record, interior, pixels):
+            monkeypatch.setattr(module, "device_of", lambda variant: made_up)
+
+    return be
+
+
+@pytest.mark.parametrize("media", [False, True])
+def test_the_size_of_a_record_is_that_of_its_type(media: bool) -> None:
+    walk = walk_of(mi.load_dict(cloud(heterogeneous(smooth(0.5, 3), 0.8))) if media else room())
+    sizes = []
+    for moves in (False, True):
+        kind = record_type(Layout.of(walk, moves))
+        blank = {name: dr.zeros(field.type) for name, field in kind.__dataclass_fields__.items()}
+        sizes.append(sum(4 * len(np.ravel(np.array(value))) for value in blank.values()))
+    print(f"{sizes} bytes a vertex")
+    assert largest_record(walk) == max(sizes) <= (210 if media else LARGEST_RECORD)
+
+
+def test_footprints_are_those_of_all_resident_threads() -> None:
+    """The figures of the docs: 0.27 GB at depth 8, 69 GB at depth 2048, on 132 multiprocessors."""
+    walk = walk_of(room(), 2048)
+    assert footprint(walk, H100) == largest_record(walk) * 2048 * H100.lanes
+    assert round(footprint(walk, H100) / 1e9) == 69 and round(footprint(walk_of(room(), 8), H100) / 1e9, 2) == 0.27
+    assert footprint(walk, PROCESSOR) == 0
+
+
+@pytest.mark.parametrize(
+    ("made_up", "media", "told"), [(H100, False, 596), (H100, True, 173), (LAPTOP, False, 262), (LAPTOP, True, 74)]
+)
+def test_the_deepest_sweep_is_the_last_that_keeps_its_share(made_up: Device, media: bool, told: int) -> None:
+    """Depths that the docs tell."""
+    scene = mi.load_dict(cloud(heterogeneous(smooth(0.5, 3), 0.8))) if media else room()
+    most = deepest(walk_of(scene), made_up)
+    share = device.SHARE * made_up.memory
+    assert most == told < deepest(walk_of(scene), PROCESSOR)
+    assert footprint(walk_of(scene, most), made_up) <= share < footprint(walk_of(scene, most + 1), made_up)
+
+
+def test_what_cannot_be_asked_has_the_limits_of_a_processor() -> None:
+    walk = walk_of(room())
+    assert deepest(walk, UNKNOWN) == deepest(walk, PROCESSOR) == record.MAX_DEPTH
+    assert PROCESSOR.keeps_order and not H100.keeps_order
+
+
+def gradient(integrator: mi.Integrator) -> np.ndarray:
+    scene = room()
+    params = mi.traverse(scene)
+    dr.enable_grad(params[KEY])
+    params.update()
+    integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (4, 4, 3)), seed=3, spp=16)
+    return np.array(dr.grad(params[KEY])).ravel()
+
+
+def test_auto_walks_twice_where_records_would_take_too_much_and_says_so_once(
+    pretend: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
+    recorded = gradient(mi.load_dict({"type": "pathreplay", "max_depth": 1500}))
+    pretend(H100)
+    capfd.readouterr()
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": 1500})
+    np.testing.assert_allclose(gradient(ours), recorded, rtol=1e-4)
+    np.testing.assert_allclose(gradient(ours), recorded, rtol=1e-4)
+    told = capfd.readouterr().out
+    assert told.count("paths are walked twice instead") == 1
+    assert "records of 1500 vertices would take" in told and "GB of the memory of NVIDIA H100" in told
+    most = deepest(walk_of(room()), H100)
+    assert f"up to max_depth = {most} they are recorded" in told
+    assert ours.interior._sweeps(walk_of(room(), most)) and not ours.interior._sweeps(walk_of(room(), most + 1))
+
+
+def test_what_must_be_recorded_is_refused_before_anything_is_launched(pretend: Any) -> None:
+    pretend(LAPTOP)
+    most = deepest(walk_of(room()), LAPTOP)
+    with pytest.raises(PathreplayError, match=rf"more than the sweep driver can hold \({most}\)"):
+        gradient(mi.load_dict({"type": "pathreplay", "max_depth": 1500, "driver": "sweep"}))
+
+
+def test_pixels_are_swept_where_a_lane_holds_their_paths(pretend: Any) -> None:
+    scene, ours = room(), mi.load_dict({"type": "pathreplay", "max_depth": 8})
+    assert ours.sweeps_pixels(scene, 0, 128)
+    pretend(LAPTOP)
+    most = LAPTOP.most_records(LARGEST_RECORD, record.MAX_DEPTH) // 8
+    assert ours.sweeps_pixels(scene, 0, most) and not ours.sweeps_pixels(scene, 0, most + 1)
+    assert 1 < most < 128
