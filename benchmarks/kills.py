@@ -96,7 +96,7 @@ def _undisturbed(folder: Path) -> tuple[dict[str, Any], float, float]:
     made = time.perf_counter() - begin
     if trouble := _finish(process):
         raise SystemExit(f"the undisturbed run failed: {trouble}")
-    return _outcome(folder / "run"), made, time.perf_counter() - begin
+    return outcome(folder / "run"), made, time.perf_counter() - begin
 
 
 def _finish(process: subprocess.Popen[str]) -> str:
@@ -143,7 +143,7 @@ def _history(run: Path) -> list[Any]:
         return json.loads((file.metadata() or {})["history"])
 
 
-def _outcome(run: Path) -> dict[str, Any]:
+def outcome(run: Path) -> dict[str, Any]:
     """All that has to be the same: values, pictures, what goes into a checkpoint, and the history but for seconds."""
     tensors = safetensors.numpy.load_file(run / CHECKPOINT)
     lines = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
@@ -158,7 +158,7 @@ def _outcome(run: Path) -> dict[str, Any]:
 
 
 def _verdict(run: Path, whole: dict[str, Any], begin: str) -> str:
-    found = _outcome(run)
+    found = outcome(run)
     other = sorted(key for key in {*whole, *found} if whole.get(key) != found.get(key))
     return f"{begin}{SAME}" if not other else f"{begin}others in {', '.join(other[:3])}"
 

@@ -12,9 +12,13 @@ from .tasks import attached, depth, edges, iteration, media, surface, truth
 
 
 def _surface(record: Record) -> str:
-    """The sweep next to `prb`."""
-    rows = [[key.scene, str(v.time()), str(v.variance())] for key, v in _pairs(record, "sweep", "prb")]
-    return markdown(["gradient of a texture, sweep / prb", "time", "variance"], rows)
+    """The sweep next to `prb`, and what is done where only lights have gradients."""
+    rows = [
+        [f"{key.scene}, {surface.what(key.parameters)}", str(v.time()), str(v.variance())]
+        for ours in ("sweep", "default")
+        for key, v in _pairs(record, ours, "prb")
+    ]
+    return markdown(["gradient, pathreplay / prb", "time", "variance"], rows)
 
 
 def _attached(record: Record) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -13,6 +14,7 @@ import edge_scenes as scenes
 from pathreplay.gradient.centres import Centres
 from pathreplay.gradient.counted import key_of, quasi_random
 from pathreplay.gradient.crofton import Picked, PlaneLine, Sight, bisect, glance
+from pathreplay.gradient.lamps import sample_at
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.facts import SceneFacts
 from pathreplay.render.places import FilmPlaces
@@ -220,3 +222,17 @@ def test_passes_share_no_random_numbers() -> None:
     keys = [set(np.array(key_of(dr.arange(mi.UInt32, lanes), mi.UInt32(seed))).tolist()) for seed in (1, 2, 3)]
     assert all(len(each) > lanes - 4 for each in keys)
     assert len(set.union(*keys)) > 3 * lanes - 12
+
+
+def test_samples_of_a_ball_are_asked_for_on_a_disk() -> None:
+    """As many by area, and places that are close to each other have directions that are."""
+    walk: Any = SimpleNamespace(traits=SimpleNamespace(ball_lights=True))
+    lamp: Any = SimpleNamespace(around=mi.Bool(True))
+    x, y = dr.meshgrid(*2 * (dr.linspace(mi.Float, 0.005, 0.995, 100),))
+    u = sample_at(walk, lamp, mi.Point2f(x, y))
+    counts, *_ = np.histogram2d(*np.array(u), bins=4, range=((0, 1), (0, 1)))
+    assert counts.sum() == 10_000 and np.abs(counts - 625).max() < 40
+    close = [sample_at(walk, lamp, mi.Point2f(0.5 + d, 0.5)) for d in (-1e-3, 1e-3)]
+    there = [dr.sqrt(p.x) * mi.Point2f(dr.cos(dr.two_pi * p.y), dr.sin(dr.two_pi * p.y)) for p in close]
+    assert dr.all(dr.norm(there[1] - there[0]) < 1e-2)
+    assert dr.all(sample_at(walk, SimpleNamespace(around=mi.Bool(False)), close[0]).x == close[0].x)

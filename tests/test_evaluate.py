@@ -59,9 +59,7 @@ def test_shards_add_up_whatever_was_computed_before(kind: str) -> None:
         at_once = evaluate(values, both, known)
     assert all(np.abs(gradient).max() > 0 for gradient in first.gradients.values())
     assert early.loss != late.loss
-    if kind != "medium":  # there the second view of a shard knows what the first one has learned
-        assert bits(at_once) == bits(first)
-    np.testing.assert_allclose(at_once.loss, first.loss, rtol=1e-6)
+    assert bits(at_once) == bits(first)
 
 
 @pytest.mark.parametrize("kind", ["sweep", "medium"])

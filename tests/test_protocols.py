@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pathreplay import backend
-from pathreplay.inverse.evaluate import Evaluate, Evaluation, Executor, Local, Shard
+from pathreplay.inverse.evaluate import Evaluate, Evaluation, Executor, Local, Shard, total
 from pathreplay.inverse.optimiser import DrJitOptimiser, Optimiser
 from pathreplay.inverse.optimizer_options import Optimizer
 
@@ -120,10 +120,9 @@ def test_a_state_of_another_optimiser_is_refused() -> None:
 
 
 def counting(values: Mapping[str, np.ndarray], shard: Shard, learned: Mapping[str, np.ndarray], /) -> Evaluation:
-    """The view as loss; the seeds of all shards so far as what was learned."""
-    seen = np.concatenate([learned.get("seeds", np.zeros(0)), np.float64(shard.seeds)])
+    """The view as loss; what was known and the seed, added up, as what was learned."""
     gradients = {"a": values["a"] * shard.samples}
-    return Evaluation(float(shard.views[0]), gradients, {}, {"seeds": seen})
+    return Evaluation(float(shard.views[0]), gradients, {}, {"sum": learned["sum"] + np.float32(shard.seeds)})
 
 
 @pytest.mark.parametrize("make", EXECUTORS)
@@ -131,8 +130,9 @@ def test_an_executor_gives_results_in_the_order_of_the_shards(make: type[Local])
     evaluate: Evaluate = counting
     executor: Executor = make(evaluate)
     shards = [Shard((view,), 2 + view, (10 * view,)) for view in (3, 0, 2)]
-    found = executor.run({"a": np.float32([1, 2])}, shards, {"seeds": np.float64([7])})
+    found = executor.run({"a": np.float32([1, 2])}, shards, {"sum": np.float32([7])})
     assert [each.loss for each in found] == [3, 0, 2]
     assert [each.gradients["a"].tolist() for each in found] == [[5, 10], [2, 4], [4, 8]]
-    assert sorted(found[-1].learned["seeds"]) == [0, 7, 20, 30]
+    assert [each.learned["sum"].tolist() for each in found] == [[37], [7], [27]]  # none waits for another
+    assert total(found).learned["sum"].tolist() == [np.float32(71) / np.float32(3)]
     assert executor.run({"a": np.float32([1, 2])}, [], {}) == []

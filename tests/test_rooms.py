@@ -48,6 +48,7 @@ DRIVERS = {
     "replay": "gradient/replay.py",
     "replay_attached": "gradient/replay_attached.py",
     "pixel_sweep": "gradient/pixel_sweep.py",
+    "lights": "gradient/lights.py",
     "forward": "gradient/forward.py",
     "primal": "gradient/primal.py",
     "tape": "rivals/tape.py",

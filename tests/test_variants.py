@@ -176,6 +176,48 @@ def test_the_main_job_runs_in_every_variant(run_python, tmp_path, name: str) -> 
     assert all(verdict == "pass" for _, _, verdict, _ in checks), checks
 
 
+# A ball that moves hides a lamp and a sky, in the variant on the command line, with and without edges.
+EDGES_JOB = """
+import json, sys
+import pathreplay
+from pathreplay.backend import set_variant
+
+set_variant(sys.argv[1])
+import mitsuba as mi
+
+def colour(*rgb):
+    return {"type": "rgb", "value": list(rgb)}
+
+look_at = mi.ScalarTransform4f().look_at
+scene = mi.load_dict({
+    "type": "scene",
+    "camera": {"type": "perspective", "fov": 40, "to_world": look_at([0, 3, 5], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 12, "height": 10, "rfilter": {"type": "box"}}},
+    "ball": {"type": "sphere", "to_world": mi.ScalarTransform4f().translate([0.1, 0.3, 0]).scale(0.6),
+        "bsdf": {"type": "diffuse", "reflectance": colour(0.7, 0.3, 0.2)}},
+    "floor": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": colour(0.3, 0.5, 0.6)},
+        "to_world": mi.ScalarTransform4f().translate([0, -0.5, 0]).rotate([1, 0, 0], -90).scale(3)},
+    "lamp": {"type": "rectangle", "to_world": look_at([1, 3, 1], [0, 0, 0], [0, 0, 1]).scale(0.5),
+        "emitter": {"type": "area", "radiance": colour(9, 8, 6)}},
+    "sky": {"type": "constant", "radiance": colour(0.1, 0.2, 0.4)},
+}, optimize=False)
+for edges in ("all", "none"):
+    tested = {"type": "pathreplay", "max_depth": 3, "edges": edges}
+    check = pathreplay.check_gradient(scene, "ball.to_world", integrator=tested, seeds=16, spp=2048, step=0.02)
+    print()
+    print(json.dumps([edges, check.verdict, str(check)]))
+"""
+
+
+@pytest.mark.slow  # the quick tests hold edges to finite differences in one variant
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_edges_are_right_in_every_variant(run_python, variant: str) -> None:
+    done = run_python(EDGES_JOB, args=(variant,))
+    assert done.returncode == 0, done.stderr[-3000:]
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
+    assert [(edges, verdict) for edges, verdict, _ in lines] == [("all", "pass"), ("none", "fail")], lines
+
+
 def test_the_variants_here_are_all_that_there_are() -> None:
     import mitsuba as mi
 

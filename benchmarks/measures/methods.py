@@ -21,6 +21,7 @@ METHODS: dict[str, dict[str, object]] = {
     "volpath": {"type": "volpath"},
     "prbvolpath": {"type": "prbvolpath"},
     "score": {"type": "pathreplay"},
+    "default": {"type": "pathreplay"},
     "no branch": {"type": "pathreplay", "branch": False},
     "listing": {"type": "pathreplay_listing"},
 }

@@ -32,8 +32,7 @@ class Pass(SceneMeasure):
         Raises what the method raises.
         """
         integrator = self.integrator(method)
-        for key in self.job.parameters:
-            dr.clear_grad(self.params[key])
+        self.renew()
         self.counter.count = dr.zeros(mi.UInt32, 1)
         seconds, results = stopwatch(lambda: self._results(integrator, seed))
         if self.job.measure == "events":
@@ -50,7 +49,9 @@ class Pass(SceneMeasure):
         if job.measure not in ("gradient", "sum"):
             return [integrator.render(self.scene, seed=seed, spp=job.spp)]
         integrator.render_backward(self.scene, self.params, self.adjoint, seed=seed, spp=job.spp)
-        return [dr.grad(self.params[key]) for key in job.parameters]
+        dr.enqueue(dr.ADMode.Backward, [self.params[key] for key in job.parameters])
+        dr.traverse(dr.ADMode.Backward)
+        return [dr.grad(leaf) for leaf in self.leaves.values()]
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """What the gradients of all seeds say, by method: see `spread`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -22,10 +22,27 @@ class SceneMeasure:
         self.job = job
         self.scene = mi.load_dict(SCENES[job.scene](job.resolution), optimize=False)
         self.params = mi.traverse(self.scene)
-        for key in job.parameters:
-            dr.enable_grad(self.params[key])
-        self.params.update()
+        self.leaves: dict[str, Any] = {}
+        self.put(job.parameters)
+        # A scene computes the pixels of an environment from those that it is given: such a value is no leaf, and what
+        # leads back to the leaf is gone after a pass.
+        self.derived = [key for key in job.parameters if _ad(self.params[key]) != _ad(self.leaves[key])]
         self.integrators: dict[str, Any] = {}
+
+    def put(self, keys: Sequence[str]) -> None:
+        """Give the parameters leaves of their own, with gradients."""
+        for key in keys:
+            value = dr.detach(self.params[key])
+            self.leaves[key] = type(value)(value)
+            dr.enable_grad(self.leaves[key])  # first: the scene takes a copy
+            self.params[key] = self.leaves[key]
+        self.params.update()
+
+    def renew(self) -> None:
+        """Leave no gradients of earlier passes behind."""
+        self.put(self.derived)
+        for leaf in self.leaves.values():
+            dr.clear_grad(leaf)
 
     def integrator(self, name: str) -> Any:
         """The integrator of that name, made when it is first asked for; what it raises is raised each time."""
@@ -36,6 +53,11 @@ class SceneMeasure:
     def forget(self) -> None:
         """Make all integrators anew: what they have learned is gone."""
         self.integrators.clear()
+
+
+def _ad(value: Any) -> int | None:
+    """What Dr.Jit counts the variable of an array or a tensor as, None for other things."""
+    return getattr(getattr(value, "array", value), "index_ad", None)
 
 
 def stopwatch(run: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> tuple[float, Any]:

@@ -15,7 +15,7 @@ from ..measures.methods import RECORDED, TRACED
 from ..tables import comparison, markdown, method_cell
 
 TITLE = "edges"
-TAKES = (60, 600)
+TAKES = (60, 900)
 KEY = ("object.vertex_positions",)
 INNER, FILM = ("shadow", "silhouette", "ears"), ("black silhouette", "black ears")
 VERSUS = (
@@ -24,6 +24,8 @@ VERSUS = (
     ("projective inner", "inner edges alone"),
 )
 """What is compared with what that finds the same; the last the other way round, since it is many times as much."""
+ROUNDS = 60
+"""As many say a ratio of variances within a third."""
 STEPS = tuple(f"{name}, {way}" for name in ("prb", "all edges") for way in (TRACED, RECORDED))
 GUIDED = 120
 """Seconds after which `prb_projective` sits out, whose guiding takes most of them."""
@@ -48,7 +50,7 @@ def jobs(quick: bool) -> list[Job]:
             rr_depth=100,
             resolution=side,
             spp=16 if quick else 64,
-            rounds=4 if quick else 12 if patience else 24,
+            rounds=4 if quick else ROUNDS,
             warm_up=1 if patience else 2,
             patience=patience,
             measure="edges",

@@ -162,13 +162,17 @@ def optimize(
         list[str] | None,
         typer.Option("--define", "-D", metavar="KEY=VALUE", help="Change the job, as in -D spp=32; may be repeated."),
     ] = None,
+    executor: Annotated[
+        Literal["local", "ray"] | None,
+        typer.Option(help="Who computes: this process, or actors of Ray (default: as the job says)."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on the screen.")] = False,
 ) -> None:
     """Recover scene parameters from pictures; Ctrl-C or SIGTERM ends early with everything written."""
     with interrupts.undisturbed():  # what is half imported can bring the process down at its end
         from pathreplay.inverse import optimize as run_job
 
-    result = run_job(config, resume=resume, output=output, progress=not quiet, define=define or ())
+    result = run_job(config, resume=resume, output=output, progress=not quiet, define=define or (), executor=executor)
     typer.echo(result.describe())
 
 

@@ -167,27 +167,30 @@ def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> 
 
 def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sight:
     at = path.at
-    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
+    flags = mi.RayFlags.All if walk.traits.coarse_meshes else mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
+    si = at.hit.compute_surface_interaction(at.ray, flags, active)
     kind = dr.select(dr.dot(si.sh_frame.n, at.ray.d) > 0, mi.UInt32(1), 0)
     if walk.traits.coarse_meshes:
-        kind |= _below(walk, path, key, active)
+        kind |= _below(walk, path, si, key, active)
     return Sight(mixed(place_met(walk, at.hit, active), kind), si.p, si.n)
 
 
-def _below(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+def _below(walk: Walk, path: PathState, si: mi.SurfaceInteraction3f, key: mi.UInt32, active: mi.Bool) -> mi.UInt32:
     """Bits for the directions of light and lobe that are sampled there: their own triangle is in the way of them.
 
-    It is where shading and triangle are on different sides of a direction; their shape hides what is there.
+    It is where shading and triangle are on different sides of a direction; their shape hides what is there. What the
+    surface scatters nothing from changes nothing.
     """
-    u = Numbers.draw(Counted.at_vertex(key, path.depth))
-    light, si, lit = _light(walk, path.at, u.light, path.depth, active)
-    lobe, _ = si.bsdf().sample(mi.BSDFContext(), si, u.lobe, u.direction, active & si.is_valid())
+    u, ctx = Numbers.draw(Counted.at_vertex(key, path.depth)), mi.BSDFContext()
+    light, lit = _light(walk, si, u.light, path.depth, active)
+    lobe, weight = si.bsdf().sample(ctx, si, u.lobe, u.direction, active & si.is_valid())
 
     def blocked(d: mi.Vector3f) -> mi.Bool:
         return dr.dot(si.n, d) * dr.dot(si.sh_frame.n, d) < 0
 
-    to_light = dr.select(lit & blocked(light.d), mi.UInt32(2), 0)
-    return to_light | dr.select((lobe.pdf > 0) & blocked(si.to_world(lobe.wo)), mi.UInt32(4), 0)
+    f = si.bsdf().eval(ctx, si, si.to_local(light.d), lit)
+    to_light = dr.select(lit & dr.any(f != 0) & blocked(light.d), mi.UInt32(2), 0)
+    return to_light | dr.select(dr.any(weight != 0) & blocked(si.to_world(lobe.wo)), mi.UInt32(4), 0)
 
 
 def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
@@ -198,7 +201,8 @@ def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
 def _shade(walk: Walk, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Bool) -> Shade:
     """What is between the k-th vertex and the light that is sampled there, if that has no extent."""
     u = Numbers.draw(Counted.at_vertex(key, k)).light
-    light, si, lit = _light(walk, at, u, k, active)
+    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+    light, lit = _light(walk, si, u, k, active)
     ray = si.spawn_ray_to(light.p)
     hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, active=lit & light.delta)
     if walk.clear:
@@ -207,13 +211,12 @@ def _shade(walk: Walk, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Boo
 
 
 def _light(
-    walk: Walk, at: Arrival, u: mi.Point2f, k: mi.UInt32, active: mi.Bool
-) -> tuple[mi.DirectionSample3f, mi.SurfaceInteraction3f, mi.Bool]:
-    """The emitter sample of the k-th vertex, where that is, and whether there is any."""
-    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+    walk: Walk, si: mi.SurfaceInteraction3f, u: mi.Point2f, k: mi.UInt32, active: mi.Bool
+) -> tuple[mi.DirectionSample3f, mi.Bool]:
+    """The emitter sample of the k-th vertex, and whether there is any."""
     lit = active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < walk.max_depth)
     light, _ = draw_emitter(walk.scene, si, u, lit, visible=False)
-    return light, si, lit & (light.pdf != 0)
+    return light, lit & (light.pdf != 0)
 
 
 @dr.syntax

@@ -189,7 +189,7 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a.hidden, -1, 1)
     active &= dr.any(K != 0) & dr.all(dr.isfinite(K))
     u, u_lit = (line.at(dr.select(a.hidden, *ends)) for ends in ((found.a, found.b), (found.b, found.a)))
-    own = active & seer.parts(light.d, dark.ray.d)
+    own = active & seer.parts(light.d, dark.light.d)  # not that of the ray, which begins a little beside
     return Shaded(line, u, u_lit, lit, hit, dark.ray, edge_normal(hit, dark.ray, active), own, K, active)
 
 

@@ -1,8 +1,10 @@
 """What a vertex sees where it looks for an emitter: its light, or what hides it.
 
-Places are in a unit square. Of most emitters it is the square of their samples. Samples of meshes jump in theirs from
-triangle to triangle; so for these it is mapped, evenly, to the cone of directions around a ball that holds the mesh.
-What follows the emitter, the point that is glued to it, is the same in both.
+Places are in a unit square. Of most emitters it is the square of their samples. Samples of balls go around the middle
+of what is seen of them: there straight edges would be bent without bounds, and lines too long to tell; so these are
+mapped to a disk first, evenly. Samples of meshes jump in theirs from triangle to triangle; so for these it is mapped,
+evenly, to the cone of directions around a ball that holds the mesh. What follows the emitter, the point that is glued
+to it, is the same in both.
 """
 
 from __future__ import annotations
@@ -24,15 +26,19 @@ class Lamp:
     emitter: mi.EmitterPtr
     centre: mi.Point3f
     radius: mi.Float
+    around: mi.Bool  # its samples go around: see `sample_at`
 
     @staticmethod
     def of(walk: Walk, index: mi.UInt32, active: mi.Bool) -> Lamp:
         """The emitter of an index."""
         emitter = dr.gather(mi.EmitterPtr, walk.scene.emitters_dr(), index, active)
+        around = mi.Bool(False)
+        if walk.traits.ball_lights:
+            around = emitter.get_shape().shape_type() == int(mi.ShapeType.Sphere)
         if not walk.traits.mesh_lights:
-            return Lamp(emitter, mi.Point3f(0), mi.Float(0))
+            return Lamp(emitter, mi.Point3f(0), mi.Float(0), around)
         ball = dr.gather(mi.Vector4f, walk.traits.tables.lamp_balls, index, active)
-        return Lamp(emitter, mi.Point3f(ball.x, ball.y, ball.z), ball.w)
+        return Lamp(emitter, mi.Point3f(ball.x, ball.y, ball.z), ball.w, around)
 
 
 @dataclass
@@ -50,7 +56,7 @@ class Glimpse:
 def glimpse(walk: Walk, seer: Seer, lamp: Lamp, u: mi.Point2f, active: mi.Bool) -> Glimpse:
     """Look at a place of a lamp's square. Detached."""
     in_cone = active & (lamp.radius > 0)
-    light, Le = lamp.emitter.sample_direction(seer.origin, u, active & ~in_cone)
+    light, Le = lamp.emitter.sample_direction(seer.origin, sample_at(walk, lamp, u), active & ~in_cone)
     ray = seer.origin.spawn_ray_to(light.p)
     looks = active & (light.pdf != 0)
     if not walk.traits.mesh_lights:
@@ -79,6 +85,15 @@ def _hides(hit: mi.PreliminaryIntersection3f, emitter: mi.EmitterPtr, active: mi
     return active & hit.is_valid() & (hit.shape.emitter() != emitter)
 
 
+def sample_at(walk: Walk, lamp: Lamp, u: mi.Point2f) -> mi.Point2f:
+    """The sample of an emitter at a place; of a ball that at the place's distance and angle on the disk, as evenly."""
+    if not walk.traits.ball_lights:
+        return u
+    p = mi.warp.square_to_uniform_disk_concentric(u)
+    turn = dr.inv_two_pi * dr.atan2(p.y, p.x)
+    return dr.select(lamp.around, mi.Point2f(dr.squared_norm(p), turn - dr.floor(turn)), u)
+
+
 def direction(lamp: Lamp, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
     """A direction in the cone from o around the ball, and the solid angle of that; differentiable in u.
 
@@ -103,7 +118,7 @@ def followed(
     On a mesh the point that follows it is that which ``glue`` sees.
     """
     in_cone = active & (lamp.radius > 0)
-    light, _ = lamp.emitter.sample_direction(origin, u, active & ~in_cone)
+    light, _ = lamp.emitter.sample_direction(origin, sample_at(walk, lamp, u), active & ~in_cone)
     if not walk.traits.mesh_lights:
         return light.d
     d, _ = direction(lamp, origin.p, u)

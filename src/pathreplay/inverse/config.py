@@ -15,6 +15,7 @@ from pathreplay.files import MISSING, file_problem
 from pathreplay.inverse.capture_options import Capture, Exposure
 from pathreplay.inverse.config_errors import first_error
 from pathreplay.inverse.definitions import defined
+from pathreplay.inverse.executor_options import ExecutorName, RayOptions
 from pathreplay.inverse.memory_options import Memory, bytes_of
 from pathreplay.inverse.noise_options import AUTO, AutoSpp, Spp
 from pathreplay.inverse.optimizer_options import Optimizer
@@ -226,6 +227,9 @@ class Config(Table):
     preview: Preview = Preview()
     deterministic: Switch = False
     memory: Memory | None = None
+    executor: ExecutorName = "local"
+    sample_ranges: Count = 1
+    ray: RayOptions = RayOptions()
     output: str | None = None
 
     @property
@@ -248,6 +252,11 @@ class Config(Table):
     def halves_samples(self) -> bool:
         """Whether iterations take their samples in two halves, which tell signal from noise."""
         return self.signal_to_noise or self.spp == AUTO
+
+    @property
+    def parts(self) -> int:
+        """Shards of a view in an iteration: ranges of its samples, each in two halves where noise is measured."""
+        return self.sample_ranges * (2 if self.halves_samples else 1)
 
     def refine_at(self, entry: Parameter) -> list[int]:
         """The iterations at which the resolutions of a parameter after the first begin."""
@@ -281,6 +290,13 @@ class Config(Table):
             if self.signal_to_noise and stage.spp is not None and stage.spp % 2:
                 raise ValueError(
                     f"signal_to_noise takes two halves of the samples, and a stage has spp = {stage.spp}; make it even"
+                )
+        for spp in (self.auto_spp.lowest if self.spp == AUTO else self.spp, *(s.spp for s in self.stages or [])):
+            if spp is not None and self.sample_ranges > 1 and spp % self.parts:
+                halves = ", in two halves each" if self.halves_samples else ""
+                raise ValueError(
+                    f"sample_ranges = {self.sample_ranges} does not divide the {spp} samples per pixel{halves}; take "
+                    f"a multiple of {self.parts} for spp"
                 )
         return self
 
@@ -339,10 +355,9 @@ class Config(Table):
             )
         return self
 
-    def seeds(self, stream: int, sensor: int, iteration: int = 0) -> tuple[int, int]:
-        """Two independent 32-bit seeds; none is used for another stream, sensor or iteration."""
-        first, second = np.random.SeedSequence([self.seed, stream, iteration, sensor]).generate_state(2)
-        return int(first), int(second)
+    def seeds(self, stream: int, sensor: int, iteration: int = 0, count: int = 2) -> tuple[int, ...]:
+        """Independent 32-bit seeds, two by default; none is used for another stream, sensor or iteration."""
+        return tuple(np.random.SeedSequence([self.seed, stream, iteration, sensor]).generate_state(count).tolist())
 
 
 # Models of nested tables, by the name under which they appear in the file or in what pydantic tries.
@@ -357,6 +372,7 @@ _TABLES: dict[str, type[BaseModel]] = {
     "auto_spp": AutoSpp,
     "stages": Stage,
     "exposure": Exposure,
+    "ray": RayOptions,
 }
 
 

@@ -61,26 +61,48 @@ The values are those of all variables, as people see them; ``learned`` is what e
 """
 
 
-def total(evaluations: Iterable[Evaluation], share: float = 1.0, owned: bool = False) -> Evaluation:
-    """The sum, added up in the order given, times ``share``; what is known is what the last one knows.
+class Total:
+    """A sum of evaluations as they come, of which only the sum is held."""
 
-    Of what is made on the way, only the sum is held: gradients are added to it in place, to those of the first
-    evaluation, too, where these are ``owned`` and nobody wants them.
-    """
-    loss, sums = 0.0, dict[str, Array]()
-    dropped: Counter[str] = Counter()
-    learned: Arrays = {}
-    for n, each in enumerate(evaluations):
-        loss += each.loss
-        dropped += Counter(each.dropped)
-        learned = each.learned
+    def __init__(self, owned: bool = False) -> None:
+        self._owned, self._count, self._loss = owned, 0, 0.0
+        self._sums: dict[str, Array] = {}
+        self._known: dict[str, Array] = {}
+        self._dropped: Counter[str] = Counter()
+
+    def add(self, each: Evaluation) -> None:
+        """Add gradients in place, to those of the first evaluation, too, where these are ``owned`` by nobody else."""
         for key, gradient in each.gradients.items():
-            sums[key] = gradient if n == 0 else np.add(sums[key], gradient, out=sums[key] if owned else None)
-        owned |= n > 0
+            if self._count:
+                gradient = np.add(self._sums[key], gradient, out=self._sums[key] if self._owned else None)
+            self._sums[key] = gradient
+        for name, value in each.learned.items():
+            self._known[name] = np.add(self._known[name], value) if self._count else value
+        self._loss += each.loss
+        self._dropped += Counter(each.dropped)
+        self._owned |= self._count > 0
+        self._count += 1
+
+    def of(self, share: float = 1.0) -> Evaluation:
+        """The sum times ``share``; what is known is the mean of what each of them knows.
+
+        They began with the same knowledge, so that none had to wait for another.
+        """
+        sums, known = self._sums, self._known
+        if share != 1:
+            sums = {k: np.multiply(v, np.float32(share), out=v if self._owned else None) for k, v in sums.items()}
+        if self._count > 1:
+            known = {name: value / np.float32(self._count) for name, value in known.items()}
+        return Evaluation(self._loss * share, sums, dict(self._dropped), known)
+
+
+def total(evaluations: Iterable[Evaluation], share: float = 1.0, owned: bool = False) -> Evaluation:
+    """The sum, added up in the order given, times ``share``: see `Total`."""
+    found = Total(owned)
+    for each in evaluations:
+        found.add(each)
         del each
-    if share != 1:
-        sums = {key: np.multiply(sums[key], np.float32(share), out=sums[key] if owned else None) for key in sums}
-    return Evaluation(loss * share, sums, dict(dropped), learned)
+    return found.of(share)
 
 
 class Executor(Protocol):
@@ -90,11 +112,11 @@ class Executor(Protocol):
     """
 
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
-        """One evaluation for each shard, in their order; the last one has learned from all of them."""
+        """One evaluation for each shard, in their order; each begins with what was ``learned`` before all of them."""
 
 
 class Local:
-    """In this process, one after the other; each knows what those before it have learned.
+    """In this process, one after the other.
 
     Who asks for `each` has them as they come, and memory holds one gradient, however many shards there are.
     """
@@ -109,10 +131,7 @@ class Local:
     def each(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
         """One after the other."""
         for shard in shards:
-            found = self.evaluate(values, shard, learned)
-            learned = found.learned
-            yield found
-            del found
+            yield self.evaluate(values, shard, learned)
 
 
 def _taken(gradient: Any) -> Array:
@@ -166,9 +185,13 @@ class Evaluator:
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`. Raises what the integrator raises; warns as it does."""
-        self._know(learned)
-        each = zip(shard.views, shard.seeds, strict=True)
-        return total((self._view(values, view, seed, shard.samples) for view, seed in each), owned=True)
+
+        def each() -> Iterator[Evaluation]:
+            for view, seed in zip(shard.views, shard.seeds, strict=True):
+                self._know(learned)
+                yield self._view(values, view, seed, shard.samples)
+
+        return total(each(), owned=True)
 
     def _know(self, learned: Arrays) -> None:
         """Go on with what an evaluation has learned. Raises PathreplayError if it is none of this integrator's."""

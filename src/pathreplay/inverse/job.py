@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
-from pathreplay.errors import PathreplayError
+from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config import Config, load_config
+from pathreplay.inverse.executor_options import ExecutorName
 from pathreplay.inverse.result import RunResult
 from pathreplay.inverse.run_folder import Job, RunFolder, new_output, open_run_folder
 from pathreplay.inverse.session import Session
@@ -20,6 +23,7 @@ def optimize(
     output: str | Path | None = None,
     progress: bool = True,
     define: Sequence[str] = (),
+    executor: str | None = None,
 ) -> RunResult:
     """Recover the parameters that a job names, and write its run folder.
 
@@ -30,6 +34,7 @@ def optimize(
             exists, a number is appended: an earlier run is never touched.
         progress: draw a progress bar on stderr (lines, now and then, where that is no terminal).
         define: changes of what the file says, each ``KEY=VALUE`` (see docs/optimize.md).
+        executor: who computes, ``local`` or ``ray``, whatever the config says, also where a run is gone on with.
 
     The first Ctrl-C, SIGTERM or SIGHUP ends the run after the current iteration with everything written; a Ctrl-C after
     that aborts (KeyboardInterrupt). Until the run folder is there, signals do what they did before. With
@@ -40,7 +45,9 @@ def optimize(
             folder that is in use, damaged, or vanishes.
     """
     try:
-        with iterate(config, resume=resume, output=output, progress=progress, define=define) as session:
+        with iterate(
+            config, resume=resume, output=output, progress=progress, define=define, executor=executor
+        ) as session:
             for _ in session:
                 pass
             return session.finish()
@@ -56,13 +63,19 @@ def iterate(
     output: str | Path | None = None,
     progress: bool = False,
     define: Sequence[str] = (),
+    executor: str | None = None,
 ) -> Session:
     """The same, iteration by iteration: ``for state in iterate("job.toml"): ...`` gives a `State` after each.
 
     Arguments, signals and errors are those of `optimize`; the config is checked now, the rest when the first state is
     asked for. See `Session` for how it ends.
     """
-    return Session(*_started(config, resume, output, tuple(define)), progress)
+    if executor is not None and executor not in get_args(ExecutorName):
+        raise PathreplayError(f"executor is {shown(executor)}; give one of {', '.join(get_args(ExecutorName))}")
+    job, path, resumed = _started(config, resume, output, tuple(define))
+    if executor is not None:
+        job = replace(job, config=job.config.model_copy(update={"executor": executor}))
+    return Session(job, path, resumed, progress)
 
 
 def _started(

@@ -16,7 +16,7 @@ from pathreplay.inverse import noise
 from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
-from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Local, Shard, release, total
+from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Executor, Local, Shard, Total, release, total
 from pathreplay.inverse.events import Entered, Event, Faint, Finished, NonFinite, Refined, Started, Stepped, Stopped
 from pathreplay.inverse.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.grids import resampled, rmse
@@ -45,14 +45,18 @@ def new_run(
     record: bool = True,
     optimizer: Optimizer | None = None,
     evaluate: Evaluate | None = None,
+    executor: Executor | None = None,
 ) -> Run:
-    """A run at the problem's start values, in this process; ``evaluate`` is what does it, if not an `Evaluator`."""
+    """A run at the problem's start values, in this process; ``evaluate`` is what does it, if not an `Evaluator`.
+
+    Or ``executor``, in others.
+    """
     values = {
         v.key: np.array(v.start, np.float32) if dr.is_tensor_v(v.like) else get_array(to_value(v.like, v.start))
         for v in problem.variables
     }
     return Run(
-        Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
+        executor or Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
         _optimiser(problem, values, optimizer or Optimizer()),
         values,
     )
@@ -131,8 +135,8 @@ def _require_gradients(config: Config, run: Run) -> None:
 def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Event]:
     """One step, with the learning rates and resolutions of iteration ``position``; adds an entry to the history.
 
-    Evaluate the views of its `batch`, a shard with a seed of its own for each (or two halves, see `noise`), and sum in
-    their order; step with the learning rate of that iteration (see `schedules`), project every variable into its
+    Evaluate the views of its `batch`, a shard with a seed of its own for each (or parts of it, see `Config.parts`), and
+    sum in their order; step with the learning rate of that iteration (see `schedules`), project every variable into its
     bounds. A grid that moves, and whose next resolution is due, is interpolated before that; the optimiser starts anew
     on it. What is differentiated is decided by the integrator; targets, bounds and the seeds' choice of paths are not.
 
@@ -149,7 +153,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     each = getattr(run.executor, "each", None)
     evaluations = iter((each or run.executor.run)(values, shards, run.learned))
     dropped: list[dict[str, int]] = []
-    found, noise_norms = _summed(_seen(evaluations, dropped), share, halves, each is not None)
+    found, noise_norms = _summed(_seen(evaluations, dropped), share / part.config.parts, halves, each is not None)
     if not np.isfinite(found.loss):
         raise PathreplayError(
             f"The loss is {found.loss} at iteration {i}; lower the learning rates, or bound the parameters that ran "
@@ -198,13 +202,13 @@ def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array
 
 
 def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
-    """What an iteration evaluates: its views, one after the other, each whole or in two halves."""
+    """What an iteration evaluates: its views, one after the other, each whole or in parts (see `Config.parts`)."""
     same = 0 if part.config.optimizer.searches else iteration
-    halves, config, views = 2 if part.config.halves_samples else 1, part.config, part.problem.views
+    config, views = part.config, part.problem.views
     return [
-        Shard((n,), spp // halves, (seed,), part.number)
+        Shard((n,), spp // config.parts, (seed,), part.number)
         for n in batch(part.problem, config, iteration)
-        for seed in config.seeds(ITERATION, views[n].sensor, same)[:halves]
+        for seed in config.seeds(ITERATION, views[n].sensor, same, config.parts)
     ]
 
 
@@ -223,28 +227,19 @@ def _seen(evaluations: Iterable[Evaluation], dropped: list[dict[str, int]]) -> I
 def _summed(
     evaluations: Iterator[Evaluation], share: float, halves: bool, owned: bool
 ) -> tuple[Evaluation, dict[str, float]]:
-    """The sum times ``share``; and where they are halves, even and odd, their mean and |a - b|/2 of each gradient.
+    """The sum times ``share``; and where they are of two halves, in turn, |a - b| of their sums, of each gradient.
 
-    ``owned``: nobody else wants them (see `total`).
+    ``owned``: nobody else wants them (see `Total`).
     """
     if not halves:
         return total(evaluations, share, owned), {}
-    a, b = _half_sums(evaluations)
-    noise_norms = {
-        key: share * norm / 2 for key, norm in _norms({k: a.gradients[k] - b.gradients[k] for k in a.gradients}).items()
-    }
-    return total([a, b], share / 2), noise_norms
-
-
-def _half_sums(evaluations: Iterator[Evaluation]) -> tuple[Evaluation, Evaluation]:
-    """Those of even and of odd places, as they come."""
-    sums: list[Evaluation | None] = [None, None]
+    sums = Total(owned), Total(owned)
     for n, each in enumerate(evaluations):
-        before = sums[n % 2]
-        sums[n % 2] = each if before is None else total([before, each])
-    a, b = sums
-    assert a is not None and b is not None
-    return a, b
+        sums[n % 2].add(each)
+        del each
+    a, b = (each.of() for each in sums)
+    norms = _norms({key: a.gradients[key] - b.gradients[key] for key in a.gradients})
+    return total([a, b], share), {key: share * norm for key, norm in norms.items()}
 
 
 def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int, loss: float) -> dict[str, Array]:

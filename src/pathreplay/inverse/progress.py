@@ -77,6 +77,15 @@ class Progress:
         if self._lines:
             self._print(text)
 
+    def status(self, text: str) -> None:
+        """What is so for a moment, where there is a bar."""
+        self._bar.update(self._task, description=f"optimizing: {text}")
+
+    def remark(self, text: str) -> None:
+        """One line that stays, for who looks on."""
+        if self._shown:
+            self.note(text)
+
     def note(self, text: str) -> None:
         """One line that stays, above the bar."""
         self._bar.console.print(

@@ -17,6 +17,7 @@ from pathreplay.interrupts import Stop, stopping, undisturbed
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config, Plugin
 from pathreplay.inverse.events import Event, Stepped
+from pathreplay.inverse.executors import Crew, RayExecutor, crew_of, require_executor
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
 from pathreplay.inverse.loop import answer_of, iterate, new_run, picture_of, render_views, with_exposures
@@ -137,6 +138,7 @@ def _states(
         if resumed is not None:
             stack.callback(resumed.lock.close)
         stack.enter_context(memory.within(config.budget))
+        require_executor(config)
         _set_variant(config)
         bar = stack.enter_context(Progress(progress))
         bar.say("preparing")
@@ -144,9 +146,10 @@ def _states(
         require_stages(problem, config)
         for note in problem.notes:
             bar.note(note)
-        run = _run(problem, config, problem.integrator, config.integrator)
+        crew = stack.enter_context(crew_of(config, job.base, problem, bar.remark, bar.status))
+        run = _run(problem, config, problem.integrator, config.integrator, crew)
         if problem.rival is not None and config.rival is not None:
-            run.rival = _run(problem, config, problem.rival, config.rival)
+            run.rival = _run(problem, config, problem.rival, config.rival, crew, rival=True)
         if resumed is None:
             folder, before = _begun(output, job, problem, run)
             stack.callback(folder.lock.close)
@@ -192,9 +195,14 @@ def _states(
         return result_of(outcome, stop.by)
 
 
-def _run(problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin) -> Run:
-    """A run that begins, by an integrator, which is made of that plugin."""
+def _run(
+    problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin, crew: Crew | None, rival: bool = False
+) -> Run:
+    """A run that begins, by an integrator, which is made of that plugin; in this process, if there is no crew."""
     record = not config.deterministic
+    if crew is not None:
+        executor = RayExecutor(crew, [view.name for view in problem.views], rival)
+        return new_run(problem, integrator, record, config.optimizer, executor=executor)
     staged = None if config.stages is None else Staged(problem, config, integrator, plugin, record)
     return new_run(problem, integrator, record, config.optimizer, staged)
 

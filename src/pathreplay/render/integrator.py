@@ -61,7 +61,8 @@ class PathReplayIntegrator(PathIntegrator):
     (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``, ``none``), ``noise``
     (0.01; of ray adjoints with the replay driver: see `Recovery`), ``branch`` (``auto``, True, False), ``edges``
     (``none``, ``film``, ``all``: see `Boundary`) and ``edge_spp`` (0: the samples of the pass). ``auto`` drivers sweep
-    unless ``max_depth`` is more than the sweep can hold. Forward mode is the same whatever the driver.
+    unless ``max_depth`` is more than the sweep can hold, or only lights have gradients (see `lights`).
+    Forward mode is the same whatever the driver.
 
     Media are differentiated where paths went, less a baseline that is learned from earlier gradient passes of this
     integrator (with other seeds). ``branch`` walks one more path from where a medium might have scattered and did

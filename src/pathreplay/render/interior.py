@@ -13,6 +13,7 @@ from ..gradient.adjoint import LostPaths
 from ..gradient.baseline import FIRST_BRANCHING, Baseline, Seen
 from ..gradient.driver import Driver, ForwardDriver
 from ..gradient.forward import forward
+from ..gradient.lights import lights_or
 from ..gradient.pixel_sweep import PixelLoss, pixel_sweep
 from ..gradient.primal import primal
 from ..gradient.ray_jacobian import Recovery
@@ -55,13 +56,13 @@ def back_propagate(view: Pass, walk: Walk, grad_in: mi.TensorXf, driver: Driver)
 
 @dataclass(frozen=True)
 class PathReplay:
-    """The interior by our own drivers: forward, and sweep or replay.
+    """The interior by our own drivers: forward, and sweep, replay or lights.
 
     Not differentiated: see `sweep`, `replay` and `forward`; weights that are exactly zero with the replay driver.
     """
 
     driver: str  # sweep or replay
-    auto: bool  # replay where the sweep cannot hold the paths
+    auto: bool  # replay where the sweep cannot hold the paths, and lights where nothing else has gradients
     branch: str | bool  # whether a null collision of each path is kept (auto: where it is needed)
     recovery: Recovery  # of the replay driver
 
@@ -74,9 +75,10 @@ class PathReplay:
         walk = self._informed(walk, learned)
         if not self._sweeps(walk):
             again = partial(replay, recovery=self.recovery)
-            return back_propagate(view, replace(walk, baseline=None), grad_in, again)
+            return back_propagate(view, replace(walk, baseline=None), grad_in, self._or_lights(again))
         seen = None if learned is None or walk.media is None else Seen.none(learned.cells, view.key)
-        return replace(back_propagate(view, walk, grad_in, partial(sweep, seen=seen)), seen=seen)
+        found = back_propagate(view, walk, grad_in, self._or_lights(partial(sweep, seen=seen)))
+        return replace(found, seen=seen)
 
     def pixels(self, view: Pass, walk: Walk, loss: PixelLoss) -> Found:
         """The image, while the loss is back-propagated: see `pixel_sweep`. For scenes without media."""
@@ -87,6 +89,10 @@ class PathReplay:
         dr.eval(L)  # in one kernel with the gradients
         image = mi.TensorXf(dr.ravel(L), (height, width, 3))
         return Found(image, lost=lost.count, paths=width * height * view.spp, moves=True) if moves else Found(image)
+
+    def _or_lights(self, driver: Driver) -> Driver:
+        """The driver, where one was asked for; else one of its own where only lights have gradients."""
+        return lights_or(driver) if self.auto else driver
 
     def note(self, walk: Walk) -> str:
         """What is to be said of the driver that was chosen; "" if it is nothing."""

@@ -82,12 +82,16 @@ def repeat(walk: Walk, again: Replayed, attached: bool, active: mi.Bool) -> Vert
     return _in_medium(walk, at, si, kept.media.flight, flown, attached, active)
 
 
+def sees_lights(walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+    """Where what is emitted at the end of a ray counts: with ``hide_emitters`` no camera ray sees the environment."""
+    return active & (~at.camera | si.is_valid()) if walk.hide_emitters else active
+
+
 def _on_surface(
     walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool, glow: mi.Spectrum = None
 ) -> Vertex:
     if glow is None:
-        seen = active & (~at.camera | si.is_valid()) if walk.hide_emitters else active
-        glow = emission(walk.scene, at, si, attached, seen)
+        glow = emission(walk.scene, at, si, attached, sees_lights(walk, at, si, active))
     return Vertex(si, si.bsdf(at.ray), active & si.is_valid(), si, glow)
 
 

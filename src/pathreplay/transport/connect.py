@@ -23,9 +23,13 @@ class Connection:
     lit: mi.Bool  # there is one, and nothing is in its way
     shadow: Shadow = None  # type: ignore[assignment]  # not in scenes without media
 
+    def mis(self, pdf: mi.Float) -> mi.Float:
+        """Its weight; ``pdf`` is that of sampling its direction at the vertex."""
+        return dr.select(self.light.delta, 1, mis_weight(self.light.pdf, pdf))
+
     def reaches(self, pdf: mi.Float, attached: bool) -> mi.Spectrum:
         """What reaches the vertex (Spectrum), MIS weighted; ``pdf`` is that of sampling its direction there."""
-        mis = dr.select(self.light.delta, 1, mis_weight(self.light.pdf, pdf))
+        mis = self.mis(pdf)
         # A path that is held fixed needs no derivative of its weights: they sum to one whatever the parameters do.
         return self.Le * (mis if attached else dr.detach(mis))
 

@@ -8,7 +8,7 @@ import mitsuba as mi
 from .passage import beyond_null
 from .surface import held_point
 from .traits import is_painted
-from .vertex import Arrival, Walk, mis_weight, reciprocal
+from .vertex import Arrival, Lighting, Walk, mis_weight, reciprocal
 
 
 def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool) -> mi.Spectrum:
@@ -26,6 +26,12 @@ def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached
         ds = mi.DirectionSample3f(scene, si=si, ref=origin)
         mis = mis_weight(at.pdf, scene.pdf_emitter_direction(origin, ds, active & ~at.delta))
     return mis * ds.emitter.eval(si, active)
+
+
+def relight(walk: Walk, at: Arrival, lighting: Lighting) -> mi.Spectrum:
+    """The e of a vertex once more (Spectrum), differentiable in what emitters emit alone: all else is as it was."""
+    glow = emission(walk.scene, at, lighting.si, False, lighting.seen)
+    return glow + lighting.w * walk.scene.eval_emitter_direction(lighting.si, lighting.light, lighting.lit)
 
 
 def draw_emitter(

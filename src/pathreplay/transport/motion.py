@@ -1,13 +1,15 @@
-"""Does the path move with the parameters? Found out when a kernel is traced, so that it holds nothing it need not."""
+"""What of a path depends on parameters? Found out when a kernel is traced, so that it holds nothing it need not."""
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
 
+from . import scatter
+from .arrive import Vertex
 from .start import CameraStart
 from .traits import nodes_of
-from .vertex import Arrival, Walk
+from .vertex import Arrival, Kept, Numbers, Replayed, Walk
 
 FEW = 8
 """Of more moving shapes than these nobody asks which they are."""
@@ -55,3 +57,18 @@ def path_moves(walk: Walk, start: CameraStart, at: Arrival) -> bool:
         light, _ = walk.scene.sample_emitter_direction(still, mi.Point2f(0.5), False)
         moving += [light.p, light.d, light.pdf]
         return any(dr.grad_enabled(value) for value in moving)
+
+
+def weights_vary(walk: Walk, at: Arrival) -> bool:
+    """Whether the weights of continuations on surfaces depend on parameters with gradients, where nothing moves.
+
+    ``at`` is the first arrival. The weight of any lobe is looked at, as later passes find it. Nothing is evaluated.
+    """
+    lobe, valid = at.hit.prim_index, at.hit.is_valid()  # numbers that are not known while a kernel is traced
+    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, valid)
+    v = Vertex(si, si.bsdf(at.ray), valid, si, mi.Spectrum(0))
+    kept = Kept(si.to_world(si.wi), mi.Float(1), lobe == 0, mi.Bool(False), lobe, valid)
+    u = Numbers(mi.Point2f(0.5), mi.Float(0.5), mi.Point2f(0.5), mi.Float(0.5))
+    again = Replayed(at, u, kept, valid, at.hit, mi.Float(1), mi.Spectrum(1))
+    with dr.resume_grad():
+        return dr.grad_enabled(scatter.repeat(walk, v, again, mi.BSDFContext(), False)[0])

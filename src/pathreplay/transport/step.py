@@ -10,7 +10,20 @@ import drjit as dr
 import mitsuba as mi
 
 from . import arrive, connect, scatter
-from .vertex import Arrival, Chosen, Flight, KeptInMedia, KnownLight, Numbers, Replayed, Signature, Step, Walk
+from .vertex import (
+    Arrival,
+    Chosen,
+    Flight,
+    KeptInMedia,
+    KnownLight,
+    Lighting,
+    Numbers,
+    Replayed,
+    Signature,
+    Step,
+    Walk,
+    reciprocal,
+)
 
 
 def choose_step(
@@ -36,9 +49,9 @@ def choose_step(
     link = connect.choose(walk, v, at.medium, u, sampler, go_on)
     to = scatter.choose(walk, v, at, u, ctx, link.light.d, link.lit, go_on)
     reached = link.reaches(to.pdf_light, False)
-    lighting = dr.select(link.lit, to.f * reached, 0)
-    kept, e, w, medium = to.kept, v.glow + lighting, to.w, at.medium
+    kept, e, w, medium = to.kept, v.glow + dr.select(link.lit, to.f * reached, 0), to.w, at.medium
     kept.light = link.light
+    lighting: Lighting = None  # type: ignore[assignment]
     if v.inside is not None:
         kept.media = KeptInMedia(to.null, v.inside.flight, link.shadow)
         e, w = v.inside.e + v.inside.w * e, v.inside.w * w
@@ -46,8 +59,12 @@ def choose_step(
         medium = dr.select(crossed, v.si.target_medium(kept.d), medium)
     elif not walk.traits.lights_vary:
         kept.known = KnownLight(v.glow, link.light.d, reached)
+    else:
+        w_light = to.f * (link.mis(to.pdf_light) * reciprocal(link.light.pdf))
+        seen = arrive.sees_lights(walk, at, v.si, active)
+        lighting = Lighting(v.si, seen, link.light, dr.select(link.lit, w_light, 0), link.lit)
     signature, ray_next = _signature(v, at, kept.lobe, go_on), v.origin.spawn_ray(kept.d)
-    return Chosen(e, w, ray_next, kept.pdf, signature, kept, to.eta, to.null, to.active, medium)
+    return Chosen(e, w, ray_next, kept.pdf, signature, kept, to.eta, to.null, to.active, medium, lighting)
 
 
 def repeat_step(

@@ -182,6 +182,17 @@ class KnownLight:
 
 
 @dataclass
+class Lighting:
+    """What a surface adds by itself, e, as a function of what emitters emit: see `relight`."""
+
+    si: mi.SurfaceInteraction3f
+    seen: mi.Bool  # what is emitted there counts
+    light: mi.DirectionSample3f  # the emitter sample
+    w: mi.Spectrum  # weight of its radiance: scattering over density, MIS weighted
+    lit: mi.Bool
+
+
+@dataclass
 class Replayed:
     """What later passes know about a vertex and its continuation."""
 
@@ -223,6 +234,7 @@ class Chosen(Step):
     null: mi.Bool  # the continuation passes straight through
     active: mi.Bool  # there is a continuation
     medium: mi.MediumPtr = None  # what the continuation goes through, with media only
+    lighting: Lighting = None  # type: ignore[assignment]  # of surfaces, if emitters have gradients, else None
 
     @property
     def seen(self) -> mi.Bool:

@@ -1,0 +1,244 @@
+"""How steps scale to many devices: a model on paper, and a simulation of the schedule with stragglers and failures.
+
+    python -m benchmarks.schedule [--measure]
+
+prints seconds of a step for 1 to 1000 devices and 10^6 to 10^9 parameters, for three ways to bring gradients together,
+and then what the schedule that jobs use (`pathreplay.inverse.sharing`) makes of the first of them: devices that are
+slower and faster, shards that get stuck, devices that are lost. With `--measure` the costs of this machine are measured
+first and used; without it, those below, which were measured so. Takes a minute.
+"""
+
+from __future__ import annotations
+
+import heapq
+import time
+from dataclasses import dataclass, replace
+from statistics import mean
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from pathreplay.inverse.evaluate import Shard
+from pathreplay.inverse.sharing import Sharing, Step
+
+DEVICES, PARAMETERS = (1, 10, 100, 1000), (10**6, 10**7, 10**8, 10**9)
+BYTES = 4
+"""Of a value, and of an entry of a gradient."""
+STEPS, COUNTED = 12, 8
+"""Of a simulation, and how many of them count: in the first ones nothing is known yet."""
+
+
+@dataclass(frozen=True)
+class Costs:
+    """Seconds. Compute and network are assumptions, which options change; the others were measured (`--measure`)."""
+
+    shard: float = 1.0
+    """Compute of a shard."""
+    network: float = 1.25e9
+    """Bytes a second, each way, of every machine: 10 gigabit Ethernet."""
+    add: float = 2.6e-10
+    """To add an entry of a gradient to the sum."""
+    step: float = 2.2e-9
+    """Of the optimiser, for a parameter."""
+    latency: float = 2e-3
+    """To hand out a shard, and to hear of its end."""
+
+    def send(self, parameters: float) -> float:
+        """Values or a gradient, between two machines."""
+        return BYTES * parameters / self.network
+
+
+def built(costs: Costs, shards: int, devices: int, parameters: float) -> float:
+    """As jobs do it: values go out along a tree, each shard's gradient comes to one process, which adds and steps.
+
+    Gradients are fetched while other shards are computed: what is longer counts, and one more of the other.
+    """
+    out = np.ceil(np.log2(devices + 1)) * costs.send(parameters) if devices > 1 else 0.0
+    one_back = (costs.send(parameters) if devices > 1 else 0.0) + costs.add * parameters
+    compute = np.ceil(shards / devices) * (costs.shard + costs.latency)
+    return float(out + max(compute + one_back, costs.shard + shards * one_back) + costs.step * parameters)
+
+
+def summed(costs: Costs, shards: int, devices: int, parameters: float) -> float:
+    """Each device adds up its shards, of which it always has the same; then sums meet in a ring, each steps for all."""
+    compute = np.ceil(shards / devices) * (costs.shard + costs.latency + costs.add * parameters)
+    ring = 2 * (devices - 1) / devices * costs.send(parameters)
+    return float(compute + ring + costs.step * parameters)
+
+
+def sharded(costs: Costs, shards: int, devices: int, parameters: float) -> float:
+    """As `summed`, and each device steps for its part of the parameters, whose optimiser state it alone holds."""
+    return summed(costs, shards, devices, parameters) - costs.step * parameters * (1 - 1 / devices)
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """What befalls devices."""
+
+    spread: float = 0.0
+    """Of the logarithm of their speeds."""
+    stuck: float = 0.0
+    """Of all shards, how many take ten times as long."""
+    lost_after: float = np.inf
+    """Seconds of work after which a device is lost, on average."""
+    back_after: float = 30.0
+    """Seconds after which another one has taken its place, scene and kernels loaded."""
+
+
+def simulated(costs: Costs, shards: int, devices: int, parameters: float, trouble: Trouble, seed: int = 0) -> float:
+    """Mean seconds of a step as built, by the schedule of jobs, event by event; and what was done twice."""
+    random = np.random.default_rng(seed)
+    speeds = np.exp(trouble.spread * random.standard_normal(devices))
+    speeds *= devices / speeds.sum()  # as much in all as without
+    sharing, work = Sharing(), [Shard((view,), 1, (view,)) for view in range(shards)]
+    devices_ = _Devices(costs, parameters, trouble, random, speeds, free=[0.0] * devices)
+    return mean([devices_.step(Step(sharing, work)) for _ in range(STEPS)][-COUNTED:])
+
+
+@dataclass
+class _Devices:
+    """Devices from step to step: one may still be at a shard that another has done."""
+
+    costs: Costs
+    parameters: float
+    trouble: Trouble
+    random: np.random.Generator
+    speeds: np.ndarray
+    free: list[float]
+    """When each has nothing to do any more."""
+    now: float = 0.0
+
+    def step(self, step: Step) -> float:
+        """Seconds of it."""
+        begin, costs, n = self.now, self.costs, len(self.speeds)
+        self.now += float(np.ceil(np.log2(n + 1))) * costs.send(self.parameters) if n > 1 else 0.0
+        one_back = (costs.send(self.parameters) if n > 1 else 0.0) + costs.add * self.parameters
+        idle = [k for k in range(n) if self.free[k] <= self.now]
+        events = [(self.free[k], k, -1, 0.0, True) for k in range(n) if self.free[k] > self.now]
+        heapq.heapify(events)
+        fetched, asleep = self.now, np.inf  # when the process that adds has added what it was given
+        while len(step.done) < len(step.kinds):
+            waiting = list(idle)
+            for k in idle:
+                if (index := step.next(k, self.now)) is None:
+                    break  # as jobs do it
+                waiting.remove(k)
+                seconds, lives = self._seconds(k)
+                self.free[k] = self.now + seconds + (0 if lives else self.trouble.back_after)
+                heapq.heappush(events, (self.now + seconds, k, index, seconds, lives))
+            late = step.patience() if waiting else None
+            asleep = np.inf if late is None else max(self.now, late)
+            if asleep < (events[0][0] if events else np.inf):
+                self.now, idle = asleep, waiting
+                continue
+            self.now, k, index, seconds, lives = heapq.heappop(events)
+            idle = waiting
+            if not lives:
+                step.sharing.forget(k)
+                step.lost(index, k)
+                heapq.heappush(events, (self.free[k], k, -1, 0.0, True))
+                continue
+            idle = [*waiting, k]
+            if index >= 0 and step.finished(index, k, seconds):
+                fetched = max(fetched, self.now) + one_back
+        self.now = max(self.now, fetched) + costs.step * self.parameters
+        return self.now - begin
+
+    def _seconds(self, k: int) -> tuple[float, bool]:
+        """Of a shard by a device, and whether that lives to see its end."""
+        stuck = 10.0 if self.random.random() < self.trouble.stuck else 1.0
+        seconds = self.costs.latency + self.costs.shard * stuck / float(self.speeds[k])
+        lost = (
+            float(self.random.exponential(self.trouble.lost_after)) if np.isfinite(self.trouble.lost_after) else np.inf
+        )
+        return (lost, False) if lost < seconds else (seconds, True)
+
+
+def measured(costs: Costs, size: int = 2 * 10**7) -> Costs:
+    """The costs of this machine, in one thread; the optimiser's with its values in memory of Dr.Jit's."""
+    from pathreplay import backend
+
+    backend.set_variant("llvm_ad_rgb")
+    from pathreplay.inverse.optimiser import DrJitOptimiser
+
+    a, b = np.ones(size, np.float32), np.ones(size, np.float32)
+    optimiser = DrJitOptimiser({"a": a})
+    add = min(_timed(lambda: np.add(a, b)) for _ in range(5)) / size
+    step = min(_timed(lambda: optimiser.step({"a": a}, {"a": b}, {"a": 0.01})) for _ in range(3)) / size
+    return replace(costs, add=add, step=step)
+
+
+def measured_ray(costs: Costs, size: int = 10**7) -> Costs:
+    """The latency of a call of an actor here; prints how fast gradients come back from one on this machine, too."""
+    from pathreplay.inverse.executor_options import RayOptions
+    from pathreplay.inverse.ray_cluster import connected
+
+    class Echo:
+        def gradient(self, size: int) -> np.ndarray:
+            return np.ones(size, np.float32)
+
+    with connected(RayOptions(), 2) as (ray, _):
+        actor = ray.remote(Echo).remote()
+        ray.get(actor.gradient.remote(1))
+        latency = min(_timed(lambda: ray.get(actor.gradient.remote(1))) for _ in range(50))
+        back = min(_timed(lambda: ray.get(actor.gradient.remote(size))) for _ in range(5))
+    print(
+        f"Ray here: {latency * 1e3:.2g} ms for a call, {BYTES * size / (back - latency) / 1e9:.2g} GB/s for gradients"
+    )
+    return replace(costs, latency=latency)
+
+
+def _timed(work: object) -> float:
+    begin = time.perf_counter()
+    work()  # type: ignore[operator]
+    return time.perf_counter() - begin
+
+
+TROUBLES = {
+    "none": Trouble(),
+    "speeds differ by a fourth": Trouble(spread=0.25),
+    "1 shard in 100 takes 10 times as long": Trouble(stuck=0.01),
+    "each device is lost once an hour": Trouble(lost_after=3600.0),
+    "all of it": Trouble(spread=0.25, stuck=0.01, lost_after=3600.0),
+}
+
+
+def main(
+    measure: Annotated[bool, typer.Option("--measure", help="Measure adding and stepping here first.")] = False,
+    shards: Annotated[int, typer.Option(help="Of a step.")] = 4000,
+    seconds: Annotated[float, typer.Option(help="Compute of a shard.")] = 1.0,
+    gigabits: Annotated[float, typer.Option(help="Network of each machine.")] = 10.0,
+) -> None:
+    """Print the tables."""
+    costs = Costs(shard=seconds, network=gigabits * 1e9 / 8)
+    if measure:
+        costs = measured_ray(measured(costs))
+    print(f"{shards} shards of {seconds:g} s, {gigabits:g} gigabit a second, {costs.add:.1e} s to add an entry, "
+          f"{costs.step:.1e} s to step a parameter\n")  # fmt: skip
+    ways = {"as built": built, "sums in a ring": summed, "and a sharded optimiser": sharded}
+    print("| parameters | " + " | ".join(f"{n} devices" for n in DEVICES) + " | way |")
+    print("| ---: |" + " ---: |" * len(DEVICES) + " --- |")
+    for parameters in PARAMETERS:
+        for name, way in ways.items():
+            cells = [way(costs, shards, n, parameters) for n in DEVICES]
+            told = " | ".join(f"{s:.4g} s ({cells[0] / (n * s):.0%})" for n, s in zip(DEVICES, cells, strict=True))
+            print(f"| {parameters:.0e} | {told} | {name} |")
+    print("\nas built, no more than half of the devices' time is waiting up to:")
+    for parameters in PARAMETERS:
+        limit = max((n for n in range(2, 4001) if _efficiency(costs, shards, n, parameters) >= 0.5), default=1)
+        print(f"  {parameters:.0e} parameters: {limit} devices")
+    print("\nsimulated, 10^6 parameters, seconds of a step over those of the model:\n")
+    print("| trouble | " + " | ".join(f"{n} devices" for n in DEVICES[1:]) + " |")
+    print("| --- |" + " ---: |" * len(DEVICES[1:]))
+    for name, trouble in TROUBLES.items():
+        ratios = [simulated(costs, shards, n, 10**6, trouble) / built(costs, shards, n, 10**6) for n in DEVICES[1:]]
+        print(f"| {name} | " + " | ".join(f"{ratio:.2f}" for ratio in ratios) + " |")
+
+
+def _efficiency(costs: Costs, shards: int, devices: int, parameters: float) -> float:
+    return built(costs, shards, 1, parameters) / (devices * built(costs, shards, devices, parameters))
+
+
+if __name__ == "__main__":
+    typer.run(main)

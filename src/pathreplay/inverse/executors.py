@@ -1,0 +1,305 @@
+"""Shards evaluated by actors of Ray, which hold scene and kernels: on this machine or on a cluster, with the same bits.
+
+Values are sent once in a step. Who computes what is up to `Sharing`; an evaluation is a function of values, shard and
+what was learned, and evaluations are added up in the order of the shards, so that it does not matter.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config import Config
+from pathreplay.inverse.evaluate import Evaluation, Shard
+from pathreplay.inverse.problem import Problem
+from pathreplay.inverse.ray_actor import Answer, Hello, Parcel, RayActor, versions
+from pathreplay.inverse.ray_cluster import connected, load_ray
+from pathreplay.inverse.sharing import Sharing, Step
+from pathreplay.inverse.targets import Targets
+from pathreplay.inverse.values import Arrays
+from pathreplay.scenes.descriptions import one_line
+
+THREADS = 4
+"""Cores of an actor at most, if the job does not say: its Python, which traces kernels, keeps one of them busy."""
+
+SOON_S = 60.0
+"""Seconds after which it is told that no actor is there yet: loading Mitsuba and a scene takes some."""
+
+Tell = Callable[[str], None]
+
+
+@dataclass
+class Counts:
+    """What happened to a run."""
+
+    shards: int = 0
+    restarts: int = 0
+    again: int = 0
+    """Shards that were computed again since their actor was lost."""
+    twice: int = 0
+    """Shards that were late, and given to another actor as well."""
+
+    def line(self) -> str:
+        return (
+            f"{self.shards} shards; {self.restarts} restarts, {self.again} shards computed again, "
+            f"{self.twice} late ones by two actors"
+        )
+
+
+@dataclass
+class _Call:
+    """What an actor was asked and has not answered. ``step`` is None for a greeting."""
+
+    actor: int
+    step: Step | None = None
+    index: int = 0
+    sharing: Sharing | None = None
+
+
+@dataclass
+class Crew:
+    """The actors of a run, and what they are asked; the executors of a job and of its rival share them."""
+
+    ray: Any
+    actors: dict[int, Any]
+    parcel: Any
+    """Ray's reference to what they need to know."""
+    retries: int
+    tell: Tell
+    status: Tell = lambda text: None
+    """Told how far a step is, again and again."""
+    counts: Counts = field(default_factory=Counts)
+    calls: dict[Any, _Call] = field(default_factory=dict)
+    """By Ray's reference to the answer."""
+    ready: dict[int, Hello] = field(default_factory=dict)
+    said: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        for number in self.actors:
+            self._greet(number)
+
+    def idle(self) -> list[int]:
+        """Actors that are there, and have nothing to do."""
+        busy = {call.actor for call in self.calls.values()}
+        return [number for number in self.ready if number not in busy]
+
+    def ask(self, number: int, call: _Call, *question: Any) -> None:
+        """Have an actor evaluate a shard."""
+        self.calls[self.actors[number].evaluate.options(max_task_retries=0).remote(*question)] = call
+
+    def answered(self, patience: float) -> list[tuple[_Call, Any]]:
+        """Calls that have been answered, and the references to fetch the answers by; waits at most so many seconds."""
+        # Where the answer is does not matter yet: whoever gave it can go on while it is on its way.
+        ready, _ = self.ray.wait(list(self.calls), num_returns=1, timeout=patience, fetch_local=False)
+        return [(self.calls.pop(reference), reference) for reference in ready]
+
+    def fetch(self, call: _Call, reference: Any) -> Answer | None:
+        """What was answered to a shard; None where there is nothing, since the actor was lost, or to a greeting.
+
+        Raises PathreplayError where no actor is left; what an evaluation raised.
+        """
+        try:
+            answer = self.ray.get(reference)
+        except self.ray.exceptions.RayTaskError as error:
+            raise _cause(error) from None
+        except self.ray.exceptions.RayError as error:
+            self._lost(call, error)
+            return None
+        if isinstance(answer, Hello):
+            self._there(call.actor, answer)
+            return None
+        return answer
+
+    def _greet(self, number: int) -> None:
+        self.calls[self.actors[number].hello.remote(self.parcel)] = _Call(number)
+
+    def _there(self, number: int, hello: Hello) -> None:
+        """An actor is ready. Raises PathreplayError if it is of other versions."""
+        if hello.versions != versions():
+            raise PathreplayError(
+                f"ray: {hello.host} has {hello.versions}, this machine {versions()}; install the same on both"
+            )
+        self.ready[number] = hello
+        machines = {each.machine for each in self.ready.values()}
+        if len(machines) > 1:
+            self.say_once(
+                f"ray: the actors have different processors ({'; '.join(sorted(machines))}), which may round "
+                "differently in the last bit"
+            )
+
+    def _lost(self, call: _Call, error: Exception) -> None:
+        """An actor does not answer any more: it is greeted again, unless Ray has given it up."""
+        number, host = call.actor, getattr(self.ready.pop(call.actor, None), "host", "its machine")
+        if call.step is None:  # it was being started as often as it may
+            del self.actors[number]
+            if not self.actors:
+                raise PathreplayError(
+                    f"ray: all actors are lost ({one_line(error)[:300]}); look into Ray's logs, give them more memory, "
+                    "or raise ray.max_restarts"
+                )
+            self.say_once(f"ray: actor {number + 1} is lost for good; {len(self.actors)} are left")
+            return
+        if any(other.actor == number and other.step is None for other in self.calls.values()):
+            return  # known: it was given another shard meanwhile
+        self.counts.restarts += 1
+        self.tell(f"ray: actor {number + 1} on {host} was lost and is started again; its shard is computed again")
+        self._greet(number)
+
+    def say_once(self, line: str) -> None:
+        """Tell what may come from several actors."""
+        if line not in self.said:
+            self.said.add(line)
+            self.tell(line)
+
+
+class RayExecutor:
+    """Evaluates shards by actors of Ray: an `Executor`. `crew_of` makes the crew; ``rival`` says whose integrator."""
+
+    def __init__(self, crew: Crew, names: Sequence[str] = (), rival: bool = False) -> None:
+        self.crew, self.names, self.rival = crew, names, rival
+        self.sharing = Sharing()
+
+    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
+        """See `Executor`. Raises PathreplayError where actors are lost for good, and what evaluations raise."""
+        if not shards:
+            return []
+        crew, step = self.crew, Step(self.sharing, shards)
+        # Sent once: actors get it from the object store of their machine.
+        sent = [crew.ray.put(dict(each)) for each in (values, learned)]
+        found: dict[int, Evaluation] = {}
+        losses: dict[int, int] = {}
+        begin = time.monotonic()
+        while len(found) < len(shards):
+            self._hand_out(step, shards, *sent)
+            late = step.patience()
+            patience = SOON_S if late is None else min(SOON_S, max(0.0, late - time.monotonic()))
+            answered = crew.answered(patience)
+            self._hand_out(step, shards, *sent)
+            for call, reference in answered:
+                answer = crew.fetch(call, reference)
+                if call.step is not None:
+                    self._heard(call, answer, step, shards, found, losses)
+            if not crew.ready and time.monotonic() - begin > SOON_S:
+                crew.say_once("ray: no actor is ready yet; is there room for them? 'ray status' tells")
+        crew.counts.shards += len(shards)
+        return [found[index] for index in range(len(shards))]
+
+    def _hand_out(self, step: Step, shards: Sequence[Shard], values: Any, learned: Any) -> None:
+        for number in self.crew.idle():
+            late = len(step.again)
+            index = step.next(number, time.monotonic())
+            if index is None:
+                break  # what is nothing for one is nothing for the others
+            self.crew.counts.twice += len(step.again) - late
+            call = _Call(number, step, index, self.sharing)
+            self.crew.ask(number, call, self.rival, values, shards[index], learned)
+
+    def _heard(
+        self,
+        call: _Call,
+        answer: Answer | None,
+        step: Step,
+        shards: Sequence[Shard],
+        found: dict[int, Evaluation],
+        losses: dict[int, int],
+    ) -> None:
+        """Take in what has become of a call, which may be one of a step before."""
+        assert call.step is not None and call.sharing is not None
+        if answer is None:
+            call.sharing.forget(call.actor)
+            call.step.lost(call.index, call.actor)
+            if call.step is step:
+                self.crew.counts.again += 1
+                losses[call.index] = losses.get(call.index, 0) + 1
+                if losses[call.index] > self.crew.retries:
+                    raise PathreplayError(
+                        f"ray: {self._name(shards[call.index])} has ended {losses[call.index]} actors, one after the "
+                        "other; give them more memory, or raise ray.max_task_retries"
+                    )
+            return
+        first = call.step.finished(call.index, call.actor, answer.seconds)
+        if call.step is not step or not first:
+            return
+        found[call.index] = answer.evaluation
+        for line in answer.warnings:
+            if line not in self.crew.said:
+                self.crew.said.add(line)
+                mi.Log(mi.LogLevel.Warn, line)
+        self.crew.status(f"{len(self.crew.ready)} actors, shard {len(found)} of {len(shards)}")
+
+    def _name(self, shard: Shard) -> str:
+        return "the shard of view " + ", ".join(self.names[n] if self.names else str(n) for n in shard.views)
+
+
+def _cause(error: Any) -> BaseException:
+    """What an evaluation has raised, as it would have been raised here."""
+    cause = error.cause
+    return cause if isinstance(cause, BaseException) else PathreplayError(f"ray: {one_line(error)}")
+
+
+def require_executor(config: Config) -> None:
+    """Raise PathreplayError unless what the job's executor needs is installed."""
+    if config.executor == "ray":
+        load_ray()
+
+
+@contextmanager
+def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Tell) -> Iterator[Crew | None]:
+    """The actors of a job, until the end of the block; None where it computes in this process. Raises PathreplayError.
+
+    ``tell`` is given lines that stay, ``status`` what is so for a moment.
+    """
+    if config.executor != "ray":
+        yield None
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads = config.ray.threads or (1 if config.deterministic else max(1, min(THREADS, cores // 2)))
+    wanted = max(cores, threads * (config.ray.actors or 1))
+    with connected(config.ray, wanted) as (ray, own):
+        count = _count(ray, config, threads, problem)
+        targets = Targets(
+            {view.name: view.target for view in problem.views},
+            {view.name: view.weight for view in problem.views if view.weight is not None},
+        )
+        parcel = ray.put(Parcel(config, base.resolve(), targets, mi.variant(), threads))
+        kind = ray.remote(**_needs(threads), max_restarts=config.ray.max_restarts, max_task_retries=-1)(RayActor)
+        actors = {number: kind.remote() for number in range(count)}
+        where = "this machine" if own else f"a cluster of {len(ray.nodes())} nodes"
+        tell(f"ray: {count} actors with {threads} {'thread' if threads == 1 else 'threads'} each on {where}")
+        crew = Crew(ray, actors, parcel, config.ray.max_task_retries, tell, status)
+        try:
+            yield crew
+            tell(f"ray: {crew.counts.line()}")
+        finally:
+            for actor in crew.actors.values():
+                ray.kill(actor)  # a cluster that others use goes on without them
+
+
+def _needs(threads: int) -> dict[str, float]:
+    return {"num_cpus": threads, "num_gpus": 1 if mi.variant().startswith("cuda") else 0}
+
+
+def _count(ray: Any, config: Config, threads: int, problem: Problem) -> int:
+    """How many actors there are to be. Raises PathreplayError where there is no room for them."""
+    needs = {"CPU": threads, "GPU": _needs(threads)["num_gpus"]}
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    room = sum(min(int(node.get(name, 0) // n) for name, n in needs.items() if n) for node in nodes)
+    if room < (config.ray.actors or 1):
+        asked = f"{threads} cores" + (" and a GPU" if needs["GPU"] else "")
+        raise PathreplayError(
+            f"ray: no room for {config.ray.actors or 1} actors with {asked} each: the cluster has "
+            f"{sum(node.get('CPU', 0) for node in nodes):.0f} cores and "
+            f"{sum(node.get('GPU', 0) for node in nodes):.0f} GPUs; ask for fewer, or for fewer threads"
+        )
+    if config.ray.actors is not None:
+        return config.ray.actors
+    views = len(problem.trained())
+    return min(room, config.parts * min(views, config.views_per_step or views))

@@ -1,0 +1,143 @@
+"""What an actor of Ray holds and does: the scene of a job, its compiled kernels, and evaluations of shards by them."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay import backend
+from pathreplay.inverse.config import Config
+from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Shard
+from pathreplay.inverse.problem import Problem, build_problem
+from pathreplay.inverse.stages import Staged
+from pathreplay.inverse.targets import Targets
+from pathreplay.inverse.values import Arrays
+from pathreplay.scenes.descriptions import told
+from pathreplay.threads import one_thread
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """What an actor needs to know to build the problem of a job as the process has it that sends this."""
+
+    config: Config
+    base: Path
+    targets: Targets
+    variant: str
+    threads: int
+
+
+@dataclass(frozen=True)
+class Hello:
+    """Who an actor is, when it is ready."""
+
+    host: str
+    process: int
+    versions: str
+    machine: str
+    """What decides how its kernels round."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What an actor has to say of a shard."""
+
+    evaluation: Evaluation
+    seconds: float
+    warnings: tuple[str, ...]
+    """What was logged meanwhile."""
+
+
+def versions() -> str:
+    """Of what has to be the same in all actors, and in the process that asks them."""
+    return ", ".join(f"{name} {version(name)}" for name in ("pathreplay", "mitsuba", "drjit", "numpy"))
+
+
+class RayActor:
+    """Evaluates shards of one job; nothing that is sent changes it, but for kernels, which it keeps."""
+
+    def __init__(self) -> None:
+        self.problem: Problem | None = None
+        self.config: Config
+        self.evaluators: dict[bool, Evaluate] = {}
+        self.log: Any = None
+
+    def hello(self, parcel: Parcel) -> Hello:
+        """Build the problem: before anything else. Raises PathreplayError for what this machine has not."""
+        backend.set_variant(parcel.variant)
+        dr.set_thread_count(parcel.threads)
+        self.config = parcel.config
+        self.problem = build_problem(parcel.config, parcel.base, parcel.targets)
+        self.log = _kept_log()
+        machine = f"{_processor()}, LLVM {'.'.join(map(str, backend.loaded_version()))}"
+        return Hello(platform.node(), os.getpid(), versions(), machine)
+
+    def evaluate(self, rival: bool, values: Arrays, shard: Shard, learned: Arrays) -> Answer | None:
+        """A shard by the job's integrator, or by that of its rival; None where this actor was started again since."""
+        if self.problem is None:
+            return None
+        config = self.config
+        plugin = config.rival if rival and config.rival is not None else config.integrator
+        self.log.lines.clear()
+        begin = time.perf_counter()
+        with one_thread(config.deterministic), told(f"Integrator '{plugin.type}' cannot do this job"):
+            evaluation = self._evaluator(rival)(values, shard, learned)
+        return Answer(evaluation, time.perf_counter() - begin, tuple(self.log.lines))
+
+    def _evaluator(self, rival: bool) -> Evaluate:
+        if rival not in self.evaluators:
+            config, problem = self.config, self.problem
+            assert problem is not None
+            plugin, integrator = config.integrator, problem.integrator
+            if rival and config.rival is not None and problem.rival is not None:
+                plugin, integrator = config.rival, problem.rival
+            record = not config.deterministic
+            self.evaluators[rival] = (
+                Evaluator(problem, integrator, record)
+                if config.stages is None
+                else Staged(problem, config, integrator, plugin, record)
+            )
+        return self.evaluators[rival]
+
+
+def _kept_log() -> Any:
+    """Takes the place of what Mitsuba's log is written to: nobody looks at the terminal of an actor."""
+
+    class Kept(mi.Appender):  # type: ignore[misc]  # here, since it belongs to the variant
+        def __init__(self) -> None:
+            super().__init__()
+            self.lines: list[str] = []
+
+        def append(self, level: mi.LogLevel, text: str) -> None:
+            if level >= mi.LogLevel.Warn:
+                self.lines.append(text)
+
+        def log_progress(self, *_: Any) -> None:
+            pass
+
+    kept, logger, plain = Kept(), mi.logger(), mi.DefaultFormatter()
+    plain.set_has_date(False)
+    plain.set_has_log_level(False)
+    plain.set_has_thread(False)
+    plain.set_has_class(False)
+    logger.set_formatter(plain)
+    logger.clear_appenders()
+    logger.add_appender(kept)
+    return kept
+
+
+def _processor() -> str:
+    """The processor's name, where the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())

@@ -1,0 +1,215 @@
+"""Ray as a job uses it: a cluster of its own on this machine, which nobody else can reach, or one at an address.
+
+A cluster of its own listens on loopback only, wants a secret token of whoever speaks to it, and keeps its sockets in a
+folder that only this user can enter. Left alone, Ray would listen on every interface. One at an address must
+have authentication on, since what is sent to it is unpickled, and so are its answers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from pathreplay.errors import PathreplayError, plain_line
+from pathreplay.interrupts import undisturbed
+from pathreplay.inverse.executor_options import RayOptions
+
+OLDEST = (2, 60)
+"""Its token authentication is on for clusters that a program starts."""
+
+# Ray's own way to use loopback addresses, made for the firewalls of other systems.
+_MANY_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+_MODE, _TOKEN, _ADDRESS = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"
+_LONGEST_FOLDER = 20
+_SECRET = secrets.token_hex(32)
+"""Of all clusters of this process's own: Ray reads it once."""
+
+
+def load_ray() -> Any:
+    """The module. Raises PathreplayError where it is not installed, or too old."""
+    os.environ.setdefault(_MODE, "token")  # read when it is imported
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # leave devices as they are; it warns otherwise
+    try:
+        import ray
+    except ImportError as error:
+        raise PathreplayError(f"executor = 'ray' needs a module ({error}): pip install 'pathreplay[ray]'") from None
+    found = tuple(int(part) for part in ray.__version__.split(".")[:2])
+    if found < OLDEST:
+        raise PathreplayError(
+            f"executor = 'ray' needs Ray 2.60 or newer, this is {ray.__version__}: pip install 'pathreplay[ray]'"
+        )
+    return ray
+
+
+@contextmanager
+def connected(options: RayOptions, cores: int) -> Iterator[tuple[Any, bool]]:
+    """Ray, connected within this block to the cluster of the options, and whether that is the run's own.
+
+    One of its own gets so many ``cores``. What was connected before, by whoever calls us, is used and left as it is.
+    Raises PathreplayError.
+    """
+    ray = load_ray()
+    if ray.is_initialized():
+        _require_authentication(ray, "that this process is connected to")
+        yield ray, False
+        return
+    address = options.address or os.environ.get(_ADDRESS)
+    with contextlib.ExitStack() as stack:
+        with undisturbed():  # Ray has handlers of its own for signals
+            if address is None:
+                _start(ray, stack, cores)
+            else:
+                _connect(ray, address)
+                stack.callback(ray.shutdown)
+        yield ray, address is None
+
+
+def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> None:
+    """A cluster of our own."""
+    usual = tempfile.gettempdir()
+    # Which only this user may enter; Ray's is open to all. Names of sockets may have 107 characters.
+    folder = tempfile.mkdtemp(prefix="pathreplay-", dir=usual if len(usual) <= _LONGEST_FOLDER else "/tmp")
+    stack.callback(shutil.rmtree, folder, ignore_errors=True)
+    with _private_environment(ray), _apart(ray):
+        try:
+            ray.init(
+                address="local",
+                num_cpus=cores,
+                include_dashboard=False,
+                log_to_driver=False,
+                logging_level="ERROR",
+                _node_ip_address="127.0.0.1",
+                _temp_dir=str(Path(folder) / "ray"),
+            )
+        except (RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
+            with contextlib.suppress(Exception):
+                ray.shutdown()
+            raise PathreplayError(f"executor = 'ray': Ray cannot start here ({_first_line(error)})") from None
+    stack.callback(ray.shutdown)
+    _require_authentication(ray, "of this run")
+    if open_to_others := _beyond_loopback():
+        raise PathreplayError(
+            f"executor = 'ray': Ray {ray.__version__} listens at {open_to_others[0]}, where others reach it; install "
+            "another version, or use executor = 'local'"
+        )
+
+
+def _connect(ray: Any, address: str) -> None:
+    if os.environ.get(_MODE) != "token":
+        raise PathreplayError(
+            f"ray: {_MODE} = '{os.environ.get(_MODE)}' turns authentication off, and who reaches a cluster without it "
+            f"can run programs there; start the cluster with {_MODE}=token, and set it here, too"
+        )
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+    except (RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
+        raise PathreplayError(
+            f"ray: no cluster at '{address}' that lets this program in ({_first_line(error)}); start one there with "
+            f"'ray start' on this machine, too, and give both the same token (see docs/scale.md)"
+        ) from None
+    try:
+        _require_authentication(ray, f"at '{address}'")
+        _require_closed(ray, address)
+    except PathreplayError:
+        ray.shutdown()
+        raise
+
+
+def _require_authentication(ray: Any, which: str) -> None:
+    core = ray._raylet
+    if core.get_authentication_mode() != core.AuthenticationMode.TOKEN:
+        raise PathreplayError(
+            f"ray: the cluster {which} has no authentication, and who reaches it can run programs there; start it with "
+            f"{_MODE}=token"
+        )
+
+
+_KNOCK = """
+import sys
+from ray._raylet import GcsClient
+GcsClient(address=sys.argv[1]).check_alive([], timeout=10)
+"""
+
+
+def _require_closed(ray: Any, address: str) -> None:
+    """Raise PathreplayError if the cluster lets somebody in who has no token."""
+    gcs = ray.get_runtime_context().gcs_address
+    others = {name: value for name, value in os.environ.items() if name not in (_TOKEN, "RAY_AUTH_TOKEN_PATH")}
+    command = [sys.executable, "-c", _KNOCK, gcs]
+    knock = subprocess.run(command, env={**others, _MODE: "disabled"}, capture_output=True, check=False)
+    if knock.returncode == 0:
+        raise PathreplayError(
+            f"ray: the cluster at '{address}' lets in whoever reaches it, without a token; start it with {_MODE}=token"
+        )
+
+
+@contextmanager
+def _private_environment(ray: Any) -> Iterator[None]:
+    """Within this block Ray starts a cluster that uses loopback and our token, and tells nobody of it."""
+    ours = {_MANY_MACHINES: "0", _MODE: "token", _TOKEN: _SECRET, "RAY_USAGE_STATS_ENABLED": "0"}
+    ours["RAY_worker_niceness"] = "0"  # actors are the run, and no less urgent than it would be by itself
+    before = {name: os.environ.get(name) for name in ours}
+    constants = ray._private.ray_constants
+    many = constants.ENABLE_RAY_CLUSTER
+    os.environ.update(ours)
+    constants.ENABLE_RAY_CLUSTER = False
+    ray._raylet.Config.initialize("")  # both may have been read before
+    ray._raylet.AuthenticationTokenLoader.instance().reset_cache()
+    try:
+        yield
+    finally:
+        constants.ENABLE_RAY_CLUSTER = many
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+
+
+@contextmanager
+def _apart(ray: Any) -> Iterator[None]:
+    """Within this block Ray's processes are started in sessions of their own, where the kernel ends them with this one.
+
+    A terminal or a scheduler sends its signals to all processes of a job. This one ends a run in peace then, and needs
+    its actors for that.
+    """
+    services = ray._private.services
+    plain = services.ConsolePopen
+
+    class Apart(plain):  # type: ignore[misc, valid-type]
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options, start_new_session=True)
+
+    if sys.platform.startswith("linux"):
+        services.ConsolePopen = Apart
+    try:
+        yield
+    finally:
+        services.ConsolePopen = plain
+
+
+def _beyond_loopback() -> list[str]:
+    """Addresses other than loopback at which this process's children, or itself, listen for Ray."""
+    found = []
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):
+            found += [
+                f"{each.laddr.ip}:{each.laddr.port}"
+                for each in process.net_connections(kind="inet")
+                if each.status == psutil.CONN_LISTEN and each.laddr.ip not in ("127.0.0.1", "::1", "::ffff:127.0.0.1")
+            ]
+    return found
+
+
+def _first_line(error: BaseException) -> str:
+    return plain_line(next((line for line in str(error).splitlines() if line.strip()), type(error).__name__))

@@ -1,0 +1,179 @@
+"""Who computes which shard of a step: decided by measured seconds while results come in, and without effect on them.
+
+Every actor goes on with the views that it had before, whose kernels it holds. One that has nothing left takes from
+whoever has most left; so the shares of the actors become such that all end together. When nothing is left to begin,
+a shard that takes much longer than expected is computed by an idle actor as well, and the first result counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from pathreplay.inverse.evaluate import Shard
+
+Actor = int
+"""The number of an actor; one that was started again keeps it."""
+
+LATE = 2.0
+"""A shard is late when it has taken so many times what it takes otherwise: noise of a shared machine is less."""
+
+WARM = 2
+"""Evaluations of a view by an actor after which its kernels are there: one is traced, the next one is recorded."""
+
+SMOOTHING = 0.5
+"""How much of what was known of a view's seconds stays when they are measured again."""
+
+Kind = tuple[tuple[int, ...], int, int]
+"""What shards that take the same time have in common: views, samples, stage."""
+
+
+def kind_of(shard: Shard) -> Kind:
+    return shard.views, shard.samples, shard.stage
+
+
+@dataclass
+class Sharing:
+    """What is known of shards and actors from step to step."""
+
+    seconds: dict[Kind, float] = field(default_factory=dict)
+    """Of an evaluation by an actor that has done it before."""
+    extra: float = 0.0
+    """More seconds of one that has not."""
+    owner: dict[Kind, Actor] = field(default_factory=dict)
+    """Who did it last."""
+    times: dict[tuple[Actor, Kind], int] = field(default_factory=dict)
+    """How often an actor has done it."""
+
+    def expected(self, actor: Actor, kind: Kind) -> float | None:
+        """Seconds that the actor will take; None where such a shard has never been done."""
+        known = self.seconds.get(kind)
+        if known is None:
+            return None
+        return known if self.times.get((actor, kind), 0) >= WARM else known + self.extra
+
+    def measured(self, actor: Actor, kind: Kind, seconds: float) -> None:
+        """An actor has taken so many seconds."""
+        times = self.times.get((actor, kind), 0)
+        self.times[actor, kind], self.owner[kind] = times + 1, actor
+        known = self.seconds.get(kind)
+        if known is None:
+            self.seconds[kind] = seconds
+        elif times >= WARM:
+            # What was measured before it was warm is not mixed in.
+            warm = times > WARM or any(self.times.get((a, kind), 0) > WARM for a in self.actors() if a != actor)
+            self.seconds[kind] = SMOOTHING * known + (1 - SMOOTHING) * seconds if warm else seconds
+        elif seconds > known:
+            self.extra = SMOOTHING * self.extra + (1 - SMOOTHING) * (seconds - known)
+
+    def actors(self) -> set[Actor]:
+        """Those that have done something."""
+        return {actor for actor, _ in self.times}
+
+    def forget(self, actor: Actor) -> None:
+        """The actor was lost with all that it held."""
+        self.times = {key: n for key, n in self.times.items() if key[0] != actor}
+        self.owner = {kind: other for kind, other in self.owner.items() if other != actor}
+
+
+class Step:
+    """The shards of one step: which wait, who is at which, which are done. Costs little for each, however many."""
+
+    def __init__(self, sharing: Sharing, shards: Sequence[Shard]) -> None:
+        self.sharing = sharing
+        self.kinds = [kind_of(shard) for shard in shards]
+        self.waiting: dict[Actor | None, list[int]] = {}
+        """By who had them last, if that is known: the longest comes last, of some that are alike the first."""
+        self.left: dict[Actor | None, float] = {}
+        """Seconds that each will take for those."""
+        self.running: dict[Actor, tuple[int, float]] = {}
+        """Who is at which shard, since when."""
+        self.done: set[int] = set()
+        self.again: set[int] = set()
+        """Begun by a second actor, since they were late."""
+        self._wait(range(len(shards)))
+
+    def next(self, actor: Actor, now: float) -> int | None:
+        """The shard that an idle actor begins; None if it has nothing to do for now."""
+        for owner in (actor, None):
+            if self.waiting.get(owner):
+                return self._begin(actor, owner, -1, now)
+        most = self._busiest(now)
+        if most is not None:
+            other, left = most
+            # It goes without help where it would be ready sooner by itself, as long as it is there.
+            for place in reversed(range(len(self.waiting[other]))):
+                kind = self.kinds[self.waiting[other][place]]
+                if other not in self.running or (self.sharing.expected(actor, kind) or 0.0) < left:
+                    return self._begin(actor, other, place, now)
+        late = self._latest()
+        if late is None or late[0] > now:
+            return None
+        self.again.add(late[1])
+        self.running[actor] = late[1], now
+        return late[1]
+
+    def finished(self, index: int, actor: Actor, seconds: float) -> bool:
+        """A result is there; whether it is the first of its shard."""
+        self.running.pop(actor, None)
+        self.sharing.measured(actor, self.kinds[index], seconds)
+        first = index not in self.done
+        self.done.add(index)
+        return first
+
+    def lost(self, index: int, actor: Actor) -> None:
+        """An actor has gone without a result; if no other is at the shard, it waits again. Its others are nobody's."""
+        self.running.pop(actor, None)
+        self.left.pop(actor, None)
+        theirs = self.waiting.pop(actor, [])
+        if index not in self.done and all(index != other for other, _ in self.running.values()):
+            self.again.discard(index)
+            theirs.append(index)
+        self._wait(theirs)
+
+    def patience(self) -> float | None:
+        """When the next shard is late, for whoever waits; None if none will be."""
+        late = None if any(self.waiting.values()) else self._latest()
+        return None if late is None else late[0]
+
+    def _wait(self, indices: Iterable[int]) -> None:
+        seconds, touched = self.sharing.seconds, set()
+        for i in indices:
+            owner = self.sharing.owner.get(self.kinds[i])
+            touched.add(owner)
+            self.waiting.setdefault(owner, []).append(i)
+            self.left[owner] = self.left.get(owner, 0.0) + self._seconds(owner, i)
+        for owner in touched:
+            self.waiting[owner].sort(key=lambda i: (seconds.get(self.kinds[i], 0.0), -i))
+
+    def _begin(self, actor: Actor, owner: Actor | None, place: int, now: float) -> int:
+        index = self.waiting[owner].pop(place)
+        self.left[owner] -= self._seconds(owner, index)
+        self.running[actor] = index, now
+        return index
+
+    def _seconds(self, owner: Actor | None, index: int) -> float:
+        return 0.0 if owner is None else self.sharing.expected(owner, self.kinds[index]) or 0.0
+
+    def _busiest(self, now: float) -> tuple[Actor, float] | None:
+        """Who has most left to do, of those for whom shards wait, and how many seconds."""
+        found: tuple[Actor, float] | None = None
+        for owner, indices in self.waiting.items():
+            if owner is None or not indices:
+                continue
+            left = self.left[owner]
+            if owner in self.running:
+                index, since = self.running[owner]
+                left += max(0.0, self._seconds(owner, index) - (now - since))
+            if found is None or (left, -owner) > (found[1], -found[0]):
+                found = owner, left
+        return found
+
+    def _latest(self) -> tuple[float, int] | None:
+        """When the first of the shards that are at one actor alone is late, and which that is."""
+        late = []
+        for actor, (index, since) in self.running.items():
+            expected = self.sharing.expected(actor, self.kinds[index])
+            if expected is not None and index not in self.again and index not in self.done:
+                late.append((since + LATE * expected, index))
+        return min(late, default=None)

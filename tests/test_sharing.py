@@ -1,0 +1,125 @@
+"""Who computes which shard: actors keep their views, take from each other, and do again what is late or lost."""
+
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+import pytest
+
+from pathreplay.inverse.evaluate import Shard
+from pathreplay.inverse.sharing import LATE, Sharing, Step, kind_of
+
+
+def shards_of(count: int) -> list[Shard]:
+    return [Shard((view,), 4, (view,)) for view in range(count)]
+
+
+def played(sharing: Sharing, shards: list[Shard], speeds: dict[int, float], costs: list[float]) -> tuple[float, dict]:
+    """A step in which actors take cost/speed seconds: when it ended, and who began what."""
+    step, begun = Step(sharing, shards), {actor: [] for actor in speeds}
+    events: list[tuple[float, int, int, float]] = []
+    idle, now = sorted(speeds), 0.0
+    while len(step.done) < len(shards):
+        waiting = []
+        for actor in idle:
+            index = step.next(actor, now)
+            if index is None:
+                waiting.append(actor)
+            else:
+                begun[actor].append(index)
+                seconds = costs[index] / speeds[actor]
+                heapq.heappush(events, (now + seconds, actor, index, seconds))
+        late = step.patience()
+        if waiting and late is not None and (not events or late < events[0][0]):
+            now, idle = max(now, late), waiting
+            continue
+        now, actor, index, seconds = heapq.heappop(events)
+        step.finished(index, actor, seconds)
+        idle = [*waiting, actor]
+    return now, begun
+
+
+def test_every_shard_is_done_once_by_actors_that_are_alike() -> None:
+    sharing, shards = Sharing(), shards_of(10)
+    for _ in range(6):
+        _, begun = played(sharing, shards, {0: 1, 1: 1}, [1.0] * 10)
+        assert sorted(begun[0] + begun[1]) == list(range(10))
+        assert len(begun[0]) == 5
+
+
+def test_actors_keep_their_views() -> None:
+    """From the second step on, whoever had a view has it again: its kernels are there."""
+    sharing, shards = Sharing(), shards_of(8)
+    costs = [1.0, 1.1, 0.9, 1.0, 1.2, 0.8, 1.0, 1.0]
+    first, *later = (played(sharing, shards, {0: 1, 1: 1}, costs)[1] for _ in range(4))
+    for begun in later:
+        assert {actor: sorted(indices) for actor, indices in begun.items()} == {
+            actor: sorted(indices) for actor, indices in first.items()
+        }
+
+
+@pytest.mark.parametrize("speeds", [{0: 1.0, 1: 1.0}, {0: 1.0, 1: 3.0}, {0: 1.0, 1: 1.0, 2: 0.5, 3: 2.0}])
+def test_all_end_together(speeds: dict[int, float]) -> None:
+    """Views of unequal costs, actors of unequal speeds: within the longest shard of the best that can be."""
+    costs = list(np.random.default_rng(3).uniform(0.5, 2.0, 40))
+    sharing = Sharing()
+    for _ in range(8):
+        end, _ = played(sharing, shards_of(40), speeds, costs)
+    best = sum(costs) / sum(speeds.values())
+    print(f"{end:.2f} s, at best {best:.2f} s")
+    assert best <= end <= best + max(costs) / min(speeds.values())
+
+
+def test_what_is_late_is_given_to_an_idle_actor_as_well() -> None:
+    sharing, shards = Sharing(), shards_of(2)
+    for _ in range(4):
+        played(sharing, shards, {0: 1, 1: 1}, [1.0, 1.0])
+    step = Step(sharing, shards)
+    first, second = step.next(0, 0.0), step.next(1, 0.0)
+    assert {first, second} == {0, 1}
+    assert step.finished(first, 0, 1.0)
+    assert step.next(0, 1.0) is None
+    assert step.patience() == pytest.approx(LATE)
+    assert step.next(0, LATE) == second
+    assert step.patience() is None and step.next(2, 10 * LATE) is None, "a third one is not asked"
+    assert step.finished(second, 0, 1.0) and not step.finished(second, 1, 3.0), "the first result counts"
+
+
+def test_what_was_never_done_is_not_late() -> None:
+    step = Step(Sharing(), shards_of(1))
+    assert step.next(0, 0.0) == 0
+    assert step.patience() is None and step.next(1, 100.0) is None
+
+
+def test_what_is_lost_waits_again() -> None:
+    sharing, shards = Sharing(), shards_of(3)
+    step = Step(sharing, shards)
+    index = step.next(0, 0.0)
+    assert index is not None
+    sharing.forget(0)
+    step.lost(index, 0)
+    assert index in step.waiting[None]
+    assert sorted(step.next(1, now) for now in (1.0, 2.0, 3.0)) == [0, 1, 2]  # type: ignore[type-var]
+
+
+def test_a_loss_after_another_has_taken_over_is_none() -> None:
+    sharing, shards = Sharing(), shards_of(1)
+    played(sharing, shards, {0: 1}, [1.0])
+    step = Step(sharing, shards)
+    assert step.next(0, 0.0) == 0 and step.next(1, 10.0) == 0
+    step.lost(0, 0)
+    assert not any(step.waiting.values())
+    step.finished(0, 1, 1.0)
+    step.lost(0, 0)
+    assert not any(step.waiting.values())
+
+
+def test_the_views_of_a_lost_actor_are_nobodys() -> None:
+    sharing, shards = Sharing(), shards_of(4)
+    for _ in range(3):
+        played(sharing, shards, {0: 1, 1: 1}, [1.0] * 4)
+    sharing.forget(0)
+    assert set(sharing.owner.values()) == {1}
+    kind = kind_of(shards[0])
+    assert sharing.expected(0, kind) == sharing.seconds[kind] + sharing.extra
