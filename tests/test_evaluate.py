@@ -116,6 +116,15 @@ def test_each_view_is_recorded_once_where_it_can_be(changes: dict[str, Any], rec
     assert [each.n_recordings for each in recordings] == [1, 1] * records
 
 
+def test_views_are_not_recorded_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each recording would hold all of them."""
+    problem = problem_of(**SWEEP)
+    sensors = len(problem.scene.sensors())
+    for most, records in ((sensors, True), (sensors - 1, False)):
+        monkeypatch.setattr("pathreplay.inverse.evaluate.MOST_SENSORS", most)
+        assert Evaluator(problem, problem.integrator).freezes == records
+
+
 def test_observers_hear_of_everything_in_order() -> None:
     grid = [{"key": TEXTURE, "initial": 0.5, "resolutions": [2, 4], "refine_at": [2]}]
     config = make_config({**JOB, "iterations": 3, "parameters": grid})

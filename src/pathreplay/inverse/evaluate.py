@@ -26,6 +26,9 @@ from pathreplay.scenes.parameters import get_array
 
 LARGE = 2**22
 """Entries of a variable from which on its memory is looked after."""
+MOST_SENSORS = 64
+"""Of a scene whose passes are recorded: what is recorded of a view holds all sensors, so that memory grows with the
+square of their number (by measurement 3 MB a view where there are 50, and 11 MB where there are 200)."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +180,8 @@ class Evaluator:
         self._moving = {v.key for v in problem.variables} if moving is None else set(moving)
         self._facts = facts = SceneFacts(problem.scene)
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
-        self.freezes = record and is_recordable(integrator, facts.has_media) and problem.loss not in ELSEWHERE
+        known = len(problem.scene.sensors()) <= MOST_SENSORS
+        self.freezes = known and record and is_recordable(integrator, facts.has_media) and problem.loss not in ELSEWHERE
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
         # Of each view and number of samples that was seen: whether pixels can be swept.
         self._sweeps: dict[tuple[int, int], bool] = {}

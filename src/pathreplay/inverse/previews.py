@@ -19,6 +19,7 @@ from pydantic import TypeAdapter
 
 from pathreplay.errors import PathreplayError, plain_line
 from pathreplay.interrupts import Stop
+from pathreplay.inverse import grids
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.events import Event, Notes, Started, Stepped, Stopped
@@ -308,8 +309,9 @@ def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
 
 def _encoded(image: Image, exposure: float, side: int, kind: str) -> bytes:
     """The picture as a display shows it, no longer than ``side`` pixels: PNG, or WebP, which loses what few see."""
-    shown = np.round(255 * displayed(image, exposure)).astype(np.uint8)
-    picture = PIL.Image.fromarray(shown[..., 0] if shown.shape[2] == 1 else shown).convert("RGB")
+    # In double precision a large texture would take more than all else that is known of it.
+    pixels = np.round(255 * displayed(grids.shown(image, 2 * side), exposure)).astype(np.uint8)
+    picture = PIL.Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
     if max(picture.size) > side:
         factor = side / max(picture.size)
         picture = picture.resize([max(1, round(n * factor)) for n in picture.size], PIL.Image.Resampling.BOX)

@@ -166,6 +166,7 @@ def _states(
                 saving.observe(event)
                 with computing(config):
                     previews.observe(event)
+                problem.album.rest()
                 if isinstance(event, Stepped):
                     views = tuple(view.name for view in problem.views)
                     yield State(event.entry, answer_of(problem, run), views, folder.path, look)
