@@ -217,7 +217,7 @@ def main(
     print(f"{shards} shards of {seconds:g} s, {gigabits:g} gigabit a second, {costs.add:.1e} s to add an entry, "
           f"{costs.step:.1e} s to step a parameter\n")  # fmt: skip
     ways = {"as built": built, "sums in a ring": summed, "and a sharded optimiser": sharded}
-    print("| parameters | " + " | ".join(f"{n} devices" for n in DEVICES) + " | way |")
+    print("| parameters | " + " | ".join(f"{n} {'device' if n == 1 else 'devices'}" for n in DEVICES) + " | way |")
     print("| ---: |" + " ---: |" * len(DEVICES) + " --- |")
     for parameters in PARAMETERS:
         for name, way in ways.items():
