@@ -223,7 +223,8 @@ def test_actors_that_are_killed_change_nothing(capfd: pytest.CaptureFixture[str]
     finally:
         over.set()
         killer.join()
-    told = capfd.readouterr().err
+    out, told = capfd.readouterr()
+    assert "raylet" not in out + told, "Ray's own words are not for users"
     assert killed and found == expected
     assert "was lost and is started again; its shard is computed again" in told
     (restarts,) = re.findall(r"(\d+) restarts", told)

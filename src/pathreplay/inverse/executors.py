@@ -116,6 +116,8 @@ class Crew:
         if isinstance(answer, Hello):
             self._there(call.actor, answer)
             return None
+        if answer is None:
+            self._lost(call, RuntimeError("it was started again"))
         return answer
 
     def _greet(self, number: int) -> None:

@@ -67,14 +67,14 @@ class RayActor:
     def __init__(self) -> None:
         self.problem: Problem | None = None
         self.config: Config
-        self.evaluators: dict[bool, Evaluate] = {}
+        self.evaluators: dict[bool, Evaluate]
         self.log: Any = None
 
     def hello(self, parcel: Parcel) -> Hello:
         """Build the problem: before anything else. Raises PathreplayError for what this machine has not."""
         backend.set_variant(parcel.variant)
         dr.set_thread_count(parcel.threads)
-        self.config = parcel.config
+        self.config, self.evaluators = parcel.config, {}
         self.problem = build_problem(parcel.config, parcel.base, parcel.targets)
         self.log = _kept_log()
         machine = f"{_processor()}, LLVM {'.'.join(map(str, backend.loaded_version()))}"

@@ -66,6 +66,7 @@ def connected(options: RayOptions, cores: int) -> Iterator[tuple[Any, bool]]:
         return
     address = options.address or os.environ.get(_ADDRESS)
     with contextlib.ExitStack() as stack:
+        stack.enter_context(_silent(ray))
         with undisturbed():  # Ray has handlers of its own for signals
             if address is None:
                 _start(ray, stack, cores)
@@ -196,6 +197,18 @@ def _apart(ray: Any) -> Iterator[None]:
         yield
     finally:
         services.ConsolePopen = plain
+
+
+@contextmanager
+def _silent(ray: Any) -> Iterator[None]:
+    """Within this block Ray does not print what happens to its processes: we tell it in a line of our own."""
+    worker = ray._private.worker
+    plain = worker.print_to_stdstream
+    worker.print_to_stdstream = lambda *_, **__: None
+    try:
+        yield
+    finally:
+        worker.print_to_stdstream = plain
 
 
 def _beyond_loopback() -> list[str]:

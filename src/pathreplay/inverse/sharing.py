@@ -62,9 +62,10 @@ class Sharing:
         elif times >= WARM:
             # What was measured before it was warm is not mixed in.
             warm = times > WARM or any(self.times.get((a, kind), 0) > WARM for a in self.actors() if a != actor)
+            seconds = min(seconds, LATE * known)  # an accident shall not make the next one seem early
             self.seconds[kind] = SMOOTHING * known + (1 - SMOOTHING) * seconds if warm else seconds
-        elif seconds > known:
-            self.extra = SMOOTHING * self.extra + (1 - SMOOTHING) * (seconds - known)
+        else:
+            self.extra = SMOOTHING * self.extra + (1 - SMOOTHING) * max(0.0, seconds - known)
 
     def actors(self) -> set[Actor]:
         """Those that have done something."""
