@@ -117,7 +117,7 @@ def lit_box(make: Callable[[Place, dict], Any]) -> Callable[[], dict]:
 
 
 def can_lit_from_the_front() -> dict:
-    """Without places where a facet hides a lamp that smooth shading would see: those jumps are left out."""
+    """Without places where a facet hides a lamp that smooth shading would see: `hexagon_lit` has those."""
     place = T().translate([0.1, 0.2, 4.5]).rotate([0, 1, 0], 180).scale([0.5, 0.5, 1])
     return scene(wall=shape(BACK, patterned()), lamp=lamp(place), object=can(BOX, paint(0.5, 0.5, 0.2)))
 
