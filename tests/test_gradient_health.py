@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -93,15 +94,15 @@ def test_a_few_bad_entries_end_nothing(spoilt: type[Spoilt]) -> None:
 
 
 def test_a_loss_that_is_no_number_leaves_a_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = Local.run
+    real = Local.each
 
-    def run(self: Local, values: Any, shards: Any, learned: Any) -> list[Evaluation]:
-        found = real(self, values, shards, learned)
+    def each(self: Local, values: Any, shards: Any, learned: Any) -> Iterator[Evaluation]:
         calls.append(1)
-        return found if len(calls) != 4 else [replace(each, loss=float("nan")) for each in found]
+        for found in real(self, values, shards, learned):
+            yield found if len(calls) != 4 else replace(found, loss=float("nan"))
 
     calls: list[int] = []
-    monkeypatch.setattr(Local, "run", run)
+    monkeypatch.setattr(Local, "each", each)
     with pytest.raises(PathreplayError, match=r"The loss is nan at iteration 3;.*go on with: pathreplay optimize"):
         optimize(make_config({**JOB, "output": "run"}), progress=False)
     result = optimize(resume="run", progress=False)

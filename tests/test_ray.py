@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -117,8 +118,9 @@ def test_ranges_of_samples_are_means_over_more_seeds(noise: bool) -> None:
 
     def watched(values: Any, shard: Any, learned: Any) -> Any:
         shards.append(shard)
-        kept.append(evaluate(values, shard, learned))
-        return kept[-1]
+        found = evaluate(values, shard, learned)
+        kept.append(deepcopy(found))  # what a step is given it adds up in place
+        return found
 
     run.executor.evaluate = watched  # type: ignore[attr-defined]
     with one_thread(True):
