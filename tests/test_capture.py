@@ -285,13 +285,18 @@ def test_an_object_of_the_same_name_is_told(folder: Path) -> None:
         optimize(make_config({**JOB, "parameters": [{"key": "shot_1.bsdf.reflectance.value"}]}), progress=False)
 
 
+def small_capture(folder: Path) -> tuple[Path, Path]:
+    """The folder of the example, and one with twelve small pictures that its script has made."""
+    example, pictures = Path(__file__).parents[1] / "examples" / "capture", folder / "small"
+    script = [sys.executable, str(example / "make_capture.py"), str(pictures)]
+    subprocess.run([*script, "--views", "12", "--width", "24", "--spp", "256"], check=True, capture_output=True)
+    return example, pictures
+
+
 @pytest.mark.slow
 def test_the_example_finds_texture_roughness_and_sky(folder: Path) -> None:
     """A small version, by its own script and config."""
-    example = Path(__file__).parents[1] / "examples" / "capture"
-    pictures = folder / "small"
-    script = [sys.executable, str(example / "make_capture.py"), str(pictures)]
-    subprocess.run([*script, "--views", "12", "--width", "24", "--spp", "256"], check=True, capture_output=True)
+    example, pictures = small_capture(folder)
     assert len(json.loads((pictures / "transforms.json").read_text())["frames"]) == 12
     changes = [f"capture.transforms={pictures / 'transforms.json'}", "iterations=300", "picture_spp=64"]
     result = optimize(example / "config.toml", output="found", progress=False, define=changes)
@@ -308,10 +313,7 @@ def test_the_example_finds_texture_roughness_and_sky(folder: Path) -> None:
 @pytest.mark.slow
 def test_exposures_of_a_capture_are_found(folder: Path) -> None:
     """Of the example's pictures at exposures of half to twice, with noise; texture, roughness and sky are given."""
-    example = Path(__file__).parents[1] / "examples" / "capture"
-    pictures = folder / "small"
-    script = [sys.executable, str(example / "make_capture.py"), str(pictures)]
-    subprocess.run([*script, "--views", "12", "--width", "24", "--spp", "256"], check=True, capture_output=True)
+    example, pictures = small_capture(folder)
     logs = np.random.default_rng(3).uniform(-0.7, 0.7, 12)
     factors = np.exp(logs - logs[[k for k in range(12) if k % 6]].mean())
     for k, factor in enumerate(factors):
