@@ -1,8 +1,8 @@
 """Sets the variant that the tests run in, before any of them builds a scene.
 
-Every test runs in `llvm_ad_rgb`; what needs another variant, or a Python that has not imported us yet, starts one
-of its own with `run_python`. (Setting a second variant runs Mitsuba's Python modules once more: its stock integrators
-are then no longer instances of the classes that those modules show.)
+Every test runs in the variant that variant.py names; what needs another one, or a Python that has not imported us
+yet, starts one of its own with `run_python`. (Setting a second variant runs Mitsuba's Python modules once more: its
+stock integrators are then no longer instances of the classes that those modules show.)
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ import numpy as np  # isort: skip
 
 from pathreplay.inverse import report  # isort: skip
 from pathreplay.inverse.images import png_bytes  # isort: skip
+from variant import VARIANT  # isort: skip
 
 #: Files that compute and neither read nor write pictures, which a pool of one thread would wait for for ever.
 COMPUTING = {"test_truth_media", "test_pixel_sweep", "test_replay_attached", "test_primal_media", "test_rivals",
              "test_truth_materials", "test_truth_attached", "test_motion_noise", "test_fixed_set", "test_drivers",
              "test_terms", "test_evaluated", "test_step", "test_truth_edges", "test_truth_edges_inner",
              "test_truth_edges_media"}  # fmt: skip
-VARIANT = "llvm_ad_rgb"
 #: Far above what any of these takes (a few seconds): a hanging process must not hang the tests.
 TIMEOUT_S = 120
 #: Files that take longest, begun first, so that of several processes none is left alone with one of them.

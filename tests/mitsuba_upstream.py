@@ -26,6 +26,7 @@ import numpy as np
 from mitsuba_configs import Limits
 from mitsuba_errors import ADJOINT, FLOOR_FORWARD, FLOOR_PRIMAL, FLOOR_REVERSE, LANES, relative
 from pathreplay.backend import set_variant
+from variant import VARIANT
 
 TESTS = "src/integrators/tests/test_ad_integrators.py"
 REFERENCE_SPP = 12000
@@ -146,7 +147,7 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=1.0, help="of Mitsuba's samples: fewer are harder to pass with")
     parser.add_argument("--again", type=int, default=0, metavar="N", help="only make references again, with N seeds")
     given = parser.parse_intermixed_args()
-    set_variant("llvm_ad_rgb")
+    set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
     tests = upstream(given.checkout.resolve())
     ours = {"edges": given.edges, "edge_spp": given.edge_spp} if given.plugin == "pathreplay" else {}

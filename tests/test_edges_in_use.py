@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pathreplay import backend
 from pathreplay.check.objective import integrator_name
 from pathreplay.check.reference import integrator_under_test
 from pathreplay.cli import app
@@ -25,7 +24,6 @@ from pathreplay.scenes.loading import load_scene
 
 @pytest.fixture(autouse=True)
 def variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    backend.set_variant("llvm_ad_rgb")
     monkeypatch.chdir(tmp_path)
 
 

@@ -9,7 +9,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay import backend
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import images, load_config, make_config
 from pathreplay.inverse.grids import resampled
@@ -17,12 +16,6 @@ from pathreplay.inverse.losses import RELATIVE_FLOOR, find_loss, mean_loss
 from pathreplay.inverse.values import make_value
 from pathreplay.media.volume_files import save_vol
 from pathreplay.threads import spare_thread
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    backend.set_variant("llvm_ad_rgb")
-
 
 # What the docstrings say, in NumPy.
 FORMULAS = {

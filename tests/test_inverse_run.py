@@ -56,10 +56,8 @@ JOB = {
 
 @pytest.fixture(autouse=True)
 def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    from pathreplay import backend
     from pathreplay.inverse.images import exr_bytes
 
-    backend.set_variant("llvm_ad_rgb")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "room.xml").write_text(SCENE)
     texels = np.array([[0.1, 0.4], [0.6, 0.9]], np.float32)[:, :, None] * np.array([1, 0.8, 0.6], np.float32)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathreplay import backend, cli
+from pathreplay import cli
 
 SCENE = """<scene version="3.0.0">
   <sensor type="perspective" id="eye">
@@ -39,7 +39,6 @@ target = { images = ["target.exr"] }
 @pytest.fixture
 def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a job that works."""
-    backend.set_variant("llvm_ad_rgb")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ball.xml").write_text(SCENE)
     write_image(tmp_path / "texture.exr", np.full((2, 2, 3), 0.5))

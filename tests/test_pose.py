@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pathreplay import backend
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize, problem, targets
 from pathreplay.inverse.config import load_config
@@ -24,7 +23,6 @@ from pathreplay.scenes.parameters import get_array
 
 @pytest.fixture(autouse=True)
 def variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    backend.set_variant("llvm_ad_rgb")
     monkeypatch.chdir(tmp_path)
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pathreplay import backend
 from pathreplay.inverse.evaluate import Evaluate, Evaluation, Executor, Local, Shard, total
 from pathreplay.inverse.optimiser import DrJitOptimiser, Optimiser
 from pathreplay.inverse.optimizer_options import Optimizer
@@ -34,11 +33,6 @@ Arrays = dict[str, np.ndarray]
 @pytest.fixture(params=OPTIMISERS)
 def make(request: pytest.FixtureRequest) -> Make:
     return partial(DrJitOptimiser, options=Optimizer(**OPTIMISERS[request.param]))
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    backend.set_variant("llvm_ad_rgb")
 
 
 def start() -> Arrays:

@@ -7,7 +7,6 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 
-from pathreplay import backend
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.loading import BUILTINS, load_scene, load_scene_for
 
@@ -19,11 +18,6 @@ XML = """<scene version="3.0.0">
   <shape type="sphere" id="one"><ref id="paint"/></shape>
   <shape type="sphere" id="two"><ref id="paint"/></shape>
 </scene>"""
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    backend.set_variant("llvm_ad_rgb")
 
 
 CORNELL = {"red.reflectance.value", "green.reflectance.value", "light.emitter.radiance.value"}

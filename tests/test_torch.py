@@ -36,14 +36,14 @@ def test_the_picture_is_that_of_mitsuba(render: Any) -> None:
     expected = np.array(mi.render(scene, sensor=1, integrator=mi.load_dict(PLAIN), spp=16, seed=4))
     image = render(render.start(), 1, seed=4)
     assert image.shape == (6, 6, 3) and image.dtype == torch.float32
-    np.testing.assert_allclose(image.numpy(), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(image.cpu().numpy(), expected, rtol=1e-5, atol=1e-6)
 
 
 def mitsubas(values: dict[str, Any], sensor: int, seed: int, weights: np.ndarray) -> dict[str, np.ndarray]:
     """The gradient of sum(weights * picture) by Mitsuba alone, with many samples."""
     scene = load_scene("cornell-box-photo", **SMALL)
     params = mi.traverse(scene)
-    params[TEXTURE], params[WALL] = mi.TensorXf(values[TEXTURE].numpy()), mi.Color3f(*values[WALL].tolist())
+    params[TEXTURE], params[WALL] = mi.TensorXf(values[TEXTURE].cpu().numpy()), mi.Color3f(*values[WALL].tolist())
     for key in (TEXTURE, WALL):
         dr.enable_grad(params[key])
     params.update()
@@ -60,13 +60,13 @@ def test_gradients_of_several_calls_are_each_their_own(render: Any) -> None:
         for tensor in values.values():
             tensor.requires_grad_()
     weights = [np.random.default_rng(i).uniform(0.5, 1, (6, 6, 3)).astype(np.float32) for i in (0, 1)]
-    loss = (render(first, 0, seed=1, spp=2048) * torch.tensor(weights[0])).sum()
-    loss = loss + (render(second, 1, seed=2, spp=2048) * torch.tensor(weights[1])).sum()
+    loss = (render(first, 0, seed=1, spp=2048) * torch.tensor(weights[0], device=render.device)).sum()
+    loss = loss + (render(second, 1, seed=2, spp=2048) * torch.tensor(weights[1], device=render.device)).sum()
     loss.backward()
     for values, sensor, weight in ((first, 0, weights[0]), (second, 1, weights[1])):
         expected = mitsubas({k: v.detach() for k, v in values.items()}, sensor, 3, weight)
         for key, gradient in expected.items():
-            found = values[key].grad.numpy()
+            found = values[key].grad.cpu().numpy()
             assert found.shape == gradient.shape
             np.testing.assert_allclose(found.mean(), gradient.mean(), rtol=0.05)
             assert np.abs(found - gradient).mean() < 0.15 * np.abs(gradient).mean()
@@ -79,8 +79,8 @@ def test_transforms_vectors_and_numbers_have_gradients() -> None:
     values["camera.to_world"].requires_grad_()
     assert values["camera.to_world"].shape == (4, 4)
     ramp = np.broadcast_to(np.linspace(-1, 1, 8, dtype=np.float32)[:, None], (8, 8, 3)).copy()  # else shifts cancel
-    (render(values, 0, seed=1) * torch.tensor(ramp)).sum().backward()
-    found = values["camera.to_world"].grad.numpy()
+    (render(values, 0, seed=1) * torch.tensor(ramp, device=render.device)).sum().backward()
+    found = values["camera.to_world"].grad.cpu().numpy()
     scene = load_scene("mirror-camera", resolution=8)
     params, x = mi.traverse(scene), mi.Float(0)
     dr.enable_grad(x)

@@ -83,7 +83,7 @@ def lpips(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
     @dr.wrap(source="drjit", target="torch")
     def distance(a: Any, b: Any) -> Any:
         a, b = (2 * x.permute(2, 0, 1)[None] - 1 for x in (a, b))
-        return network(a, b)[0].permute(1, 2, 0).contiguous()
+        return network.to(a.device)(a, b)[0].permute(1, 2, 0).contiguous()
 
     try:
         return distance(_encoded(image), _encoded(target))
