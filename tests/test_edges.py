@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,9 +13,10 @@ import pytest
 
 import edge_scenes as scenes
 from pathreplay.gradient.centres import Centres
-from pathreplay.gradient.counted import key_of, quasi_random
+from pathreplay.gradient.counted import ROUNDS, Counted, key_of, quasi_random
 from pathreplay.gradient.crofton import Picked, PlaneLine, Sight, bisect, glance
 from pathreplay.gradient.lamps import sample_at
+from pathreplay.gradient.seer import Seer
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.facts import SceneFacts
 from pathreplay.render.places import FilmPlaces
@@ -222,6 +224,33 @@ def test_passes_share_no_random_numbers() -> None:
     keys = [set(np.array(key_of(dr.arange(mi.UInt32, lanes), mi.UInt32(seed))).tolist()) for seed in (1, 2, 3)]
     assert all(len(each) > lanes - 4 for each in keys)
     assert len(set.union(*keys)) > 3 * lanes - 12
+
+
+def most_together(numbers: list[np.ndarray]) -> float:
+    """z of chi² of those two that go together most, on 16 x 16 cells."""
+    cells, n = [np.minimum((16 * x).astype(int), 15) for x in numbers], len(numbers[0])
+    counts = [np.bincount(16 * a + b, minlength=256) for a, b in combinations(cells, 2)]
+    return max((((each - n / 256) ** 2).sum() * 256 / n - 255) / np.sqrt(2 * 255) for each in counts)
+
+
+def test_numbers_of_a_key_know_nothing_of_each_other() -> None:
+    """With four rounds they do: what a vertex sees went together with how paths had come to it."""
+    keys = key_of(dr.arange(mi.UInt32, 2**20), mi.UInt32(3))
+    numbers = Counted.of(keys)
+    found = [np.array(numbers.next_1d()) for _ in range(12)]
+    assert most_together(found) < 5
+    fewer = [np.array(mi.sample_tea_float32(keys, mi.UInt32(i), ROUNDS // 2)) for i in range(12)]
+    assert most_together(fewer) > 100
+
+
+def test_what_is_closer_than_rays_begin_is_rounding() -> None:
+    """On an H100 rays that left a can by its rim met its side at 2e-9, and one edge there counted a thousand others."""
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.p, si.n = mi.Point3f(2, -7, 0.5), mi.Normal3f(0, 0, 1)
+    beside = dr.norm(si.spawn_ray(mi.Vector3f(0, 0, 1)).o - si.p)
+    seer: Any = SimpleNamespace(origin=si)
+    far = Seer.is_off(seer, beside * mi.Float(0, 1e-5, 0.99, 1.01, 100))
+    assert np.array(far).tolist() == [False, False, False, True, True]
 
 
 def test_samples_of_a_ball_are_asked_for_on_a_disk() -> None:

@@ -20,6 +20,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .counted import ROUNDS
+
 BISECTIONS = 12
 """How often a line is halved: what is left of it is 2^-12 as long."""
 OFF_PLANE = 0.1
@@ -129,7 +131,7 @@ class Picked:
         until = dr.cumsum(mi.Float64(mass))
         total = dr.gather(mi.Float64, until, n - 1)
         lane = dr.arange(mi.UInt32, lanes)
-        x = (mi.Float64(lane) + mi.Float64(mi.sample_tea_float32(seed, lane))) * (total / lanes)
+        x = (mi.Float64(lane) + mi.Float64(mi.sample_tea_float32(seed, lane, ROUNDS))) * (total / lanes)
         index = dr.minimum(dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float64, until, i) <= x), n - 1)
         own = dr.gather(mi.Float, mass, index)
         return Picked(index, dr.select(own > 0, mi.Float(total / lanes) / own, 0))

@@ -183,6 +183,7 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     lit, dark = dr.select(a.hidden, b, a), dr.select(a.hidden, a, b)
     active &= (line.lamp.radius == 0) | (dark.hit.t < lit.hit.t)  # or it is the mesh that ends there
     light, hit = lit.light, dark.hit
+    active &= seer.is_off(hit.t)
     f, pdf = seer.towards(light.d, active)
     F = x.β * f * lit.Le * seer.past(light, hit.t, key, active) * line.share
     F *= dr.select(light.delta, 1, mis_weight(lit.density / line.share, pdf))
@@ -283,7 +284,7 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
     near_a = edges[0].t <= edges[1].t
     edge, near, far = dr.select(near_a, *edges), dr.select(near_a, *firsts), dr.select(near_a, *firsts[::-1])
     ray_near, ray_far = dr.select(near_a, *rays), dr.select(near_a, *rays[::-1])
-    active &= edge.is_valid()
+    active &= edge.is_valid() & seer.is_off(edge.t)
 
     bend = Bend.of(walk, ((edge, ray_near), (dr.select(near_a, *edges[::-1]), ray_far)), active)
     slope = derivative_by_ray(ray_near, lambda ray: bend.gap(ray, active)).d

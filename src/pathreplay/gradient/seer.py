@@ -87,6 +87,10 @@ class Seer:
         between = dr.dot(n, a) * dr.dot(n, b) < 0
         return between if self.walk.media is None else between & ~self.event
 
+    def is_off(self, t: mi.Float) -> mi.Bool:
+        """Whether a distance is more than that by which rays begin beside their surface: closer ones are rounding."""
+        return t > mi.math.RayEpsilon * (1 + dr.max(dr.abs(self.origin.p)))
+
     def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
         """Whether a direction follows what it hits: from particles only what scatters or emits, see `scatter`."""
         active = active & ~self.keeps
