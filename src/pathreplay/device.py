@@ -4,8 +4,8 @@ On LLVM a kernel has as many lanes under way as threads have places in a packet,
 thread's stack. A GPU sets local memory aside for every thread that can be resident, whatever is launched: a record of
 124 bytes x depth 2048 x 2048 threads x 132 multiprocessors is 69 GB. So deep records are for processors.
 
-No GPU has been at hand: what stands here about them follows from NVIDIA's and Dr.Jit's documentation, is tested with
-devices that are made up, and is measured by `pathreplay doctor --gpu` where there is one.
+What stands here about GPUs was measured on an H100 (docs/scale.md), is tested with devices that are made up, and is
+measured by `pathreplay doctor --gpu` elsewhere.
 """
 
 from __future__ import annotations
@@ -18,8 +18,12 @@ from pathreplay import memory
 
 SHARE = 0.25
 """Of a GPU's memory that records may take: the rest is for scene, film, and what else runs there."""
-LARGEST_LOCAL = 512 * 1024
-"""Bytes of local memory that a CUDA thread can have, by NVIDIA's tables for all devices since 2010."""
+LARGEST_LOCAL = 56 * 1024
+"""Bytes that a CUDA thread may remember: OptiX gives it a stack of 64 KiB, and ends the process where that is not
+enough. A record of 560 x 96 bytes fits, one of 700 x 96 does not."""
+FEWEST_RECORDS = 9
+"""That a GPU makes room for: an array of up to eight is kept in registers, and reading one of these by its index makes
+a pass take more than twice as long."""
 
 # CUDA's numbers for what it is asked.
 _MULTIPROCESSORS, _THREADS_EACH = 16, 39
@@ -49,18 +53,19 @@ class Device:
 
     def local_bytes(self) -> int | None:
         """Bytes that a lane may remember in local memory; None: as much as the drivers are made for."""
-        if not self.is_gpu or not self.lanes or not self.memory:
+        if not self.is_gpu:
             return None
-        return min(LARGEST_LOCAL, int(SHARE * self.memory) // self.lanes)
+        known = self.lanes > 0 and self.memory > 0
+        return min(LARGEST_LOCAL, int(SHARE * self.memory) // self.lanes) if known else LARGEST_LOCAL
 
     def most_records(self, size: int, otherwise: int) -> int:
         """How many records of ``size`` bytes a lane may hold, and ``otherwise`` at most."""
         room = self.local_bytes()
         return otherwise if room is None else min(otherwise, room // size)
 
-    def footprint(self, size: int, records: int) -> int:
-        """Bytes of local memory that a kernel with so many records takes on a GPU."""
-        return size * records * self.lanes
+    def room(self, records: int) -> int:
+        """For how many records to make room, where so many are needed."""
+        return max(records, FEWEST_RECORDS) if self.is_gpu else records
 
 
 def backend_of(variant: str) -> str:

@@ -48,15 +48,10 @@ def _bytes(layout: Layout) -> int:
     return 4 * sum(dr.size_v(kind) if dr.depth_v(kind) > 1 else 1 for kind in kinds) + 4  # and the word
 
 
-def footprint(walk: Walk, device: Device) -> int:
-    """Bytes of local memory that a GPU sets aside for the records of the sweep driver; 0 on a processor."""
-    return device.footprint(largest_record(walk), room_for(walk))
-
-
 def room_for(walk: Walk) -> int:
     """How many vertices the record has room for: with media also two null boundaries at each, as convex ones need."""
     if walk.media is None:
-        return max(walk.max_depth, 1)
+        return device_of(mi.variant()).room(max(walk.max_depth, 1))
     return min(3 * walk.max_depth + 8, MAX_RECORDS_MEDIA)
 
 

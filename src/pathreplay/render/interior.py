@@ -17,7 +17,7 @@ from ..gradient.lights import lights_or
 from ..gradient.pixel_sweep import PixelLoss, pixel_sweep
 from ..gradient.primal import primal
 from ..gradient.ray_jacobian import Recovery
-from ..gradient.record import deepest, footprint
+from ..gradient.record import deepest
 from ..gradient.replay import replay
 from ..gradient.sweep import sweep
 from ..transport.vertex import Walk
@@ -99,10 +99,10 @@ class PathReplay:
         device = device_of(mi.variant())
         if self._sweeps(walk) or self.driver == "replay" or not device.is_gpu:
             return ""
-        size, most, name = footprint(walk, device) / 1e9, deepest(walk, device), device.name or "the GPU"
         return (
-            f"records of {walk.max_depth} vertices would take {size:.3g} GB of the memory of {name}: paths are "
-            f"walked twice instead (driver = 'replay'); up to max_depth = {most} they are recorded"
+            f"records of {walk.max_depth} vertices are more than {device.name or 'the GPU'} can hold for each of its "
+            f"threads: paths are walked twice instead (driver = 'replay'); up to max_depth = {deepest(walk, device)} "
+            "they are recorded"
         )
 
     def _sweeps(self, walk: Walk) -> bool:

@@ -16,7 +16,8 @@ from .camera_pass import Pass
 
 def _fits(max_depth: int, spp: int) -> bool:
     """Whether there are two paths or more, and the record of a lane can hold all of them."""
-    return 1 < spp <= device_of(mi.variant()).most_records(LARGEST_RECORD, MAX_DEPTH) // max(max_depth, 1)
+    device = device_of(mi.variant())
+    return 1 < spp <= device.most_records(LARGEST_RECORD, MAX_DEPTH) // device.room(max(max_depth, 1))
 
 
 def sweepable(sensor: mi.Sensor, max_depth: int, spp: int) -> bool:
