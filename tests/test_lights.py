@@ -1,4 +1,4 @@
-"""The lights driver: its gradient is the sweep's, path by path or in expectation, and it is used where it is right."""
+"""The lights driver: its gradient is the sweep's, path by path, and it is used where it is right."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.check.statistics import gap
-from pathreplay.check.verdict import Z_LIMIT
 from pathreplay.gradient import lights as module
 from pathreplay.gradient.lights import lights, lights_alone
 from pathreplay.gradient.sweep import sweep
@@ -35,17 +33,6 @@ def painted_lamp() -> dict[str, Any]:
     return {"type": "rectangle", "to_world": at, "emitter": {"type": "area", "radiance": texture()}}
 
 
-def bright(width: int = 8) -> np.ndarray:
-    """A dim sky with a patch a hundred times as bright, which emitter samples are drawn to."""
-    sky = np.random.default_rng(1).uniform(0.2, 1, (width // 2, width, 3)).astype(np.float32)
-    sky[1, 2] *= 100
-    return sky
-
-
-def under_sky(bsdf: dict[str, Any] | None = None) -> mi.Scene:
-    return world(fresh(bsdf), {"sky": {"type": "envmap", "bitmap": mi.Bitmap(bright())}})
-
-
 def even() -> mi.TensorXf:
     """The adjoint of the mean of a picture."""
     return dr.full(mi.TensorXf, 1 / (3 * SIZE**2), (SIZE, SIZE, 3))
@@ -61,10 +48,15 @@ def alone(scene: mi.Scene, *keys: str, **options: Any) -> bool:
 
 @pytest.mark.parametrize(
     ("bsdf", "key"),
-    [({"type": "plastic"}, LAMP), (GLASS, "lamp.emitter.radiance.data"), (METAL, "bulb.intensity.value")],
+    [
+        ({"type": "plastic"}, LAMP),
+        (GLASS, "lamp.emitter.radiance.data"),
+        (METAL, "bulb.intensity.value"),
+        (METAL, SKY),
+    ],
 )
 def test_it_has_the_gradient_of_the_sweep(bsdf: dict[str, Any], key: str) -> None:
-    scene = world(bsdf, None if key == LAMP else {"lamp": painted_lamp(), "bulb": BULB})
+    scene = world(bsdf, None if key in (LAMP, SKY) else {"lamp": painted_lamp(), "bulb": BULB})
     found, moves = driven(lights, scene, key)
     assert moves is False
     close(found, driven(sweep, scene, key)[0])
@@ -117,88 +109,3 @@ def test_it_has_no_limit_of_depth() -> None:
             found.append(np.array(dr.grad(params[LAMP])))
     close(found[1], found[0])
     close(found[2], found[0])
-
-
-# ------------------------------ By the sky alone ------------------------------
-
-BSDFS: dict[str, dict[str, Any]] = {
-    "diffuse": PAINT,
-    "dielectric": GLASS,
-    "thindielectric": {"type": "thindielectric"},
-    "conductor": {"type": "conductor"},
-    "roughconductor": METAL,
-    "plastic": {"type": "plastic"},
-    "roughplastic": {"type": "roughplastic", "alpha": 0.2},
-    "principled": {"type": "principled", "metallic": 0.5, "roughness": 0.3, "clearcoat": 0.5, "sheen": 0.5},
-    "principled glass": {"type": "principled", "spec_trans": 0.8, "roughness": 0.4, "eta": 1.4},
-    "twosided": {"type": "twosided", "bsdf": METAL},
-    "mask": {"type": "mask", "opacity": 0.4, "bsdf": PAINT},
-    "blendbsdf": {"type": "blendbsdf", "weight": 0.3, "a": PAINT, "b": METAL},
-    "normalmap": {"type": "normalmap", "normalmap": {"type": "rgb", "value": [0.55, 0.5, 0.95]}, "bsdf": METAL},
-    "bumpmap": {"type": "bumpmap", "scale": 0.1, "bsdf": PAINT},
-}
-
-
-def fresh(bsdf: dict[str, Any] | None) -> dict[str, Any] | None:
-    """With texels of its own, where it has any."""
-    return {**bsdf, "texture": texture()} if bsdf is not None and bsdf["type"] == "bumpmap" else bsdf
-
-
-def sky_gradient(scene: mi.Scene, seed: int) -> np.ndarray:
-    """By the pixels of the sky, of the mean of the picture; the columns at its ends repeat others, and have none."""
-    params = mi.traverse(scene)
-    leaf = mi.TensorXf(params["sky.data"])
-    dr.enable_grad(leaf)
-    params["sky.data"] = leaf
-    params.update()
-    ours().render_backward(scene, params, even(), seed=seed, spp=SPP)
-    dr.enqueue(dr.ADMode.Backward, params["sky.data"])
-    dr.traverse(dr.ADMode.Backward)
-    gradient = np.array(dr.grad(leaf))
-    params["sky.data"] = mi.TensorXf(dr.detach(leaf))
-    params.update()
-    return gradient
-
-
-def seen(bsdf: dict[str, Any], sky: np.ndarray, seeds: int) -> list[float]:
-    """Means of pictures by Mitsuba's `path`."""
-    scene = world(fresh(bsdf), {"sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)}})
-    path = mi.load_dict({"type": "path", "max_depth": 4})
-    return [float(np.mean(mi.render(scene, integrator=path, spp=8 * SPP, seed=900 + k))) for k in range(seeds)]
-
-
-def held_to_pictures(bsdf: dict[str, Any], seeds: int) -> list[float]:
-    """z of the derivative by the sky as it is, and by a white one: the picture is linear, so those are its pictures."""
-    scene, sky = under_sky(bsdf), bright()
-    gradients = [sky_gradient(scene, k) for k in range(seeds)]
-    assert all(np.isfinite(g).all() and (g >= 0).all() for g in gradients)
-    along = [
-        np.array([np.vdot(g, v) for g in gradients])
-        for v in (np.array(mi.traverse(scene)["sky.data"]), 1 + 0 * gradients[0])
-    ]
-    return [float(gap(found, seen(bsdf, v, seeds)).z) for found, v in zip(along, (sky, np.ones_like(sky)), strict=True)]
-
-
-@pytest.mark.parametrize("name", [n if n == "diffuse" else pytest.param(n, marks=pytest.mark.slow) for n in BSDFS])
-def test_by_the_sky_it_is_right(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against pictures by `path`; glossy and rough BSDFs sample exactly what they scatter."""
-    used = []
-    monkeypatch.setattr(module, "_sky", lambda *args, of=module._sky: used.append(args) or of(*args))
-    z = held_to_pictures(BSDFS[name], 8 if name == "diffuse" else 32)
-    print(name, z)
-    assert len(used) and np.abs(z).max() < Z_LIMIT
-
-
-def test_rough_glass_keeps_emitter_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its samples leave out a part of what it scatters."""
-    monkeypatch.setattr(module, "_sky", None)
-    assert (sky_gradient(under_sky({"type": "roughdielectric", "alpha": 0.3}), 0) != 0).any()
-
-
-@pytest.mark.slow
-def test_a_sky_whose_scale_has_gradients_keeps_emitter_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_sky", None)
-    scene = under_sky()
-    with attached(scene, "sky.scale") as params:
-        ours().render_backward(scene, params, even(), seed=SEED, spp=SPP)
-        assert (np.array(dr.grad(params["sky.scale"])) != 0).all()

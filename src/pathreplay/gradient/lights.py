@@ -1,10 +1,6 @@
 """The lights driver: where only what lights emit has gradients, one walk is enough, and nothing is recorded.
 
-L = Σ β_i e_i is linear in what lights emit, and β knows nothing of it. So δL β_i de_i is back-propagated on the way.
-The derivative knows nothing of how bright lights are, either. A picture draws emitter samples to where the environment
-is bright. Paths that go on as surfaces scatter come by its pixels in proportion to the derivative by them, for half of
-the work: so by those no emitter sample is drawn, and a path counts where it leaves the scene.
-"""
+L = Σ β_i e_i is linear in what lights emit, and β knows nothing of it. So δL β_i de_i is back-propagated on the way."""
 
 from __future__ import annotations
 
@@ -40,22 +36,13 @@ def lights_or(other: Driver) -> Driver:
     return driver
 
 
+@dr.syntax
 def lights(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into what lights emit. Of any depth; for `lights_alone`.
 
-    Returns that paths do not move. Not differentiated: all but what lights emit.
-    Raises PathreplayError when no parameter reaches the paths.
+    At each vertex what was hit, and an emitter sample, by the weights of the picture. Returns that paths do not move.
+    Not differentiated: all but what lights emit. Raises PathreplayError when no parameter reaches the paths.
     """
-    if walk.traits.only_sky and walk.traits.samples_all:
-        _sky(walk, start, δL)
-    else:
-        _lamps(walk, start, δL)
-    return False
-
-
-@dr.syntax
-def _lamps(walk: Walk, start: CameraStart, δL: mi.Spectrum) -> None:
-    """At each vertex what was hit, and an emitter sample, by the weights of the picture."""
     sampler, path = start.sampler, PathState.begin(walk, start)
 
     while dr.hint(path.active, exclude=[walk], label="pathreplay: lights"):
@@ -63,23 +50,4 @@ def _lamps(walk: Walk, start: CameraStart, δL: mi.Spectrum) -> None:
         with dr.resume_grad():
             backward(dr.sum(δL * path.β * relight(walk, path.at, step.lighting)))
         path = path.advance(walk, u, step)[0]
-
-
-@dr.syntax
-def _sky(walk: Walk, start: CameraStart, δL: mi.Spectrum) -> None:
-    """The environment as the ray meets it that leaves the scene, whose weight is all of its own."""
-    sampler, path = start.sampler, PathState.begin(walk, start)
-    d, β = mi.Vector3f(path.at.ray.d), mi.Spectrum(0)  # of that ray
-
-    while dr.hint(path.active, exclude=[walk], label="pathreplay: sky"):
-        u, step = path.choose(walk, sampler)
-        leaves = path.active & ~path.at.hit.is_valid()
-        if dr.hint(walk.hide_emitters, mode="scalar"):
-            leaves &= ~path.at.camera
-        d, β = dr.select(leaves, path.at.ray.d, d), dr.select(leaves, path.β, β)
-        path = path.advance(walk, u, step)[0]
-
-    with dr.resume_grad():
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wi, si.time, si.wavelengths = -d, path.at.ray.time, path.at.ray.wavelengths
-        backward(dr.sum(δL * β * walk.scene.environment().eval(si, dr.any(β != 0))))
+    return False

@@ -17,7 +17,6 @@ from ..transport.traits import (
     is_null,
     lamp_balls,
     nodes_of,
-    only_sky,
     pieces_of,
     with_gradients,
 )
@@ -40,7 +39,6 @@ class SceneFacts:
         self._sizes = _sizes(self._shapes)
         self._lights = scene.emitters()
         self._emitters = [*scene.emitters(), *(shape for shape in self._shapes if shape.is_emitter())]
-        self._sky = scene.environment()
         self._lamps = [shape for shape in self._shapes if shape.is_mesh() and shape.is_emitter()]
         self._instances = [shape for shape in self._shapes if shape.class_name() == INSTANCE]
         bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
@@ -63,15 +61,13 @@ class SceneFacts:
 
     def traits(self, tables: Tables | None = None) -> Traits:
         """What the drivers want to know now; ``tables`` are those of this scene, where they cannot be made."""
-        lights_vary = any(map(with_gradients, self._emitters))
         return replace(
             self._traits,
             tables=self.tables() if tables is None else tables,
             lights_deform=any(with_gradients(lamp, "vertex_positions") for lamp in self._lamps),
             instances_move=any(with_gradients(instance, "to_world") for instance in self._instances),
             opacity_moves=any(with_gradients(mask, "opacity") for mask in self._masks),
-            lights_vary=lights_vary,
-            only_sky=lights_vary and only_sky(self._sky, self._emitters),
+            lights_vary=any(map(with_gradients, self._emitters)),
         )
 
     def tables(self) -> Tables:

@@ -22,12 +22,6 @@ FRAMES = frozenset({"NormalMap", "BumpMap", TWO_SIDED})
 DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
 # Their samples, weighted, bring exactly what `eval` says, so that nothing must be left to emitter samples:
 # `roughdielectric` throws some away.
-SAMPLED = FRAMES | {
-    *("BlendBSDF", MASK, "Null", "Principled", "RoughConductor", "RoughPlastic", "SmoothConductor"),
-    *("SmoothDielectric", "SmoothDiffuse", "SmoothPlastic", "ThinDielectric"),
-}
-# Environments, and what they emit in each direction: of nothing else can rays alone find the derivative well.
-SKIES = {"EnvironmentMapEmitter": "data", "ConstantBackgroundEmitter": "radiance"}
 INSTANCE = "Instance"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
@@ -69,7 +63,6 @@ class Traits:
     two_sides: bool  # a surface may have another BSDF on its back
     masks_mirrors: bool  # a mask lies over delta lobes
     glossy: bool  # a surface may have a narrow smooth lobe, and no texture has seams
-    samples_all: bool  # all surfaces sample what they scatter, exactly: no light is left to emitter samples alone
     outlines: bool  # a point of a surface may see where a shape, a lamp or a texture ends
     tables: Tables  # of single BSDFs and shapes
     # What has gradients:
@@ -77,7 +70,6 @@ class Traits:
     instances_move: bool = False  # the to_world of an instance
     opacity_moves: bool = False  # the opacity of a mask
     lights_vary: bool = False  # something about an emitter, or about a shape that emits
-    only_sky: bool = False  # of the emitters, only the radiance of an environment that rays find by themselves
     moving: tuple[mi.Shape, ...] | None = None  # the shapes that may move, or None: all, and the camera, too
 
 
@@ -106,7 +98,6 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         glossy=_is_glossy(bsdfs, nodes),
-        samples_all=all(bsdf.class_name() in SAMPLED for bsdf in nodes if isinstance(bsdf, mi.BSDF)),
         outlines=not _seamless(shapes, nodes),
         tables=Tables(
             mi.Bool(_by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)) if attachables else None,
@@ -250,14 +241,6 @@ def _is_attachable(bsdf: mi.BSDF) -> bool:
     if name in FRAMES:
         return all(_is_attachable(nested) for nested in nodes_of(bsdf) if isinstance(nested, mi.BSDF))
     return name in ATTACHABLE
-
-
-def only_sky(sky: mi.Emitter | None, emitters: Iterable[mi.Object]) -> bool:
-    """Whether of these emitters (and shapes that emit) nothing has gradients but the radiance of the environment."""
-    name = "" if sky is None else SKIES.get(sky.class_name(), "")
-    if not name or any(with_gradients(emitter) for emitter in emitters if emitter is not sky):
-        return False
-    return 0 < len(with_gradients(sky, name)) == len(with_gradients(sky))
 
 
 def with_gradients(node: mi.Object, *names: str) -> list[Any]:
