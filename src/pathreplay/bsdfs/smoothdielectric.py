@@ -36,7 +36,13 @@ def _index(props: Any, name: str, default: str) -> float:
     if name in props and props.type(name) == mi.Properties.Type.Integer:
         ior = float(props[name])
     else:
-        ior = float(mi.lookup_ior(props, name, default))
+        try:
+            ior = float(mi.lookup_ior(props, name, default))
+        except RuntimeError:
+            raise PathreplayError(
+                f"smoothdielectric: {name} = {props[name]!r:.60} is no material that Mitsuba knows; give a number, "
+                "or a name such as 'bk7' or 'water'"
+            ) from None
     if not 0 < ior < float("inf"):
         raise PathreplayError(f"smoothdielectric: {name} is {ior:g}; give a finite index of refraction above 0")
     return ior

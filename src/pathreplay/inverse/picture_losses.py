@@ -5,7 +5,6 @@ Their gradients are biased by the noise of a rendering: give them samples.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -92,7 +91,7 @@ def lpips(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 @lru_cache(maxsize=1)
-def _network() -> Callable[..., Any]:
+def _network() -> Any:
     try:
         import lpips as module
 

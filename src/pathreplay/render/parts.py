@@ -29,12 +29,15 @@ A_PART = 2**22
 MOST_A_PIXEL = 2**16
 # Of a part of many pixels: beside fewer, the work on the film would count.
 LEAST_A_PIXEL = 4
+# Samples of one call, which cannot be stopped or seen: minutes on the machines of today.
+MOST_IN_ALL = 2**36
 
 
 def parts(view: Pass) -> list[Pass]:
     """The pass, or those that it is the mean of, weighted by their ``share``; the first has its seed.
 
-    Raises PathreplayError where one sample for each pixel is beyond what Dr.Jit can count.
+    Raises PathreplayError where one sample for each pixel is beyond what Dr.Jit can count, or all of them would take
+    hours.
     """
     width, height = film_size(view.sensor)
     pixels = width * height
@@ -42,6 +45,11 @@ def parts(view: Pass) -> list[Pass]:
         raise PathreplayError(
             f"The film of sensor '{view.sensor.id()}' has {width} x {height} pixels, beyond the {MOST_SAMPLES} samples "
             "that Dr.Jit takes at once; make it smaller, or give it a crop window"
+        )
+    if pixels * view.spp > MOST_IN_ALL:
+        raise PathreplayError(
+            f"spp = {view.spp} with a film of {width} x {height} pixels are more samples than one call takes, "
+            f"{MOST_IN_ALL}; take spp up to {MOST_IN_ALL // pixels}, and the mean of calls with other seeds"
         )
     if pixels * view.spp <= MOST_AT_ONCE and view.spp <= MOST_A_PIXEL:
         return [view]
