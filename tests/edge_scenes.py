@@ -127,6 +127,12 @@ def hexagon_lit(**more: Any) -> Callable[[], dict]:
     return lambda: scene(lamp=lamp(OVERHEAD), object=can(BOX, paint(0.5, 0.5, 0.2), 6), **more)
 
 
+def facet_seen() -> dict:
+    """A bit of one triangle before a wide glow: what its plane hides moves on the wall, and not on the film."""
+    wide = T().translate([0, 0, -1]).scale([30, 30, 1])
+    return scene(0.2, wall=lamp(wide, 1), object=can(BOX, paint(0.5, 0.5, 0.2), 6))
+
+
 def lamp_seen() -> dict:
     place = T().translate([0.2, 0.1, 0.3]).rotate([0, 1, 0], 200).scale([0.5, 0.4, 1])
     return scene(wall=shape(BACK, patterned()), lamp=lamp(place, 3), other=lamp(OVERHEAD, 6))
@@ -294,6 +300,8 @@ SEEN = [
     cell("hexagon_moves", hexagon_lit(), VERTICES, translate_vertices(*ASIDE), seeds=32),
     cell("hexagon_seen", hexagon_lit(), "camera.to_world", translate(*ASIDE), seeds=32),
     cell("hexagon_bounced", hexagon_lit(wall=shape(BACK, paint(0.9))), VERTICES, translate_vertices(*ASIDE), 3),
+    cell("facet_seen", facet_seen, VERTICES, translate_vertices(1, 0.3, 0.4), step=0.002, spp=1024, reference_spp=4096,
+         seeds=24),
     cell("camera_moves", before_a_glow(lambda: shape(CARD, BLACK)), "camera.to_world", translate(*ASIDE)),
     cell("lamp_seen", lamp_seen, "lamp.to_world", translate(*ASIDE)),
 ]  # fmt: skip

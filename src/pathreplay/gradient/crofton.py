@@ -28,8 +28,11 @@ OFF_PLANE = 0.1
 """Share of their distance by which two points leave each other's tangent planes, where a surface hides itself."""
 ROUNDING = 1e-5
 """Share of their coordinates by which points may be wrong."""
-HIDES, BENDS = 0.25, 0.02
-"""How much an edge is looked for between two points of one shape, as it were another: 1. Most of these are bends."""
+HIDES, BENDS, CREASE = 0.25, 0.02, 0.1
+"""How much an edge is looked for between two points of one shape, as it were another: 1. Most of these are bends, and
+at most creases between triangles no light is cut off."""
+ANGLE = 1e-3
+"""Between two surfaces, from which on they meet at an edge."""
 
 
 @dataclass
@@ -40,6 +43,9 @@ class Sight:
     p: mi.Point3f  # where the view ends; zero where it does not
     n: mi.Normal3f
     moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # between two that do not, an edge does nothing
+    # Of a mesh that is shaded smoothly and is not smooth:
+    triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 0: no matter
+    cut: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # what its plane hides of light that is scattered
 
     @staticmethod
     def nothing() -> Sight:
@@ -52,8 +58,14 @@ class Sight:
     def hint(self, other: Sight) -> mi.Float:
         """How likely it is that there is an edge between, as an importance: 0 where there is none for certain."""
         same = dr.select(hides_itself(self.p, self.n, other.p, other.n), bend_or_edge(self, other), 0)
+        same = dr.maximum(same, dr.select(self._crease(other), dr.select(self.cut != other.cut, 1, CREASE), 0))
         hint = dr.select(self.signature != other.signature, 1, same)
         return dr.select(self.moves | other.moves, hint, 0)
+
+    def _crease(self, other: Sight) -> mi.Bool:
+        """Whether another triangle is seen: only from one to the next it jumps what its plane hides."""
+        angle = dr.squared_norm(dr.cross(self.n, other.n)) > dr.square(ANGLE)
+        return (self.triangle != other.triangle) & angle
 
 
 def hides_itself(p: mi.Point3f, n: mi.Normal3f, p_other: mi.Point3f, n_other: mi.Normal3f) -> mi.Bool:

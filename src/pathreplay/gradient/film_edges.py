@@ -170,9 +170,11 @@ def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sigh
     flags = mi.RayFlags.All if walk.traits.coarse_meshes else mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
     si = at.hit.compute_surface_interaction(at.ray, flags, active)
     kind = dr.select(dr.dot(si.sh_frame.n, at.ray.d) > 0, mi.UInt32(1), 0)
-    if walk.traits.coarse_meshes:
-        kind |= _below(walk, path, si, key, active)
-    return Sight(mixed(place_met(walk, at.hit, active), kind), si.p, si.n)
+    sight = Sight(mixed(place_met(walk, at.hit, active), kind), si.p, si.n)
+    if not walk.traits.coarse_meshes:
+        return sight
+    triangle = dr.select(si.is_valid() & si.shape.is_mesh(), at.hit.prim_index + 1, 0)
+    return replace(sight, triangle=triangle, cut=_below(walk, path, si, key, active))
 
 
 def _below(walk: Walk, path: PathState, si: mi.SurfaceInteraction3f, key: mi.UInt32, active: mi.Bool) -> mi.UInt32:
