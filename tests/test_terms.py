@@ -16,6 +16,7 @@ import pytest
 from media_scenes import cloud, heterogeneous, smooth
 from pathreplay import PathreplayError
 from pathreplay.gradient.baseline import Baseline, Seen
+from pathreplay.render.boundary import Boundary
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.facts import SceneFacts
 from pathreplay.render.term import Found, Term
@@ -24,7 +25,7 @@ from truth import lit_room, rgb
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}
 COLOUR, DENSITY = "object.bsdf.reflectance.value", "object.interior_medium.sigma_t.data"
 SPP = 4
-METHODS = ("forward", "backward")
+METHODS = ("forward", "backward", "note")
 # Every plugin's terms, in a scene for which all of them are.
 PLUGINS = ("pathreplay", "pathreplay_tape", "pathreplay_rb", "pathreplay_listing")
 
@@ -79,6 +80,15 @@ def test_a_term_has_the_methods_of_the_protocol_and_gives_what_it_says(plugin: s
                     term.forward(view, walk, None)
             else:
                 assert term.forward(view, walk, None).image.shape == (16, 16, 3)
+
+
+def test_another_term_may_stand_for_the_interior(load) -> None:
+    """As the benchmarks of edges have it."""
+    scene, params = load(lit_room(DIFFUSE), COLOUR)
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    integrator.interior = Boundary(inner=False)
+    integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (16, 16, 3)), seed=1, spp=SPP)
+    assert dr.all(dr.grad(params[COLOUR]) == 0)
 
 
 def test_terms_add_up(load, monkeypatch: pytest.MonkeyPatch) -> None:

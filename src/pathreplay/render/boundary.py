@@ -73,6 +73,10 @@ class Boundary:
         dr.eval()
         return Found(lost=lost.count, paths=paths, moves=True)
 
+    def note(self, walk: Walk) -> str:
+        """Nothing: see `Term`."""
+        return ""
+
     def _searches(self, view: Pass, walk: Walk, places: FilmPlaces) -> Iterator[Edges]:
         """The edges of each search."""
         if view.sensor.class_name() == BATCH:

@@ -143,7 +143,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
         """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
-        for doubt in filter(None, (*doubts(walk), self.interior.note(walk))):
+        for doubt in filter(None, (*doubts(walk), *(term.note(walk) for term in self.terms))):
             self._tell_once(doubt)
         if walk.media is None:
             return None

@@ -43,3 +43,6 @@ class Term(Protocol):
 
     def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Baseline | None) -> Found:
         """Back-propagate the adjoint of the image into the parameters. Everything has been launched on return."""
+
+    def note(self, walk: Walk) -> str:
+        """What is to be said of how it goes about it; "" if it is nothing."""

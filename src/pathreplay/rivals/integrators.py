@@ -45,6 +45,10 @@ class OtherInterior:
         """Back-propagate the adjoint of the image: see `Term`."""
         return back_propagate(view, walk, grad_in, self.backwards)
 
+    def note(self, walk: Walk) -> str:
+        """Nothing: see `Term`."""
+        return ""
+
 
 class TapeIntegrator(PathIntegrator):
     """Plain AD of a wavefront path tracer: for comparison only, since memory grows with the depth (see `tape`).
