@@ -249,7 +249,7 @@ def test_what_is_closer_than_rays_begin_is_rounding() -> None:
     si.p, si.n = mi.Point3f(2, -7, 0.5), mi.Normal3f(0, 0, 1)
     beside = dr.norm(si.spawn_ray(mi.Vector3f(0, 0, 1)).o - si.p)
     seer: Any = SimpleNamespace(origin=si)
-    far = Seer.is_off(seer, beside * mi.Float(0, 1e-5, 0.99, 1.01, 100))
+    far = Seer.is_off(seer, beside * mi.Float(0, 1e-5, 9.9, 10.1, 100))
     assert np.array(far).tolist() == [False, False, False, True, True]
 
 

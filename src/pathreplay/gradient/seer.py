@@ -17,6 +17,9 @@ from ..transport.vertex import Arrival, Chosen, Flight, Walk, is_smooth
 from .counted import Counted
 from .through_media import going_on
 
+NEAR = 10.0
+"""So many times as far as rays begin beside a surface is what they see well: directions are off by a tenth at most."""
+
 
 def may_see(walk: Walk, at: Arrival, step: Chosen) -> tuple[mi.Bool, mi.Spectrum]:
     """Whether the vertex that a path arrived at scatters smoothly, and the weight of the flight before it."""
@@ -88,8 +91,11 @@ class Seer:
         return between if self.walk.media is None else between & ~self.event
 
     def is_off(self, t: mi.Float) -> mi.Bool:
-        """Whether a distance is more than that by which rays begin beside their surface: closer ones are rounding."""
-        return t > mi.math.RayEpsilon * (1 + dr.max(dr.abs(self.origin.p)))
+        """Whether a distance is well beyond that by which rays begin beside their surface.
+
+        What is closer is seen where it is not, if it is there at all; and one over such distances has no bounds.
+        """
+        return t > NEAR * mi.math.RayEpsilon * (1 + dr.max(dr.abs(self.origin.p)))
 
     def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
         """Whether a direction follows what it hits: from particles only what scatters or emits, see `scatter`."""
