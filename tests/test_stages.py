@@ -12,8 +12,9 @@ import safetensors.numpy
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import iterate, make_config, optimize
 from pathreplay.inverse.evaluate import Evaluator, Shard
-from pathreplay.inverse.problem import View, build_problem
+from pathreplay.inverse.problem import build_problem
 from pathreplay.inverse.stages import Staged, part_at, scaled
+from pathreplay.inverse.views import View
 from pathreplay.scenes.parameters import get_array
 from pathreplay.threads import one_thread
 from test_deterministic import CLOUD

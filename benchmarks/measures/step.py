@@ -16,7 +16,9 @@ from pathreplay.inverse.evaluate import Evaluator, Local
 from pathreplay.inverse.loop import take_step
 from pathreplay.inverse.losses import l2
 from pathreplay.inverse.optimiser import DrJitOptimiser
-from pathreplay.inverse.problem import Problem, Variable, View
+from pathreplay.inverse.problem import Problem
+from pathreplay.inverse.variables import Variable
+from pathreplay.inverse.views import View
 from pathreplay.scenes.parameters import get_array
 
 from ..scenes import SCENES

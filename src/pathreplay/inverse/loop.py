@@ -24,11 +24,12 @@ from pathreplay.inverse.images import Image
 from pathreplay.inverse.line_search import LineSearch
 from pathreplay.inverse.optimiser import DrJitOptimiser, Optimiser
 from pathreplay.inverse.optimizer_options import Optimizer
-from pathreplay.inverse.problem import Problem, View, pose_errors, put_values
+from pathreplay.inverse.problem import Problem, pose_errors, put_values
 from pathreplay.inverse.schedules import rate
 from pathreplay.inverse.stage_options import place
 from pathreplay.inverse.stages import Part, part_at
 from pathreplay.inverse.values import Array, Arrays
+from pathreplay.inverse.views import View
 from pathreplay.render.film import fit_film
 from pathreplay.scenes.parameters import get_array, to_value
 

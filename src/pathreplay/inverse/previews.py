@@ -42,9 +42,10 @@ from pathreplay.inverse.page_parts import (
     target_row,
     uri,
 )
-from pathreplay.inverse.problem import Problem, View
+from pathreplay.inverse.problem import Problem
 from pathreplay.inverse.recovered import poses_of, recovered_of
 from pathreplay.inverse.run_folder import RunFolder
+from pathreplay.inverse.views import View
 from pathreplay.pages import page as pages
 from pathreplay.pages.page import Page, Parameter, Picture, Still
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import gc
-import re
 import weakref
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,21 +13,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.errors import PathreplayError, shown
-from pathreplay.files import file_names
+from pathreplay.errors import PathreplayError
 from pathreplay.inverse import limits
 from pathreplay.inverse.album import Album
 from pathreplay.inverse.background import require_known
 from pathreplay.inverse.capture import Shot, fingerprint, read_capture
-from pathreplay.inverse.config import Config, Parameter, Plugin
+from pathreplay.inverse.config import Config, Plugin
 from pathreplay.inverse.exposures import EXPOSURE, Factors, fixed_rows
 from pathreplay.inverse.exposures import start as start_of_exposures
-from pathreplay.inverse.grids import Levels, make_levels, resampled
-from pathreplay.inverse.images import Image, picture_size
+from pathreplay.inverse.images import picture_size
 from pathreplay.inverse.losses import Loss, find_loss
-from pathreplay.inverse.penalties import Penalty
-from pathreplay.inverse.pose import Pose, make_pose
-from pathreplay.inverse.surface import Surface
+from pathreplay.inverse.pose import Pose
 from pathreplay.inverse.targets import (
     Targets,
     by_view,
@@ -40,56 +35,15 @@ from pathreplay.inverse.targets import (
     target_scene,
     truth_of,
 )
-from pathreplay.inverse.transforms import Coordinates, Transform
-from pathreplay.inverse.values import Array, Arrays, make_value, seen
+from pathreplay.inverse.values import Array, Arrays
+from pathreplay.inverse.variables import Variable, keys_of, make_variables
+from pathreplay.inverse.views import View, held_out_of, named_views, sensors_of, shares_of
 from pathreplay.render.edge_notes import edges_note, moves_edges
 from pathreplay.render.integrator import EDGES
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.scenes.loading import load_scene_for
-from pathreplay.scenes.stored import AS_STORED, Form, form_of
 from pathreplay.threads import one_thread
-
-
-@dataclass(frozen=True)
-class Variable:
-    """What the optimiser moves: its name, bounds, learning rate, start value, and the truth where it is known.
-
-    The name is the key of a scene parameter, or that of a pose with ':translation' or ':rotation' behind it.
-    """
-
-    key: str
-    like: Any
-    """A Dr.Jit value of its type and shape."""
-    bounds: tuple[float, float]
-    """Lowest and highest value that a step may end at."""
-    learning_rate: float
-    start: Array
-    truth: Array | None
-    """In the shape of ``start``, or for a grid in another resolution."""
-    levels: Levels | None = None
-    """Of a grid that is refined on the way."""
-    coordinates: Coordinates | None = None
-    """Where steps are taken, if not in the values themselves."""
-    penalty: Penalty | None = None
-    """What is added to the loss for its values alone."""
-    form: Form = AS_STORED
-    """How Mitsuba stores it; everything here is what people see."""
-
-
-@dataclass(frozen=True)
-class View:
-    """One sensor and the picture that it should see (linear, height x width x channels)."""
-
-    name: str
-    sensor: int
-    target: Image
-    weight: Image | None = None
-    """How much pixels count (height x width x 1, with the mean 1); None: all the same."""
-    held_out: bool = False
-    """It is only looked at in the end, and never learned from."""
-    share: float = 1.0
-    """How much it counts; of the views that are learned from the mean is 1."""
 
 
 class Held:
@@ -191,22 +145,22 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     params = mi.traverse(scene)
     parameters.require_finite(params)
     integrator = _gradient_integrator(config.integrator)
-    keys = _keys(params, config.parameters, integrator)
+    keys = keys_of(params, config.parameters, integrator)
     notes += _edges(params, keys, integrator)
     rival = None if config.rival is None else _gradient_integrator(config.rival)
     if rival is not None:
-        _keys(params, config.parameters, rival)
+        keys_of(params, config.parameters, rival)
         _edges(params, keys, rival)  # for its log: one note is enough
     judge = integrator if config.brings_pictures else load_integrator(config.target.integrator.model_dump())
     # Before any target is rendered: the cheap mistakes first.
-    sensors = _sensors(scene, list(shots) or None if config.sensors is None else config.sensors)
+    sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
     taken = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
-    held_out = _held_out(scene, sensors, config, list(shots))
+    held_out = held_out_of(scene, sensors, config, list(shots))
     limits.require_visible(scene, params, keys)
     if config.target.alpha == "scene":
         require_known(scene, params, keys)
     limits.require_films(scene, sensors, {"spp": config.most_spp, "picture_spp": config.picture_spp})
-    unsolved, moved = _variables(scene, params, keys, config, base)
+    unsolved, moved = make_variables(scene, params, keys, config, base)
     limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
     truth: dict[str, Array] = {}
@@ -231,7 +185,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
         raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
     given = config.target.masks is not None or config.target.alpha == "mask"
     require_weights(targets, {n for n in sensors if given or (n in taken and (taken[n].mask or taken[n].lens))})
-    shares = _shares(scene, sensors, config, held_out)
+    shares = shares_of(scene, sensors, config, held_out)
     views = tuple(
         View(name, index, targets.images[name], targets.weights.get(name), name in held_out, shares[name])
         for name, index in sensors.items()
@@ -262,7 +216,7 @@ def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list
     trained = [n for n, view in enumerate(views) if not view.held_out]
     reference = None
     if asked.reference is not None:
-        places = _named(scene, {view.name: view.sensor for view in views}, [asked.reference], "exposure.reference")
+        places = named_views(scene, {view.name: view.sensor for view in views}, [asked.reference], "exposure.reference")
         reference = places[0]
         if views[[view.name for view in views].index(reference)].held_out:
             raise PathreplayError(
@@ -271,28 +225,6 @@ def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list
     fixed = fixed_rows([view.name for view in views], trained, reference, asked.free)
     rate = asked.learning_rate or config.learning_rate
     return [Variable(EXPOSURE, mi.TensorXf(value), (-np.inf, np.inf), rate, value, None, coordinates=Factors(fixed))]
-
-
-def _shares(scene: mi.Scene, sensors: dict[str, int], config: Config, held_out: set[str]) -> dict[str, float]:
-    """How much each view counts, by name."""
-    names = _named(scene, sensors, list(config.view_weights), "view_weights")
-    if out := set(names) & held_out:
-        raise PathreplayError(f"view_weights: view '{min(out)}' is held out, and counts for nothing; leave it out here")
-    given = dict(zip(names, config.view_weights.values(), strict=True))
-    shares = {name: given.get(name, 1.0) for name in sensors}
-    mean = float(np.mean([share for name, share in shares.items() if name not in held_out]))
-    return {name: share / mean for name, share in shares.items()}
-
-
-def _named(scene: mi.Scene, sensors: dict[str, int], wanted: Sequence[int | str], key: str) -> list[str]:
-    """The names of views that a key asks for. Raises PathreplayError for what is no view of the job."""
-    everywhere, ids = list(_sensors(scene, None)), [sensor.id() for sensor in scene.sensors()]
-    names = {index: name for name, index in sensors.items()}
-    places = [_place(item, ids, everywhere) for item in wanted]
-    for place in places:
-        if place not in names:
-            raise PathreplayError(f"{key}: sensor '{everywhere[place]}' is not among 'sensors'; add it there")
-    return [names[place] for place in places]
 
 
 def _pictures(
@@ -325,19 +257,6 @@ def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
     return integrator
 
 
-def _keys(params: mi.SceneParameters, entries: list[Parameter], integrator: mi.Integrator) -> dict[str, Parameter]:
-    keys: dict[str, Parameter] = {}
-    for entry in entries:
-        for key in parameters.resolve_keys(params, entry.key):
-            if key in keys:
-                raise PathreplayError(
-                    f"Parameter '{key}' is named twice, by '{keys[key].key}' and '{entry.key}'; remove one"
-                )
-            parameters.require_differentiable(params, key, integrator)
-            keys[key] = entry
-    return keys
-
-
 def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
     """What is to be said of edges that move. An integrator of ours need not say it once more."""
     moving = [key for key in keys if moves_edges(params, key)]
@@ -348,143 +267,3 @@ def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integ
     if hasattr(integrator, "told"):
         integrator.told.add(EDGES)
     return (edges_note(moving, edges),)
-
-
-def _variables(
-    scene: mi.Scene, params: mi.SceneParameters, keys: dict[str, Parameter], config: Config, base: Path
-) -> tuple[list[Variable], list[Pose]]:
-    variables: list[Variable] = []
-    poses: list[Pose] = []
-    for key, entry in keys.items():
-        rate = entry.learning_rate or config.learning_rate
-        # A step of SGD is the rate times the gradient, which may be anything.
-        bounded = limits.require_learning_rate if config.optimizer.type != "sgd" else lambda *_: None
-        if entry.pose is None:
-            form = form_of(params, key)
-            like = seen(params, key)
-            start = _start(key, like, form, entry, base)
-            bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
-            coordinates = _coordinates(params, key, entry, start)
-            if isinstance(coordinates, Transform):
-                bounded(key, rate, coordinates.latent(start))
-            else:
-                bounded(key, rate, start, (entry.lower, entry.upper))
-            levels = _levels(key, entry, config.refine_at(entry), start)
-            if levels is not None:
-                start = resampled(start, levels.shapes[0])
-            if dr.is_tensor_v(like):
-                like = dr.zeros(type(like), start.shape)  # which nobody writes down
-            penalty = _penalty(key, entry, start)
-            variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
-            continue
-        limits.require_near(scene, key, parameters.get_array(params[key]), entry)
-        pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
-        poses.append(pose)
-        for part, name in pose.parts().items():
-            start = np.array(getattr(entry.start, part, None) or [0.0, 0.0, 0.0], np.float32)
-            if part == "rotation":
-                # Users write degrees. A learning rate without unit is taken in radians, fit for a scene of size 1.
-                start = np.radians(start)
-                degrees = entry.rotation_learning_rate
-                rate = rate if degrees is None else float(np.radians(degrees))
-            bounded(name, rate, start)
-            variables.append(Variable(name, mi.Vector3f(0), (-np.inf, np.inf), rate, start, None))
-    return variables, poses
-
-
-def _coordinates(params: mi.SceneParameters, key: str, entry: Parameter, start: Array) -> Coordinates | None:
-    if entry.transform is not None:
-        transform = Transform(entry.transform, *(-np.inf if x is None else x for x in (entry.lower, entry.upper)))
-        transform.require_inside(key, start)
-        return transform
-    if entry.smooth is None:
-        return None
-    owner, _, name = key.rpartition(".")
-    if name != "vertex_positions" or (faces := f"{owner}.faces") not in params:
-        raise PathreplayError(f"Parameter '{key}' is no mesh's vertex_positions; leave 'smooth' out")
-    return Surface(parameters.get_array(params[key]), np.array(params[faces]), entry.smooth)
-
-
-def _penalty(key: str, entry: Parameter, start: Array) -> Penalty | None:
-    if entry.total_variation is not None and start.ndim < 3:
-        raise PathreplayError(
-            f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'total_variation' out"
-        )
-    if entry.total_variation is None and entry.prior is None:
-        return None
-    return Penalty(entry.total_variation or 0.0, entry.prior or 0.0, start)
-
-
-def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> Levels | None:
-    if entry.resolutions is None:
-        return None
-    if start.ndim < 3:
-        raise PathreplayError(
-            f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'resolutions' out"
-        )
-    limits.require_grid(key, start.shape, entry.resolutions)
-    return make_levels(start.shape, entry.resolutions, refine_at)
-
-
-def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path) -> Array:
-    if not dr.is_array_v(like):
-        raise PathreplayError(
-            f"Parameter '{key}' is a matrix, whose 16 numbers do not stay a motion; give it "
-            "pose = 'translation', 'rotation' or 'rigid'"
-        )
-    if entry.initial is None:
-        start = parameters.get_array(like)
-    else:
-        start = form.of_colours(key, make_value(key, like, entry.initial, base))
-    for bound, name, wrong in ((entry.lower, "lower", np.less), (entry.upper, "upper", np.greater)):
-        if bound is not None and wrong(start, np.float32(bound)).any():
-            extreme = start.min() if name == "lower" else start.max()
-            raise PathreplayError(
-                f"Parameter '{key}' starts at {extreme:g}, beyond its {name} bound {bound:g}; change one of them"
-            )
-    return start
-
-
-def _sensors(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int]:
-    """The wanted sensors of the scene: readable unique name, fit for a file -> index."""
-    available = scene.sensors()
-    if not available:
-        raise PathreplayError("The scene has no sensor; add one")
-    ids = [sensor.id() for sensor in available]
-    names = [s if re.fullmatch(r"[A-Za-z0-9][\w-]*", s or "") else f"view-{i}" for i, s in enumerate(ids)]
-    if len(set(names)) < len(names):
-        names = [f"view-{i}" for i in range(len(available))]
-    names = list(file_names(names).values())
-    if wanted is None:
-        return {name: i for i, name in enumerate(names)}
-    chosen = {names[index]: index for index in (_place(item, ids, names) for item in wanted)}
-    if not chosen:
-        raise PathreplayError("'sensors' is empty; name one, or leave the key out for all of them")
-    return chosen
-
-
-def _place(item: int | str, ids: list[str], names: list[str]) -> int:
-    """The index of a sensor that is named, or given by its number."""
-    index = next((each.index(item) for each in (ids, names) if item in each), item)
-    if not isinstance(index, int) or not 0 <= index < len(names):
-        raise PathreplayError(
-            f"No sensor {shown(item)} in the scene; it has {', '.join(names)} (0 to {len(names) - 1})"
-        )
-    return index
-
-
-def _held_out(scene: mi.Scene, sensors: dict[str, int], config: Config, shots: list[str]) -> set[str]:
-    """The names of the views that are not learned from: those that the job names, and every so many of ``shots``."""
-    everywhere = _sensors(scene, None)
-    ids = [sensor.id() for sensor in scene.sensors()]
-    places = {_place(item, ids, list(everywhere)) for item in config.held_out}
-    found = {name for name, index in sensors.items() if index in places}
-    every = None if config.capture is None else config.capture.hold_out_every
-    if len(found) < len(places):
-        other = next(name for name, index in everywhere.items() if index in places and name not in found)
-        raise PathreplayError(f"held_out: sensor '{other}' is not among 'sensors'; add it there, or leave it out here")
-    regular = set(shots[::every]) if every else set()
-    found |= {name for name, index in sensors.items() if ids[index] in regular}
-    if len(found) == len(sensors):
-        raise PathreplayError("Every sensor of the job is held out; leave one to learn from")
-    return found

@@ -12,9 +12,10 @@ from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config import Config, Plugin
 from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard
 from pathreplay.inverse.images import Image
-from pathreplay.inverse.problem import Problem, View
+from pathreplay.inverse.problem import Problem
 from pathreplay.inverse.stage_options import Stage, place
 from pathreplay.inverse.values import Arrays
+from pathreplay.inverse.views import View
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator
 

@@ -1,0 +1,162 @@
+"""What the optimiser moves: variables with bounds, rates and starts, as the parameters of a job ask for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse import limits
+from pathreplay.inverse.config import Config, Parameter
+from pathreplay.inverse.grids import Levels, make_levels, resampled
+from pathreplay.inverse.penalties import Penalty
+from pathreplay.inverse.pose import Pose, make_pose
+from pathreplay.inverse.surface import Surface
+from pathreplay.inverse.transforms import Coordinates, Transform
+from pathreplay.inverse.values import Array, make_value, seen
+from pathreplay.scenes import parameters
+from pathreplay.scenes.stored import AS_STORED, Form, form_of
+
+
+@dataclass(frozen=True)
+class Variable:
+    """What the optimiser moves: its name, bounds, learning rate, start value, and the truth where it is known.
+
+    The name is the key of a scene parameter, or that of a pose with ':translation' or ':rotation' behind it.
+    """
+
+    key: str
+    like: Any
+    """A Dr.Jit value of its type and shape."""
+    bounds: tuple[float, float]
+    """Lowest and highest value that a step may end at."""
+    learning_rate: float
+    start: Array
+    truth: Array | None
+    """In the shape of ``start``, or for a grid in another resolution."""
+    levels: Levels | None = None
+    """Of a grid that is refined on the way."""
+    coordinates: Coordinates | None = None
+    """Where steps are taken, if not in the values themselves."""
+    penalty: Penalty | None = None
+    """What is added to the loss for its values alone."""
+    form: Form = AS_STORED
+    """How Mitsuba stores it; everything here is what people see."""
+
+
+def keys_of(params: mi.SceneParameters, entries: list[Parameter], integrator: mi.Integrator) -> dict[str, Parameter]:
+    """The scene's keys that entries name, each with its entry. Raises PathreplayError for those that cannot move."""
+    keys: dict[str, Parameter] = {}
+    for entry in entries:
+        for key in parameters.resolve_keys(params, entry.key):
+            if key in keys:
+                raise PathreplayError(
+                    f"Parameter '{key}' is named twice, by '{keys[key].key}' and '{entry.key}'; remove one"
+                )
+            parameters.require_differentiable(params, key, integrator)
+            keys[key] = entry
+    return keys
+
+
+def make_variables(
+    scene: mi.Scene, params: mi.SceneParameters, keys: dict[str, Parameter], config: Config, base: Path
+) -> tuple[list[Variable], list[Pose]]:
+    """Of each key a variable, or a pose with those of its parts; truths are not known yet.
+
+    Raises PathreplayError for starts, rates and options that do not fit what is there.
+    """
+    variables: list[Variable] = []
+    poses: list[Pose] = []
+    for key, entry in keys.items():
+        rate = entry.learning_rate or config.learning_rate
+        # A step of SGD is the rate times the gradient, which may be anything.
+        bounded = limits.require_learning_rate if config.optimizer.type != "sgd" else lambda *_: None
+        if entry.pose is None:
+            form = form_of(params, key)
+            like = seen(params, key)
+            start = _start(key, like, form, entry, base)
+            bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
+            coordinates = _coordinates(params, key, entry, start)
+            if isinstance(coordinates, Transform):
+                bounded(key, rate, coordinates.latent(start))
+            else:
+                bounded(key, rate, start, (entry.lower, entry.upper))
+            levels = _levels(key, entry, config.refine_at(entry), start)
+            if levels is not None:
+                start = resampled(start, levels.shapes[0])
+            if dr.is_tensor_v(like):
+                like = dr.zeros(type(like), start.shape)  # which nobody writes down
+            penalty = _penalty(key, entry, start)
+            variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
+            continue
+        limits.require_near(scene, key, parameters.get_array(params[key]), entry)
+        pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
+        poses.append(pose)
+        for part, name in pose.parts().items():
+            start = np.array(getattr(entry.start, part, None) or [0.0, 0.0, 0.0], np.float32)
+            if part == "rotation":
+                # Users write degrees. A learning rate without unit is taken in radians, fit for a scene of size 1.
+                start = np.radians(start)
+                degrees = entry.rotation_learning_rate
+                rate = rate if degrees is None else float(np.radians(degrees))
+            bounded(name, rate, start)
+            variables.append(Variable(name, mi.Vector3f(0), (-np.inf, np.inf), rate, start, None))
+    return variables, poses
+
+
+def _coordinates(params: mi.SceneParameters, key: str, entry: Parameter, start: Array) -> Coordinates | None:
+    if entry.transform is not None:
+        transform = Transform(entry.transform, *(-np.inf if x is None else x for x in (entry.lower, entry.upper)))
+        transform.require_inside(key, start)
+        return transform
+    if entry.smooth is None:
+        return None
+    owner, _, name = key.rpartition(".")
+    if name != "vertex_positions" or (faces := f"{owner}.faces") not in params:
+        raise PathreplayError(f"Parameter '{key}' is no mesh's vertex_positions; leave 'smooth' out")
+    return Surface(parameters.get_array(params[key]), np.array(params[faces]), entry.smooth)
+
+
+def _penalty(key: str, entry: Parameter, start: Array) -> Penalty | None:
+    if entry.total_variation is not None and start.ndim < 3:
+        raise PathreplayError(
+            f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'total_variation' out"
+        )
+    if entry.total_variation is None and entry.prior is None:
+        return None
+    return Penalty(entry.total_variation or 0.0, entry.prior or 0.0, start)
+
+
+def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> Levels | None:
+    if entry.resolutions is None:
+        return None
+    if start.ndim < 3:
+        raise PathreplayError(
+            f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'resolutions' out"
+        )
+    limits.require_grid(key, start.shape, entry.resolutions)
+    return make_levels(start.shape, entry.resolutions, refine_at)
+
+
+def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path) -> Array:
+    if not dr.is_array_v(like):
+        raise PathreplayError(
+            f"Parameter '{key}' is a matrix, whose 16 numbers do not stay a motion; give it "
+            "pose = 'translation', 'rotation' or 'rigid'"
+        )
+    if entry.initial is None:
+        start = parameters.get_array(like)
+    else:
+        start = form.of_colours(key, make_value(key, like, entry.initial, base))
+    for bound, name, wrong in ((entry.lower, "lower", np.less), (entry.upper, "upper", np.greater)):
+        if bound is not None and wrong(start, np.float32(bound)).any():
+            extreme = start.min() if name == "lower" else start.max()
+            raise PathreplayError(
+                f"Parameter '{key}' starts at {extreme:g}, beyond its {name} bound {bound:g}; change one of them"
+            )
+    return start
