@@ -22,7 +22,7 @@ MANY = 32
 """Passes where a small difference is to be seen, or where small lamps are looked for by chance."""
 COUNTED_TWICE = {
     "shadow_lamp": MANY,
-    "shadow_all": MANY,
+    "shadow_all": 2 * MANY,
     "lamp_lights": MANY,
     "sphere_lamp": MANY,
     "cube8_lit": 4 * MANY,

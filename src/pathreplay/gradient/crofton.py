@@ -28,9 +28,8 @@ OFF_PLANE = 0.1
 """Share of their distance by which two points leave each other's tangent planes, where a surface hides itself."""
 ROUNDING = 1e-5
 """Share of their coordinates by which points may be wrong."""
-HIDES, BENDS, CREASE = 0.25, 0.02, 0.1
-"""How much an edge is looked for between two points of one shape, as it were another: 1. Most of these are bends, and
-at most creases between triangles no light is cut off."""
+HIDES, BENDS = 0.25, 0.02
+"""How much an edge is looked for between two points of one shape, as it were another: 1. Most of these are bends."""
 ANGLE = 1e-3
 """Between two surfaces, from which on they meet at an edge."""
 
@@ -45,7 +44,8 @@ class Sight:
     moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # between two that do not, an edge does nothing
     # Of a mesh that is shaded smoothly and is not smooth:
     triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 0: no matter
-    cut: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # what its plane hides of light that is scattered
+    light: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # directions that are scattered, or none:
+    lobe: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # its plane may hide what is there
 
     @staticmethod
     def nothing() -> Sight:
@@ -58,14 +58,20 @@ class Sight:
     def hint(self, other: Sight) -> mi.Float:
         """How likely it is that there is an edge between, as an importance: 0 where there is none for certain."""
         same = dr.select(hides_itself(self.p, self.n, other.p, other.n), bend_or_edge(self, other), 0)
-        same = dr.maximum(same, dr.select(self._crease(other), dr.select(self.cut != other.cut, 1, CREASE), 0))
-        hint = dr.select(self.signature != other.signature, 1, same)
+        hint = dr.select((self.signature != other.signature) | self._crease(other), 1, same)
         return dr.select(self.moves | other.moves, hint, 0)
 
     def _crease(self, other: Sight) -> mi.Bool:
-        """Whether another triangle is seen: only from one to the next it jumps what its plane hides."""
+        """Whether another triangle is seen, and a direction is between their planes, or close: it jumps what they hide.
+
+        Directions turn with the shading normal on the way to the crease, by no more than triangles do.
+        """
+        between = mi.Bool(False)
+        for d in (self.light, self.lobe, other.light, other.lobe):
+            a, b = dr.dot(self.n, d), dr.dot(other.n, d)
+            between |= (a * b < 0) | (dr.minimum(dr.abs(a), dr.abs(b)) < dr.abs(a - b))
         angle = dr.squared_norm(dr.cross(self.n, other.n)) > dr.square(ANGLE)
-        return (self.triangle != other.triangle) & angle
+        return (self.triangle != other.triangle) & angle & between
 
 
 def hides_itself(p: mi.Point3f, n: mi.Normal3f, p_other: mi.Point3f, n_other: mi.Normal3f) -> mi.Bool:

@@ -174,25 +174,20 @@ def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sigh
     if not walk.traits.coarse_meshes:
         return sight
     triangle = dr.select(si.is_valid() & si.shape.is_mesh(), at.hit.prim_index + 1, 0)
-    return replace(sight, triangle=triangle, cut=_below(walk, path, si, key, active))
+    light, lobe = _directions(walk, path, si, key, active)
+    return replace(sight, triangle=triangle, light=light, lobe=lobe)
 
 
-def _below(walk: Walk, path: PathState, si: mi.SurfaceInteraction3f, key: mi.UInt32, active: mi.Bool) -> mi.UInt32:
-    """Bits for the directions of light and lobe that are sampled there: their own triangle is in the way of them.
-
-    It is where shading and triangle are on different sides of a direction; their shape hides what is there. What the
-    surface scatters nothing from changes nothing.
-    """
+def _directions(
+    walk: Walk, path: PathState, si: mi.SurfaceInteraction3f, key: mi.UInt32, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Those of light and lobe that are sampled there; zero where nothing is scattered."""
     u, ctx = Numbers.draw(Counted.at_vertex(key, path.depth)), mi.BSDFContext()
     light, lit = _light(walk, si, u.light, path.depth, active)
     lobe, weight = si.bsdf().sample(ctx, si, u.lobe, u.direction, active & si.is_valid())
-
-    def blocked(d: mi.Vector3f) -> mi.Bool:
-        return dr.dot(si.n, d) * dr.dot(si.sh_frame.n, d) < 0
-
     f = si.bsdf().eval(ctx, si, si.to_local(light.d), lit)
-    to_light = dr.select(lit & dr.any(f != 0) & blocked(light.d), mi.UInt32(2), 0)
-    return to_light | dr.select(dr.any(weight != 0) & blocked(si.to_world(lobe.wo)), mi.UInt32(4), 0)
+    to_light = dr.select(lit & dr.any(f != 0), light.d, 0)
+    return to_light, dr.select(dr.any(weight != 0), si.to_world(lobe.wo), 0)
 
 
 def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
