@@ -4,7 +4,7 @@ On LLVM a kernel has as many lanes under way as threads have places in a packet,
 thread's stack. A GPU sets local memory aside for every thread that can be resident, whatever is launched: a record of
 124 bytes x depth 2048 x 2048 threads x 132 multiprocessors is 69 GB. So deep records are for processors.
 
-What stands here about GPUs was measured on an H100 (docs/scale.md), is tested with devices that are made up, and is
+What stands here about GPUs was measured on an H100 (docs/memory.md), is tested with devices that are made up, and is
 measured by `pathreplay doctor --gpu` elsewhere.
 """
 

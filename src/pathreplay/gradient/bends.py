@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from ..transport.signature import place_met
 from ..transport.vertex import Walk
-from .crofton import ANGLE, hides_itself
+from .crofton import at_an_angle, hides_itself
 
 MEETS = 1e-3
 """Relative difference of two distances up to which surfaces meet."""
@@ -37,8 +37,7 @@ class Bend:
         (a, _), (b, _) = sides
         both = active & a.is_valid() & b.is_valid()
         si_a, si_b = (x.compute_surface_interaction(ray, mi.RayFlags.Minimal, both) for x, ray in sides)
-        angle = dr.squared_norm(dr.cross(si_a.n, si_b.n)) > dr.square(ANGLE)
-        meets = both & angle & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
+        meets = both & at_an_angle(si_a.n, si_b.n) & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
         same = both & (place_met(walk, a, both) == place_met(walk, b, both))
         return Bend(a, b, meets, same & ~hides_itself(si_a.p, si_a.n, si_b.p, si_b.n))
 

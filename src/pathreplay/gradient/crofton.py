@@ -70,8 +70,12 @@ class Sight:
         for d in (self.light, self.lobe, other.light, other.lobe):
             a, b = dr.dot(self.n, d), dr.dot(other.n, d)
             between |= (a * b < 0) | (dr.minimum(dr.abs(a), dr.abs(b)) < dr.abs(a - b))
-        angle = dr.squared_norm(dr.cross(self.n, other.n)) > dr.square(ANGLE)
-        return (self.triangle != other.triangle) & angle & between
+        return (self.triangle != other.triangle) & at_an_angle(self.n, other.n) & between
+
+
+def at_an_angle(n: mi.Normal3f, n_other: mi.Normal3f) -> mi.Bool:
+    """Whether two surfaces with these normals meet at an edge, if they meet."""
+    return dr.squared_norm(dr.cross(n, n_other)) > dr.square(ANGLE)
 
 
 def hides_itself(p: mi.Point3f, n: mi.Normal3f, p_other: mi.Point3f, n_other: mi.Normal3f) -> mi.Bool:

@@ -20,8 +20,6 @@ MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
 FRAMES = frozenset({"NormalMap", "BumpMap", TWO_SIDED})
 # Those without a narrow lobe of their own, and a texture that jumps within itself.
 DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
-# Their samples, weighted, bring exactly what `eval` says, so that nothing must be left to emitter samples:
-# `roughdielectric` throws some away.
 INSTANCE = "Instance"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
