@@ -36,10 +36,13 @@ class Bend:
         """Detached."""
         (a, _), (b, _) = sides
         both = active & a.is_valid() & b.is_valid()
-        si_a, si_b = (x.compute_surface_interaction(ray, mi.RayFlags.Minimal, both) for x, ray in sides)
+        flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
+        si_a, si_b = (x.compute_surface_interaction(ray, flags, both) for x, ray in sides)
         meets = both & at_an_angle(si_a.n, si_b.n) & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
         same = both & (place_met(walk, a, both) == place_met(walk, b, both))
-        return Bend(a, b, meets, same & ~hides_itself(si_a.p, si_a.n, si_b.p, si_b.n))
+        dark = [dr.dot(si.sh_frame.n, ray.d) > 0 for si, (_, ray) in zip((si_a, si_b), sides, strict=True)]
+        turns = same & (dark[0] != dark[1]) & ~hides_itself(si_a.p, si_a.n, si_b.p, si_b.n)
+        return Bend(a, b, meets, turns)
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
         """B: zero on the edge, and wherever there is none; differentiable in the ray and in the shapes."""

@@ -33,6 +33,7 @@ from ..transport.passage import SHORT_OF, beyond_null
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met
 from ..transport.start import CameraStart
+from ..transport.surface import steady
 from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
 from .bends import Bend
@@ -137,6 +138,11 @@ def without_roulette(walk: Walk) -> Walk:
     return replace(walk, rr_depth=0xFFFFFFFF, max_depth=min(walk.max_depth, MAX_CHAIN))
 
 
+def steadied(walk: Walk) -> Walk:
+    """The walk beyond an edge: coarse meshes cut lobes off at creases, and nothing else is to jump there."""
+    return replace(walk, steady=walk.traits.coarse_meshes and not walk.traits.brushed_meshes)
+
+
 def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> Sight:
     """What a path meets from the camera to the first vertex where it is scattered; until something moves, nothing."""
     if walk.traits.mirrors or walk.traits.hard_lights or walk.media is not None:
@@ -174,7 +180,9 @@ def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sigh
     if not walk.traits.coarse_meshes:
         return sight
     triangle = dr.select(si.is_valid() & si.shape.is_mesh(), at.hit.prim_index + 1, 0)
-    light, lobe = _directions(walk, path, si, key, active)
+    if walk.traits.brushed_meshes:  # at every crease the tangent jumps, and lobes with it
+        return replace(sight, signature=mixed(sight.signature, triangle))
+    light, lobe = _directions(walk, path, steady(si, at.ray, active), key, active)
     return replace(sight, triangle=triangle, light=light, lobe=lobe)
 
 
@@ -251,9 +259,9 @@ def _weighed(walk: Walk, full: Walk, places: Places, found: Crossed, per_line: m
     (ray_a, weight), (ray_b, _) = (places.ray(s, line.key) for s in ends)
     fork = _fork(walk, (ray_a, ray_b), line.key, active)
     active &= fork.found
-    sides, onward = [fork.a, fork.b], walk
+    sides, onward = [fork.a, fork.b], steadied(walk)
     if full.media is not None:
-        onward, t = full, SHORT_OF * dr.minimum(fork.a.hit.t, fork.b.hit.t)
+        onward, t = steadied(full), SHORT_OF * dr.minimum(fork.a.hit.t, fork.b.hit.t)
         T, medium = left_of_light(full, ray_a, line.key, fork.k, t, active)
         active &= dr.any(T != 0)
         sides, weight = [going_on(full, side, t, medium, active) for side in sides], weight * T

@@ -14,7 +14,7 @@ import mitsuba as mi
 from .emitters import emission
 from .flight import Flown, fly, fly_again
 from .media import interaction
-from .surface import met
+from .surface import met, steady
 from .traits import is_null
 from .vertex import Arrival, Flight, Replayed, Walk
 
@@ -52,6 +52,8 @@ def choose(
     Real collisions are chosen by the throughput ``β``, see `fly`.
     """
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+    if walk.steady:
+        si = steady(si, at.ray, active)
     if walk.media is None:
         return _on_surface(walk, at, si, False, active)
     flight = fly(walk, at, sampler, β, active) if flight is None else flight

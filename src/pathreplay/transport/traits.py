@@ -17,7 +17,8 @@ from .velocity import blend_length
 # Sampling is a smooth function of the random numbers, and no choice among lobes depends on a parameter.
 ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
 MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
-FRAMES = frozenset({"NormalMap", "BumpMap", TWO_SIDED})
+RELIEFS = frozenset({"NormalMap", "BumpMap"})
+FRAMES = RELIEFS | {TWO_SIDED}
 # Those without a narrow lobe of their own, and a texture that jumps within itself.
 DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
 INSTANCE = "Instance"
@@ -57,6 +58,7 @@ class Traits:
     mesh_lights: bool  # there are meshes that emit
     ball_lights: bool  # there are spheres that emit
     coarse_meshes: bool  # there are meshes that are shaded as if they were smooth, and are not: see `is_coarse`
+    brushed_meshes: bool  # of these, some with BSDFs that tell one tangent from another
     painted_meshes: bool  # there are meshes that emit, with a texture
     two_sides: bool  # a surface may have another BSDF on its back
     masks_mirrors: bool  # a mask lies over delta lobes
@@ -82,6 +84,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     shapes = [node for node in nodes if isinstance(node, mi.Shape)]
     attachables = _attachables(nodes, shapes)
     others = [bsdf for bsdf in bsdfs if not _is_attachable(bsdf) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
+    coarse = [shape for shape in shapes if shape.is_mesh() and is_coarse(shape)]
     return Traits(
         mirrors=tuple(bsdf for bsdf in bsdfs if _delta_lobes(bsdf)),
         lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs), default=0),
@@ -91,7 +94,8 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         mesh_lights=any(_ball(lamp)[3] > 0 for lamp in _mesh_lamps(shapes)),
         ball_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
-        coarse_meshes=any(is_coarse(shape) for shape in shapes if shape.is_mesh()),
+        coarse_meshes=bool(coarse),
+        brushed_meshes=any(is_brushed(shape.bsdf()) for shape in coarse),
         painted_meshes=any(is_painted(lamp.emitter()) for lamp in _mesh_lamps(shapes)),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
@@ -145,6 +149,13 @@ def is_coarse(mesh: mi.Mesh) -> bool:
     n = np.cross(b - a, c - a)
     cosines = np.einsum("fk,fik->fi", n, normals[faces]) / np.maximum(np.linalg.norm(n, axis=1), 1e-30)[:, None]
     return bool(np.degrees(np.arccos(np.clip(cosines, -1, 1))).mean() > COARSE)
+
+
+def is_brushed(bsdf: mi.BSDF) -> bool:
+    """Whether a BSDF tells one tangent from another: it, or one nested in it."""
+    if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Anisotropic):
+        return True
+    return any(isinstance(node, mi.BSDF) and node.class_name() in RELIEFS for node in {bsdf, *nodes_of(bsdf)})
 
 
 def lamp_balls(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:

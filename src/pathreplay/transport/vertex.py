@@ -41,6 +41,8 @@ class Walk:
     edges: bool = False
     # Null boundaries are passed as if they were not there, and ``media`` is None: what edges are looked for with.
     clear: bool = False
+    # Shading frames of meshes are `steady` ones.
+    steady: bool = False
 
     @property
     def resamples(self) -> bool:
