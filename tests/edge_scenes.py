@@ -30,6 +30,7 @@ def paint(*value: float) -> dict:
 
 
 BLACK = paint(0, 0, 0)
+BRUSHED = {"type": "twosided", "inner": {"type": "roughconductor", "alpha_u": 0.15, "alpha_v": 0.5}}
 GLASS = {"type": "smoothdielectric", "int_ior": 1.5}
 BACK = T().translate([0, 0, -1]).scale([6, 6, 1])
 
@@ -125,6 +126,12 @@ def can_lit_from_the_front() -> dict:
 def hexagon_lit(**more: Any) -> Callable[[], dict]:
     """Its triangles hide a lamp that their smooth shading would see."""
     return lambda: scene(lamp=lamp(OVERHEAD), object=can(BOX, paint(0.5, 0.5, 0.2), 6), **more)
+
+
+def can_from_near(bsdf: dict) -> Callable[[], dict]:
+    """Some sides of a can and nothing else, before a wide glow: all that the film has of edges are creases."""
+    wide = T().translate([0, 0, -1]).scale([30, 30, 1])
+    return lambda: scene(8, wall=lamp(wide, 1), object=can(BOX, bsdf, 16))
 
 
 def facet_seen() -> dict:
@@ -301,6 +308,10 @@ SEEN = [
     cell("hexagon_seen", hexagon_lit(), "camera.to_world", translate(*ASIDE), seeds=32),
     cell("hexagon_bounced", hexagon_lit(wall=shape(BACK, paint(0.9))), VERTICES, translate_vertices(*ASIDE), 3),
     cell("facet_seen", facet_seen, VERTICES, translate_vertices(1, 0.3, 0.4), step=0.002, spp=1024, reference_spp=4096,
+         seeds=24),
+    cell("can_seen", can_from_near(paint(0.5, 0.5, 0.2)), VERTICES, translate_vertices(1, 0.3, 0.4), step=0.002,
+         spp=1024, seeds=24),
+    cell("brushed_can_seen", can_from_near(BRUSHED), VERTICES, translate_vertices(1, 0.3, 0.4), step=0.002, spp=1024,
          seeds=24),
     cell("camera_moves", before_a_glow(lambda: shape(CARD, BLACK)), "camera.to_world", translate(*ASIDE)),
     cell("lamp_seen", lamp_seen, "lamp.to_world", translate(*ASIDE)),
