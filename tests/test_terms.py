@@ -147,7 +147,7 @@ def test_what_shards_have_seen_can_be_added(load) -> None:
     def seen(seed: int) -> Seen:
         with dr.suspend_grad(), dr.isolate_grad():
             term, view = integrator.interior, Pass.of(scene, 0, seed, SPP)
-            return term.backward(view, walk, dr.ones(mi.TensorXf, (16, 16, 3)), nothing).seen
+            return term.backward(view, walk, dr.ones(mi.TensorXf, (16, 16, 3)), nothing.guess).seen
 
     one, other = seen(1), seen(2)
     both = one + other
@@ -161,7 +161,7 @@ def test_what_shards_have_seen_can_be_added(load) -> None:
     for name, value in after.learned().items():
         np.testing.assert_allclose(again.learned()[name], value, rtol=1e-5)
     restored = Baseline.restored(scene.bbox(), after.learned())
-    np.testing.assert_allclose(np.array(restored.known), np.array(after.known))
+    np.testing.assert_allclose(np.array(restored.guess.known), np.array(after.guess.known))
 
 
 def test_facts_are_found_once_and_keep_up_with_the_scene(load) -> None:

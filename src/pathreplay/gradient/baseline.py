@@ -42,17 +42,19 @@ def _channels() -> int:
 class BaselineCells:
     """The cells of position and direction, in a box that holds all media."""
 
-    low: mi.ScalarPoint3f
-    scale: mi.ScalarVector3f  # cells per unit of length
+    low: tuple[float, ...]  # numbers that a frozen function takes as they are
+    scale: tuple[float, ...]  # cells per unit of length
 
     @staticmethod
     def of(box: mi.ScalarBoundingBox3f) -> BaselineCells:
-        scale = mi.ScalarVector3f(*(CELLS / max(float(e), 1e-20) for e in box.extents()))
-        return BaselineCells(mi.ScalarPoint3f(box.min), scale)
+        scale = (CELLS / max(float(e), 1e-20) for e in box.extents())
+        return BaselineCells(tuple(map(float, box.min)), tuple(scale))
 
     def index(self, p: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
         """Index of the first average of the cell."""
-        at = mi.Vector3u(dr.clip(mi.Vector3f(p - self.low) * self.scale, 0, CELLS - 1))
+        at = mi.Vector3u(
+            dr.clip(mi.Vector3f(p - mi.ScalarPoint3f(self.low)) * mi.ScalarVector3f(self.scale), 0, CELLS - 1)
+        )
         d = d * dr.rcp(dr.abs(d.x) + dr.abs(d.y) + dr.abs(d.z))
         sx, sy = dr.select(d.x >= 0, 1.0, -1.0), dr.select(d.y >= 0, 1.0, -1.0)
         x = dr.select(d.z >= 0, d.x, (1 - dr.abs(d.y)) * sx)
@@ -72,11 +74,11 @@ class Seen:
     passes: frozenset[Hashable]  # keys of the passes
 
     @staticmethod
-    def none(cells: BaselineCells, key: Hashable) -> Seen:
-        """For the pass with that key to begin with."""
+    def none(cells: BaselineCells, *keys: Hashable) -> Seen:
+        """For the pass with that key to begin with; recorded ones have none."""
         sums, nulls = dr.zeros(mi.Float, 4 * AVERAGES), dr.zeros(mi.Float, SLOTS)
         dr.make_opaque(sums, nulls)
-        return Seen(cells, sums, nulls, 0, frozenset([key]))
+        return Seen(cells, sums, nulls, 0, frozenset(keys))
 
     def __add__(self, other: Seen) -> Seen:
         sums, nulls, paths = self.sums + other.sums, self.nulls + other.nulls, self.paths + other.paths
@@ -111,27 +113,15 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Baseline:
-    """What is known of the media of a scene.
+class Guess:
+    """What a pass asks of a baseline, which a frozen function can be handed.
 
-    ``look`` is the guess, and ``after`` what is known when more has been seen. ``branching`` is what a null collision
-    is to count.
+    ``branching`` is what a null collision is to count.
     """
 
     cells: BaselineCells
-    sums: mi.Float  # those of `Seen`, of which older passes count less
+    known: mi.Float  # the averages
     branching: mi.Float
-    passes: frozenset[Hashable] = frozenset()  # keys of the passes that were learned from: none is its own judge
-    known: mi.Float = field(init=False)  # the averages
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "known", _averages(self.sums))
-        dr.make_opaque(self.known, self.sums, self.branching)
-
-    @staticmethod
-    def fresh(box: mi.ScalarBoundingBox3f) -> Baseline:
-        """Nothing is known yet of what is in the box."""
-        return Baseline(BaselineCells.of(box), dr.zeros(mi.Float, 4 * AVERAGES), mi.Float(FIRST_BRANCHING))
 
     def look(self, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool) -> mi.Spectrum:
         """The guess at an interaction, for radiance that travels along -mei.wi; σ̄ is the majorant."""
@@ -141,6 +131,26 @@ class Baseline:
         p = dr.select(σ_bar > 0, dr.clip(dr.mean(σ_t) / σ_bar, 0, 1), 0)
         b = X + p * (Y - X)
         return mi.Spectrum(b.x, b.y, b.z) if _channels() == 3 else mi.Spectrum(b.x)
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What is known of the media of a scene. ``after`` is what is known when more has been seen."""
+
+    cells: BaselineCells
+    sums: mi.Float  # those of `Seen`, of which older passes count less
+    branching: mi.Float
+    passes: frozenset[Hashable] = frozenset()  # keys of the passes that were learned from: none is its own judge
+    guess: Guess = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "guess", Guess(self.cells, _averages(self.sums), self.branching))
+        dr.make_opaque(self.guess.known, self.sums, self.branching)
+
+    @staticmethod
+    def fresh(box: mi.ScalarBoundingBox3f) -> Baseline:
+        """Nothing is known yet of what is in the box."""
+        return Baseline(BaselineCells.of(box), dr.zeros(mi.Float, 4 * AVERAGES), mi.Float(FIRST_BRANCHING))
 
     def after(self, seen: Seen) -> Baseline:
         """What is known when passes have seen that, too. Ask when their kernels have been launched."""
@@ -162,7 +172,9 @@ class Baseline:
                 f"What was learned of the media has the shapes {shapes}, not {wanted}, or branching beyond 0 to 1; "
                 "start the job from its config"
             )
-        sums, branching = (mi.Float(np.array(learned[name], np.float32)) for name in ("sums", "branching"))
+        # In memory of Dr.Jit's own: recorded passes want it aligned as it was.
+        one = dr.opaque(mi.Float, 1)
+        sums, branching = (mi.Float(np.array(learned[name], np.float32)) * one for name in ("sums", "branching"))
         return Baseline(BaselineCells.of(box), sums, branching)
 
 

@@ -253,12 +253,13 @@ class Evaluator:
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         share = about.share / len(problem.trained())
+        handed = self.integrator.to_hand(problem.scene) if hasattr(self.integrator, "to_hand") else None
         problem.album.rest()
         with plain_errors():
-            value, lost, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
-                problem.params, problem.scene, sensor, self.integrator, target, weight, number, spp,
-                problem.loss, share, self._sweeps[which], self._facts.tables(), factor,
+            value, untold, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
+                problem.params, problem.scene, sensor, handed, self.integrator, target, weight, number, spp,
+                problem.loss, share, self._sweeps[which], factor,
             )  # fmt: skip
-        if lost is not None:
-            self.integrator.tell_lost(lost, target.shape[0] * target.shape[1] * spp)
+        if untold is not None:
+            self.integrator.tell(untold, target.shape[0] * target.shape[1] * spp)
         return float(value[0]) if dr.width(value) else float("nan"), by_factor

@@ -8,6 +8,7 @@ as a frozen function, later calls launch its kernels without tracing them again.
 from __future__ import annotations
 
 import gc
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -17,7 +18,7 @@ import mitsuba as mi
 
 from pathreplay.inverse.exposures import derivative
 from pathreplay.inverse.losses import Loss, mean_loss
-from pathreplay.render.facts import Tables
+from pathreplay.render.path_integrator import Handed
 from pathreplay.scenes.parameters import keep_only
 
 # Integrators of Mitsuba's that look at nothing on the host while they render; they do not say so. Ours does.
@@ -28,6 +29,8 @@ _OF_MITSUBA = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})
 _RECORDING = "while recording a frozen function"
 
 
+MOST_RECORDINGS = 8
+"""Of a view: where what kernels take for constants changes more often, recording is not worth its time."""
 _OTHER = 0x5EED
 """Makes another seed of one."""
 
@@ -38,30 +41,36 @@ class NotRecordable(Exception):
 
 def is_recordable(integrator: mi.Integrator, has_media: bool) -> bool:
     """Whether passes of the integrator can be recorded in a scene with or without media, as far as that is known."""
-    # What an integrator learns of media from pass to pass is read and written between kernels. Spectral variants look
-    # up the eye's response in tables of Mitsuba's library: no input of ours, as a recorded function must have them,
-    # leads there.
-    if mi.is_spectral or has_media:
+    # Spectral variants look up the eye's response in tables of Mitsuba's library: no input of ours, as a recorded
+    # function must have them, leads there.
+    if mi.is_spectral:
         return False
-    return getattr(integrator, "recordable", type(integrator).__name__ in _OF_MITSUBA)
+    return getattr(integrator, "recordable", type(integrator).__name__ in _OF_MITSUBA and not has_media)
 
 
 class Recordings:
-    """Frozen functions for `differentiate`, by view and shapes of the parameters."""
+    """Frozen functions for `differentiate`, by view, shapes of the parameters, and what kernels take for constants."""
 
     def __init__(self) -> None:
         self._frozen: dict[Any, Callable[..., Any]] = {}
+        self._made: Counter[Any] = Counter()  # of each view with such shapes
 
-    def differentiate(self, params: mi.SceneParameters, scene: mi.Scene, sensor: int, *args: Any) -> Any:
+    def differentiate(
+        self, params: mi.SceneParameters, scene: mi.Scene, sensor: int, handed: Handed | None, *args: Any
+    ) -> Any:
         """As the function of that name. Raises NotRecordable; a part of the gradient may be there, then."""
         keys = list(params.keys())
         # By view, since Dr.Jit thinks that something is wrong with a function that it has to record often.
-        which = (sensor, *(dr.shape(params[key]) for key in keys))
+        view = (sensor, *(dr.shape(params[key]) for key in keys))
+        which = view, None if handed is None else handed.constants
         if which not in self._frozen:
+            self._made[view] += 1
+            if self._made[view] > MOST_RECORDINGS:
+                raise NotRecordable
             gc.collect()  # scenes of the past would be traced, too
             self._frozen[which] = _recording(keys)
         try:
-            return self._frozen[which](scene, sensor, *args)
+            return self._frozen[which](scene, sensor, handed, *args)
         except RuntimeError as error:
             if _RECORDING not in str(error):
                 raise
@@ -83,6 +92,7 @@ def differentiate(
     params: mi.SceneParameters,
     scene: mi.Scene,
     sensor: int,
+    handed: Handed | None,
     integrator: mi.Integrator,
     target: mi.TensorXf,
     weight: mi.TensorXf | None,
@@ -91,15 +101,15 @@ def differentiate(
     loss: Loss,
     share: float,
     sweeps: bool,
-    tables: Tables,
     factor: mi.TensorXf | None = None,
 ) -> tuple[Any, Any, Any]:
     """``share`` times the loss of a view, whose gradient is added to the parameters; ``sweeps``: in one pass.
 
-    Also how many paths lost a part of their gradient (None if nobody counts, or it has been told), and the derivative
-    by the logarithm of the ``factor`` on the picture (see `exposures`) for each channel, if there is one.
+    An integrator of ours is ``handed`` what it needs. Also what that has not told (see `Untold`; None of another), and
+    the derivative by the logarithm of the ``factor`` on the picture (see `exposures`) for each channel, if there is
+    one.
     """
-    with _handed(integrator, tables):
+    with _handing(integrator, handed):
         if sweeps:
             offset, slope = (term * share for term in linear_derivative(loss, target, weight))
             # By the chain rule, of what is linear in the factor times the image.
@@ -117,7 +127,7 @@ def differentiate(
                 other: Any = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(_OTHER))[0]
                 again = mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=other)
             by_factor = derivative(loss, image, again, factor, target, weight) * share
-    return dr.detach(value), integrator.take_lost() if hasattr(integrator, "take_lost") else None, by_factor
+    return dr.detach(value), integrator.take_untold() if hasattr(integrator, "take_untold") else None, by_factor
 
 
 def _times(tensor: Any, factor: Any) -> Any:
@@ -125,16 +135,16 @@ def _times(tensor: Any, factor: Any) -> Any:
 
 
 @contextmanager
-def _handed(integrator: Any, tables: Tables) -> Iterator[None]:
-    """Within this block an integrator of ours has the tables: inputs of a frozen function, which cannot make them."""
-    if not hasattr(integrator, "tables"):
+def _handing(integrator: Any, handed: Handed | None) -> Iterator[None]:
+    """Within this block an integrator of ours has what it is handed."""
+    if handed is None:
         yield
         return
-    integrator.tables = tables
+    integrator.handed = handed
     try:
         yield
     finally:
-        integrator.tables = None
+        integrator.handed = None
 
 
 def linear_derivative(loss: Loss, target: Any, weight: Any = None) -> tuple[Any, Any]:

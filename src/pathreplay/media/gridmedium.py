@@ -96,6 +96,13 @@ class GridMedium:
         chosen = first + cheapest(self.levels[allowed], collisions, mean_chord(self.box))
         return cellwalk.make_cells(self.levels[chosen], values[chosen])
 
+    @property
+    def constants(self) -> tuple[object, ...]:
+        """All that kernels take for constants: one that was recorded is of no use where they are others."""
+        cells = self.flight_cells, self.shadow_cells
+        box = *map(float, self.box.min), *map(float, self.box.max)
+        return self.is_chromatic, box, *((each.shape, tuple(each.to_cell.ravel().tolist())) for each in cells)
+
     def to_string(self) -> str:
         lines = [f"sigma_t = {self.sigma_t}", f"albedo = {self.albedo}", f"emission = {self.emission}"]
         cells = " x ".join(str(n - 2) for n in self.flight_cells.shape)

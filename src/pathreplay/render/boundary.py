@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ..errors import PathreplayError
 from ..gradient.adjoint import LostPaths
-from ..gradient.baseline import Baseline
+from ..gradient.baseline import Guess
 from ..gradient.beam_edges import beam_edges
 from ..gradient.counted import Counted
 from ..gradient.edges import Edges, edges_backward, edges_forward
@@ -46,7 +46,7 @@ class Boundary:
     inner: bool = True  # those that surfaces see
     spp: int = 0  # lines per pixel, of each kind; 0: samples of the pass
 
-    def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
+    def forward(self, view: Pass, walk: Walk, learned: Guess | None) -> Found:
         """Tangent of the image: see `Term`."""
         places = FilmPlaces.of(view)
         if not _moves(walk, places):
@@ -58,7 +58,7 @@ class Boundary:
             image = part if image is None else image + part
         return Found(image)
 
-    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Baseline | None) -> Found:
+    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
         """Back-propagate the adjoint of the image: see `Term`."""
         places = FilmPlaces.of(view)
         if not _moves(walk, places):

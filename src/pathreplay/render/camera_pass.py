@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
+import drjit as dr
 import mitsuba as mi
 
 from ..plugins import mitsuba_integrator
@@ -71,7 +72,12 @@ class Pass:
         return sampler
 
     @cached_property
-    def key(self) -> tuple[int, int, int]:
-        """What tells the passes over one scene apart. Reads the seed, which takes time if it is an array."""
+    def keys(self) -> tuple[tuple[int, int, int], ...]:
+        """What tells the passes over one scene apart. Reads the seed, which takes time if it is an array.
+
+        Nothing in a frozen function, which cannot read it.
+        """
+        if dr.flag(dr.JitFlag.FreezingScope):
+            return ()
         seed = int(self.seed) if isinstance(self.seed, int) else int(self.seed[0])
-        return seed, self.spp, self.sensor.ptr
+        return ((seed, self.spp, self.sensor.ptr),)

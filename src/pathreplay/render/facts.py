@@ -7,7 +7,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
-from ..transport.media import Media, scene_media
+from ..transport.media import Media, scene_media, wants_branch
 from ..transport.traits import (
     INSTANCE,
     MASK,
@@ -55,9 +55,17 @@ class SceneFacts:
     def has_media(self) -> bool:
         return bool(self._media)
 
-    def media(self, sensor: mi.Sensor | None) -> Media | None:
-        """What the walk wants to know of media now; ``sensor`` (or None) may be in one."""
-        return scene_media(self._media, self._passes, sensor)
+    def media(self, sensor: mi.Sensor | None, branches: bool | None = None) -> Media | None:
+        """What the walk wants to know of media now; ``sensor`` (or None) may be in one. For the rest: see there."""
+        return scene_media(self._media, self._passes, sensor, branches)
+
+    def constants(self) -> tuple[object, ...]:
+        """All of media that kernels take for constants, now: see `GridMedium`. Those of Mitsuba have none."""
+        return tuple(medium.constants for medium in self._media if hasattr(medium, "constants"))
+
+    def branches(self) -> bool:
+        """That of `Media`, now."""
+        return wants_branch(self._media)
 
     def traits(self, tables: Tables | None = None) -> Traits:
         """What the drivers want to know now; ``tables`` are those of this scene, where they cannot be made."""

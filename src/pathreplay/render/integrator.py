@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..errors import PathreplayError
-from ..gradient.baseline import Baseline
+from ..gradient.baseline import SLOTS, Baseline, Guess, Seen
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
 from ..transport.vertex import Walk
@@ -19,7 +19,7 @@ from .camera_pass import Pass, Seed, Which
 from .diagnostics import doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts
 from .interior import PathReplay
-from .path_integrator import UNBOUNDED, PathIntegrator
+from .path_integrator import UNBOUNDED, Handed, PathIntegrator
 from .pixels import pixel_loss, sweepable
 from .properties import choice, deviation, whole_number
 from .term import Found, Term
@@ -54,6 +54,15 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
     return PathReplay(driver, auto, branch, recovery)
 
 
+@dataclass
+class Untold:
+    """What is to be told of passes that a frozen function has made."""
+
+    lost: mi.UInt32 | None = None  # how many paths lost a part of their gradient, if they were counted
+    sums: mi.Float | None = None  # those of `Seen`
+    nulls: mi.Float | None = None  # if they were counted
+
+
 class PathReplayIntegrator(PathIntegrator):
     """Differentiable path tracer for surfaces and media.
 
@@ -77,7 +86,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     name = "pathreplay"
     interior: PathReplay
-    recordable = True  # where there are no media: it looks at nothing on the host while it renders
+    recordable = True  # it looks at nothing on the host while it renders
 
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
@@ -141,20 +150,27 @@ class PathReplayIntegrator(PathIntegrator):
         self._told(view, walk, found)
         return found.image
 
-    def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
+    def _learned(self, view: Pass, walk: Walk) -> Guess | None:
         """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
         for doubt in filter(None, (*doubts(walk), *(term.note(walk) for term in self.terms))):
             self._tell_once(doubt)
         if walk.media is None:
             return None
+        if dr.flag(dr.JitFlag.FreezingScope):
+            return None if self.handed is None else self.handed.guess
         # Not by the facts of the last pass: other scenes may have been rendered between.
         if self.baseline is None or not self.baseline[0].are_about(walk.scene):
             self.baseline = self._facts(walk.scene), Baseline.fresh(walk.scene.bbox())
         baseline = self.baseline[1]
-        if view.key in baseline.passes:
-            self._tell_once(used_before_note(view.key[0]))
+        if baseline.passes.intersection(view.keys):
+            self._tell_once(used_before_note(view.keys[0][0]))
             return None
-        return baseline
+        return baseline.guess
+
+    def to_hand(self, scene: mi.Scene) -> Handed:
+        """See `PathIntegrator`."""
+        handed = PathIntegrator.to_hand(self, scene)
+        return handed if self.baseline is None else replace(handed, guess=self.baseline[1].guess)
 
     def learned(self) -> dict[str, np.ndarray]:
         """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
@@ -166,14 +182,18 @@ class PathReplayIntegrator(PathIntegrator):
         self.baseline = self._facts(scene), Baseline.restored(box, learned) if learned else Baseline.fresh(box)
 
     def _told(self, view: Pass, walk: Walk, found: Found) -> None:
-        """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see `take_lost`,
-        which tells of the passes before, too."""
+        """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see
+        `take_untold`, which tells of the passes before, too."""
         if found.moves:
             self._tell_edges(walk, view.sensor)
         frozen = dr.flag(dr.JitFlag.FreezingScope)
-        self.untold = self.untold + Found(lost=found.lost) if frozen else Found()
-        if found.lost is not None and not frozen:
-            self.tell_lost(found.lost, found.paths)
+        self.untold = self.untold + replace(found, image=None) if frozen else Found()
+        if not frozen:
+            self._keep(found)
+
+    def _keep(self, found: Found) -> None:
+        if found.lost is not None and found.lost[0] > 0:
+            mi.Log(mi.LogLevel.Warn, f"pathreplay: {lost_note(found.lost[0], found.paths)}")
         if found.seen is not None and self.baseline is not None:
             self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
 
@@ -191,15 +211,22 @@ class PathReplayIntegrator(PathIntegrator):
             self.told.add(message)
             mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
 
-    def take_lost(self) -> mi.UInt32 | None:
-        """How many paths lost a part of their gradient, or None: a frozen function cannot look itself."""
-        lost, self.untold = self.untold.lost, Found()
-        return lost
+    def take_untold(self) -> Untold:
+        """What passes in a frozen function found out, which cannot look at it itself; nothing of others."""
+        found, self.untold = self.untold, Found()
+        if found.seen is None:
+            return Untold(found.lost)
+        return Untold(found.lost, found.seen.sums, found.seen.nulls if found.seen.paths else None)
 
-    def tell_lost(self, count: mi.UInt32, paths: int) -> None:
-        """Warn if paths lost a part of their gradient; ``count`` of so many ``paths``."""
-        if count[0] > 0:
-            mi.Log(mi.LogLevel.Warn, f"pathreplay: {lost_note(count[0], paths)}")
+    def tell(self, untold: Untold, paths: int) -> None:
+        """Warn, and keep what was learned, as passes themselves do; there were so many ``paths``."""
+        found = Found(lost=untold.lost, paths=paths)
+        if untold.sums is not None and self.baseline is not None:
+            counted = untold.nulls is not None
+            nulls = untold.nulls if counted else dr.zeros(mi.Float, SLOTS)
+            seen = Seen(self.baseline[1].cells, untold.sums, nulls, paths if counted else 0, frozenset())
+            found = replace(found, seen=seen)
+        self._keep(found)
 
     def to_string(self) -> str:
         return self._described(

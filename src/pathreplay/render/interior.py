@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ..device import device_of
 from ..gradient.adjoint import LostPaths
-from ..gradient.baseline import FIRST_BRANCHING, Baseline, Seen
+from ..gradient.baseline import FIRST_BRANCHING, Guess, Seen
 from ..gradient.driver import Driver, ForwardDriver
 from ..gradient.forward import forward
 from ..gradient.lights import lights_or
@@ -66,17 +66,17 @@ class PathReplay:
     branch: str | bool  # whether a null collision of each path is kept (auto: where it is needed)
     recovery: Recovery  # of the replay driver
 
-    def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
+    def forward(self, view: Pass, walk: Walk, learned: Guess | None) -> Found:
         """Tangent of the image: see `Term`."""
         return tangent(view, self._informed(walk, learned), forward)
 
-    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Baseline | None) -> Found:
+    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
         """Back-propagate the adjoint of the image: see `Term`."""
         walk = self._informed(walk, learned)
         if not self._sweeps(walk):
             again = partial(replay, recovery=self.recovery)
             return back_propagate(view, replace(walk, baseline=None), grad_in, self._or_lights(again))
-        seen = None if learned is None or walk.media is None else Seen.none(learned.cells, view.key)
+        seen = None if learned is None or walk.media is None else Seen.none(learned.cells, *view.keys)
         found = back_propagate(view, walk, grad_in, self._or_lights(partial(sweep, seen=seen)))
         return replace(found, seen=seen)
 
@@ -108,7 +108,7 @@ class PathReplay:
     def _sweeps(self, walk: Walk) -> bool:
         return self.driver == "sweep" and not (self.auto and walk.max_depth > deepest(walk))
 
-    def _informed(self, walk: Walk, learned: Baseline | None) -> Walk:
+    def _informed(self, walk: Walk, learned: Guess | None) -> Walk:
         """The walk, with what earlier passes found out about media."""
         if walk.media is None:
             return walk

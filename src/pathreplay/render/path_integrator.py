@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from typing import Any
@@ -13,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..gradient.baseline import Baseline
+from ..gradient.baseline import Guess
 from ..gradient.primal import primal
 from ..plugins import mitsuba_integrator
 from ..transport.start import CameraStart
@@ -69,6 +70,16 @@ def careful() -> Iterator[None]:
             gc.enable()
 
 
+@dataclass
+class Handed:
+    """What a pass in a frozen function cannot find out, and has to be handed."""
+
+    tables: Tables  # of the scene
+    branches: bool  # see `Media`
+    constants: tuple[object, ...]  # other passes than those with the same have to be recorded anew
+    guess: Guess | None = None  # of what is known of its media
+
+
 class PathIntegrator:
     """A template of an integrator (see `on_base`), for those of ours.
 
@@ -96,7 +107,7 @@ class PathIntegrator:
         hide_emitters = flag(props, self.name, "hide_emitters", False)
         mitsuba_integrator().__init__(self, props)
         self.hide_emitters = hide_emitters
-        self.tables: Tables | None = None  # of the scene, in a frozen function, which cannot make them
+        self.handed: Handed | None = None  # in a frozen function
         self.facts: SceneFacts | None = None  # about the scene that was rendered last
 
     @property
@@ -173,7 +184,7 @@ class PathIntegrator:
             raise PathreplayError(f"{self.name}: sample() is not differentiated: use mi.render, or render_backward")
         return *primal(self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
 
-    def _learned(self, view: Pass, walk: Walk) -> Baseline | None:
+    def _learned(self, view: Pass, walk: Walk) -> Guess | None:
         """What earlier passes found out that this one may use."""
         return None
 
@@ -204,14 +215,19 @@ class PathIntegrator:
         facts = self._facts(scene)
         return Walk(
             scene=scene,
-            traits=facts.traits(self.tables),
-            media=facts.media(sensor),  # type: ignore[arg-type]
+            traits=facts.traits(None if self.handed is None else self.handed.tables),
+            media=facts.media(sensor, None if self.handed is None else self.handed.branches),  # type: ignore[arg-type]
             attach=self.attach,
             hide_emitters=self.hide_emitters,
             max_depth=self.max_depth,
             rr_depth=self.rr_depth,
             skip_area_emitters=self.skip_area_emitters,
         )
+
+    def to_hand(self, scene: mi.Scene) -> Handed:
+        """What passes over this scene are to be handed if they are recorded."""
+        facts = self._facts(scene)
+        return Handed(facts.tables(), facts.branches(), facts.constants())
 
     def _facts(self, scene: mi.Scene) -> SceneFacts:
         """The facts about a scene, those of its last pass if it has not become another."""

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import mitsuba as mi
 
-from ..gradient.baseline import Baseline, Seen
+from ..gradient.baseline import Guess, Seen
 from ..transport.vertex import Walk
 from .camera_pass import Pass
 
@@ -38,10 +38,10 @@ class Term(Protocol):
     a pass; ``learned`` is what earlier passes found out, or None.
     """
 
-    def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
+    def forward(self, view: Pass, walk: Walk, learned: Guess | None) -> Found:
         """Its part of the tangent of the image. The parameters carry their tangents already."""
 
-    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Baseline | None) -> Found:
+    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
         """Back-propagate the adjoint of the image into the parameters. Everything has been launched on return."""
 
     def note(self, walk: Walk) -> str:

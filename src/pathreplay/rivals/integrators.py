@@ -11,7 +11,7 @@ from functools import partial
 
 import mitsuba as mi
 
-from ..gradient.baseline import Baseline
+from ..gradient.baseline import Guess
 from ..gradient.driver import Driver, ForwardDriver
 from ..gradient.forward import forward
 from ..render.camera_pass import Pass
@@ -37,11 +37,11 @@ class OtherInterior:
     backwards: Driver
     forwards: ForwardDriver
 
-    def forward(self, view: Pass, walk: Walk, learned: Baseline | None) -> Found:
+    def forward(self, view: Pass, walk: Walk, learned: Guess | None) -> Found:
         """Tangent of the image: see `Term`."""
         return tangent(view, walk, self.forwards)
 
-    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Baseline | None) -> Found:
+    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
         """Back-propagate the adjoint of the image: see `Term`."""
         return back_propagate(view, walk, grad_in, self.backwards)
 

@@ -25,8 +25,13 @@ class Media:
     around: mi.Medium | None  # the one that the sensor is in
 
 
-def scene_media(media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | None) -> Media | None:
-    """Look at the media of a scene; None if there are none. ``passes`` is that of `Media`; the sensor may be in one."""
+def scene_media(
+    media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | None, branches: bool | None = None
+) -> Media | None:
+    """Look at the media of a scene; None if there are none. ``passes`` is that of `Media`; the sensor may be in one.
+
+    So is ``branches``, if it is known already.
+    """
     if not media:
         return None
     grids = tuple(medium for medium in media if hasattr(medium, "free_flight"))
@@ -39,7 +44,7 @@ def scene_media(media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | No
         chromatic=any(grid.is_chromatic for grid in grids) or any(map(_is_chromatic, plain)),
         emissive=any(grid.emission is not None for grid in grids),
         passes=passes,
-        branches=any(map(_wants_branch, media)),
+        branches=wants_branch(media) if branches is None else branches,
         around=next((node for node in below if isinstance(node, mi.Medium)), None),
     )
 
@@ -57,7 +62,12 @@ def _is_chromatic(medium: mi.Medium) -> bool:
     return not one_number or not all(one_number)
 
 
-def _wants_branch(medium: mi.Medium) -> bool:
+def wants_branch(media: Sequence[mi.Medium]) -> bool:
+    """Whether the gradient by some extinction would miss what collisions tell where there are none."""
+    return any(map(_misses, media))
+
+
+def _misses(medium: mi.Medium) -> bool:
     """Whether the extinction has gradients, and varies in space or is zero."""
     moving = with_gradients(medium, "sigma_t", "scale")
     return bool(moving) and not (
