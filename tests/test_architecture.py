@@ -307,8 +307,8 @@ def test_an_executor_gives_what_the_local_one_gives(skeleton: Load) -> None:
     turns = skeleton("executor").Turns(evaluators)
     assert conforms(turns.run, Executor.run)
     with one_thread(True):
-        found = turns.run(values[0], shards, {})
-        expected = Local(evaluators[0]).run(values[0], shards, {})
+        found = list(turns.run(values[0], shards, {}))
+        expected = list(Local(evaluators[0]).run(values[0], shards, {}))
     assert [each.loss for each in found] == [each.loss for each in expected]
     for one, other in zip(found, expected, strict=True):
         for key, gradient in other.gradients.items():

@@ -61,9 +61,18 @@ def test_shards_are_evaluated_as_they_are_asked_for() -> None:
         return evaluation(shard.samples, np.zeros(1, np.float32))
 
     shards = [Shard((0,), n, (n,)) for n in range(3)]
-    stream = Local(evaluate).each({}, shards, {})
+    stream = Local(evaluate).run({}, shards, {})
     assert done == [] and next(stream).loss == 0 and done == [0]
-    assert [each.loss for each in Local(evaluate).run({}, shards, {})] == [0, 1, 2]
+    assert [each.loss for each in stream] == [1, 2] and done == [0, 1, 2]
+
+
+def test_a_sum_begins_with_what_may_only_be_read() -> None:
+    """As a gradient from another process."""
+    parts = [array(5) for _ in range(3)]
+    for part in parts:
+        part.flags.writeable = False
+    found = total((evaluation(n, part) for n, part in enumerate(parts)), 0.5, owned=True)
+    np.testing.assert_array_equal(found.gradients["a"], ((parts[0] + parts[1]) + parts[2]) * np.float32(0.5))
 
 
 @pytest.mark.parametrize("kind", ["adam", "adamw", "rmsprop", "sgd"])

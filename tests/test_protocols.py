@@ -124,9 +124,9 @@ def test_an_executor_gives_results_in_the_order_of_the_shards(make: type[Local])
     evaluate: Evaluate = counting
     executor: Executor = make(evaluate)
     shards = [Shard((view,), 2 + view, (10 * view,)) for view in (3, 0, 2)]
-    found = executor.run({"a": np.float32([1, 2])}, shards, {"sum": np.float32([7])})
+    found = list(executor.run({"a": np.float32([1, 2])}, shards, {"sum": np.float32([7])}))
     assert [each.loss for each in found] == [3, 0, 2]
     assert [each.gradients["a"].tolist() for each in found] == [[5, 10], [2, 4], [4, 8]]
     assert [each.learned["sum"].tolist() for each in found] == [[37], [7], [27]]  # none waits for another
     assert total(found).learned["sum"].tolist() == [np.float32(71) / np.float32(3)]
-    assert executor.run({"a": np.float32([1, 2])}, [], {}) == []
+    assert list(executor.run({"a": np.float32([1, 2])}, [], {})) == []

@@ -77,7 +77,7 @@ class Total:
         """Add gradients in place, to those of the first evaluation, too, where these are ``owned`` by nobody else."""
         for key, gradient in each.gradients.items():
             if self._count:
-                gradient = np.add(self._sums[key], gradient, out=self._sums[key] if self._owned else None)
+                gradient = np.add(self._sums[key], gradient, out=self._room(key))
             self._sums[key] = gradient
         for name, value in each.learned.items():
             self._known[name] = np.add(self._known[name], value) if self._count else value
@@ -86,6 +86,11 @@ class Total:
         self._owned |= self._count > 0
         self._count += 1
 
+    def _room(self, key: str) -> Array | None:
+        """Where a sum may be written: what came from another process may only be read."""
+        here = self._sums[key]
+        return here if self._owned and here.flags.writeable else None
+
     def of(self, share: float = 1.0) -> Evaluation:
         """The sum times ``share``; what is known is the mean of what each of them knows.
 
@@ -93,7 +98,7 @@ class Total:
         """
         sums, known = self._sums, self._known
         if share != 1:
-            sums = {k: np.multiply(v, np.float32(share), out=v if self._owned else None) for k, v in sums.items()}
+            sums = {key: np.multiply(value, np.float32(share), out=self._room(key)) for key, value in sums.items()}
         if self._count > 1:
             known = {name: value / np.float32(self._count) for name, value in known.items()}
         return Evaluation(self._loss * share, sums, dict(self._dropped), known)
@@ -111,28 +116,22 @@ def total(evaluations: Iterable[Evaluation], share: float = 1.0, owned: bool = F
 class Executor(Protocol):
     """Evaluates the shards of an iteration. Results come in the order of the shards, whoever was ready first.
 
-    One that also has ``each``, with the same arguments, gives them one by one, and wants none of them back.
+    Each is given when it is asked for and none is wanted back: memory holds one gradient and the sum, however many
+    shards there are.
     """
 
-    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
+    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
         """One evaluation for each shard, in their order; each begins with what was ``learned`` before all of them."""
 
 
 class Local:
-    """In this process, one after the other.
-
-    Who asks for `each` has them as they come, and memory holds one gradient, however many shards there are.
-    """
+    """In this process, one after the other."""
 
     def __init__(self, evaluate: Evaluate) -> None:
         self.evaluate = evaluate
 
-    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
+    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
         """See `Executor`."""
-        return list(self.each(values, shards, learned))
-
-    def each(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
-        """One after the other."""
         for shard in shards:
             yield self.evaluate(values, shard, learned)
 

@@ -169,17 +169,21 @@ class RayExecutor:
         self.crew, self.names, self.rival = crew, names, rival
         self.sharing = Sharing()
 
-    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Evaluation]:
+    def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
         """See `Executor`. Raises PathreplayError where actors are lost for good, and what evaluations raise."""
         if not shards:
-            return []
+            return
         crew, step = self.crew, Step(self.sharing, shards)
         # Sent once: actors get it from the object store of their machine.
         sent = [crew.ray.put(dict(each)) for each in (values, learned)]
         found: dict[int, Evaluation] = {}
         losses: dict[int, int] = {}
-        begin = time.monotonic()
-        while len(found) < len(shards):
+        begin, given = time.monotonic(), 0
+        while given < len(shards):
+            if given in found:
+                yield found.pop(given)
+                given += 1
+                continue
             self._hand_out(step, shards, *sent)
             late = step.patience()
             patience = SOON_S if late is None else min(SOON_S, max(0.0, late - time.monotonic()))
@@ -191,8 +195,6 @@ class RayExecutor:
                     self._heard(call, answer, step, shards, found, losses)
             if not crew.ready and time.monotonic() - begin > SOON_S:
                 crew.say_once("ray: no actor is ready yet; is there room for them? 'ray status' tells")
-        crew.counts.shards += len(shards)
-        return [found[index] for index in range(len(shards))]
 
     def _hand_out(self, step: Step, shards: Sequence[Shard], values: Any, learned: Any) -> None:
         for number in self.crew.idle():
@@ -231,11 +233,12 @@ class RayExecutor:
         if call.step is not step or not first:
             return
         found[call.index] = answer.evaluation
+        self.crew.counts.shards += 1
         for line in answer.warnings:
             if line not in self.crew.said:
                 self.crew.said.add(line)
                 mi.Log(mi.LogLevel.Warn, line)
-        self.crew.status(f"{len(self.crew.ready)} actors, shard {len(found)} of {len(shards)}")
+        self.crew.status(f"{len(self.crew.ready)} actors, shard {len(step.done)} of {len(shards)}")
 
     def _name(self, shard: Shard) -> str:
         return "the shard of view " + ", ".join(self.names[n] if self.names else str(n) for n in shard.views)

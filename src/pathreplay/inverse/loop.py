@@ -150,11 +150,9 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     spp = asked if isinstance(asked, int) else noise.next_spp(config.auto_spp, run.history)
     shards = _shards(part, i, spp)
     share = len(part.problem.trained()) / len({shard.views for shard in shards})
-    # As they come, where the executor has them one by one: none is held that has been added.
-    each = getattr(run.executor, "each", None)
-    evaluations = iter((each or run.executor.run)(values, shards, run.learned))
+    evaluations = run.executor.run(values, shards, run.learned)
     dropped: list[dict[str, int]] = []
-    found, noise_norms = _summed(_seen(evaluations, dropped), share / part.config.parts, halves, each is not None)
+    found, noise_norms = _summed(_seen(evaluations, dropped), share / part.config.parts, halves)
     if not np.isfinite(found.loss):
         raise PathreplayError(
             f"The loss is {found.loss} at iteration {i}; lower the learning rates, or bound the parameters that ran "
@@ -225,16 +223,11 @@ def _seen(evaluations: Iterable[Evaluation], dropped: list[dict[str, int]]) -> I
         del each
 
 
-def _summed(
-    evaluations: Iterator[Evaluation], share: float, halves: bool, owned: bool
-) -> tuple[Evaluation, dict[str, float]]:
-    """The sum times ``share``; and where they are of two halves, in turn, |a - b| of their sums, of each gradient.
-
-    ``owned``: nobody else wants them (see `Total`).
-    """
+def _summed(evaluations: Iterator[Evaluation], share: float, halves: bool) -> tuple[Evaluation, dict[str, float]]:
+    """The sum times ``share``; and where they are of two halves, in turn, |a - b| of their sums, of each gradient."""
     if not halves:
-        return total(evaluations, share, owned), {}
-    sums = Total(owned), Total(owned)
+        return total(evaluations, share, owned=True), {}
+    sums = Total(owned=True), Total(owned=True)
     for n, each in enumerate(evaluations):
         sums[n % 2].add(each)
         del each
