@@ -31,7 +31,10 @@ class Centres:
         return Centres(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
 
     def refined(self, c: mi.Point2f, found: mi.Float, evenly: float = EVENLY) -> Centres:
-        """More often where there was something, at places ``c`` so much, and around: edges go on."""
+        """More often where there was something, at places ``c`` so much, and around: edges go on.
+
+        By the root of how much: variance is a sum of (what lines find, squared) / density, which is then least.
+        """
         n = self.width * self.height
         counts = dr.zeros(mi.Float, n)
         for dy, dx in product((-1, 0, 1), repeat=2):
@@ -39,6 +42,7 @@ class Centres:
             inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
             part = 1.0 if dx == dy == 0 else AROUND / 8
             dr.scatter_add(counts, part * dr.minimum(found, 1), mi.UInt32(y * self.width + x), inside)
+        counts = dr.sqrt(counts)
         total = dr.sum(counts)
         share = dr.select(total > 0, dr.fma(counts, (1 - evenly) / total, evenly / n), 1 / n)
         until = dr.cumsum(share)
