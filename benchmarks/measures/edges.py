@@ -16,7 +16,6 @@ from pathreplay.check.objective import Objective, smooth_weights
 from pathreplay.inverse.losses import l2
 from pathreplay.inverse.recorded import Recordings, differentiate
 from pathreplay.render.boundary import Boundary
-from pathreplay.render.facts import SceneFacts
 
 from ..scenes import SCENES
 from .job import Job
@@ -49,7 +48,6 @@ class EdgePass:
         shape = (job.resolution, job.resolution, 3)
         self.objective.weigh(smooth_weights(shape, alpha=False))
         self.target = dr.full(mi.TensorXf, 0.2, shape)
-        self.tables = SceneFacts(self.scene).traits().tables
         self.forget()
 
     def forget(self) -> None:
@@ -81,9 +79,10 @@ class EdgePass:
         records = parts(method)[1] == RECORDED and self.passes[method] > 0
         self.passes[method] += 1
         run = self.recordings[method].differentiate if records else differentiate
+        handed = integrator.to_hand(self.scene) if hasattr(integrator, "to_hand") else None
         number = dr.opaque(mi.UInt32, seed)
         return run(
-            self.params, self.scene, 0, integrator, self.target, None, number, self.job.spp, l2, 1.0, False, self.tables
+            self.params, self.scene, 0, handed, integrator, self.target, None, number, self.job.spp, l2, 1.0, False
         )
 
     def _integrator(self, name: str) -> Any:
