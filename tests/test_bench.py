@@ -227,6 +227,15 @@ def test_a_worker_measures_and_stays_within_its_memory(tmp_path: Path) -> None:
     assert done.stderr.strip().endswith("MemoryError")
 
 
+@pytest.mark.slow
+def test_recorded_steps_with_edges_are_measured(tmp_path: Path) -> None:
+    """A call that is handed what it no longer takes is a row with an error, which nobody sees until the end."""
+    job = TASKS["edges"].jobs(quick=True)[-1]
+    measured = runner.run_jobs("edges", [job], drafts.Draft(tmp_path / "draft.json"))
+    assert [point.method for point in measured.points] == list(job.methods)
+    assert [point.error for point in measured.points] == [None] * len(job.methods)
+
+
 def test_a_cause_of_death_fits_into_a_table() -> None:
     crash = RuntimeError("dr.while_loop(): jit_malloc(): out of memory! Could not allocate 262144 bytes. " + "x" * 999)
     assert told(crash) == told(MemoryError()) == "out of memory (of 8 GiB)"
