@@ -94,15 +94,15 @@ def test_a_few_bad_entries_end_nothing(spoilt: type[Spoilt]) -> None:
 
 
 def test_a_loss_that_is_no_number_leaves_a_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = Local.each
+    real = Local.run
 
-    def each(self: Local, values: Any, shards: Any, learned: Any) -> Iterator[Evaluation]:
+    def run(self: Local, values: Any, shards: Any, learned: Any) -> Iterator[Evaluation]:
         calls.append(1)
         for found in real(self, values, shards, learned):
             yield found if len(calls) != 4 else replace(found, loss=float("nan"))
 
     calls: list[int] = []
-    monkeypatch.setattr(Local, "each", each)
+    monkeypatch.setattr(Local, "run", run)
     with pytest.raises(PathreplayError, match=r"The loss is nan at iteration 3;.*go on with: pathreplay optimize"):
         optimize(make_config({**JOB, "output": "run"}), progress=False)
     result = optimize(resume="run", progress=False)
