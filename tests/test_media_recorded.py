@@ -48,8 +48,8 @@ def steps(scene: mi.Scene, key: str, integrator: dict, recorded: bool) -> np.nda
         params[key] = value
         params.update()
         step = recordings.differentiate if recorded and i > 0 else differentiate
-        seed, handed = dr.opaque(mi.UInt32, i), made.to_hand(scene)
-        loss, untold, _ = step(params, scene, 0, handed, made, target, None, seed, SPP, l2, 1.0, False)
+        seed = dr.opaque(mi.UInt32, i)
+        loss, untold, _ = step(params, scene, 0, made, target, None, seed, SPP, l2, 1.0, False)
         made.tell(untold, 16 * 16 * SPP)
         parts = [loss, dr.grad(value).array if dr.is_tensor_v(value) else dr.grad(value), *made.learned().values()]
         found.append(np.concatenate([np.ravel(part) for part in parts]))

@@ -79,11 +79,8 @@ class EdgePass:
         records = parts(method)[1] == RECORDED and self.passes[method] > 0
         self.passes[method] += 1
         run = self.recordings[method].differentiate if records else differentiate
-        handed = integrator.to_hand(self.scene) if hasattr(integrator, "to_hand") else None
         number = dr.opaque(mi.UInt32, seed)
-        return run(
-            self.params, self.scene, 0, handed, integrator, self.target, None, number, self.job.spp, l2, 1.0, False
-        )
+        return run(self.params, self.scene, 0, integrator, self.target, None, number, self.job.spp, l2, 1.0, False)
 
     def _integrator(self, name: str) -> Any:
         if name not in self.integrators:

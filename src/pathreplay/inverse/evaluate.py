@@ -177,10 +177,10 @@ class Evaluator:
     ) -> None:
         self.problem, self.integrator = problem, integrator
         self._moving = {v.key for v in problem.variables} if moving is None else set(moving)
-        self._facts = facts = SceneFacts(problem.scene)
+        has_media = SceneFacts(problem.scene).has_media
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
-        self.freezes = known and record and is_recordable(integrator, facts.has_media) and problem.loss not in ELSEWHERE
+        self.freezes = known and record and is_recordable(integrator, has_media) and problem.loss not in ELSEWHERE
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
         # Of each view and number of samples that was seen: whether pixels can be swept.
         self._sweeps: dict[tuple[int, int], bool] = {}
@@ -252,11 +252,10 @@ class Evaluator:
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         share = about.share / len(problem.trained())
-        handed = self.integrator.to_hand(problem.scene) if hasattr(self.integrator, "to_hand") else None
         problem.album.rest()
         with plain_errors():
             value, untold, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
-                problem.params, problem.scene, sensor, handed, self.integrator, target, weight, number, spp,
+                problem.params, problem.scene, sensor, self.integrator, target, weight, number, spp,
                 problem.loss, share, self._sweeps[which], factor,
             )  # fmt: skip
         if untold is not None:

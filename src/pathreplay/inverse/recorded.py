@@ -56,9 +56,10 @@ class Recordings:
         self._made: Counter[Any] = Counter()  # of each view with such shapes
 
     def differentiate(
-        self, params: mi.SceneParameters, scene: mi.Scene, sensor: int, handed: Handed | None, *args: Any
+        self, params: mi.SceneParameters, scene: mi.Scene, sensor: int, integrator: mi.Integrator, *args: Any
     ) -> Any:
         """As the function of that name. Raises NotRecordable; a part of the gradient may be there, then."""
+        handed = _to_hand(integrator, scene)
         keys = list(params.keys())
         # By view, since Dr.Jit thinks that something is wrong with a function that it has to record often.
         view = (sensor, *(dr.shape(params[key]) for key in keys))
@@ -70,7 +71,7 @@ class Recordings:
             gc.collect()  # scenes of the past would be traced, too
             self._frozen[which] = _recording(keys)
         try:
-            return self._frozen[which](scene, sensor, handed, *args)
+            return self._frozen[which](scene, handed, sensor, integrator, *args)
         except RuntimeError as error:
             if _RECORDING not in str(error):
                 raise
@@ -83,16 +84,28 @@ def _recording(keys: list[str]) -> Callable[..., Any]:
     def frozen(scene: Any, *args: Any) -> tuple[Any, Any, Any]:
         params = mi.traverse(scene)
         keep_only(params, keys)
-        return differentiate(params, scene, *args)
+        return _differentiate(params, scene, *args)
 
     return dr.freeze(frozen)
 
 
 def differentiate(
+    params: mi.SceneParameters, scene: mi.Scene, sensor: int, integrator: mi.Integrator, *args: Any
+) -> tuple[Any, Any, Any]:
+    """The loss of a view and its gradient, traced anew: see `_differentiate`."""
+    return _differentiate(params, scene, _to_hand(integrator, scene), sensor, integrator, *args)
+
+
+def _to_hand(integrator: Any, scene: mi.Scene) -> Handed | None:
+    """What an integrator of ours is handed; others want nothing."""
+    return integrator.to_hand(scene) if hasattr(integrator, "to_hand") else None
+
+
+def _differentiate(
     params: mi.SceneParameters,
     scene: mi.Scene,
-    sensor: int,
     handed: Handed | None,
+    sensor: int,
     integrator: mi.Integrator,
     target: mi.TensorXf,
     weight: mi.TensorXf | None,
