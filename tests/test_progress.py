@@ -1,4 +1,4 @@
-"""Progress where there is no terminal: lines on stderr, in notebooks too, and a result that prints short."""
+"""Progress where there is no terminal: lines on stderr, and a result that prints short."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     assert 8 <= len(capsys.readouterr().err.splitlines()) < 40
 
 
-def test_a_notebook_gets_lines(run_python) -> None:
+def test_who_only_looks_like_a_notebook_gets_lines(run_python) -> None:
     code = """
 class ZMQInteractiveShell: pass
 import builtins

@@ -32,7 +32,7 @@ def optimize(
         resume: run folder of an earlier, unfinished run, to go on with; excludes ``config`` and ``output``.
         output: run folder to make; the default is the config's ``output``, else ``runs/<name of the config>``. Where it
             exists, a number is appended: an earlier run is never touched.
-        progress: draw a progress bar on stderr (lines, now and then, where that is no terminal).
+        progress: draw a progress bar on stderr (lines, now and then, where that is no terminal), or in a notebook.
         define: changes of what the file says, each ``KEY=VALUE`` (see docs/optimize.md).
         executor: who computes, ``local`` or ``ray``, whatever the config says, also where a run is gone on with.
 

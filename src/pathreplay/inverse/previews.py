@@ -59,8 +59,12 @@ PAUSE_S, PAUSE = 1.0, 100
 LARGEST, FRAME_SIDE = 1024, 384
 # Of all frames in a report: enough for a film of each picture, and no burden to a page.
 MOST_FILM_BYTES = 2_000_000
+# Pixels along the longer side of the small pictures that a notebook shows.
+SMALL_SIDE = 192
 # Samples per pixel of a picture at least, where the job's own pictures have as many: fewer are hard to look at.
 LEAST_SPP = 16
+
+CAPTIONS = {"target": "target", "result": "now", "difference": f"difference ×{DIFFERENCE_GAIN:g}"}
 
 PAGES = TypeAdapter(Page)
 
@@ -109,6 +113,21 @@ class Previews:
             self._log.append(f"ended after {event.done} iterations{by}")
             self._log.append(f"pictures while it ran took {self._spent:.1f} of {took:.1f} s")
             self._write({})
+
+    @property
+    def shown_at(self) -> int:
+        """After how many iterations there were pictures the last time."""
+        return self._shown_at
+
+    def small_pictures(self) -> tuple[pages.View, ...]:
+        """Target, now and difference of the views, small, each within its address."""
+        found = []
+        for view in self._views:
+            shown, stored = self._now[view.name].pictures(), self._stored(view)
+            small = {kind: _encoded(shown[kind], stored, SMALL_SIDE, "webp") for kind in CAPTIONS}
+            pictures = tuple(Picture(kind, CAPTIONS[kind], uri("image/webp", data)) for kind, data in small.items())
+            found.append(pages.View(view.name, pictures))
+        return tuple(found)
 
     def _take_wish(self) -> None:
         with contextlib.suppress(OSError):
@@ -252,9 +271,8 @@ class Previews:
 
     def _view(self, view: View, shown: Mapping[str, tuple[Still, ...]]) -> pages.View:
         it, stored = self._now[view.name], self._stored(view)
-        captions = {"result": "now", "difference": f"difference ×{DIFFERENCE_GAIN:g}"}
         pictures = tuple(
-            Picture(kind, captions.get(kind, kind), f"{FOLDER}/{kind}-{view.name}.png?{self._shown_at}")
+            Picture(kind, CAPTIONS.get(kind, kind), f"{FOLDER}/{kind}-{view.name}.png?{self._shown_at}")
             for kind in it.pictures()
         )
         likeness = self._likenesses[view.name]

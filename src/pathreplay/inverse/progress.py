@@ -42,7 +42,7 @@ class _Forgiving:
 class Progress:
     """Progress of a job, or silence; use as a context manager.
 
-    A notebook gets lines, too: rich's bar needs ipywidgets there, and shows nothing without them.
+    Never rich's own bar for notebooks, which needs ipywidgets, and shows nothing without them: see `NotebookPanel`.
     """
 
     def __init__(self, shown: bool) -> None:

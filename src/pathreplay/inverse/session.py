@@ -21,6 +21,7 @@ from pathreplay.inverse.executors import Crew, RayExecutor, crew_of, require_exe
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
 from pathreplay.inverse.loop import answer_of, iterate, new_run, picture_of, render_views, with_exposures
+from pathreplay.inverse.notebook import NotebookPanel, in_notebook
 from pathreplay.inverse.outcome import resume_command
 from pathreplay.inverse.previews import Previews
 from pathreplay.inverse.problem import Problem, build_problem
@@ -140,7 +141,8 @@ def _states(
         stack.enter_context(memory.within(config.budget))
         require_executor(config)
         _set_variant(config)
-        bar = stack.enter_context(Progress(progress))
+        bar = _progress(progress)
+        stack.enter_context(bar)
         bar.say("preparing")
         problem = build_problem(config, job.base, None if resumed is None else saved_targets(resumed.path))
         require_stages(problem, config)
@@ -159,6 +161,8 @@ def _states(
         stack.enter_context(stopping(bar.say, way_out, stop))
         saving = Saving(folder, run, config.checkpoint_every)
         previews = Previews(folder, config, problem, run, before, stop)
+        if isinstance(bar, NotebookPanel):
+            bar.follow(previews, str(folder.path), [entry.loss for entry in run.history])
         look = _looker(problem, config)
         try:
             for event in _events(problem, config, run, stop):
@@ -193,6 +197,11 @@ def _states(
         problem.album.rest()
         folder.write(files)
         return result_of(outcome, stop.by)
+
+
+def _progress(shown: bool) -> Progress | NotebookPanel:
+    """What tells the user how it goes, where they are."""
+    return NotebookPanel() if shown and in_notebook() else Progress(shown)
 
 
 def _run(

@@ -20,7 +20,8 @@ def _file(name: str) -> str:
 
 
 @cache
-def _template() -> jinja2.Template:
+def template(name: str) -> jinja2.Template:
+    """One of this package's templates; texts that are put into it are escaped."""
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(_file),
         autoescape=True,
@@ -28,7 +29,7 @@ def _template() -> jinja2.Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template("page.html.j2")
+    return environment.get_template(name)
 
 
 def document(page: Page, live: bool = False) -> bytes:
@@ -36,7 +37,7 @@ def document(page: Page, live: bool = False) -> bytes:
 
     One that is saved carries its policy itself; for one that is served, `policy` is that of the header.
     """
-    html = _template().render(
+    html = template("page.html.j2").render(
         page=page, live=live, policy="" if live else policy("data:"), data=_data(page, live),
         style=_file("page.css"), script=_file("page.js"),
     )  # fmt: skip
