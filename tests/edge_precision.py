@@ -1,6 +1,6 @@
 """How exact gradients with edges are: cells of truth, each with as many seeds as make the difference sure to 0.4 %.
 
-    python tests/edge_precision.py [--seconds 240] [--times N] [--processes N] [CELL ...]
+    python tests/edge_precision.py [--seconds 240] [--times N] [--processes N] [--length PIXELS] [CELL ...]
 
 prints a line for each cell, and then what all of them say together: by how much gradients differ from finite
 differences, on average, and how their z are spread. A cell that is still noisy after so many seconds says so by its ±.
@@ -20,6 +20,7 @@ import numpy as np
 
 from pathreplay import backend
 from pathreplay.check.statistics import gap
+from pathreplay.render import boundary
 from variant import VARIANT
 
 backend.set_variant(VARIANT)
@@ -63,17 +64,19 @@ class Samples:
 
 @dataclass(frozen=True)
 class Cell:
-    """What is measured, for how long, and with how many times its samples."""
+    """What is measured, for how long, with how many times its samples, and by how long lines on the film."""
 
     name: str
     seconds: float
     times: int
+    length: float
 
 
 def precise(cell: Cell) -> tuple[Samples, float]:
     """Samples until the difference is sure, or so many seconds of the processor are over; the seconds."""
     case = {**BY_NAME, ALL_MOVE.name: ALL_MOVE}[cell.name]
     more = replace(case, spp=cell.times * case.spp, reference_spp=cell.times * (case.reference_spp or case.spp))
+    boundary.FILM_LENGTH = cell.length
     samples, begin = Samples(), time.process_time()
     with loaded(more) as bench:
         while not samples.differences or (samples.relative()[1] > SURE and time.process_time() - begin < cell.seconds):
@@ -109,11 +112,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=240, help="of the processor, for a cell")
     parser.add_argument("--times", type=int, default=1, help="how many times a cell's samples are taken at once")
     parser.add_argument("--processes", type=int, default=1, help="that measure side by side")
+    parser.add_argument("--length", type=float, default=boundary.FILM_LENGTH, help="of lines on the film, in pixels")
     asked = parser.parse_args()
     known = [*BY_NAME, ALL_MOVE.name]
     if unknown := [name for name in asked.cells if name not in known]:
         parser.error(f"no cell is called {unknown[0]!r}; there are {', '.join(known)}")
-    cells = [Cell(name, asked.seconds, asked.times) for name in asked.cells or known]
+    cells = [Cell(name, asked.seconds, asked.times, asked.length) for name in asked.cells or known]
     found = []
     for cell, (samples, spent) in zip(cells, measured(cells, asked.processes), strict=True):
         found.append(samples.relative())
