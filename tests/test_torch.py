@@ -117,20 +117,6 @@ def test_what_does_not_fit_is_told(render: Any) -> None:
         Render("cornell-box", "blue")
 
 
-def test_without_torch_one_line_says_so(run_python: Any) -> None:
-    code = """
-import sys
-sys.modules["torch"] = None
-import mitsuba as mi, pathreplay
-mi.set_variant("llvm_ad_rgb")
-try:
-    import pathreplay.bridge.torch
-except pathreplay.PathreplayError as error:
-    print(error)
-"""
-    assert run_python(code).stdout == "PyTorch is not installed: pip install torch, or 'pathreplay[torch]'\n"
-
-
 @pytest.mark.slow
 def test_five_hundred_iterations_leave_nothing_behind() -> None:
     """Neither memory of the process nor variables of Dr.Jit's."""

@@ -1,0 +1,98 @@
+"""Rendering as a function of JAX arrays: pictures out, and gradients back from a loss of JAX's.
+
+JAX calls back to Python for both, so that `jax.jit`, `jax.grad` and `jax.vmap` (one after the other) go over it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.bridge.scene_function import SceneFunction, View
+from pathreplay.errors import PathreplayError
+
+try:
+    import jax
+    import jax.numpy as jnp
+except ImportError:
+    raise PathreplayError("JAX is not installed: pip install jax, or 'pathreplay[jax]'") from None
+
+Arrays = Mapping[str, jax.Array]
+"""By key of the parameter: what people see of it, in the shapes of `Render.start`."""
+
+
+class Render(SceneFunction):
+    """Pictures of a scene as a function of some of its parameters: see `SceneFunction`.
+
+    Arrays are float32, and go by way of the host.
+    """
+
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        super().__init__(*arguments, **more)
+        self._functions: dict[tuple[int, int], Any] = {}
+
+    def start(self) -> dict[str, jax.Array]:
+        """The values that the scene had: textures (height, width, channels), grids (z, y, x, channels), colours (3,),
+        numbers (n,), vertices (3 n,), transforms (4, 4)."""
+        return {key: jnp.asarray(value) for key, value in self._start.items()}
+
+    def __call__(
+        self, values: Arrays, sensor: int = 0, *, seed: int | jax.Array = 0, spp: int | None = None
+    ) -> jax.Array:
+        """The picture (height, width, channels; linear) that a sensor sees with these values.
+
+        Textures and grids may have other sizes. The picture is an unbiased estimate, and so is the gradient of what is
+        linear in it, by samples of its own; take another ``seed`` for every step, which may be an array in what JAX
+        compiles. Differentiated is what the integrator differentiates; there are no second derivatives. Raises
+        PathreplayError for missing values and wrong shapes; what the integrator cannot do JAX tells in its own words.
+        """
+        self.require({key: tuple(np.shape(value)) for key, value in values.items()})
+        arrays = tuple(jnp.asarray(values[key], jnp.float32) for key in self.keys)
+        which = sensor, spp or self.spp
+        if which not in self._functions:
+            self._functions[which] = _function(self, *which)
+        image: jax.Array = self._functions[which](jnp.asarray(seed, jnp.uint32), arrays)
+        return image
+
+
+def _function(render: Render, sensor: int, spp: int) -> Any:
+    """The picture as a function of seed and values, with its derivative."""
+    size = _size(render, sensor)
+
+    def picture(seed: np.ndarray, *values: np.ndarray) -> np.ndarray:
+        return np.array(render.picture(_to_drjit(values), View(sensor, int(seed), spp)), np.float32)
+
+    def gradient(seed: np.ndarray, weights: np.ndarray, *values: np.ndarray) -> tuple[np.ndarray, ...]:
+        found = render.gradient(_to_drjit(values), View(sensor, int(seed), spp), mi.TensorXf(np.array(weights)))
+        return tuple(np.array(each, np.float32) for each in found)
+
+    call = partial(jax.pure_callback, vmap_method="sequential")
+
+    @jax.custom_vjp
+    def function(seed: jax.Array, values: tuple[jax.Array, ...]) -> jax.Array:
+        return call(picture, jax.ShapeDtypeStruct(size, jnp.float32), seed, *values)
+
+    def forward(seed: jax.Array, values: tuple[jax.Array, ...]) -> tuple[jax.Array, Any]:
+        return function(seed, values), (seed, values)
+
+    def backward(kept: Any, weights: jax.Array) -> tuple[None, tuple[jax.Array, ...]]:
+        seed, values = kept
+        like = tuple(jax.ShapeDtypeStruct(value.shape, jnp.float32) for value in values)
+        return None, call(gradient, like, seed, weights, *values)
+
+    function.defvjp(forward, backward)
+    return function
+
+
+def _size(render: Render, sensor: int) -> tuple[int, ...]:
+    """Height, width and channels of a sensor's pictures, by the cheapest one."""
+    start = [mi.TensorXf(render._start[key]) for key in render.keys]
+    return tuple(render.picture(start, View(sensor, 0, 1)).shape)
+
+
+def _to_drjit(values: tuple[np.ndarray, ...]) -> list[mi.TensorXf]:
+    return [mi.TensorXf(np.array(value, np.float32)) for value in values]

@@ -1,0 +1,93 @@
+"""What the bridges share: a scene as a function of values, in Dr.Jit's own tensors; and bridges that lead nowhere."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from pathreplay.bridge.scene_function import SceneFunction, View
+from pathreplay.errors import PathreplayError
+from pathreplay.scenes.loading import load_scene
+from pathreplay.scenes.parameters import get_array
+
+TEXTURE, WALL = "back.bsdf.reflectance.data", "red.reflectance.value"
+SMALL = {"resolution": 6, "texture": 3}
+PLAIN = {"type": "pathreplay", "max_depth": 3}
+FEW, MANY = View(1, 4, 16), View(1, 4, 2048)
+
+
+@pytest.fixture
+def function() -> SceneFunction:
+    return SceneFunction("cornell-box-photo", [TEXTURE, WALL], integrator=PLAIN, arguments=SMALL)
+
+
+def values_of(function: SceneFunction, wall: float = 0.5) -> list[Any]:
+    found = {key: np.full_like(value, wall) if key == WALL else value for key, value in function._start.items()}
+    return [mi.TensorXf(found[key]) for key in function.keys]
+
+
+def test_pictures_and_gradients_are_those_of_mitsuba(function: SceneFunction) -> None:
+    scene = load_scene("cornell-box-photo", **SMALL)
+    params = mi.traverse(scene)
+    params[WALL] = mi.Color3f(0.5)
+    for key in (TEXTURE, WALL):
+        dr.enable_grad(params[key])
+    params.update()
+    integrator = mi.load_dict(PLAIN)
+    expected = np.array(mi.render(scene, sensor=1, integrator=integrator, spp=FEW.spp, seed=FEW.seed))
+    values = values_of(function)
+    np.testing.assert_allclose(np.array(function.picture(values, FEW)), expected, rtol=1e-5, atol=1e-6)
+
+    weights = mi.TensorXf(np.random.default_rng(0).uniform(0.5, 1, (6, 6, 3)).astype(np.float32))
+    function.picture(values_of(function, 0.1), FEW)  # which the next one is to know nothing of
+    found = dict(zip(function.keys, function.gradient(values, MANY, weights), strict=True))
+    image = mi.render(scene, params, sensor=1, integrator=integrator, spp=MANY.spp, seed=3)
+    dr.backward(dr.sum(image * weights, axis=None))
+    for key in (TEXTURE, WALL):
+        gradient, own = get_array(dr.grad(params[key])), np.array(found[key])
+        assert own.shape == gradient.shape
+        np.testing.assert_allclose(own.mean(), gradient.mean(), rtol=0.05)
+        assert np.abs(own - gradient).mean() < 0.15 * np.abs(gradient).mean()
+
+
+def test_the_scene_keeps_no_graph_and_values_are_not_shared(function: SceneFunction) -> None:
+    values = values_of(function)
+    function.gradient(values, FEW, mi.TensorXf(np.ones((6, 6, 3), np.float32)))
+    assert not any(dr.grad_enabled(function.params[key]) for key in function.keys)
+    assert not any(dr.grad_enabled(value) for value in values)
+
+
+def test_what_does_not_fit_is_told(function: SceneFunction) -> None:
+    shapes = {key: value.shape for key, value in function._start.items()}
+    function.require(shapes)
+    function.require({**shapes, TEXTURE: (5, 7, 3)})
+    for wrong in ((5, 7, 1), (0, 7, 3), (7, 3)):
+        with pytest.raises(PathreplayError, match="given for the parameter 'back"):
+            function.require({**shapes, TEXTURE: wrong})
+    with pytest.raises(PathreplayError, match=r"there is a difference: 'red\.reflectance\.value'"):
+        function.require({TEXTURE: shapes[TEXTURE]})
+    with pytest.raises(PathreplayError, match="there is a difference: 'blue'"):
+        function.require({**shapes, "blue": (3,)})
+    with pytest.raises(PathreplayError, match="Integrator 'path' computes no gradients"):
+        SceneFunction("cornell-box", WALL, integrator={"type": "path"})
+    with pytest.raises(PathreplayError, match="No parameter 'blue'"):
+        SceneFunction("cornell-box", "blue")
+
+
+@pytest.mark.parametrize(("name", "module"), [("PyTorch", "torch"), ("JAX", "jax")])
+def test_one_line_says_what_is_not_installed(run_python: Any, name: str, module: str) -> None:
+    code = f"""
+import sys
+sys.modules["{module}"] = None
+import mitsuba as mi, pathreplay
+mi.set_variant("llvm_ad_rgb")
+try:
+    import pathreplay.bridge.{module}
+except pathreplay.PathreplayError as error:
+    print(error)
+"""
+    assert run_python(code).stdout == f"{name} is not installed: pip install {module}, or 'pathreplay[{module}]'\n"
