@@ -146,6 +146,20 @@ def test_a_vanished_folder_ends_the_run_and_does_not_come_back(
         assert optimize(resume="elsewhere", progress=False).iterations == 2
 
 
+def test_nothing_half_written_stays_in_a_folder_that_is_renamed_meanwhile(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    folder = run_folder.RunFolder(tmp_path / "run")
+
+    def content() -> list[bytes]:
+        (tmp_path / "run").rename(tmp_path / "elsewhere")
+        return [b"2"]
+
+    with pytest.raises(PathreplayError, match="cannot be written"):
+        folder.write({"one": b"1", "within/two": content})
+    folder.lock.close()
+    assert [path.name for path in (tmp_path / "elsewhere").rglob("*")] == [LOCK]
+
+
 def test_links_in_the_folder_are_not_followed(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     precious = room / "precious"
     precious.write_text("x")

@@ -7,7 +7,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,28 +73,30 @@ class RunFolder:
             PathreplayError: the disk is full, the folder is gone or cannot be written, or a folder in it is a link that
                 leads elsewhere. Temporary files are removed, and so are folders that were made for them.
         """
-        parts: list[tuple[Path, Path]] = []
-        made: list[Path] = []
+        parts: list[str] = []
+        made: list[str] = []
         self.require_in_place("what was not yet written is")
-        try:
-            for name, content in files.items():
-                final = self.path / name
-                self._make_parent(final.parent, made)
-                part = final.with_name(final.name + PART)
-                parts.append((part, final))
-                _write_through(part, content)
-            with undisturbed():  # all or none: a second Ctrl-C waits
-                for part, final in parts:
-                    os.replace(part, final)
-        except BaseException as error:  # a second Ctrl-C, too
-            for remove in (*(part.unlink for part, _ in parts), *(folder.rmdir for folder in made)):
-                with contextlib.suppress(OSError):
-                    remove()
-            if isinstance(error, OSError):
-                raise PathreplayError(self._failure(error)) from error
-            raise
+        with _held(self.path) as held:
+            try:
+                for name, content in files.items():
+                    self._make_parent(name, made)
+                    parts.append(name)
+                    _write_through(self.path / f"{name}{PART}", content)
+                with undisturbed():  # all or none: a second Ctrl-C waits
+                    for name in parts:
+                        os.replace(self.path / f"{name}{PART}", self.path / name)
+            except BaseException as error:  # a second Ctrl-C, too
+                # By the folder itself: it may have been renamed meanwhile.
+                base = self.path if held is None else Path()
+                for remove, name in (*((os.unlink, f"{name}{PART}") for name in parts), *((os.rmdir, n) for n in made)):
+                    with contextlib.suppress(OSError):
+                        remove(base / name, dir_fd=held)
+                if isinstance(error, OSError):
+                    raise PathreplayError(self._failure(error)) from error
+                raise
 
-    def _make_parent(self, folder: Path, made: list[Path]) -> None:
+    def _make_parent(self, name: str, made: list[str]) -> None:
+        folder = (self.path / name).parent
         if folder == self.path:
             return
         if folder.is_symlink():
@@ -103,7 +105,7 @@ class RunFolder:
             )
         if not folder.exists():
             folder.mkdir()
-            made.append(folder)
+            made.append(os.path.relpath(folder, self.path))
 
     def _failure(self, error: OSError) -> str:
         if (self.path / CHECKPOINT).exists():
@@ -233,6 +235,18 @@ def _make_new(output: Path) -> Path:
         raise PathreplayError(
             f"Run folder {output} cannot be made ({error.strerror}); give another with --output"
         ) from error
+
+
+@contextlib.contextmanager
+def _held(folder: Path) -> Iterator[int | None]:
+    """The folder itself, whatever it may be called meanwhile; None where it cannot be held (Windows, no right)."""
+    with contextlib.ExitStack() as stack:
+        held = None
+        if os.unlink in os.supports_dir_fd:
+            with contextlib.suppress(OSError):
+                held = os.open(folder, os.O_RDONLY)
+                stack.callback(os.close, held)
+        yield held
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
