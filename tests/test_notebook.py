@@ -10,8 +10,8 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from pathreplay.inverse import iterate, make_config, notebook, optimize
-from pathreplay.pages.page import Picture, View
-from pathreplay.pages.panel import MOST_POINTS, Panel, thinned
+from pathreplay.pages.page import Picture, View, thinned
+from pathreplay.pages.panel import MOST_POINTS, Panel
 from test_steps import JOB, SCENE
 
 HOSTILE = "<script>alert('\"')</script>"
@@ -109,8 +109,9 @@ def test_curves_stay_inside(losses: tuple[float, ...]) -> None:
 
 def test_long_curves_are_thinned() -> None:
     values = tuple(map(float, range(10_000)))
-    found = thinned(values)
+    found = [values[i] for i in thinned(len(values), MOST_POINTS)]
     assert len(found) == MOST_POINTS and found[0] == values[0] and found[-1] == values[-1] and found == sorted(found)
+    assert len(points(Panel("run", "optimizing", losses=values).html())) == MOST_POINTS
 
 
 def points(html: str) -> list[tuple[float, float]]:

@@ -6,7 +6,7 @@ JAX calls back to Python for both, so that `jax.jit`, `jax.grad` and `jax.vmap` 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import mitsuba as mi
@@ -31,9 +31,10 @@ class Render(SceneFunction):
     Arrays are float32, and go by way of the host.
     """
 
-    def __init__(self, *arguments: Any, **more: Any) -> None:
-        super().__init__(*arguments, **more)
-        self._functions: dict[tuple[int, int], Any] = {}
+    @cached_property
+    def _functions(self) -> dict[tuple[int, int], Any]:
+        """What JAX differentiates, by sensor and samples per pixel."""
+        return {}
 
     def start(self) -> dict[str, jax.Array]:
         """The values that the scene had: textures (height, width, channels), grids (z, y, x, channels), colours (3,),

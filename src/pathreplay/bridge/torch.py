@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import mitsuba as mi
@@ -26,9 +27,10 @@ class Render(SceneFunction):
     Tensors are float32 on ``device``: the CPU, or the GPU in variants with CUDA; others are brought there.
     """
 
-    def __init__(self, *arguments: Any, **more: Any) -> None:
-        super().__init__(*arguments, **more)
-        self.device = torch.device("cuda" if backend_of(mi.variant()) == "cuda" else "cpu")
+    @cached_property
+    def device(self) -> torch.device:
+        """Where pictures and gradients are."""
+        return torch.device("cuda" if backend_of(mi.variant()) == "cuda" else "cpu")
 
     def start(self) -> dict[str, torch.Tensor]:
         """The values that the scene had: textures (height, width, channels), grids (z, y, x, channels), colours (3,),

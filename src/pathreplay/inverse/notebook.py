@@ -31,8 +31,7 @@ class NotebookPanel:
         from IPython.display import HTML, display
 
         self._html, self._title, self._status = HTML, "optimize", "preparing"
-        self._done = self._wanted = self._before = 0
-        self._losses: list[float] = []
+        self._wanted = self._before = 0
         self._lines: list[str] = []
         self._notes = Notes()
         self._previews: Previews | None = None
@@ -47,9 +46,9 @@ class NotebookPanel:
         self._status = "ended" if kind is None else f"ended by {kind.__name__}"
         self._draw()
 
-    def follow(self, previews: Previews, title: str, losses: list[float]) -> None:
-        """Show the pictures of a run from now on, after the losses that it has had so far."""
-        self._previews, self._title, self._losses = previews, title, losses
+    def follow(self, previews: Previews) -> None:
+        """Show the pictures and losses of a run from now on."""
+        self._previews, self._title = previews, str(previews.folder.path)
 
     def say(self, text: str) -> None:
         """Name what is going on now."""
@@ -72,12 +71,10 @@ class NotebookPanel:
     def observe(self, event: Event) -> None:
         """Show what the run tells."""
         if isinstance(event, Started):
-            self._begin, self._before, self._done, self._wanted = time.monotonic(), event.done, event.done, event.wanted
+            self._begin, self._before, self._wanted = time.monotonic(), event.done, event.wanted
             self.say("optimizing")
         elif isinstance(event, Stepped):
-            self._done += 1
-            self._losses.append(event.entry.loss)
-            if time.monotonic() - self._told >= PAUSE_S or self._done == self._wanted:
+            if time.monotonic() - self._told >= PAUSE_S or event.entry.iteration + 1 == self._wanted:
                 self._draw()
         elif note := self._notes.of(event):
             self.note(note)
@@ -90,19 +87,20 @@ class NotebookPanel:
     def _panel(self) -> Panel:
         if self._previews is not None and self._previews.shown_at != self._views[0]:
             self._views = self._previews.shown_at, self._previews.small_pictures()
+        history = self._previews.run.history if self._previews else []
         return Panel(
             self._title,
             self._status,
-            self._done,
+            len(history),
             self._wanted,
-            self._left(),
-            tuple(self._losses),
+            self._left(len(history)),
+            tuple(entry.loss for entry in history),
             self._views[1],
             tuple(self._lines),
         )
 
-    def _left(self) -> str:
-        steps = self._done - self._before
-        if not 0 < steps or self._done == self._wanted:
+    def _left(self, done: int) -> str:
+        steps = done - self._before
+        if not 0 < steps or done == self._wanted:
             return ""
-        return f"about {(time.monotonic() - self._begin) / steps * (self._wanted - self._done):.0f} s left"
+        return f"about {(time.monotonic() - self._begin) / steps * (self._wanted - done):.0f} s left"

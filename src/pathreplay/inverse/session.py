@@ -162,7 +162,7 @@ def _states(
         saving = Saving(folder, run, config.checkpoint_every)
         previews = Previews(folder, config, problem, run, before, stop)
         if isinstance(bar, NotebookPanel):
-            bar.follow(previews, str(folder.path), [entry.loss for entry in run.history])
+            bar.follow(previews)
         look = _looker(problem, config)
         try:
             for event in _events(problem, config, run, stop):

@@ -151,7 +151,7 @@ class Page:
     """Other words for the headings: 'views', 'plots', 'parameters', 'how'."""
 
 
-def thinned(count: int) -> list[int]:
+def thinned(count: int, most: int = MOST_POINTS) -> list[int]:
     """The places of a sequence that a curve takes: all, or every so many, and the last."""
-    step = -(-count // MOST_POINTS) or 1
+    step = -(-count // most) or 1
     return [*range(0, count - 1, step), count - 1] if count else []

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from pathreplay.pages.document import template
-from pathreplay.pages.page import View
+from pathreplay.pages.page import View, thinned
 
 WIDTH, HEIGHT, BORDER = 480, 120, 4
 """Of the curve, in pixels."""
@@ -29,19 +29,12 @@ class Panel:
 
     def html(self) -> str:
         """The curve is logarithmic where all losses are above zero; of many iterations it takes every so many."""
-        losses = thinned(self.losses)
+        losses = [self.losses[i] for i in thinned(len(self.losses), MOST_POINTS)]
         log = bool(losses) and min(losses) > 0
         return template("panel.html.j2").render(
             panel=self, points=_points([math.log(x) for x in losses] if log else losses),
             log=log, width=WIDTH, height=HEIGHT,
         )  # fmt: skip
-
-
-def thinned(values: tuple[float, ...]) -> list[float]:
-    """All of few, and of many every so many: the first and the last are among them."""
-    if len(values) <= MOST_POINTS:
-        return list(values)
-    return [values[round(i * (len(values) - 1) / (MOST_POINTS - 1))] for i in range(MOST_POINTS)]
 
 
 def _points(values: list[float]) -> str:
