@@ -62,11 +62,12 @@ def beam_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
 
     def draw(i: mi.UInt32) -> tuple[BeamLine, mi.Bool]:
         key = key_of(i, seed ^ 0x3C6EF372)
-        x, y, turn, z = quasi_random(i, lines, seed ^ 0x1F83D9AB, 4)
-        w = mi.Vector2f(dr.cos(dr.two_pi * turn), dr.sin(dr.two_pi * turn))
-        c, density = centres.draw(mi.Point2f(x, y))
+        numbers = Counted(key, mi.UInt32(0x30000))
+        turn = dr.two_pi * numbers.next_1d()
+        w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
+        c, density = centres.draw(quasi_random(i, lines, seed ^ 0x1F83D9AB))
         reach = _reach(walk, dr.detach(places.ray(c - centres.margin, key)[0]))
-        τ = z * reach
+        τ = numbers.next_1d() * reach
         ok = dr.isfinite(reach) & (reach > 0)
         density *= dr.select(ok, dr.rcp(reach), 1)
         begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)

@@ -45,10 +45,10 @@ JUMP = 4.0
 """So many times as far from an edge as its slope says is the other end of a line where a sample of an emitter jumps."""
 EVENLY = 0.25
 """Share of the arcs that are thrown evenly: those that begin below the horizon, or where lobes are weak, count, too."""
+
+
 WIDELY = 0.5
 """Share of the lines that are thrown evenly over the film: where things touch, few lines find what counts much."""
-OF_SQUARES, OF_ARCS = 0x1B873593, 0x38B34AE5
-"""Bits of a key that tell one kind of line from the other."""
 
 
 @dataclass
@@ -63,15 +63,6 @@ class Chosen:
     moves: mi.Bool  # it, or a vertex before, may move
     active: mi.Bool
     flight: Flight | None = None  # before it, with media
-
-
-@dataclass
-class Throw:
-    """Where a vertex throws its lines: random numbers, those of all vertices together fill the cube evenly."""
-
-    u: mi.Point2f  # the centre
-    turn: mi.Float  # the direction, as an angle
-    key: mi.UInt32  # of all others
 
 
 @dataclass
@@ -159,10 +150,12 @@ class Shaded:
     active: mi.Bool
 
 
-def emitter_line(walk: Walk, x: Chosen, l: float, throw: Throw) -> tuple[SquareLine, mi.Bool]:
+def emitter_line(walk: Walk, x: Chosen, l: float, key: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
     """A line among the samples of an emitter, and whether there is one."""
-    index, share, _ = walk.scene.sample_emitter(Counted.of(throw.key ^ OF_SQUARES).next_1d())
-    c, w = throw.u * (1 + l) - 0.5 * l, mi.Vector2f(dr.cos(throw.turn), dr.sin(throw.turn))
+    numbers, scene = Counted(key, mi.UInt32(0)), walk.scene
+    index, share, _ = scene.sample_emitter(numbers.next_1d())
+    turn = dr.two_pi * numbers.next_1d()
+    c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(dr.cos(turn), dr.sin(turn))
     begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)
     for axis in range(2):  # the part that is inside
         cuts = (BORDER - c[axis]) / w[axis], (1 - BORDER - c[axis]) / w[axis]
@@ -172,9 +165,9 @@ def emitter_line(walk: Walk, x: Chosen, l: float, throw: Throw) -> tuple[SquareL
     return SquareLine(c, w, begin, end, Lamp.of(walk, index, x.active), share), inside
 
 
-def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, throw: Throw, search: Search) -> Any:
+def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
     """Find the edge of a shadow among the samples of an emitter, and weigh it: see `Search`. Detached."""
-    line, inside = emitter_line(walk, x, l, throw)
+    line, inside = emitter_line(walk, x, l, key)
 
     def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
         seen = glimpse(walk, seer, line.lamp, line.at(t), active)
@@ -192,7 +185,7 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, throw: Throw, sea
     light, hit = lit.light, dark.hit
     active &= seer.is_off(hit.t)
     f, pdf = seer.towards(light.d, active)
-    F = x.β * f * lit.Le * seer.past(light, hit.t, throw.key ^ OF_SQUARES, active) * line.share
+    F = x.β * f * lit.Le * seer.past(light, hit.t, key, active) * line.share
     F *= dr.select(light.delta, 1, mis_weight(lit.density / line.share, pdf))
     K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a.hidden, -1, 1)
     active &= dr.any(K != 0) & dr.all(dr.isfinite(K))
@@ -244,25 +237,26 @@ class Hiding:
     active: mi.Bool
 
 
-def arc(x: Chosen, seer: Seer, l: float, throw: Throw) -> tuple[Arc, mi.Bool]:
+def arc(seer: Seer, l: float, key: mi.UInt32, active: mi.Bool) -> tuple[Arc, mi.Bool]:
     """An arc around a direction in which a vertex scatters, and whether there is one."""
-    numbers = Counted(throw.key ^ OF_ARCS, mi.UInt32(0x100))
-    d, smooth = seer.sample(numbers.next_1d(), throw.u)
+    numbers = Counted(key, mi.UInt32(0x100))
+    d, smooth = seer.sample(numbers.next_1d(), numbers.next_2d())
     evenly = numbers.next_1d() < EVENLY
-    d = dr.select(evenly, mi.warp.square_to_uniform_sphere(throw.u), d)
-    ok = x.active & (evenly | smooth)
+    d = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), d)
+    ok = active & (evenly | smooth)
     pdf = dr.lerp(seer.towards(d, ok)[1], dr.inv_four_pi, EVENLY)
     c = dr.select(ok, d, mi.Vector3f(0, 0, 1))
-    w = mi.Frame3f(c).to_world(mi.Vector3f(dr.cos(throw.turn), dr.sin(throw.turn), 0))
+    turn = dr.two_pi * numbers.next_1d()
+    w = mi.Frame3f(c).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
     return Arc(c, w, dr.select(ok, pdf, 1), mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
 
 
-def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, throw: Throw, search: Search) -> Any:
+def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
     """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides: see `Search`.
 
     Detached.
     """
-    line, ok = arc(x, seer, l, throw)
+    line, ok = arc(seer, l, key, x.active)
 
     def look(line: Arc, t: mi.Float, active: mi.Bool) -> Sight:
         ray = seer.origin.spawn_ray(line.at(t))
@@ -302,7 +296,6 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, throw: Throw, search:
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
     steep = dr.select(bent, dr.dot(slope, n), 1)
     f, pdf = seer.towards(ray_far.d, active)
-    key = throw.key ^ OF_ARCS
     common = x.β * f * (0.5 * dr.pi / l * found.weight / line.pdf)
     active &= dr.any(common != 0)
     arrivals, depth = [seer.arrival(ray_near, near, pdf), seer.arrival(ray_far, far, pdf)], x.depth + 1
@@ -361,18 +354,17 @@ def inner_edges(
 
     def path(centres: Centres, i: mi.UInt32, n: int, seed: mi.UInt32, records: Any) -> tuple[Any, ...]:
         key = key_of(i, seed ^ 0x2545F491)
-        *first, u, v, turn = quasi_random(i, n, seed, 5)
-        s, density = centres.draw(mi.Point2f(first))
+        s, density = centres.draw(quasi_random(i, n, seed))
         ray, weight = dr.detach(places.ray(s, key))
         records, x = choose_vertex(walk, Counted.of(key), ray, layout, records)
         x.β *= weight / (density * dr.opaque(mi.Float, n))
-        return s, density, Throw(mi.Point2f(u, v), dr.two_pi * turn, key), records, x
+        return s, density, key, records, x
 
     def glances(centres: Centres, n: int, seed: mi.UInt32) -> tuple[mi.Point2f, mi.Float, mi.Float]:
-        s, density, throw, _, x = path(centres, dr.arange(mi.UInt32, n), n, seed, None)
+        s, density, key, _, x = path(centres, dr.arange(mi.UInt32, n), n, seed, None)
         seer = Seer(walk, x.at, x.flight, x.active)
-        in_squares = emitter_edges(walk, x, seer, square, throw, Search()) / density
-        on_arcs = arc_edges(walk, x, seer, arc, throw, Search()) / density
+        in_squares = emitter_edges(walk, x, seer, square, key ^ 0x1B873593, Search()) / density
+        on_arcs = arc_edges(walk, x, seer, arc, key ^ 0x38B34AE5, Search()) / density
         return s, in_squares + dr.zeros(mi.Float, n), on_arcs + dr.zeros(mi.Float, n)
 
     centres = Centres(int(places.size.x), int(places.size.y), 0.0)
@@ -385,16 +377,16 @@ def inner_edges(
     on_arc = chosen.index >= lines
     i = dr.select(on_arc, chosen.index - lines, chosen.index)
     pick = mi.PCG32(closer, initstate=seed + 1, initseq=dr.arange(mi.UInt32, closer))
-    s, _, throw, records, x = path(centres, i, lines, seed, dr.alloc_local(record_type(layout), room_for(walk)))
+    s, _, key, records, x = path(centres, i, lines, seed, dr.alloc_local(record_type(layout), room_for(walk)))
     x.active &= chosen.weight > 0
     of_square, of_arc = dr.select(on_arc, 0, chosen.weight), dr.select(on_arc, chosen.weight, 0)
     seer = Seer(walk, x.at, x.flight, x.active)
-    shaded = emitter_edges(walk, x, seer, square, throw, Search(of_square, pick))
+    shaded = emitter_edges(walk, x, seer, square, key ^ 0x1B873593, Search(of_square, pick))
     K = shadow_weight(seer, shaded)
-    hiding = arc_edges(walk, x, seer, arc, throw, Search(of_arc, pick))
+    hiding = arc_edges(walk, x, seer, arc, key ^ 0x38B34AE5, Search(of_arc, pick))
 
     def motion(ray: mi.Ray3f) -> mi.Spectrum:
         return hiding_motion(walk, seer, hiding, ray) - K * shadow_gap(seer, shaded, ray, shaded.u)
 
     k = dr.select(x.active, x.k, 0)
-    return Edges(s, throw.key, k, x.at.ray, layout, records, motion)
+    return Edges(s, key, k, x.at.ray, layout, records, motion)
