@@ -51,7 +51,7 @@ FILMS = {
 
 def some_places(view: Pass, n: int = 100000) -> tuple[FilmPlaces, mi.Point2f]:
     places = FilmPlaces.of(view)
-    return places, quasi_random(dr.arange(mi.UInt32, n), n, mi.UInt32(1)) * places.size
+    return places, mi.Point2f(quasi_random(dr.arange(mi.UInt32, n), n, mi.UInt32(1))) * places.size
 
 
 @pytest.mark.parametrize("film", FILMS.values(), ids=FILMS)
@@ -138,7 +138,7 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
         number = dr.opaque(mi.UInt32, seed)
 
         def line(i: mi.UInt32) -> PlaneLine:
-            c = quasi_random(i, n, number) * (1 + 2 * l) - l
+            c = mi.Point2f(quasi_random(i, n, number)) * (1 + 2 * l) - l
             turn = dr.two_pi * mi.sample_tea_float32(i, number)
             return PlaneLine(c, mi.Vector2f(dr.cos(turn), dr.sin(turn)), mi.Float(-l / 2), mi.Float(l / 2))
 

@@ -65,7 +65,7 @@ def beam_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
         numbers = Counted(key, mi.UInt32(0x30000))
         turn = dr.two_pi * numbers.next_1d()
         w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
-        c, density = centres.draw(quasi_random(i, lines, seed ^ 0x1F83D9AB))
+        c, density = centres.draw(mi.Point2f(quasi_random(i, lines, seed ^ 0x1F83D9AB)))
         reach = _reach(walk, dr.detach(places.ray(c - centres.margin, key)[0]))
         τ = numbers.next_1d() * reach
         ok = dr.isfinite(reach) & (reach > 0)

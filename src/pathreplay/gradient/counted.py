@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-GOLDEN = 2654435769
-"""2^32 over the golden ratio."""
+STEPS = tuple(round(2**32 * (root % 1)) for root in ((1 + 5**0.5) / 2, 2**0.5, 3**0.5, 7**0.5))
+"""What has such multiples fills a circle evenly, and several of them a torus: no root is a sum of others."""
 ROUNDS = 8
 """Of the cipher that makes them. With Mitsuba's default of 4, neighbours of one key go together: light that came by two
 bounces had 4 % too little shadow."""
@@ -49,8 +49,8 @@ def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     return mi.sample_tea_32(i, seed, ROUNDS)[0]
 
 
-def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32) -> mi.Point2f:
-    """The i-th of n points that fill the unit square evenly, from left to right (Fibonacci's lattice), shifted."""
-    x = i * dr.opaque(mi.UInt32, 2**32 // n) + mi.sample_tea_32(seed, mi.UInt32(1), ROUNDS)[0]
-    y = i * mi.UInt32(GOLDEN) + mi.sample_tea_32(seed, mi.UInt32(2), ROUNDS)[0]
-    return mi.Point2f(mi.Float(x >> 8), mi.Float(y >> 8)) * 2**-24
+def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32, dimensions: int = 2) -> list[mi.Float]:
+    """The i-th of n points that fill the unit cube evenly, from left to right, shifted: a lattice of few dimensions."""
+    steps = [dr.opaque(mi.UInt32, 2**32 // n), *map(mi.UInt32, STEPS)][:dimensions]
+    shifts = [mi.sample_tea_32(seed, mi.UInt32(k + 1), ROUNDS)[0] for k in range(dimensions)]
+    return [mi.Float((i * step + shift) >> 8) * 2**-24 for step, shift in zip(steps, shifts, strict=True)]

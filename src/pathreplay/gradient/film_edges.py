@@ -38,7 +38,7 @@ from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
 from .bends import Bend
 from .centres import LOOKS, Centres
-from .counted import ROUNDS, Counted, key_of, quasi_random
+from .counted import Counted, key_of, quasi_random
 from .crofton import Crossed, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places, ray_to_camera
 from .primal import walk_on
@@ -105,9 +105,9 @@ def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
 
     def line(centres: Centres, i: mi.UInt32, n: int, seed: mi.UInt32, l: float) -> FilmLine:
         key = key_of(i, seed ^ 0x51ED270B)
-        turn = dr.two_pi * mi.sample_tea_float32(key, mi.UInt32(0x30000), ROUNDS)
-        c, density = centres.draw(quasi_random(i, n, seed))
-        w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
+        x, y, turn = quasi_random(i, n, seed, 3)
+        c, density = centres.draw(mi.Point2f(x, y))
+        w = mi.Vector2f(dr.cos(dr.two_pi * turn), dr.sin(dr.two_pi * turn))
         return FilmLine(c - centres.margin, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key)
 
     def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:

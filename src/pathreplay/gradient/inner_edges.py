@@ -354,7 +354,7 @@ def inner_edges(
 
     def path(centres: Centres, i: mi.UInt32, n: int, seed: mi.UInt32, records: Any) -> tuple[Any, ...]:
         key = key_of(i, seed ^ 0x2545F491)
-        s, density = centres.draw(quasi_random(i, n, seed))
+        s, density = centres.draw(mi.Point2f(quasi_random(i, n, seed)))
         ray, weight = dr.detach(places.ray(s, key))
         records, x = choose_vertex(walk, Counted.of(key), ray, layout, records)
         x.β *= weight / (density * dr.opaque(mi.Float, n))
