@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations
 from types import SimpleNamespace
 from typing import Any
@@ -156,6 +157,24 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
     error = np.std(lengths, ddof=1) / len(lengths) ** 0.5
     assert error < 0.01
     assert abs(np.mean(lengths) - 1.6) < 4 * error
+
+
+@pytest.mark.parametrize("at", [-0.5, 0.0, 0.5], ids=["begin", "middle", "end"])
+def test_cracks_are_no_edges(at: float) -> None:
+    """Between triangles rays slip through, on a line's begin, middle or end: an edge as close to it is one, though."""
+    line = PlaneLine(mi.Point2f(0), mi.Vector2f(1, 0), mi.Float(-0.5), mi.Float(0.5))
+
+    def halved(differs: Callable[[mi.Float], mi.Bool]) -> float:
+        def look(line: PlaneLine, t: mi.Float, active: mi.Bool) -> Sight:
+            return Sight(mi.UInt32(differs(t)), mi.Point3f(0), mi.Normal3f(0))
+
+        found = glance(look, line, mi.Bool(True))
+        assert found[0] > 0
+        return bisect(look, line, found, mi.PCG32(1)).weight[0]
+
+    assert halved(lambda t: dr.abs(t - at) < 1e-6) == 0
+    beside = at + 1e-5 if at < 0 else at - 1e-5
+    assert halved(lambda t: t > beside) == 1
 
 
 def test_lines_are_picked_as_often_as_they_count() -> None:
