@@ -21,6 +21,7 @@ from pathreplay.inverse.config import Capture
 from pathreplay.inverse.exposures import exposed
 from pathreplay.inverse.images import exr_bytes, picture_size, png_bytes, read_image
 from pathreplay.inverse.problem import build_problem
+from pathreplay.output.export import export_run
 from pathreplay.scenes.loading import load_scene_for
 
 WIDTH, HEIGHT = 12, 8
@@ -308,6 +309,29 @@ def test_the_example_finds_texture_roughness_and_sky(folder: Path) -> None:
     paint = runpy.run_path(str(example / "make_capture.py"))["paint"]()
     found = result.parameters["ball.bsdf.base_color.data"]
     assert np.corrcoef(found[4:12].ravel(), paint[4:12].ravel())[0, 1] > 0.8
+
+
+@pytest.mark.slow
+def test_a_run_in_stages_with_exposures_comes_out_with_its_cameras(folder: Path) -> None:
+    """Its scene renders to the pictures that the run shows, less their exposures, which are told beside it."""
+    changes = {
+        "exposure": {"learning_rate": 0.1},
+        "iterations": 4,
+        "stages": [{"iterations": 2, "downscale": 2}, {"iterations": 2, "max_depth": 2}],
+    }
+    result = optimize(make_config({**JOB, **changes, "output": "run"}), progress=False)
+    export_run(result.folder)
+    scene = mi.load_file(str(folder / "run/export/scene.xml"))
+    numbers = json.loads((folder / "run/export/values.json").read_text())
+    assert np.ravel(numbers["exposure"]) == pytest.approx(result.parameters["exposure"].ravel())
+    assert numbers[KEY] == pytest.approx(result.parameters[KEY].tolist())
+    views = {sensor.id(): n for n, sensor in enumerate(scene.sensors())}
+    names = [f"shot_{k}" for k in range(4)]
+    assert set(names) <= set(views)
+    for k, name in enumerate(names):
+        image = np.array(mi.render(scene, sensor=views[name], spp=4))
+        shown = read_image(folder / f"run/images/result-{name}.exr")
+        np.testing.assert_allclose(exposed(result.parameters, k, image), shown, rtol=1e-3)
 
 
 @pytest.mark.slow

@@ -101,14 +101,17 @@ def test_plugins_work_in_every_order_of_variants(run_python, name: str) -> None:
         assert of["pathreplay", "cloud.interior_medium.sigma_t.data"][1] < 0
 
 
-# Optimises for five iterations in each of the variants on the command line, and checks three kinds of parameters.
+# Optimises for five iterations in each of the variants on the command line, exports what came of it, and checks three
+# kinds of parameters.
 MAIN_JOB = """
 import json, sys
 from pathlib import Path
 import numpy as np
 import pathreplay
 from pathreplay import check_gradient, optimize
-from pathreplay.inverse.images import exr_bytes
+from pathreplay.inverse.config import PICTURE, load_config
+from pathreplay.inverse.images import exr_bytes, read_image
+from pathreplay.output.export import export_run
 from pathreplay.scenes.loading import load_scene
 
 folder, *variants = sys.argv[1:]
@@ -147,6 +150,15 @@ for variant in variants:
     result = optimize(folder / f"{variant}.toml", output=folder / "out", progress=False)
     print()  # ends what Mitsuba's log may have begun
     print(json.dumps([variant, "loss", *(entry.loss for entry in result.history)]))
+    export_run(result.folder)
+    import mitsuba as mi
+    exported = mi.load_file(str(result.folder / "export" / "scene.xml"))
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    seed = load_config(folder / f"{variant}.toml").seeds(PICTURE, 0)[0]
+    image = np.array(mi.render(exported, integrator=ours, spp=4, seed=seed))
+    (shown,) = (result.folder / "images").glob("result-*.exr")
+    print()
+    print(json.dumps([variant, "export", float(np.isclose(image, read_image(shown), rtol=1e-3, atol=1e-4).mean())]))
     scene = load_scene(folder / "room.xml")
     keys = ("red.bsdf.reflectance.value", "floor.bsdf.reflectance.data", "lamp.emitter.radiance.value")
     for key in keys if len(variants) == 1 else keys[:1]:
@@ -171,7 +183,9 @@ def test_the_main_job_runs_in_every_variant(run_python, tmp_path, name: str) -> 
     losses = [line[2:] for line in lines if line[1] == "loss"]
     assert len(losses) == len(JOBS[name]) and all(len(history) == 5 for history in losses)
     assert all(history[-1] < 0.8 * history[0] for history in losses), losses
-    checks = [line for line in lines if line[1] != "loss"]
+    exports = [line[2] for line in lines if line[1] == "export"]
+    assert len(exports) == len(JOBS[name]) and min(exports) > 0.95, exports
+    checks = [line for line in lines if line[1] not in ("loss", "export")]
     assert len(checks) == (3 if len(JOBS[name]) == 1 else len(JOBS[name]))
     assert all(verdict == "pass" for _, _, verdict, _ in checks), checks
 
