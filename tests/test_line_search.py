@@ -187,6 +187,7 @@ def test_a_job_that_was_left_goes_on_bit_for_bit(room: Path) -> None:
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "stages": ({"stages": [{"iterations": 40}]}, "leave 'stages' out"),
     "batches": ({"views_per_step": 1}, "leave 'views_per_step' out"),
+    "pixels": ({"pixels_per_step": 9}, "leave 'pixels_per_step' out"),
     "rival": ({"rival": {"type": "prb"}}, "leave 'rival' out"),
     "schedule": ({"learning_rate_decay": 0.5}, "leave 'learning_rate_decay' out"),
     "auto": ({"spp": "auto"}, "leave 'spp = 'auto'' out"),

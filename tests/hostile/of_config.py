@@ -29,9 +29,9 @@ KEYS: dict[str, Mapping[str, Any]] = {
             "parameters.0 parameters.0.key parameters.0.lower parameters.0.upper parameters.0.learning_rate "
             "parameters.0.initial parameters.0.initial.image parameters.0.resolutions parameters.0.refine_at "
             "parameters.0.pose target target.images loss spp picture_spp seed learning_rate learning_rate_decay "
-            "views_per_step held_out capture capture.transforms capture.colmap exposure exposure.reference "
-            "exposure.white_balance exposure.free view_weights view_weights.eye target.masks target.alpha "
-            "learning_rate_schedule warm_up "
+            "views_per_step pixels_per_step held_out capture capture.transforms capture.colmap exposure "
+            "exposure.reference exposure.white_balance exposure.free view_weights view_weights.eye target.masks "
+            "target.alpha learning_rate_schedule warm_up "
             " optimizer optimizer.type optimizer.beta_1 optimizer.epsilon "
             "parameters.0.transform parameters.0.total_variation parameters.0.prior checkpoint_every unknown "
             "auto_spp auto_spp.ratio auto_spp.lowest auto_spp.highest signal_to_noise non_finite_in_a_row "
@@ -56,7 +56,8 @@ KEYS: dict[str, Mapping[str, Any]] = {
     **dict.fromkeys(
         (
             "stages stages.0 stages.0.iterations stages.0.downscale stages.0.spp stages.0.max_depth stages.0.sensors "
-            "stages.0.views_per_step stages.0.parameters stages.0.learning_rate_factor iterations warm_up"
+            "stages.0.views_per_step stages.0.pixels_per_step stages.0.parameters stages.0.learning_rate_factor "
+            "iterations warm_up"
         ).split(),
         STAGED,
     ),

@@ -23,7 +23,7 @@ KEYS: dict[str, Mapping[str, Any]] = {
     **dict.fromkeys(
         (
             "stages stages.0 stages.0.downscale stages.0.spp stages.0.max_depth stages.0.sensors stages.0.parameters "
-            "stages.0.views_per_step stages.0.learning_rate_factor stages.1.unknown"
+            "stages.0.views_per_step stages.0.pixels_per_step stages.0.learning_rate_factor stages.1.unknown"
         ).split(),
         STAGED,
     ),

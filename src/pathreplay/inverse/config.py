@@ -189,6 +189,9 @@ class Target(Table):
         return self
 
 
+PIXELWISE = ("l2", "relative-l2")
+"""Losses of which some pixels can be taken: those of `losses.QUADRATIC`."""
+
 # Streams of random numbers: pictures never share a seed with iterations, nor targets with renderings.
 ITERATION, TARGET, PICTURE, JUDGEMENT, BATCH = 0, 1, 2, 3, 4
 
@@ -215,6 +218,7 @@ class Config(Table):
     signal_to_noise: Switch = False
     non_finite_in_a_row: Count = 10
     views_per_step: Count | None = None
+    pixels_per_step: Count | None = None
     picture_spp: Count = 128
     seed: Annotated[Whole, Field(ge=0, le=10**18)] = 0
     learning_rate: Positive = 0.02
@@ -340,11 +344,25 @@ class Config(Table):
         return self
 
     @model_validator(mode="after")
+    def _in_batches(self) -> Config:
+        stages = [stage.pixels_per_step for stage in self.stages or []]
+        if self.pixels_per_step is None and not any(stages):
+            return self
+        if self.loss not in PIXELWISE:
+            raise ValueError(
+                f"pixels_per_step: loss = '{self.loss}' wants whole pictures; take {' or '.join(PIXELWISE)}, or "
+                "leave 'pixels_per_step' out"
+            )
+        if self.exposure is not None:
+            raise ValueError("pixels_per_step: 'exposure' wants whole pictures; leave one of them out")
+        return self
+
+    @model_validator(mode="after")
     def _searched(self) -> Config:
         if not self.optimizer.searches:
             return self
         rates = {"learning_rate_schedule", "learning_rate_decay", "warm_up"} & self.model_fields_set
-        wrong = sorted(rates | ({"stages", "rival", "views_per_step"} & self.model_fields_set))
+        wrong = sorted(rates | ({"stages", "rival", "views_per_step", "pixels_per_step"} & self.model_fields_set))
         if self.spp == AUTO:
             wrong.append("spp = 'auto'")
         wrong += ["refine_at" for entry in self.parameters if len(entry.resolutions or []) > 1]

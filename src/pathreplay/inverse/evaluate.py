@@ -17,13 +17,19 @@ from pathreplay.inverse.exposures import EXPOSURE, factor_of
 from pathreplay.inverse.exposures import gradient as exposure_gradient
 from pathreplay.inverse.losses import ELSEWHERE, QUADRATIC
 from pathreplay.inverse.problem import Problem, scene_values
-from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
+from pathreplay.inverse.recorded import Batch, NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.render.facts import SceneFacts
 from pathreplay.render.film import fit_film
 from pathreplay.render.path_integrator import plain_errors
 from pathreplay.scenes.parameters import get_array
 
+SINGLE = (
+    "a film of pixel_format 'rgb' with a filter that is nowhere negative ('box', 'gaussian', 'tent'), an independent "
+    "sampler, a camera that stands still, no media, the integrator 'pathreplay' with its sweep driver, and 2 samples "
+    "per pixel or more, of at most 2048 vertices in all"
+)
+"""What single pixels are rendered with: see `PathReplayIntegrator.sweeps_pixels`."""
 LARGE = 2**22
 """Entries of a variable from which on its memory is looked after."""
 MOST_SENSORS = 64
@@ -40,6 +46,8 @@ class Shard:
     seeds: tuple[int, ...]
     stage: int = 0
     """Of the job, whose views these are, and which says what is differentiated."""
+    pixels: int | None = None
+    """Of each view, drawn by its seed; None: all."""
 
 
 @dataclass(frozen=True)
@@ -182,8 +190,8 @@ class Evaluator:
         known = len(problem.scene.sensors()) <= MOST_SENSORS
         self.freezes = known and record and is_recordable(integrator, has_media) and problem.loss not in ELSEWHERE
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
-        # Of each view and number of samples that was seen: whether pixels can be swept.
-        self._sweeps: dict[tuple[int, int], bool] = {}
+        # Of each view and number of samples that was seen, whole or a batch of it: whether pixels can be swept.
+        self._sweeps: dict[tuple[int, int, bool], bool] = {}
         self._learned: Arrays = {}  # what the integrator knows
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
@@ -192,7 +200,7 @@ class Evaluator:
         def each() -> Iterator[Evaluation]:
             for view, seed in zip(shard.views, shard.seeds, strict=True):
                 self._know(learned)
-                yield self._view(values, view, seed, shard.samples)
+                yield self._view(values, view, seed, shard.samples, shard.pixels)
 
         return total(each(), owned=True)
 
@@ -208,7 +216,7 @@ class Evaluator:
         self.integrator.restore_learned(self.problem.scene, learned)
         self._learned = learned
 
-    def _view(self, values: Arrays, view: int, seed: int, spp: int) -> Evaluation:
+    def _view(self, values: Arrays, view: int, seed: int, spp: int, pixels: int | None) -> Evaluation:
         about = self.problem.views[view]
         fit_film(self.problem.scene.sensors()[about.sensor], about.target.shape)
         variables = self.problem.held.variables(self.problem, values)
@@ -217,10 +225,13 @@ class Evaluator:
         self.problem.params.update(scene_values(self.problem, variables))
         try:
             factor = factor_of(values, view, about.target.shape[2])
-            loss, by_factor = self._differentiated(view, seed, spp, None if factor is None else mi.TensorXf(factor))
+            batch = None if pixels is None else Batch.of(about.target, about.weight, pixels, seed)
+            loss, by_factor = self._differentiated(
+                view, seed, spp, None if factor is None else mi.TensorXf(factor), batch
+            )
         except NotRecordable:  # a part of the gradient may be there: once more, with variables of its own
             self.freezes = False
-            return self._view(values, view, seed, spp)
+            return self._view(values, view, seed, spp, pixels)
         gradients = {}
         for key, value in moving.items():
             gradients[key] = _taken(dr.grad(value))
@@ -237,18 +248,21 @@ class Evaluator:
             self._learned = self.integrator.learned()
         return Evaluation(loss, gradients, dropped, self._learned)
 
-    def _differentiated(self, view: int, seed: int, spp: int, factor: Any = None) -> tuple[float, Any]:
+    def _differentiated(self, view: int, seed: int, spp: int, factor: Any, batch: Batch | None) -> tuple[float, Any]:
         """What the view adds to the loss, and the derivative by its ``factor``; the rest is added to the parameters."""
         problem, about = self.problem, self.problem.views[view]
         sensor, target = about.sensor, held_tensor(about.target)
         weight = None if about.weight is None else held_tensor(about.weight)
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
-        which = view, spp
+        which = view, spp, batch is not None
         records = self.freezes and which in self._sweeps
         if which not in self._sweeps:
-            may = problem.loss in QUADRATIC and hasattr(self.integrator, "sweeps_pixels")
-            scene = problem.scene
-            self._sweeps[which] = may and bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp))
+            self._sweeps[which] = self._can_sweep(sensor, spp, batch is not None)
+            if batch is not None and not self._sweeps[which]:
+                raise PathreplayError(
+                    f"'pixels_per_step': view '{about.name}' cannot be rendered pixel by pixel, which takes {SINGLE}; "
+                    "leave 'pixels_per_step' out, or give the view what it takes"
+                )
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         share = about.share / len(problem.trained())
@@ -256,8 +270,16 @@ class Evaluator:
         with plain_errors():
             value, untold, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
                 problem.params, problem.scene, sensor, self.integrator, target, weight, number, spp,
-                problem.loss, share, self._sweeps[which], factor,
+                problem.loss, share, self._sweeps[which], factor, batch,
             )  # fmt: skip
         if untold is not None:
-            self.integrator.tell(untold, target.shape[0] * target.shape[1] * spp)
+            pixels = target.shape[0] * target.shape[1] if batch is None else dr.width(batch.pixels)
+            self.integrator.tell(untold, pixels * spp)
         return float(value[0]) if dr.width(value) else float("nan"), by_factor
+
+    def _can_sweep(self, sensor: int, spp: int, some: bool) -> bool:
+        """Whether paths are walked once for picture and gradient, of all pixels or of ``some``."""
+        scene = self.problem.scene
+        if self.problem.loss not in QUADRATIC or not hasattr(self.integrator, "sweeps_pixels"):
+            return False
+        return bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp, some))

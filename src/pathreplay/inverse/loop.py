@@ -205,7 +205,7 @@ def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
     same = 0 if part.config.optimizer.searches else iteration
     config, views = part.config, part.problem.views
     return [
-        Shard((n,), spp // config.parts, (seed,), part.number)
+        Shard((n,), spp // config.parts, (seed,), part.number, config.pixels_per_step)
         for n in batch(part.problem, config, iteration)
         for seed in config.seeds(ITERATION, views[n].sensor, same, config.parts)
     ]

@@ -43,7 +43,8 @@ def part_at(problem: Problem, config: Config, iteration: int) -> Part:
 
 
 def _part(problem: Problem, config: Config, number: int, stage: Stage) -> Part:
-    given = {name: value for name in ("spp", "views_per_step") if (value := getattr(stage, name)) is not None}
+    names = "spp", "views_per_step", "pixels_per_step"
+    given = {name: value for name in names if (value := getattr(stage, name)) is not None}
     seen = _views(problem, stage)
     views = tuple(replace(v, held_out=v.held_out or (seen is not None and v.name not in seen)) for v in problem.views)
     moving = frozenset(_moving(problem, stage))

@@ -64,11 +64,10 @@ class Pass:
         ray, weight, position = mitsuba.sample_rays(None, self.scene, self.sensor, sampler)
         return Rays(sampler, ray, weight, position, spp)
 
-    def pixel_sampler(self) -> mi.Sampler:
+    def pixel_sampler(self, pixels: int) -> mi.Sampler:
         """Random numbers for a lane per pixel, each of which draws its own camera rays."""
-        width, height = self.size
         sampler = self.sensor.sampler().clone()
-        sampler.seed(self.seed, width * height)
+        sampler.seed(self.seed, pixels)
         return sampler
 
     @cached_property

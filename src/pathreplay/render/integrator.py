@@ -54,6 +54,15 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
     return PathReplay(driver, auto, branch, recovery)
 
 
+def _at(pixels: mi.UInt32 | None, image: mi.TensorXf) -> mi.TensorXf:
+    """The image where there are such pixels, zero elsewhere; None: all of it."""
+    if pixels is None:
+        return image
+    found = dr.zeros(mi.TensorXf, image.shape)
+    dr.scatter(found.array, dr.gather(mi.Color3f, image.array, pixels), pixels)
+    return found
+
+
 @dataclass
 class Untold:
     """What is to be told of passes that a frozen function has made."""
@@ -120,33 +129,46 @@ class PathReplayIntegrator(PathIntegrator):
     def _boundary(self) -> Boundary:
         return Boundary(inner=self.edges == "all", spp=self.edge_spp)
 
-    def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0) -> bool:
-        """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media."""
+    def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
+        """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media.
+
+        ``some``: for some of the pixels only.
+        """
         view = Pass.of(scene, sensor, 0, spp)
-        if self.driver != "sweep" or not sweepable(view.sensor, self.max_depth, view.spp):
+        if self.driver != "sweep" or not sweepable(view.sensor, self.max_depth, view.spp, some):
             return False
         return not self._facts(scene).has_media
 
     def render_and_backward(
-        self, scene: mi.Scene, offset: mi.TensorXf, slope: mi.TensorXf, sensor: Which = 0, seed: Seed = 0, spp: int = 0
+        self,
+        scene: mi.Scene,
+        offset: mi.TensorXf,
+        slope: mi.TensorXf,
+        sensor: Which = 0,
+        seed: Seed = 0,
+        spp: int = 0,
+        pixels: mi.UInt32 | None = None,
     ) -> mi.TensorXf:
         """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
 
         ``offset`` and ``slope`` are tensors like the image (height x width x 3); the loss adds up over its values.
-        Each path is judged by the others of its pixel: see `pixel_sweep`; edges, by the image. What is not
-        differentiated: see `sweep`.
+        Each path is judged by the others of its pixel: see `pixel_sweep`; edges, by the image. With ``pixels`` (their
+        numbers, row by row, none twice) only these are rendered, and add to the loss; the image is zero elsewhere.
+        What is not differentiated: see `sweep`.
         Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
         number of samples does not, or a tensor has another shape.
         """
         self._require_active(scene)
         view = Pass.of(scene, sensor, seed, spp)
         with self._passing(), dr.isolate_grad():
-            loss = pixel_loss(view, self.max_depth, offset, slope)
+            width, height = view.size
+            pixel = dr.arange(mi.UInt32, width * height) if pixels is None else pixels
+            loss = pixel_loss(view, self.max_depth, offset, slope, pixel)
             walk = self._walk(scene, view.sensor)
             self._learned(view, walk)
-            found = self.interior.pixels(view, walk, loss)
+            found = self.interior.pixels(view, walk, loss, pixel)
             if self.edges != "none":
-                found += self._boundary.backward(view, walk, offset + slope * found.image, None)
+                found += self._boundary.backward(view, walk, _at(pixels, offset + slope * found.image), None)
         self._told(view, walk, found)
         return found.image
 

@@ -80,15 +80,19 @@ class PathReplay:
         found = back_propagate(view, walk, grad_in, self._or_lights(partial(sweep, seen=seen)))
         return replace(found, seen=seen)
 
-    def pixels(self, view: Pass, walk: Walk, loss: PixelLoss) -> Found:
-        """The image, while the loss is back-propagated: see `pixel_sweep`. For scenes without media."""
+    def pixels(self, view: Pass, walk: Walk, loss: PixelLoss, pixel: mi.UInt32) -> Found:
+        """The image, while the loss is back-propagated: see `pixel_sweep`. For scenes without media.
+
+        A lane for each ``pixel``; the image is zero in others.
+        """
         width, height = view.size
-        lost = LostPaths()
-        camera = pixel_camera(view.sensor, dr.arange(mi.UInt32, width * height))
-        moves, L = pixel_sweep(walk, view.pixel_sampler(), camera, view.spp, loss, lost)
-        dr.eval(L)  # in one kernel with the gradients
-        image = mi.TensorXf(dr.ravel(L), (height, width, 3))
-        return Found(image, lost=lost.count, paths=width * height * view.spp, moves=True) if moves else Found(image)
+        lost, lanes = LostPaths(), dr.width(pixel)
+        camera = pixel_camera(view.sensor, pixel)
+        moves, L = pixel_sweep(walk, view.pixel_sampler(lanes), camera, view.spp, loss, lost)
+        image = dr.zeros(mi.TensorXf, (height, width, 3))
+        dr.scatter(image.array, L, pixel)
+        dr.eval(image)  # in one kernel with the gradients
+        return Found(image, lost=lost.count, paths=lanes * view.spp, moves=True) if moves else Found(image)
 
     def _or_lights(self, driver: Driver) -> Driver:
         """The driver, where one was asked for; else one of its own where only lights have gradients."""

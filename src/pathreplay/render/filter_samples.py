@@ -1,0 +1,63 @@
+"""Places around a pixel that are drawn by the film's filter, so that a path belongs to one pixel, whatever the filter.
+
+Filter importance sampling (Ernst, Stamminger and Greiner, "Filter Importance Sampling", 2006): with density w / ∫ w the
+mean of what paths bring is the filtered pixel. No sample is shared with the neighbours, which makes a picture noisier
+than one that is splatted. Filters are products of one function of x and one of y, taken as a staircase of `STEPS`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+STEPS = 1024
+
+
+def is_drawable(film: mi.Film) -> bool:
+    """Whether the film's filter is a density: those of some are negative in places (`mitchell`, `lanczos`)."""
+    values = film.rfilter().eval(_middles(film.rfilter().radius()))
+    return bool(dr.all(values >= 0)) and not film.rfilter().is_box_filter()
+
+
+def _middles(radius: float) -> mi.Float:
+    return (dr.arange(mi.Float, STEPS) + 0.5) * (2 * radius / STEPS) - radius
+
+
+@dataclass(frozen=True)
+class FilterSamples:
+    """Draws distances from the middle of a pixel, in pixels and along one axis, with the density of a filter."""
+
+    radius: float
+    until: mi.Float  # of each step, the share of the filter up to its end
+
+    @staticmethod
+    def of(film: mi.Film) -> FilterSamples:
+        """Those of the film's filter: see `is_drawable`."""
+        radius = film.rfilter().radius()
+        sums = dr.cumsum(film.rfilter().eval(_middles(radius)))
+        until = sums / dr.gather(mi.Float, sums, STEPS - 1)
+        dr.eval(until)  # before loops read it
+        return FilterSamples(radius, until)
+
+    def share(self, x: mi.Float) -> mi.Float:
+        """The share of the filter up to a distance."""
+        place = dr.clip((x + self.radius) * (0.5 * STEPS / self.radius), 0, STEPS)
+        i = dr.minimum(mi.UInt32(place), STEPS - 1)
+        begin, end = self._step(i)
+        return dr.lerp(begin, end, place - mi.Float(i))
+
+    def draw(self, u: mi.Float, low: mi.Float, high: mi.Float) -> mi.Float:
+        """A distance from a random number, between those of the shares ``low`` and ``high``."""
+        v = dr.lerp(low, high, u)
+        last = STEPS - 1
+        i = dr.minimum(dr.binary_search(0, last, lambda i: dr.gather(mi.Float, self.until, i) <= v), last)
+        begin, end = self._step(i)
+        across = dr.clip((v - begin) / (end - begin), 0, 1)
+        return (mi.Float(i) + across) * (2 * self.radius / STEPS) - self.radius
+
+    def _step(self, i: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+        """The shares up to its begin and its end."""
+        begin = dr.select(i > 0, dr.gather(mi.Float, self.until, i - 1, i > 0), 0)
+        return begin, dr.gather(mi.Float, self.until, i)
