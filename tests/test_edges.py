@@ -15,9 +15,11 @@ import pytest
 import edge_scenes as scenes
 from pathreplay.gradient.centres import Centres
 from pathreplay.gradient.counted import ROUNDS, Counted, key_of, quasi_random
-from pathreplay.gradient.crofton import Picked, PlaneLine, Sight, bisect, glance
+from pathreplay.gradient.crofton import BEYOND, BISECTIONS, Picked, PlaneLine, Sight, bisect, glance
+from pathreplay.gradient.inner_edges import BORDER
 from pathreplay.gradient.lamps import sample_at
 from pathreplay.gradient.seer import Seer
+from pathreplay.render.boundary import INNER_LENGTHS
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.facts import SceneFacts
 from pathreplay.render.places import FilmPlaces
@@ -173,6 +175,7 @@ def test_cracks_are_no_edges(at: float) -> None:
         return bisect(look, line, found, mi.PCG32(1)).weight[0]
 
     assert halved(lambda t: dr.abs(t - at) < 1e-6) == 0
+    assert BEYOND * INNER_LENGTHS[0] < BORDER * 2**BISECTIONS  # among samples of an emitter one looks at samples
     beside = at + 1e-5 if at < 0 else at - 1e-5
     assert halved(lambda t: t > beside) == 1
 

@@ -15,13 +15,13 @@ from pathreplay.check.statistics import gap
 from pathreplay.check.stencil import CENTRAL
 from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import optimize
+from pathreplay.inverse import iterate, optimize
 from pathreplay.inverse.config import PIXELWISE, make_config
 from pathreplay.inverse.evaluate import Evaluator, Shard
 from pathreplay.inverse.loop import new_run
 from pathreplay.inverse.losses import LOSSES, QUADRATIC
+from pathreplay.inverse.pixel_batches import Batch
 from pathreplay.inverse.problem import build_problem
-from pathreplay.inverse.recorded import Batch
 from pathreplay.render.filter_samples import FilterSamples, is_drawable
 from truth import RES, Bench, Case, bitmap, camera, lit_room, noise, random, rgb
 
@@ -63,17 +63,17 @@ def opened() -> Iterator:
 
 
 def swept(bench: Bench, integrator: mi.Integrator, seed: int, count: int, offset: Any, slope: Any) -> tuple:
-    """Of a batch of so many pixels: its image, its pixels, and what it says of the gradient by the case's t."""
+    """Of a batch of so many pixels: what they are, which, and what they say of the gradient by the case's t."""
     t = dr.opaque(mi.Float, 0)
     dr.enable_grad(t)
     bench.put(t)
     each = RES**2 / count
-    loss = (mi.TensorXf((each * term).astype(np.float32)) for term in (offset, slope))
     pixels = np.sort(np.random.default_rng(seed).choice(RES**2, count, replace=False))
-    image = integrator.render_and_backward(
+    loss = (mi.TensorXf((each * term.reshape(-1, 1, 3)[pixels]).astype(np.float32)) for term in (offset, slope))
+    rows = integrator.render_and_backward(
         bench.scene, *loss, 0, mi.UInt32(seed), bench.case.spp, mi.UInt32(pixels.astype(np.uint32))
     )
-    return np.array(image), pixels, bench.collect(t)
+    return np.array(rows)[:, 0], pixels, bench.collect(t)
 
 
 @pytest.mark.parametrize("film", [pytest.param(n, marks=() if n in QUICK else SLOW) for n in FILMS])
@@ -87,11 +87,10 @@ def test_some_pixels_stand_for_all(film: str, opened) -> None:
     ours = bench.integrator(rr_depth=bench.case.rr_depth)
     assert ours.sweeps_pixels(bench.scene, 0, 4, some=True)
 
-    images, counts, gradients = np.zeros_like(expected), np.zeros((RES**2, 1)), []
+    sums, counts, gradients = np.zeros((RES**2, 3)), np.zeros((RES**2, 1)), []
     for seed in range(1, bench.case.seeds + 1):
-        image, pixels, gradient = swept(bench, ours, seed, RES**2 // 4, offset, slope)
-        assert (np.delete(image.reshape(-1, 3), pixels, axis=0) == 0).all()
-        images += image
+        rows, pixels, gradient = swept(bench, ours, seed, RES**2 // 4, offset, slope)
+        sums[pixels] += rows
         counts[pixels] += 1
         gradients.append(gradient)
     adjoint = offset + slope * expected
@@ -102,7 +101,7 @@ def test_some_pixels_stand_for_all(film: str, opened) -> None:
     assert abs(wrong.z) < Z_LIMIT, wrong
 
     # Pixel by pixel, at the film's border, too, where the filter is cut off.
-    found = images.reshape(-1, 3) / counts
+    found = sums / counts
     error = np.abs(found - expected.reshape(-1, 3)).mean() / expected.mean()
     assert error < 0.12, error
     rim = np.ones((RES, RES), bool)
@@ -129,10 +128,10 @@ def test_places_are_drawn_by_the_filter(filter: str) -> None:
         assert np.abs(exact - np.array(u)).max() < 2e-3
 
 
-@pytest.mark.parametrize("name", ["mitchell", "catmullrom", "lanczos", "box"])
+@pytest.mark.parametrize("name", ["mitchell", "catmullrom", "lanczos", "box", "gaussian", "tent"])
 def test_filters_that_are_negative_somewhere_are_no_density(name: str) -> None:
-    """And the box needs none."""
-    assert not is_drawable(mi.load_dict({"type": "hdrfilm", "rfilter": {"type": name}}))
+    film = mi.load_dict({"type": "hdrfilm", "rfilter": {"type": name}})
+    assert is_drawable(film) == (name in ("box", "gaussian", "tent"))
 
 
 def test_whole_pictures_are_splatted_unless_the_filter_is_a_box(opened) -> None:
@@ -143,10 +142,11 @@ def test_whole_pictures_are_splatted_unless_the_filter_is_a_box(opened) -> None:
     assert not ours.sweeps_pixels(bench.scene, 0, 1, some=True)
 
 
-JOB = {
+RED = "red.reflectance.value"
+JOB: dict[str, Any] = {
     "scene": "cornell-box",
-    "parameters": [{"key": "red.reflectance.value"}],
-    "target": {"values": {"red.reflectance.value": 0.7}, "spp": 16},
+    "parameters": [{"key": RED}],
+    "target": {"values": {RED: 0.7}, "spp": 16},
     "spp": 4,
     "iterations": 3,
     "scene_parameters": {"resolution": 16},
@@ -156,15 +156,15 @@ JOB = {
 
 
 def test_batches_take_pixels_that_count() -> None:
-    target, weight = np.zeros((6, 5, 3), np.float32), np.zeros((6, 5, 1), np.float32)
+    weight = np.zeros((6, 5, 1), np.float32)
     weight[1:4, 2:] = 30 / 9
-    batch = Batch.of(target, weight, 4, 1)
-    assert batch is not None and batch.each == 9 / 4
-    numbers = [np.array(Batch.of(target, weight, 4, seed).pixels) for seed in range(20)]
-    assert all(len(np.unique(each)) == 4 for each in numbers)
-    assert set(np.concatenate(numbers)) == set(np.flatnonzero(weight))
-    assert Batch.of(target, weight, 9, 1) is None and Batch.of(target, None, 30, 1) is None
-    assert list(batch.pixels) == list(Batch.of(target, weight, 4, 1).pixels)
+    batches = [Batch.of(weight, (6, 5), 4, seed) for seed in range(20)]
+    assert all(each is not None and len(np.unique(each.pixels)) == 4 and each.share == 9 / 30 for each in batches)
+    assert set(np.concatenate([each.pixels for each in batches])) == set(np.flatnonzero(weight))
+    assert list(batches[1].pixels) == list(Batch.of(weight, (6, 5), 4, 1).pixels) != list(batches[2].pixels)
+    assert list(Batch.of(weight, (6, 5), 25, 1).pixels) == list(np.flatnonzero(weight))  # though fewer than asked for
+    assert Batch.of(weight, (6, 5), 30, 1) is None and Batch.of(None, (6, 5), 30, 1) is None
+    assert (batches[0].rows(weight) > 0).all()
 
 
 def test_losses_that_take_single_pixels_have_names() -> None:
@@ -193,23 +193,77 @@ def test_loss_and_gradient_are_those_of_whole_pictures(masked: bool, tmp_path: P
     exact = [whole(values, Shard((0,), 256, (5000 + seed,)), {}) for seed in range(4)]
     sums = [[each.gradients[key].sum() for each in some] for some in (found[False], exact)]
     assert abs(gap(*sums).z) < Z_LIMIT
-    # Of a pixel's noise the loss has the variance on top, here that of four samples.
-    assert np.mean([each.loss for each in found[False]]) > np.mean([each.loss for each in exact])
+
+
+@SLOW
+@pytest.mark.parametrize("edges", ["none", "all"])
+def test_the_mean_of_batches_is_the_whole_where_all_is_rendered_alike(edges: str, tmp_path: Path) -> None:
+    """With a box filter: the loss, with its noise, and the gradient, by a colour or by what moves and has edges."""
+    pose = {"key": "large-box.vertex_positions", "pose": "translation", "start": {"translation": [0.1, 0.1, 0.1]}}
+    colour = {"key": RED, "initial": 0.2}
+    boxed = {"scene": "cornell-box-photo", "scene_parameters": {"resolution": 16, "texture": 8}, "sensors": [0]}
+    target = {**boxed, "spp": 16}
+    del target["sensors"]
+    integrator = {"type": "pathreplay", "max_depth": 3, "edges": edges}
+    moved = [pose if edges == "all" else colour]
+    config = make_config({**JOB, **boxed, "parameters": moved, "target": target, "integrator": integrator})
+    problem = build_problem(config, tmp_path)
+    evaluate = Evaluator(problem, problem.integrator)
+    values = new_run(problem, problem.integrator).values
+    some, whole = ([evaluate(values, Shard((0,), 4, (seed,), 0, n), {}) for seed in range(400)] for n in (64, None))
+    losses, gradients = [[each.loss for each in found] for found in (some, whole)], []
+    for found in (some, whole):
+        gradients.append([float(np.sum(each.gradients[problem.variables[0].key])) for each in found])
+    for a, b in (losses, gradients):
+        assert abs(gap(a, b).z) < Z_LIMIT
+        assert gap(a, b).error < 0.2 * abs(np.mean(b))
 
 
 def test_a_job_takes_batches_of_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other pixels in every iteration, the same in every run."""
+    """Other pixels in every iteration, the same in every run, also in one that goes on."""
     monkeypatch.chdir(tmp_path)
-    one, two = (optimize(make_config({**JOB, "output": name}), progress=False) for name in "ab")
-    losses = [[entry.loss for entry in result.history] for result in (one, two)]
-    assert losses[0] == pytest.approx(losses[1], rel=1e-4) and len(set(losses[0])) == 3
-    assert one.history[-1].loss < one.history[0].loss
+    job = {**JOB, "deterministic": True, "output": "whole"}
+    whole = optimize(make_config(job), progress=False)
+    losses = [entry.loss for entry in whole.history]
+    assert len(set(losses)) == 3 and losses[-1] < losses[0]
+    for state in iterate(make_config({**job, "output": "cut"})):
+        if state.iteration == 1:
+            break
+    cut = optimize(resume="cut", progress=False)
+    assert [entry.loss for entry in cut.history] == losses
+    assert cut.parameters[RED].tobytes() == whole.parameters[RED].tobytes()
+
+
+@SLOW
+def test_stages_halves_and_ranges_take_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    stages = [
+        {"iterations": 3, "downscale": 2, "pixels_per_step": 16},
+        {"iterations": 3, "max_depth": 2, "spp": 8},
+        {"iterations": 3, "pixels_per_step": 400},  # more than there are
+    ]
+    changes = {"stages": stages, "signal_to_noise": True, "sample_ranges": 2, "iterations": 9, "output": "run"}
+    changes["spp"] = 16
+    result = optimize(make_config({**JOB, **changes}), progress=False)
+    assert len(result.history) == 9 and all(entry.noise_norms[RED] > 0 for entry in result.history)
+    assert result.history[-1].loss < result.history[0].loss
+
+
+def test_pixels_that_are_none_are_refused(opened) -> None:
+    bench = opened(Case("gaussian", lambda: room(**FILMS["gaussian"]), FLOOR, random(1.0)))
+    rows = mi.TensorXf(np.ones((2, 1, 3), np.float32))
+    for pixels in ([3, 3], [3, RES**2]):
+        with pytest.raises(PathreplayError, match=f"one twice, or one beyond the {RES} x {RES}"):
+            bench.integrator().render_and_backward(bench.scene, rows, rows, spp=4, pixels=mi.UInt32(pixels))
+    with pytest.raises(PathreplayError, match=r"shape \(2, 1, 3\): use \(3, 1, 3\)"):
+        bench.integrator().render_and_backward(bench.scene, rows, rows, spp=4, pixels=mi.UInt32([1, 2, 3]))
 
 
 MOVED = {
     "parameters": [{"key": "sensor.to_world", "pose": "translation", "start": {"translation": [0.1, 0, 0]}}],
     "target": {"scene": "cornell-box", "scene_parameters": {"resolution": 16}, "spp": 16},
 }
+PRB = {"type": "prb", "max_depth": 3}
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "loss": ({"loss": "ssim"}, "loss = 'ssim' wants whole pictures; take l2 or relative-l2"),
     "loss, in a stage": (
@@ -217,10 +271,15 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         "loss = 'l1' wants whole pictures",
     ),
     "exposure": ({"exposure": {"free": True}}, "'exposure' wants whole pictures; leave one of them out"),
-    "integrator": ({"integrator": {"type": "prb", "max_depth": 3}}, "the integrator 'pathreplay'"),
-    "replay": ({"integrator": {"type": "pathreplay", "driver": "replay"}}, "its sweep driver"),
-    "one sample": ({"spp": 1}, "2 samples per pixel or more"),
-    "camera": (MOVED, "a camera that stands still"),
+    "auto": ({"spp": "auto"}, "spp = 'auto' cannot lessen"),
+    "integrator": ({"integrator": PRB}, "PRBIntegrator renders whole pictures; take the integrator 'pathreplay'"),
+    "rival": ({"rival": PRB}, "PRBIntegrator renders whole pictures"),
+    "replay": ({"integrator": {"type": "pathreplay", "driver": "replay"}}, "driver = 'replay'.*; take 'sweep'"),
+    "one sample": ({"spp": 1}, "1 samples a pixel cannot judge each other; take 2 or more"),
+    "one sample of a half": ({"spp": 2, "signal_to_noise": True}, "1 samples a pixel"),
+    "too many": ({"spp": 1024}, "1024 samples a pixel of 3 vertices are more than the 682 that are held; take fewer"),
+    "late": ({"stages": [{"iterations": 2}, {"iterations": 1, "max_depth": 1500}]}, "of 1500 vertices"),
+    "camera": (MOVED, "its camera moves; hold 'sensor.to_world:translation', or leave 'pixels_per_step' out"),
 }
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-STEPS = tuple(round(2**32 * (root % 1)) for root in ((1 + 5**0.5) / 2, 2**0.5, 3**0.5, 7**0.5))
-"""What has such multiples fills a circle evenly, and several of them a torus: no root is a sum of others."""
+STEPS = tuple(round(2**32 * (root % 1)) for root in ((1 + 5**0.5) / 2, 2**0.5))
+"""Of lattices. No rational multiples of both add up to a rational number, so that they fill a square evenly, too."""
 ROUNDS = 8
 """Of the cipher that makes them. With Mitsuba's default of 4, neighbours of one key go together: light that came by two
 bounces had 4 % too little shadow."""
@@ -50,7 +50,8 @@ def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
 
 
 def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32, dimensions: int = 2) -> list[mi.Float]:
-    """The i-th of n points that fill the unit cube evenly, from left to right, shifted: a lattice of few dimensions."""
+    """The i-th of n points that fill the unit square (or cube) evenly, from left to right: Kronecker's rank-1 lattice,
+    randomly shifted."""
     steps = [dr.opaque(mi.UInt32, 2**32 // n), *map(mi.UInt32, STEPS)][:dimensions]
     shifts = [mi.sample_tea_32(seed, mi.UInt32(k + 1), ROUNDS)[0] for k in range(dimensions)]
     return [mi.Float((i * step + shift) >> 8) * 2**-24 for step, shift in zip(steps, shifts, strict=True)]

@@ -34,8 +34,8 @@ ANGLE = 1e-3
 """Between two surfaces, from which on they meet at an edge."""
 STILL = 8
 """Halvings in a row that leave one end of a line where it was: of a line with an edge on it 1 in 2^7 does."""
-BEYOND = 4
-"""Lengths of what is left of a line, by which one looks beyond such an end."""
+BEYOND = 1.5
+"""Lengths of what is left of a line, by which one looks beyond such an end. (Within the `BORDER` of inner edges.)"""
 
 
 @dataclass

@@ -355,6 +355,10 @@ class Config(Table):
             )
         if self.exposure is not None:
             raise ValueError("pixels_per_step: 'exposure' wants whole pictures; leave one of them out")
+        if self.spp == AUTO:
+            raise ValueError(
+                "pixels_per_step: spp = 'auto' cannot lessen the noise of choosing pixels; give a number of samples"
+            )
         return self
 
     @model_validator(mode="after")

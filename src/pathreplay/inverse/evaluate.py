@@ -15,21 +15,16 @@ from pathreplay import memory
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.exposures import EXPOSURE, factor_of
 from pathreplay.inverse.exposures import gradient as exposure_gradient
-from pathreplay.inverse.losses import ELSEWHERE, QUADRATIC
+from pathreplay.inverse.losses import ELSEWHERE
+from pathreplay.inverse.pixel_batches import Batch, obstacle, refused
 from pathreplay.inverse.problem import Problem, scene_values
-from pathreplay.inverse.recorded import Batch, NotRecordable, Recordings, differentiate, is_recordable
+from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.render.facts import SceneFacts
 from pathreplay.render.film import fit_film
 from pathreplay.render.path_integrator import plain_errors
 from pathreplay.scenes.parameters import get_array
 
-SINGLE = (
-    "a film of pixel_format 'rgb' with a filter that is nowhere negative ('box', 'gaussian', 'tent'), an independent "
-    "sampler, a camera that stands still, no media, the integrator 'pathreplay' with its sweep driver, and 2 samples "
-    "per pixel or more, of at most 2048 vertices in all"
-)
-"""What single pixels are rendered with: see `PathReplayIntegrator.sweeps_pixels`."""
 LARGE = 2**22
 """Entries of a variable from which on its memory is looked after."""
 MOST_SENSORS = 64
@@ -225,7 +220,7 @@ class Evaluator:
         self.problem.params.update(scene_values(self.problem, variables))
         try:
             factor = factor_of(values, view, about.target.shape[2])
-            batch = None if pixels is None else Batch.of(about.target, about.weight, pixels, seed)
+            batch = None if pixels is None else Batch.of(about.weight, about.target.shape[:2], pixels, seed)
             loss, by_factor = self._differentiated(
                 view, seed, spp, None if factor is None else mi.TensorXf(factor), batch
             )
@@ -251,18 +246,18 @@ class Evaluator:
     def _differentiated(self, view: int, seed: int, spp: int, factor: Any, batch: Batch | None) -> tuple[float, Any]:
         """What the view adds to the loss, and the derivative by its ``factor``; the rest is added to the parameters."""
         problem, about = self.problem, self.problem.views[view]
-        sensor, target = about.sensor, held_tensor(about.target)
-        weight = None if about.weight is None else held_tensor(about.weight)
+        sensor, picture, counts = about.sensor, about.target, about.weight
+        if batch is not None:
+            picture, counts = batch.rows(picture), None if counts is None else batch.rows(counts)
+        target, weight = held_tensor(picture), None if counts is None else held_tensor(counts)
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
         which = view, spp, batch is not None
         records = self.freezes and which in self._sweeps
         if which not in self._sweeps:
-            self._sweeps[which] = self._can_sweep(sensor, spp, batch is not None)
-            if batch is not None and not self._sweeps[which]:
-                raise PathreplayError(
-                    f"'pixels_per_step': view '{about.name}' cannot be rendered pixel by pixel, which takes {SINGLE}; "
-                    "leave 'pixels_per_step' out, or give the view what it takes"
-                )
+            why = obstacle(problem, self.integrator, sensor, spp, batch is not None)
+            if why and batch is not None:
+                raise refused(about.name, why)
+            self._sweeps[which] = not why
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         share = about.share / len(problem.trained())
@@ -273,13 +268,5 @@ class Evaluator:
                 problem.loss, share, self._sweeps[which], factor, batch,
             )  # fmt: skip
         if untold is not None:
-            pixels = target.shape[0] * target.shape[1] if batch is None else dr.width(batch.pixels)
-            self.integrator.tell(untold, pixels * spp)
+            self.integrator.tell(untold, target.shape[0] * target.shape[1] * spp)
         return float(value[0]) if dr.width(value) else float("nan"), by_factor
-
-    def _can_sweep(self, sensor: int, spp: int, some: bool) -> bool:
-        """Whether paths are walked once for picture and gradient, of all pixels or of ``some``."""
-        scene = self.problem.scene
-        if self.problem.loss not in QUADRATIC or not hasattr(self.integrator, "sweeps_pixels"):
-            return False
-        return bool(self.integrator.sweeps_pixels(scene, scene.sensors()[sensor], spp, some))

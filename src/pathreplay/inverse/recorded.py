@@ -11,16 +11,14 @@ import gc
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from pathreplay.inverse.config import BATCH
 from pathreplay.inverse.exposures import derivative
 from pathreplay.inverse.losses import Loss, mean_loss
+from pathreplay.inverse.pixel_batches import Batch
 from pathreplay.render.path_integrator import Handed
 from pathreplay.scenes.parameters import keep_only
 
@@ -36,31 +34,6 @@ MOST_RECORDINGS = 8
 """Of a view: where what kernels take for constants changes more often, recording is not worth its time."""
 _OTHER = 0x5EED
 """Makes another seed of one."""
-
-
-@dataclass
-class Batch:
-    """Pixels of a view, chosen at random among those that count."""
-
-    pixels: mi.UInt32
-    each: float
-    """Pixels that one of them stands for."""
-
-    @staticmethod
-    def of(target: np.ndarray, weight: np.ndarray | None, most: int, seed: int) -> Batch | None:
-        """At most so many pixels of a picture, none twice; None where that is all of them."""
-        height, width, _ = target.shape
-        among = np.arange(height * width) if weight is None else np.flatnonzero(weight)
-        if most >= len(among):
-            return None
-        numbers = np.random.default_rng([BATCH, seed]).choice(len(among), most, replace=False)
-        return Batch(mi.UInt32(among[np.sort(numbers)].astype(np.uint32)), len(among) / most)
-
-    def alone(self, picture: mi.TensorXf) -> mi.TensorXf:
-        """The picture at these pixels, zero elsewhere."""
-        found = dr.zeros(mi.TensorXf, picture.shape)
-        dr.scatter(found.array, dr.gather(mi.Color3f, picture.array, self.pixels), self.pixels)
-        return found
 
 
 class NotRecordable(Exception):
@@ -147,21 +120,19 @@ def _differentiate(
 ) -> tuple[Any, Any, Any]:
     """``share`` times the loss of a view, whose gradient is added to the parameters; ``sweeps``: in one pass.
 
-    With a ``batch``, which only sweeps take, of the view's loss an estimate by these pixels.
+    With a ``batch``, which only sweeps take, target and weight are its rows, and so is the loss an estimate by them.
     An integrator of ours is ``handed`` what it needs. Also what that has not told (see `Untold`; None of another), and
     the derivative by the logarithm of the ``factor`` on the picture (see `exposures`) for each channel, if there is
     one.
     """
     with _handing(integrator, handed):
         if sweeps:
-            each = 1 if batch is None else batch.each
-            offset, slope = (term * (share * each) for term in linear_derivative(loss, target, weight))
+            share, pixels = (share, None) if batch is None else (share * batch.share, batch.pixels)
+            offset, slope = (term * share for term in linear_derivative(loss, target, weight))
             # By the chain rule, of what is linear in the factor times the image.
             offset, slope = _times(offset, factor), _times(_times(slope, factor), factor)
-            pixels = None if batch is None else batch.pixels
             image = integrator.render_and_backward(scene, offset, slope, scene.sensors()[sensor], seed, spp, pixels)
-            seen = target if batch is None else batch.alone(target)
-            value = mean_loss(loss, _times(image, factor), seen, weight).array * (share * each)
+            value = mean_loss(loss, _times(image, factor), target, weight).array * share
         else:
             image = mi.render(scene, params, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
             value = mean_loss(loss, _times(image, factor), target, weight).array * share

@@ -29,7 +29,7 @@ from pathreplay.inverse.progress import Progress
 from pathreplay.inverse.result import RunResult, outcome_of, result_files, result_of
 from pathreplay.inverse.run_folder import Job, RunFolder, create_run_folder
 from pathreplay.inverse.saving import Saving, first_files, go_on, saved_targets
-from pathreplay.inverse.stages import Staged, require_stages
+from pathreplay.inverse.stages import Staged, require_single_pixels, require_stages
 from pathreplay.inverse.values import Array
 from pathreplay.scenes.descriptions import told
 from pathreplay.threads import one_thread
@@ -146,6 +146,7 @@ def _states(
         bar.say("preparing")
         problem = build_problem(config, job.base, None if resumed is None else saved_targets(resumed.path))
         require_stages(problem, config)
+        require_single_pixels(problem, config)
         for note in problem.notes:
             bar.note(note)
         crew = stack.enter_context(crew_of(config, job.base, problem, bar.remark, bar.status))

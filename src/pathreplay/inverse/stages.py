@@ -12,6 +12,7 @@ from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config import Config, Plugin
 from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard
 from pathreplay.inverse.images import Image
+from pathreplay.inverse.pixel_batches import obstacle, refused
 from pathreplay.inverse.problem import Problem
 from pathreplay.inverse.stage_options import Stage, place
 from pathreplay.inverse.values import Arrays
@@ -95,6 +96,32 @@ def require_stages(problem: Problem, config: Config) -> None:
     for variable in problem.variables:
         if config.stages and not any(variable.key in _moving(problem, stage) for stage in config.stages):
             raise PathreplayError(f"stages: '{variable.key}' moves in none of them; name it in one, or leave it out")
+
+
+def require_single_pixels(problem: Problem, config: Config) -> None:
+    """Raise PathreplayError unless all views can be rendered pixel by pixel where stages, or the job, ask for that."""
+    stages: list[Stage | None] = [*config.stages] if config.stages else [None]
+    for number, stage in enumerate(stages):
+        part = part_at(problem, config, 0) if stage is None else _part(problem, config, number, stage)
+        if part.config.pixels_per_step is None:
+            continue
+        for integrator, plugin in ((problem.integrator, config.integrator), (problem.rival, config.rival)):
+            if integrator is not None and plugin is not None:
+                if stage is not None and stage.max_depth is not None:
+                    integrator = _integrator(plugin, stage.max_depth)
+                _require_single_pixels(part, integrator)
+
+
+def _require_single_pixels(part: Part, integrator: mi.Integrator) -> None:
+    problem, spp = part.problem, int(part.config.spp)  # which is not "auto" there
+    for view in problem.trained().values():
+        camera = f"{problem.scene.sensors()[view.sensor].id()}."
+        why = obstacle(problem, integrator, view.sensor, spp // part.config.parts, some=True)
+        for key in part.moving:
+            if key.startswith(camera):
+                why = f"its camera moves; hold '{key}'"
+        if why:
+            raise refused(view.name, why)
 
 
 def _require_divisible(sensor: mi.Sensor, name: str, downscale: int) -> None:

@@ -17,8 +17,7 @@ STEPS = 1024
 
 def is_drawable(film: mi.Film) -> bool:
     """Whether the film's filter is a density: those of some are negative in places (`mitchell`, `lanczos`)."""
-    values = film.rfilter().eval(_middles(film.rfilter().radius()))
-    return bool(dr.all(values >= 0)) and not film.rfilter().is_box_filter()
+    return bool(dr.all(film.rfilter().eval(_middles(film.rfilter().radius())) >= 0))
 
 
 def _middles(radius: float) -> mi.Float:

@@ -20,7 +20,7 @@ from .diagnostics import doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts
 from .interior import PathReplay
 from .path_integrator import UNBOUNDED, Handed, PathIntegrator
-from .pixels import pixel_loss, sweepable
+from .pixels import among, obstacle, pixel_loss
 from .properties import choice, deviation, whole_number
 from .term import Found, Term
 
@@ -52,15 +52,6 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
     if auto:
         driver = "sweep" if max_depth <= MAX_DEPTH else "replay"
     return PathReplay(driver, auto, branch, recovery)
-
-
-def _at(pixels: mi.UInt32 | None, image: mi.TensorXf) -> mi.TensorXf:
-    """The image where there are such pixels, zero elsewhere; None: all of it."""
-    if pixels is None:
-        return image
-    found = dr.zeros(mi.TensorXf, image.shape)
-    dr.scatter(found.array, dr.gather(mi.Color3f, image.array, pixels), pixels)
-    return found
 
 
 @dataclass
@@ -130,14 +121,17 @@ class PathReplayIntegrator(PathIntegrator):
         return Boundary(inner=self.edges == "all", spp=self.edge_spp)
 
     def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
-        """Whether `render_and_backward` can be used: see `sweepable`. It needs the sweep driver, and no media.
+        """Whether `render_and_backward` can be used, for all pixels or for ``some``: see `pixel_obstacle`."""
+        return not self.pixel_obstacle(scene, sensor, spp, some)
 
-        ``some``: for some of the pixels only.
-        """
+    def pixel_obstacle(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
+        """Why it cannot be used, with the way out: see `obstacle`. It needs the sweep driver, too, and no media."""
         view = Pass.of(scene, sensor, 0, spp)
-        if self.driver != "sweep" or not sweepable(view.sensor, self.max_depth, view.spp, some):
-            return False
-        return not self._facts(scene).has_media
+        if self.driver != "sweep":
+            return f"driver = '{self.driver}' walks paths one by one; take 'sweep'"
+        if self._facts(scene).has_media:
+            return "the scene has media; leave them out"
+        return obstacle(view.sensor, self.max_depth, view.spp, some)
 
     def render_and_backward(
         self,
@@ -153,22 +147,24 @@ class PathReplayIntegrator(PathIntegrator):
 
         ``offset`` and ``slope`` are tensors like the image (height x width x 3); the loss adds up over its values.
         Each path is judged by the others of its pixel: see `pixel_sweep`; edges, by the image. With ``pixels`` (their
-        numbers, row by row, none twice) only these are rendered, and add to the loss; the image is zero elsewhere.
-        What is not differentiated: see `sweep`.
+        numbers, row by row, none twice) only these are rendered, and add to the loss: the tensors and what is returned
+        have a row for each of them (n x 1 x 3). What is not differentiated: see `sweep`.
         Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
-        number of samples does not, or a tensor has another shape.
+        number of samples does not, a tensor has another shape, or there are no such pixels.
         """
         self._require_active(scene)
         view = Pass.of(scene, sensor, seed, spp)
+        some = None if pixels is None else mi.UInt32(pixels)
         with self._passing(), dr.isolate_grad():
-            width, height = view.size
-            pixel = dr.arange(mi.UInt32, width * height) if pixels is None else pixels
-            loss = pixel_loss(view, self.max_depth, offset, slope, pixel)
+            loss = pixel_loss(view, self.max_depth, offset, slope, some)
             walk = self._walk(scene, view.sensor)
             self._learned(view, walk)
-            found = self.interior.pixels(view, walk, loss, pixel)
+            found = self.interior.pixels(view, walk, loss, some)
             if self.edges != "none":
-                found += self._boundary.backward(view, walk, _at(pixels, offset + slope * found.image), None)
+                wanted = offset + slope * found.image
+                if some is not None:
+                    wanted = among(some, wanted, view.size)
+                found += self._boundary.backward(view, walk, wanted, None)
         self._told(view, walk, found)
         return found.image
 

@@ -80,18 +80,17 @@ class PathReplay:
         found = back_propagate(view, walk, grad_in, self._or_lights(partial(sweep, seen=seen)))
         return replace(found, seen=seen)
 
-    def pixels(self, view: Pass, walk: Walk, loss: PixelLoss, pixel: mi.UInt32) -> Found:
+    def pixels(self, view: Pass, walk: Walk, loss: PixelLoss, some: mi.UInt32 | None) -> Found:
         """The image, while the loss is back-propagated: see `pixel_sweep`. For scenes without media.
 
-        A lane for each ``pixel``; the image is zero in others.
+        If only ``some`` pixels are asked for, a row for each of them.
         """
         width, height = view.size
-        lost, lanes = LostPaths(), dr.width(pixel)
-        camera = pixel_camera(view.sensor, pixel)
-        moves, L = pixel_sweep(walk, view.pixel_sampler(lanes), camera, view.spp, loss, lost)
-        image = dr.zeros(mi.TensorXf, (height, width, 3))
-        dr.scatter(image.array, L, pixel)
-        dr.eval(image)  # in one kernel with the gradients
+        lost, pixel = LostPaths(), dr.arange(mi.UInt32, width * height) if some is None else some
+        lanes = dr.width(pixel)
+        moves, L = pixel_sweep(walk, view.pixel_sampler(lanes), pixel_camera(view.sensor, pixel), view.spp, loss, lost)
+        dr.eval(L)  # in one kernel with the gradients
+        image = mi.TensorXf(dr.ravel(L), (height, width, 3) if some is None else (lanes, 1, 3))
         return Found(image, lost=lost.count, paths=lanes * view.spp, moves=True) if moves else Found(image)
 
     def _or_lights(self, driver: Driver) -> Driver:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..device import device_of
 from ..errors import PathreplayError
@@ -15,30 +16,44 @@ from .camera_pass import Pass
 from .filter_samples import FilterSamples, is_drawable
 
 
-def _fits(max_depth: int, spp: int) -> bool:
-    """Whether there are two paths or more, and the record of a lane can hold all of them."""
+def _most(max_depth: int) -> int:
+    """Of how many paths the record of a lane can hold the vertices."""
     device = device_of(mi.variant())
-    return 1 < spp <= device.most_records(LARGEST_RECORD, MAX_DEPTH) // device.room(max(max_depth, 1))
+    return device.most_records(LARGEST_RECORD, MAX_DEPTH) // device.room(max(max_depth, 1))
 
 
-def sweepable(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) -> bool:
-    """Whether pixels of a sensor can be swept: a box filter, so that each path belongs to one pixel; colours (rgb) and
-    no alpha; an independent sampler; a camera that stands still and takes no time; two paths or more (``spp``), all of
-    which fit into the record of a lane. If only ``some`` are, any filter that is a density: see `FilterSamples`."""
-    film = sensor.film()
+def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) -> str:
+    """Why pixels of a sensor cannot be swept, as the end of a sentence, with the way out; "" where they can.
+
+    That takes a box filter, so that each path belongs to one pixel, or if only ``some`` are swept, any filter that is a
+    density (see `FilterSamples`); colours (rgb) and no alpha; an independent sampler; a camera that stands still and
+    takes no time; two paths or more (``spp``), all of which fit into the record of a lane.
+    """
+    film, sampler = sensor.film(), sensor.sampler()
     film.prepare([])
     with dr.resume_grad():
         ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
-    return bool(
-        (film.rfilter().is_box_filter() or (some and is_drawable(film)))
-        and mi.is_rgb
-        and not mi.has_flag(film.flags(), mi.FilmFlags.Special)
-        and film.bitmap().pixel_format() == mi.Bitmap.PixelFormat.RGB
-        and sensor.sampler().class_name() == "IndependentSampler"
-        and sensor.shutter_open_time() == 0
-        and not dr.grad_enabled(ray.o, ray.d)
-        and _fits(max_depth, spp)
-    )
+    format = film.bitmap().pixel_format()
+    most = _most(max_depth)
+    if not mi.is_rgb:
+        return f"variant {mi.variant()!r} has other colours than rgb; take an rgb variant"
+    if not film.rfilter().is_box_filter() and not some:
+        return "its filter couples pixels; give its film the filter 'box'"
+    if not is_drawable(film):
+        return "its filter is negative in places; give its film 'box', 'tent' or 'gaussian'"
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special) or format != mi.Bitmap.PixelFormat.RGB:
+        return "its film is none of plain colours; give it an hdrfilm with pixel_format 'rgb'"
+    if sampler.class_name() != "IndependentSampler":
+        return f"its sampler is of class {sampler.class_name()}; make it 'independent'"
+    if sensor.shutter_open_time() > 0:
+        return "its shutter is open for a while; close it at once"
+    if dr.grad_enabled(ray.o, ray.d):
+        return "it moves; hold it"
+    if spp < 2:
+        return f"{spp} samples a pixel cannot judge each other; take 2 or more"
+    if spp > most:
+        return f"{spp} samples a pixel of {max_depth} vertices are more than the {most} that are held; take fewer"
+    return ""
 
 
 def pixel_camera(sensor: mi.Sensor, pixel: mi.UInt32) -> Callable[..., tuple[mi.Ray3f, mi.Spectrum]]:
@@ -72,17 +87,36 @@ def _placing(film: mi.Film, corner: mi.Point2f) -> Callable[[mi.Point2f], mi.Poi
     return lambda u: middle + mi.Point2f(*(samples.draw(u[axis], low[axis], high[axis]) for axis in range(2)))
 
 
-def pixel_loss(view: Pass, max_depth: int, offset: mi.TensorXf, slope: mi.TensorXf, pixel: mi.UInt32) -> PixelLoss:
-    """The loss by each lane's ``pixel``. Raises PathreplayError where the pass or the tensors do not allow it."""
-    if not _fits(max_depth, view.spp):
+def pixel_loss(
+    view: Pass, max_depth: int, offset: mi.TensorXf, slope: mi.TensorXf, pixels: mi.UInt32 | None
+) -> PixelLoss:
+    """The loss by each lane's pixel: all of them, or ``pixels``, for each of which the tensors have a row.
+
+    Raises PathreplayError where the pass, the tensors or the pixels do not allow it.
+    """
+    if not 1 < view.spp <= _most(max_depth):
         raise PathreplayError(
             f"pathreplay: {view.spp} samples per pixel, of {max_depth} vertices, cannot be swept: use "
             f"2 or more, and at most {MAX_DEPTH} vertices in all, or mi.render"
         )
     width, height = view.size
+    shape = (height, width, 3) if pixels is None else (dr.width(pixels), 1, 3)
     for tensor in (offset, slope):
-        if tensor.shape != (height, width, 3):
+        if tensor.shape != shape:
+            raise PathreplayError(f"pathreplay: derivative of the loss has shape {tensor.shape}: use {shape}")
+    if pixels is not None and not dr.flag(dr.JitFlag.FreezingScope):
+        numbers = np.unique(np.array(pixels))
+        if len(numbers) < dr.width(pixels) or numbers[-1] >= width * height:
             raise PathreplayError(
-                f"pathreplay: derivative of the loss has shape {tensor.shape}: use {(height, width, 3)}"
+                f"pathreplay: 'pixels' has one twice, or one beyond the {width} x {height} of the film"
             )
-    return PixelLoss(*(dr.gather(mi.Color3f, tensor.array, pixel) for tensor in (offset, slope)))
+    row = dr.arange(mi.UInt32, shape[0] * shape[1])
+    return PixelLoss(*(dr.gather(mi.Color3f, tensor.array, row) for tensor in (offset, slope)))
+
+
+def among(pixels: mi.UInt32, rows: mi.TensorXf, size: tuple[int, int]) -> mi.TensorXf:
+    """The picture of so many pixels across and up that has these rows at its ``pixels``, and is zero elsewhere."""
+    width, height = size
+    picture = dr.zeros(mi.TensorXf, (height, width, 3))
+    dr.scatter(picture.array, dr.gather(mi.Color3f, rows.array, dr.arange(mi.UInt32, dr.width(pixels))), pixels)
+    return picture
