@@ -8,7 +8,7 @@ textures and meshes are made here. How they are measured: see `mitsuba_errors`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -43,7 +43,6 @@ class Config:
     rise: int = (
         1  # on a smaller film as many samples as on the large one per pixel (0), in a row of them (1), in all (2)
     )
-    options: dict = field(default_factory=dict)  # of the integrator
 
 
 # ------------------------------ Moves ------------------------------
@@ -271,9 +270,6 @@ def under_sky(size: int) -> dict:
 LINEAR = 0.125
 """Step where the picture is linear in the parameter. Steps of 1e-3 are lost in sums of float32, which are 2 % off; of
 values with few digits sums are exact."""
-FINE = {"edge_spp": 512}
-"""Where one line that finds an edge in a pixel that has next to none would be too much for the largest error: so many
-in each of 16 passes."""
 SWEPT = 5e-3
 """Step for edges. Mitsuba's own are from 1e-4 to 1e-3, with which few samples of a difference see an edge pass, so that
 its noise exceeds the limits; a larger one is as right, since it is held to derivatives all along the step.
@@ -362,7 +358,6 @@ EDGES = {
         Limits(0.08, 2, 0.15),
         step=SWEPT,
         rise=0,
-        options=FINE,
     ),
     "sphere that grows": Config(
         lambda n: glowing(n, ball(emitter=glow(1, 1, 1))),
@@ -372,7 +367,6 @@ EDGES = {
         step=SWEPT,
         rise=0,
         res=64,
-        options=FINE,
     ),
     "occluder": Config(
         lambda n: shadowed(n, {"type": "rectangle", "bsdf": diffuse()}),

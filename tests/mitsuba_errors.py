@@ -117,7 +117,7 @@ def measure(config: Config, full: bool = False, edges: str = "all") -> Found:
     size = config.res if full else min(SMALL, config.res)
     setup = Setup(config, size)
     plain = mi.load_dict({"type": "path", "max_depth": config.depth})
-    ours = mi.load_dict({"type": "pathreplay", "max_depth": config.depth, "edges": edges} | config.options)
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": config.depth, "edges": edges})
 
     wide = config.res // size
     reference_spp, spp = REFERENCE_SPP * wide ** min(config.rise, 1), config.spp * wide**config.rise
