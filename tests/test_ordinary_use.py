@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -58,9 +59,9 @@ def check(folder: Path, use: Use, command: Command) -> None:
     assert verdicts and set(verdicts) == {"pass"}
 
 
-def optimize(folder: Path, use: Use, command: Command) -> None:
-    """Five iterations lower the loss, and everything that the run folder should hold is there."""
-    job = {
+def job_of(use: Use) -> dict[str, Any]:
+    """Recover the key from a few iterations."""
+    return {
         "scene": "scene.xml",
         "variant": use.variant,
         "iterations": ITERATIONS,
@@ -71,6 +72,11 @@ def optimize(folder: Path, use: Use, command: Command) -> None:
         "parameters": [{"key": use.key, "initial": use.start, "lower": 0.0}],
         "target": {"values": {use.key: use.truth}, "spp": 64, "integrator": {"type": use.target, "max_depth": 4}},
     }
+
+
+def optimize(folder: Path, use: Use, command: Command) -> None:
+    """Five iterations lower the loss, and everything that the run folder should hold is there."""
+    job = job_of(use)
     (folder / "job.toml").write_text(toml(job), encoding="utf-8")
     status, words = command(use.variant, "optimize", "job.toml", "--quiet")
     assert status == 0, words
@@ -99,3 +105,29 @@ def test_check_and_optimize(write: Write, tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "scene.xml").write_text(use.xml, encoding="utf-8")
     check(tmp_path, use, command)
     optimize(tmp_path, use, command)
+
+
+NOT_BY_PIXELS = {
+    "spectral_room": "has other colours than rgb",
+    "mono_room": "has other colours than rgb",
+    "smoke": "the scene has media",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("write", [pytest.param(s, id=s.__name__) for s in SCENES])
+def test_batches_of_pixels(write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    """They go as far as whole pictures do, in twice the iterations, or one line says why there are none."""
+    monkeypatch.chdir(tmp_path)
+    use = write(tmp_path)
+    (tmp_path / "scene.xml").write_text(use.xml, encoding="utf-8")
+    job = {**job_of(use), "iterations": 2 * ITERATIONS, "pixels_per_step": 48}
+    (tmp_path / "job.toml").write_text(toml(job), encoding="utf-8")
+    status, words = command(use.variant, "optimize", "job.toml", "--quiet")
+    if write.__name__ in NOT_BY_PIXELS:
+        assert status == 2 and NOT_BY_PIXELS[write.__name__] in words and not (tmp_path / "runs" / "job").exists()
+        return
+    assert status == 0, words
+    run = tmp_path / "runs" / "job"
+    losses = [json.loads(line)["loss"] for line in (run / "history.jsonl").read_text().splitlines()]
+    assert np.isfinite(losses).all() and np.mean(losses[-3:]) < np.mean(losses[:3])
