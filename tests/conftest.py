@@ -52,6 +52,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 
+@pytest.fixture
+def opened() -> Iterator[Callable[[Any], Any]]:
+    """Opens cases of `truth`, and releases them at the end."""
+    from truth import Bench
+
+    benches: list[Bench] = []
+
+    def open_case(case: Any) -> Bench:
+        benches.append(Bench(case))
+        return benches[-1]
+
+    yield open_case
+    for bench in benches:
+        bench.release()
+
+
 @pytest.fixture(autouse=True)
 def _variant() -> Iterator[None]:
     """Hold every test to leaving the variant as it found it."""

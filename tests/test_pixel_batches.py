@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,20 +45,6 @@ def room(**film: Any) -> dict:
     found["camera"] = camera(fov=22)
     found["camera"]["film"] |= film
     return found
-
-
-@pytest.fixture
-def opened() -> Iterator:
-    """Opens cases, and releases them at the end."""
-    benches: list[Bench] = []
-
-    def open_case(case: Case) -> Bench:
-        benches.append(Bench(case))
-        return benches[-1]
-
-    yield open_case
-    for bench in benches:
-        bench.release()
 
 
 def swept(bench: Bench, integrator: mi.Integrator, seed: int, count: int, offset: Any, slope: Any) -> tuple:

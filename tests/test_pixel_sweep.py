@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -72,20 +70,6 @@ def swept(bench: Bench, integrator: mi.Integrator, seed: int, offset: np.ndarray
     sensor = bench.scene.sensors()[0]
     image = integrator.render_and_backward(bench.scene, *loss, sensor, mi.UInt32(seed), bench.case.spp)
     return np.array(image), bench.collect(t)
-
-
-@pytest.fixture
-def opened() -> Iterator:
-    """Opens cases, and releases them at the end."""
-    benches: list[Bench] = []
-
-    def open_case(case: Case) -> Bench:
-        benches.append(Bench(case))
-        return benches[-1]
-
-    yield open_case
-    for bench in benches:
-        bench.release()
 
 
 @pytest.mark.parametrize(
