@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import mitsuba as mi
@@ -15,7 +14,6 @@ from pathreplay.check.statistics import gap
 from pathreplay.check.stencil import WIDE
 from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
 from truth import (
-    Bench,
     Case,
     add,
     bitmap,
@@ -90,24 +88,10 @@ LISTED = [
 ROUNDING = 1e-4
 
 
-@pytest.fixture
-def bench() -> Callable[[Case], Bench]:
-    """Load a case; its parameter is released in the end."""
-    loaded = []
-
-    def load(case: Case) -> Bench:
-        loaded.append(Bench(case))
-        return loaded[-1]
-
-    yield load
-    for each in loaded:
-        each.release()
-
-
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_the_tape_has_the_gradient_of_the_sweep(case: Case, bench) -> None:
+def test_the_tape_has_the_gradient_of_the_sweep(case: Case, opened) -> None:
     """With the same seed, while roulette plays."""
-    b = bench(case)
+    b = opened(case)
     sweep = b.backward(b.integrator(rr_depth=2, branch=False), 1, 16)
     assert sweep != 0
     assert b.backward(b.integrator("pathreplay_tape", rr_depth=2), 1, 16) == pytest.approx(sweep, rel=ROUNDING)
@@ -115,8 +99,8 @@ def test_the_tape_has_the_gradient_of_the_sweep(case: Case, bench) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [TEXTURE, VERTICES, DENSITY, *SLOW], ids=lambda case: case.name)
-def test_the_tape_has_the_tangent_of_the_forward_driver(case: Case, bench) -> None:
-    b = bench(case)
+def test_the_tape_has_the_tangent_of_the_forward_driver(case: Case, opened) -> None:
+    b = opened(case)
     ours = b.forward(b.integrator(rr_depth=2, branch=False), 1, 16)
     tape = b.forward(b.integrator("pathreplay_tape", rr_depth=2), 1, 16)
     assert 0 < np.abs(ours).sum() and np.abs(tape - ours).sum() < ROUNDING * np.abs(ours).sum()
@@ -125,9 +109,9 @@ def test_the_tape_has_the_tangent_of_the_forward_driver(case: Case, bench) -> No
 @pytest.mark.parametrize(
     "case", [TEXTURE, FLOOR, pytest.param(DENSITY, marks=pytest.mark.slow)], ids=lambda case: case.name
 )
-def test_radiative_backpropagation_is_right_and_its_linear_variant_is_not(case: Case, bench) -> None:
+def test_radiative_backpropagation_is_right_and_its_linear_variant_is_not(case: Case, opened) -> None:
     """Light that comes back from other surfaces or from the fog is not one."""
-    b = bench(case)
+    b = opened(case)
     reference = b.reference(case.seeds)
     variants = [b.integrator("pathreplay_rb", rr_depth=case.rr_depth, linear=linear) for linear in (False, True)]
     right, wrong = (gap(b.backwards(variant), reference) for variant in variants)
@@ -137,9 +121,9 @@ def test_radiative_backpropagation_is_right_and_its_linear_variant_is_not(case: 
 
 
 @pytest.mark.parametrize("case", LISTED, ids=lambda case: case.name)
-def test_delta_tracking_as_listed_is_right_where_collisions_are_drawn(case: Case, bench) -> None:
+def test_delta_tracking_as_listed_is_right_where_collisions_are_drawn(case: Case, opened) -> None:
     """By the density its transmittance is another estimate; all else is that of the forward driver, path by path."""
-    b = bench(case)
+    b = opened(case)
     reference = b.reference(case.seeds)
     listing = b.integrator("pathreplay_listing", rr_depth=case.rr_depth)
     found = gap(b.backwards(listing), reference)
@@ -153,8 +137,8 @@ def test_delta_tracking_as_listed_is_right_where_collisions_are_drawn(case: Case
 
 
 @pytest.mark.parametrize("plugin", ["pathreplay_tape", "pathreplay_rb", "pathreplay_listing"])
-def test_images_are_those_of_pathreplay(plugin: str, bench) -> None:
-    b = bench(TEXTURE)
+def test_images_are_those_of_pathreplay(plugin: str, opened) -> None:
+    b = opened(TEXTURE)
     assert np.array_equal(b.image(b.integrator(plugin), 1, 4), b.image(b.integrator(), 1, 4))
 
 
@@ -173,8 +157,8 @@ def test_bad_properties_are_named_with_the_way_out(plugin: str, properties: dict
     assert all(word in str(error.value) for word in words), str(error.value)
 
 
-def test_radiative_backpropagation_says_what_it_cannot_do(bench) -> None:
-    b = bench(VERTICES)
+def test_radiative_backpropagation_says_what_it_cannot_do(opened) -> None:
+    b = opened(VERTICES)
     rb = b.integrator("pathreplay_rb")
     with pytest.raises(PathreplayError, match="no forward mode"):
         b.forward(rb, 1, 1)

@@ -33,13 +33,13 @@ def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) ->
     film.prepare([])
     with dr.resume_grad():
         ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
-    format = film.bitmap().pixel_format()
-    most = _most(max_depth)
+    format, most = film.bitmap().pixel_format(), _most(max_depth)
+    box = film.rfilter().is_box_filter()
     if not mi.is_rgb:
         return f"variant {mi.variant()!r} has other colours than rgb; take an rgb variant"
-    if not film.rfilter().is_box_filter() and not some:
+    if not box and not some:
         return "its filter couples pixels; give its film the filter 'box'"
-    if not is_drawable(film):
+    if not box and not is_drawable(film):
         return "its filter is negative in places; give its film 'box', 'tent' or 'gaussian'"
     if mi.has_flag(film.flags(), mi.FilmFlags.Special) or format != mi.Bitmap.PixelFormat.RGB:
         return "its film is none of plain colours; give it an hdrfilm with pixel_format 'rgb'"
