@@ -169,7 +169,7 @@ def bisect(look: Look, line: Any, weight: mi.Float, pick: mi.PCG32) -> Crossed:
 
     Of several crossings one is chosen, by how likely they are edges; what only the middle found counts twice in each
     half. None, where a surface was merely bent, weighs 0. Nor does a crack between two triangles count, through which
-    one of some 10^7 rays slips: an end in a crack never moves, and beyond it all is as at the other end.
+    very few rays slip: an end in a crack never moves, and beyond it all is as at the other end.
     """
     a, b, weight = mi.Float(line.begin), mi.Float(line.end), mi.Float(weight)
     at_a, at_b = look(line, a, weight > 0), look(line, b, weight > 0)
