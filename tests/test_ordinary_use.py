@@ -131,3 +131,23 @@ def test_batches_of_pixels(write: Write, tmp_path: Path, monkeypatch: pytest.Mon
     run = tmp_path / "runs" / "job"
     losses = [json.loads(line)["loss"] for line in (run / "history.jsonl").read_text().splitlines()]
     assert np.isfinite(losses).all() and np.mean(losses[-3:]) < np.mean(losses[:3])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("write", [pytest.param(s, id=s.__name__) for s in SCENES])
+def test_derived_parameters(write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    """What is half as much as in the pictures finds back, by the one factor that it is derived from."""
+    monkeypatch.chdir(tmp_path)
+    use = write(tmp_path)
+    (tmp_path / "scene.xml").write_text(use.xml, encoding="utf-8")
+    (tmp_path / "own.py").write_text("def scaled(first, factor):\n    return first * factor.array\n")
+    job = job_of(use)
+    job["parameters"] = [{"key": "factor", "shape": [1], "initial": 0.5, "learning_rate": 0.1}]
+    job["derived"] = [{"key": use.key, "function": "own:scaled", "of": ["factor"]}]
+    job["target"] = {"scene": "scene.xml", "spp": 256, "integrator": {"type": use.target, "max_depth": 4}}
+    job["iterations"] = 12
+    (tmp_path / "job.toml").write_text(toml(job), encoding="utf-8")
+    status, words = command(use.variant, "optimize", "job.toml", "--quiet")
+    assert status == 0, words
+    found = safetensors.numpy.load_file(tmp_path / "runs" / "job" / "parameters.safetensors")
+    assert found["factor"] == pytest.approx([1], abs=0.12)

@@ -264,7 +264,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "one sample of a half": ({"spp": 2, "signal_to_noise": True}, "1 samples a pixel"),
     "too many": ({"spp": 1024}, "1024 samples a pixel of 3 vertices are more than the 682 that are held; take fewer"),
     "late": ({"stages": [{"iterations": 2}, {"iterations": 1, "max_depth": 1500}]}, "of 1500 vertices"),
-    "camera": (MOVED, "its camera moves; hold 'sensor.to_world:translation', or leave 'pixels_per_step' out"),
+    "camera": (MOVED, "its camera moves; hold 'sensor.to_world', or leave 'pixels_per_step' out"),
 }
 
 

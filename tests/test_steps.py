@@ -15,7 +15,6 @@ import pytest
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.config import ITERATION
-from pathreplay.inverse.penalties import Penalty
 from pathreplay.inverse.schedules import rate
 from pathreplay.inverse.transforms import Transform
 
@@ -146,25 +145,6 @@ def test_a_job_steps_in_the_logarithm() -> None:
     # The first step of Adam's is the learning rate, up or down: here a factor of exp(0.1).
     shares = result.parameters[entry["key"]] / np.float32(entry["initial"])
     assert np.abs(np.log(shares)) == pytest.approx([0.1] * 3, abs=1e-5)
-
-
-@pytest.mark.parametrize("shape", [(5, 4, 3), (3, 1, 4, 1)])
-def test_penalties_are_as_they_say_and_gradients_follow(shape: tuple[int, ...]) -> None:
-    rng = np.random.default_rng(0)
-    v, start, δ = (rng.uniform(0, 1, shape).astype(np.float32) for _ in range(3))
-    penalty = Penalty(0.3, 0.2, start)
-    value, gradient = penalty.of(v)
-    axes = [np.diff(v.astype(float), axis=k) for k in range(len(shape) - 1) if shape[k] > 1]
-    expected = sum(0.3 * (np.sqrt(Δ**2 + 1e-6) - 1e-3).mean() for Δ in axes) + 0.2 * ((v - start) ** 2).mean()
-    assert value == pytest.approx(expected, rel=1e-6)
-    h = 1e-3
-    slope = (penalty.of(v + h * δ)[0] - penalty.of(v - h * δ)[0]) / (2 * h)
-    assert np.vdot(gradient, δ) == pytest.approx(slope, rel=1e-3)
-
-
-def test_a_grid_that_is_refined_is_pulled_to_its_start() -> None:
-    start = np.full((2, 2, 2, 1), 0.25, np.float32)
-    assert Penalty(0.0, 1.0, start).of(np.full((4, 4, 4, 1), 0.75, np.float32))[0] == pytest.approx(0.25)
 
 
 @pytest.mark.slow

@@ -103,6 +103,7 @@ def make_room(room: Path, vdb: Path) -> None:
     room.mkdir()
     (room / "ball.xml").write_text(SCENE)
     (room / "job.toml").write_text(toml(JOB))
+    (room / "own.py").write_text("def scaled(first, share):\n    return first * share.array\n")
     (room / "texture.png").write_bytes(png(4, 4))
     (room / "sheet.ply").write_text(coordinate_ply())
     (room / "tile.obj").write_text("vt 0 0\nvt 1 0\nvt 1 1\n" + obj().replace("f 1 2 3", "f 1/1 2/2 3/3"))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .case import Action, add, recipe
-from .room import JOB, ODD_FILES, POSED, RENDERED, Room
+from .room import DERIVED, JOB, ODD_FILES, POSED, RENDERED, Room
 from .toml_text import Raw, toml
 from .values import ESCAPE, TEXTS, VALUES, pick, spoiled
 
@@ -35,7 +35,7 @@ KEYS: dict[str, Mapping[str, Any]] = {
             " optimizer optimizer.type optimizer.beta_1 optimizer.epsilon "
             "parameters.0.transform parameters.0.total_variation parameters.0.prior checkpoint_every unknown "
             "auto_spp auto_spp.ratio auto_spp.lowest auto_spp.highest signal_to_noise non_finite_in_a_row "
-            "preview preview.share preview.views preview.frames"
+            "preview preview.share preview.views preview.frames parameters.0.laplacian parameters.0.penalty"
         ).split(),
         JOB,
     ),
@@ -52,6 +52,13 @@ KEYS: dict[str, Mapping[str, Any]] = {
             "parameters.0.distance parameters.0.rotation_learning_rate parameters.0.learning_rate"
         ).split(),
         POSED,
+    ),
+    **dict.fromkeys(
+        (
+            "derived derived.0 derived.0.key derived.0.function derived.0.of derived.0.of.0 parameters.0.shape "
+            "parameters.0.key"
+        ).split(),
+        DERIVED,
     ),
     **dict.fromkeys(
         (

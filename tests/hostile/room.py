@@ -33,6 +33,13 @@ POSED = {
     "parameters": [{"key": "eye.to_world", "pose": "rigid", "start": {"translation": [0.1, 0, 0]}}],
 }
 
+#: The same for a number from which the picture's brightness is derived.
+DERIVED = {
+    **RENDERED,
+    "parameters": [{"key": "share", "shape": [1], "initial": 0.5}],
+    "derived": [{"key": "paint.reflectance.data", "function": "own:scaled", "of": ["share"]}],
+}
+
 
 @dataclass(frozen=True)
 class Room:

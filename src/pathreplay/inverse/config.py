@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
+from math import prod
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.files import MISSING, file_problem
@@ -42,6 +43,17 @@ Value = Finite | list[Finite] | str | Picture
 Argument = Switch | Whole | Finite | str
 """What replaces a ``$name`` in a scene file, or is an argument of a built-in scene."""
 
+
+def _import_path(value: str) -> str:
+    module, _, function = value.partition(":")
+    if not module or not function or ":" in function:
+        raise ValueError(f"{shown(value)} is no import path; write module:function")
+    return value
+
+
+ImportPath = Annotated[str, AfterValidator(_import_path)]
+"""``module:function``."""
+
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 
@@ -55,7 +67,9 @@ class Displacement(Table):
     rotation: Vector | None = None
 
 
-NOT_OF_A_POSE = frozenset("lower upper initial resolutions refine_at smooth transform total_variation prior".split())
+NOT_OF_A_POSE = frozenset(
+    "lower upper initial resolutions refine_at smooth transform total_variation prior laplacian penalty shape".split()
+)
 
 
 class Parameter(Table):
@@ -77,6 +91,9 @@ class Parameter(Table):
     transform: TransformKind | None = None
     total_variation: Positive | None = None
     prior: Positive | None = None
+    laplacian: Positive | None = None
+    penalty: ImportPath | None = None
+    shape: Annotated[list[Count], Field(min_length=1, max_length=8)] | None = None
 
     @model_validator(mode="after")
     def _of_one_kind(self) -> Parameter:
@@ -125,6 +142,14 @@ class Parameter(Table):
 
     def _refuse(self, why: str) -> None:
         raise ValueError(f"parameter '{self.key}': {why}")
+
+
+class Derivation(Table):
+    """A parameter of the scene, or several by a glob, made from others by a function of the user's."""
+
+    key: str
+    function: ImportPath
+    of: Annotated[list[str], Field(min_length=1)]
 
 
 class Plugin(BaseModel):
@@ -207,6 +232,7 @@ class Config(Table):
     integrator: Plugin = Plugin(type="pathreplay")
     rival: Plugin | None = None
     parameters: Annotated[list[Parameter], Field(min_length=1)]
+    derived: list[Derivation] = Field(default_factory=list)
     capture: Capture | None = None
     exposure: Exposure | None = None
     view_weights: dict[str, Positive] = Field(default_factory=dict)
@@ -335,6 +361,18 @@ class Config(Table):
         return self
 
     @model_validator(mode="after")
+    def _derived(self) -> Config:
+        used = {name for entry in self.derived for name in entry.of}
+        for entry in self.parameters:
+            if entry.shape is None:
+                continue
+            if entry.key not in used:
+                entry._refuse("'shape' is of numbers that others are derived from; name it in 'of' of a [[derived]]")
+            if prod(entry.shape) >= 2**32:
+                entry._refuse(f"shape {entry.shape} has {prod(entry.shape)} numbers, and arrays up to {2**32 - 1}")
+        return self
+
+    @model_validator(mode="after")
     def _one_factor(self) -> Config:
         if self.exposure is not None and self.loss == "scale-invariant":
             raise ValueError(
@@ -385,6 +423,7 @@ class Config(Table):
 # Models of nested tables, by the name under which they appear in the file or in what pydantic tries.
 _TABLES: dict[str, type[BaseModel]] = {
     "parameters": Parameter,
+    "derived": Derivation,
     "target": Target,
     "Picture": Picture,
     "start": Displacement,

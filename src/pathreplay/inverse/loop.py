@@ -19,12 +19,12 @@ from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
 from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Executor, Local, Shard, Total, release, total
 from pathreplay.inverse.events import Entered, Event, Faint, Finished, NonFinite, Refined, Started, Stepped, Stopped
 from pathreplay.inverse.exposures import EXPOSURE, exposed, with_held_out
-from pathreplay.inverse.grids import resampled, rmse
+from pathreplay.inverse.grids import resampled
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.line_search import LineSearch
 from pathreplay.inverse.optimiser import DrJitOptimiser, Optimiser
 from pathreplay.inverse.optimizer_options import Optimizer
-from pathreplay.inverse.problem import Problem, pose_errors, put_values
+from pathreplay.inverse.problem import Problem, errors_of, put_values
 from pathreplay.inverse.schedules import rate
 from pathreplay.inverse.stage_options import place
 from pathreplay.inverse.stages import Part, part_at
@@ -173,14 +173,13 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     run.values = _stepped(part, run, values, gradients, position, found.loss + penalty)
     run.learned = found.learned
     seconds = time.perf_counter() - begin
-    errors = {v.key: rmse(run.values[v.key], v.truth) for v in problem.variables if v.truth is not None}
     entry = Entry(
         i,
         found.loss,
         seconds,
         norms,
         sum(found.dropped.values()),
-        errors | pose_errors(problem, run.values),
+        errors_of(problem, run.values),
         penalty=penalty,
         spp=spp,
         noise_norms=noise_norms,

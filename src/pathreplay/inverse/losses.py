@@ -10,8 +10,6 @@ meet are in `picture_losses`.
 from __future__ import annotations
 
 import difflib
-import importlib
-import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,9 +17,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.errors import PathreplayError, shown
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.imported import imported
 from pathreplay.inverse.picture_losses import lpips, scale_invariant, ssim
-from pathreplay.scenes.descriptions import one_line
 
 Loss = Callable[..., Any]
 """loss(image, target) on tensors of one shape (height, width, channels) -> such a tensor (or one number)."""
@@ -99,47 +97,23 @@ def find_loss(name: str, base: Path | None = None) -> Loss:
     """
     if name in LOSSES:
         return LOSSES[name]
-    module, colon, function = name.partition(":")
-    if colon:
-        return _imported(name, module, function, base)
+    if ":" in name:
+        return _imported(name, base)
     close = difflib.get_close_matches(name, LOSSES, n=1)
     hint = f"; did you mean '{close[0]}'?" if close else ""
     raise PathreplayError(f"No loss '{name}'{hint} (losses: {', '.join(LOSSES)}, or module:function)")
 
 
-def _imported(name: str, module: str, function: str, base: Path | None) -> Loss:
-    try:
-        found = getattr(_module(module, base), function)
-    except Exception as error:  # whatever the module does when it is imported
-        why = one_line(error) or type(error).__name__
-        raise PathreplayError(f"Loss '{name}' cannot be imported ({why}); write module:function") from None
-    if not callable(found):
-        raise PathreplayError(f"Loss '{name}' is no function of image and target, but {shown(found)}; name another")
+def _imported(name: str, base: Path | None) -> Loss:
+    own = imported("Loss", name, base, "image and target")
 
     def loss(image: Any, target: Any) -> Any:
-        try:
-            value = mi.TensorXf(found(image, target))
-        except Exception as error:  # whatever the function does
-            why = one_line(error) or type(error).__name__
-            raise PathreplayError(f"Loss '{name}' cannot be computed ({why}); mend it, or name another") from error
+        value = own(mi.TensorXf, image, target)
         if value.shape not in (image.shape, ()):
             raise PathreplayError(
-                f"Loss '{name}' gives the shape {value.shape} for pictures of {image.shape}; return a tensor like the "
-                "image, or one number"
+                f"{own} gives the shape {value.shape} for pictures of {image.shape}; return a tensor like the image, "
+                "or one number"
             )
         return value
 
     return loss
-
-
-def _module(name: str, base: Path | None) -> Any:
-    """The module in the folder, anew, since other folders may have others of that name; else an installed one."""
-    path = None if base is None else base / f"{name}.py"
-    if path is None or not path.is_file():
-        return importlib.import_module(name)
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{path} is no module")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

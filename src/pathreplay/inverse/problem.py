@@ -19,8 +19,10 @@ from pathreplay.inverse.album import Album
 from pathreplay.inverse.background import require_known
 from pathreplay.inverse.capture import Shot, fingerprint, read_capture
 from pathreplay.inverse.config import Config, Plugin
+from pathreplay.inverse.derived import Derived, make_derived
 from pathreplay.inverse.exposures import EXPOSURE, Factors, fixed_rows
 from pathreplay.inverse.exposures import start as start_of_exposures
+from pathreplay.inverse.grids import rmse
 from pathreplay.inverse.images import picture_size
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose
@@ -36,7 +38,7 @@ from pathreplay.inverse.targets import (
     truth_of,
 )
 from pathreplay.inverse.values import Array, Arrays
-from pathreplay.inverse.variables import Variable, keys_of, make_variables
+from pathreplay.inverse.variables import Variable, free_of, keys_of, make_variables
 from pathreplay.inverse.views import View, held_out_of, named_views, sensors_of, shares_of
 from pathreplay.render.edge_notes import edges_note, moves_edges
 from pathreplay.render.integrator import EDGES
@@ -82,11 +84,18 @@ class Problem:
     loss: Loss
     notes: tuple[str, ...]
     """What was done to the scene that the user should know of."""
+    derived: tuple[Derived, ...] = ()
     capture: str | None = None
     """What tells its capture from others."""
     album: Album = field(default_factory=Album)
     """Where its pictures are kept, and starts and truths."""
     held: Held = field(default_factory=Held)
+
+    def moves(self, moving: frozenset[str]) -> set[str]:
+        """The keys of the scene whose values are others when these variables are."""
+        made = {each.key for each in self.derived if not moving.isdisjoint(each.of)}
+        posed = {pose.key for pose in self.poses if not moving.isdisjoint(pose.parts().values())}
+        return {key for key in moving if key in self.params} | made | posed
 
     def trained(self) -> dict[int, View]:
         """The views that are learned from, by their place."""
@@ -97,12 +106,7 @@ def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
     """The values of the variables (what people see) as Dr.Jit holds them, in memory of its own."""
     # NumPy's memory, which Dr.Jit would take over, begins anywhere: to a frozen function that is another kind of input.
     one = dr.opaque(mi.Float, 1)
-    variables = {
-        # A grid may have another resolution than at first.
-        v.key: (type(v.like)(values[v.key]) if dr.is_tensor_v(v.like) else parameters.to_value(v.like, values[v.key]))
-        * one
-        for v in problem.variables
-    }
+    variables = {v.key: v.held(values[v.key]) * one for v in problem.variables}
     dr.eval(variables)
     return variables
 
@@ -110,7 +114,8 @@ def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
 def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, Any]:
     """The scene's parameters, by key and as Mitsuba stores them; derivatives flow to the variables."""
     plain = {v.key: v.form.store(variables[v.key]) for v in problem.variables if v.key in problem.params}
-    return plain | {pose.key: pose.value(variables) for pose in problem.poses}
+    made = {each.key: each.form.store(each.value(variables)) for each in problem.derived}
+    return plain | made | {pose.key: pose.value(variables) for pose in problem.poses}
 
 
 def put_values(problem: Problem, values: Arrays) -> None:
@@ -118,13 +123,16 @@ def put_values(problem: Problem, values: Arrays) -> None:
     problem.params.update(scene_values(problem, problem.held.variables(problem, values)))
 
 
-def pose_errors(problem: Problem, values: Arrays) -> dict[str, float]:
-    """How far the poses whose truth is known are from it, by name: see `PoseError.of`."""
-    known = [pose for pose in problem.poses if pose.truth is not None]
-    placed = scene_values(problem, problem.held.variables(problem, values)) if known else {}
-    found: dict[str, float] = {}
-    for pose in known:
-        if error := pose.error(parameters.get_array(placed[pose.key])):
+def errors_of(problem: Problem, values: Arrays) -> dict[str, float]:
+    """How far all whose truth is known are from it, by key: root mean squares; of poses by name, see `PoseError.of`."""
+    found = {v.key: rmse(values[v.key], v.truth) for v in problem.variables if v.truth is not None}
+    made = [(each, each.truth) for each in problem.derived if each.truth is not None]
+    poses = [pose for pose in problem.poses if pose.truth is not None]
+    variables = problem.held.variables(problem, values) if made or poses else {}
+    for each, truth in made:
+        found[each.key] = rmse(parameters.get_array(each.value(variables)), truth)
+    for pose in poses:
+        if error := pose.error(parameters.get_array(pose.value(variables))):
             found |= error.of(pose.key)
     return found
 
@@ -137,7 +145,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     """
     album = Album.of(config.budget)
     loss = find_loss(config.loss, base)
-    wanted = [entry.key for entry in config.parameters]
+    wanted = [entry.key for entry in config.parameters] + [entry.key for entry in config.derived]
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
     cameras = {name: shot.camera for name, shot in shots.items()}
@@ -145,11 +153,13 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     params = mi.traverse(scene)
     parameters.require_finite(params)
     integrator = _gradient_integrator(config.integrator)
-    keys = keys_of(params, config.parameters, integrator)
+    named, made = keys_of(params, config, integrator)
+    free = free_of(params, config)
+    keys = [*named, *made]
     notes += _edges(params, keys, integrator)
     rival = None if config.rival is None else _gradient_integrator(config.rival)
     if rival is not None:
-        keys_of(params, config.parameters, rival)
+        keys_of(params, config, rival)
         _edges(params, keys, rival)  # for its log: one note is enough
     judge = integrator if config.brings_pictures else load_integrator(config.target.integrator.model_dump())
     # Before any target is rendered: the cheap mistakes first.
@@ -160,7 +170,8 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     if config.target.alpha == "scene":
         require_known(scene, params, keys)
     limits.require_films(scene, sensors, {"spp": config.most_spp, "picture_spp": config.picture_spp})
-    unsolved, moved = make_variables(scene, params, keys, config, base)
+    unsolved, moved = make_variables(scene, params, named | free, config, base)
+    derived = make_derived(params, made, unsolved, base)
     limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
     truth: dict[str, Array] = {}
@@ -196,11 +207,12 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
         album.rest()
     variables = tuple(_kept(album, replace(variable, truth=truth.get(variable.key))) for variable in unsolved)
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in moved)
+    derived = tuple(replace(each, truth=truth.get(each.key)) for each in derived)
     # Traversed anew: an object from which values were read expects all its keys at the next update().
     params = mi.traverse(scene)
     parameters.keep_only(params, keys)
     known = fingerprint(taken.values()) if taken else None
-    return Problem(scene, params, integrator, rival, judge, variables, poses, views, loss, notes, known, album)
+    return Problem(scene, params, integrator, rival, judge, variables, poses, views, loss, notes, derived, known, album)
 
 
 def _kept(album: Album, variable: Variable) -> Variable:

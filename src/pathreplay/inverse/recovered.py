@@ -9,9 +9,10 @@ import numpy as np
 
 from pathreplay.files import file_names
 from pathreplay.inverse.checkpoint import Run
+from pathreplay.inverse.exposures import EXPOSURE
 from pathreplay.inverse.outcome import Recovered, RecoveredPose
 from pathreplay.inverse.pose import Pose
-from pathreplay.inverse.problem import Problem, scene_values, variables_of
+from pathreplay.inverse.problem import Problem, variables_of
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.scenes.parameters import get_array
 
@@ -19,13 +20,16 @@ VERTICES = ".vertex_positions"
 
 
 def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
-    """The parameters that are no poses."""
-    values, theirs = with_scene(problem, run.values), run.rival.values if run.rival else {}
-    files_of = file_names(v.key for v in problem.variables)
+    """The parameters that are no poses, those that are derived behind those that they are derived from."""
+    parts = {name for pose in problem.poses for name in pose.parts().values()}
+    known = [(v.key, v.truth) for v in problem.variables if v.key not in parts and v.key != EXPOSURE]
+    known += [(each.key, each.truth) for each in problem.derived]
+    starts = with_scene(problem, {v.key: v.start for v in problem.variables})
+    values = with_scene(problem, run.values)
+    theirs = with_scene(problem, run.rival.values) if run.rival else {}
+    files_of = file_names([*(v.key for v in problem.variables), *(each.key for each in problem.derived)])
     return tuple(
-        Recovered(v.key, files_of[v.key], v.start, values[v.key], v.truth, theirs.get(v.key))
-        for v in problem.variables
-        if v.key in problem.params
+        Recovered(key, files_of[key], starts[key], values[key], truth, theirs.get(key)) for key, truth in known
     )
 
 
@@ -50,12 +54,15 @@ def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:
 
 
 def with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
-    """The values of the variables, and what they make of the poses."""
-    if not problem.poses:
+    """The values of the variables, and what they make of poses and of derived parameters, as people see it."""
+    used = {name for pose in problem.poses for name in pose.parts().values()}
+    used |= {name for each in problem.derived for name in each.of}
+    if not used:
         return dict(values)
-    moved = {name for pose in problem.poses for name in pose.parts().values()}
-    few = replace(problem, variables=tuple(v for v in problem.variables if v.key in moved))
-    placed = scene_values(few, variables_of(few, values))
+    few = replace(problem, variables=tuple(v for v in problem.variables if v.key in used))
+    variables = variables_of(few, values)
+    placed = {pose.key: pose.value(variables) for pose in problem.poses}
+    placed |= {each.key: each.value(variables) for each in problem.derived}
     return {key: get_array(value) for key, value in placed.items()} | dict(values)
 
 

@@ -117,7 +117,7 @@ def _require_single_pixels(part: Part, integrator: mi.Integrator) -> None:
     for view in problem.trained().values():
         camera = f"{problem.scene.sensors()[view.sensor].id()}."
         why = obstacle(problem, integrator, view.sensor, spp // part.config.parts, some=True)
-        if moves := sorted(key for key in part.moving if key.startswith(camera)):
+        if moves := sorted(key for key in problem.moves(part.moving) if key.startswith(camera)):
             why = f"its camera moves; hold '{moves[0]}'"
         if why:
             raise refused(view.name, why)

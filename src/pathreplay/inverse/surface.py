@@ -15,6 +15,8 @@ import scipy.sparse
 import scipy.sparse.linalg
 from numpy.typing import NDArray
 
+from pathreplay.inverse.neighbours import neighbours
+
 Array = NDArray[np.float32]
 
 
@@ -27,15 +29,9 @@ class Surface:
     uniform = True
 
     def __init__(self, positions: Array, faces: NDArray[np.integer], smooth: float) -> None:
-        points, copies = np.unique(positions.reshape(-1, 3), axis=0, return_inverse=True)
-        self._copies, n = copies.ravel(), len(points)
-        corners = self._copies[faces.reshape(-1, 3)]
-        ends = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-        i, j = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0).T
-        i, j = i[i != j], j[i != j]  # faces without area have such sides
-        neighbours = scipy.sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)).tocsc()
-        laplacian = scipy.sparse.diags(np.asarray(neighbours.sum(axis=1)).ravel()) - neighbours
-        self._matrix = (scipy.sparse.identity(n) + smooth * laplacian).tocsc()
+        self._copies, adjacent = neighbours(positions, faces)
+        laplacian = scipy.sparse.diags(np.asarray(adjacent.sum(axis=1)).ravel()) - adjacent
+        self._matrix = (scipy.sparse.identity(adjacent.shape[0]) + smooth * laplacian).tocsc()
         self._solver = scipy.sparse.linalg.splu(self._matrix)
 
     def latent(self, values: Array) -> Array:

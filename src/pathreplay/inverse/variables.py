@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import limits
-from pathreplay.inverse.config import Config, Parameter
+from pathreplay.inverse.config import Config, Derivation, Parameter
 from pathreplay.inverse.grids import Levels, make_levels, resampled
-from pathreplay.inverse.penalties import Penalty
+from pathreplay.inverse.imported import imported
+from pathreplay.inverse.penalties import Laplacian, Own, Penalty, Prior, Term, TotalVariation
 from pathreplay.inverse.pose import Pose, make_pose
 from pathreplay.inverse.surface import Surface
 from pathreplay.inverse.transforms import Coordinates, Transform
@@ -27,7 +30,8 @@ from pathreplay.scenes.stored import AS_STORED, Form, form_of
 class Variable:
     """What the optimiser moves: its name, bounds, learning rate, start value, and the truth where it is known.
 
-    The name is the key of a scene parameter, or that of a pose with ':translation' or ':rotation' behind it.
+    The name is the key of a scene parameter, that of a pose with ':translation' or ':rotation' behind it, or that of
+    numbers which others are derived from.
     """
 
     key: str
@@ -48,19 +52,46 @@ class Variable:
     form: Form = AS_STORED
     """How Mitsuba stores it; everything here is what people see."""
 
+    def held(self, values: Array) -> Any:
+        """Values as Dr.Jit holds them; a grid may have another resolution than at first."""
+        return type(self.like)(values) if dr.is_tensor_v(self.like) else parameters.to_value(self.like, values)
 
-def keys_of(params: mi.SceneParameters, entries: list[Parameter], integrator: mi.Integrator) -> dict[str, Parameter]:
-    """The scene's keys that entries name, each with its entry. Raises PathreplayError for those that cannot move."""
-    keys: dict[str, Parameter] = {}
-    for entry in entries:
+
+def keys_of(
+    params: mi.SceneParameters, config: Config, integrator: mi.Integrator
+) -> tuple[dict[str, Parameter], dict[str, Derivation]]:
+    """The scene's keys that are recovered, and those that are derived, each with its entry.
+
+    Raises PathreplayError for those that cannot move, or are named twice.
+    """
+    found: dict[str, Parameter | Derivation] = {}
+    entries: list[Parameter | Derivation] = [entry for entry in config.parameters if entry.shape is None]
+    for entry in [*entries, *config.derived]:
         for key in parameters.resolve_keys(params, entry.key):
-            if key in keys:
+            if key in found:
                 raise PathreplayError(
-                    f"Parameter '{key}' is named twice, by '{keys[key].key}' and '{entry.key}'; remove one"
+                    f"Parameter '{key}' is named twice, by '{found[key].key}' and '{entry.key}'; remove one"
                 )
             parameters.require_differentiable(params, key, integrator)
-            keys[key] = entry
-    return keys
+            found[key] = entry
+    return (
+        {key: entry for key, entry in found.items() if isinstance(entry, Parameter)},
+        {key: entry for key, entry in found.items() if isinstance(entry, Derivation)},
+    )
+
+
+def free_of(params: mi.SceneParameters, config: Config) -> dict[str, Parameter]:
+    """The entries with a shape of their own, by key. Raises PathreplayError where the scene has such a parameter."""
+    free: dict[str, Parameter] = {}
+    for entry in config.parameters:
+        if entry.shape is None:
+            continue
+        if entry.key in params:
+            raise PathreplayError(f"Parameter '{entry.key}' is one of the scene; leave 'shape' out, or rename it")
+        if entry.key in free:
+            raise PathreplayError(f"Parameter '{entry.key}' is named twice; remove one")
+        free[entry.key] = entry
+    return free
 
 
 def make_variables(
@@ -77,8 +108,8 @@ def make_variables(
         # A step of SGD is the rate times the gradient, which may be anything.
         bounded = limits.require_learning_rate if config.optimizer.type != "sgd" else lambda *_: None
         if entry.pose is None:
-            form = form_of(params, key)
-            like = seen(params, key)
+            form = AS_STORED if entry.shape else form_of(params, key)
+            like = seen(params, key) if entry.shape is None else _numbers(key, entry.shape)
             start = _start(key, like, form, entry, base)
             bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
             coordinates = _coordinates(params, key, entry, start)
@@ -91,7 +122,7 @@ def make_variables(
                 start = resampled(start, levels.shapes[0])
             if dr.is_tensor_v(like):
                 like = dr.zeros(type(like), start.shape)  # which nobody writes down
-            penalty = _penalty(key, entry, start)
+            penalty = _penalty(params, key, entry, start, base)
             variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
             continue
         limits.require_near(scene, key, parameters.get_array(params[key]), entry)
@@ -116,20 +147,42 @@ def _coordinates(params: mi.SceneParameters, key: str, entry: Parameter, start: 
         return transform
     if entry.smooth is None:
         return None
+    faces = _faces(params, key, "smooth")
+    return Surface(parameters.get_array(params[key]), faces, entry.smooth)
+
+
+def _faces(params: mi.SceneParameters, key: str, option: str) -> NDArray[np.integer]:
+    """Of the mesh whose vertices a parameter is. Raises PathreplayError, for this option, where it is not."""
     owner, _, name = key.rpartition(".")
     if name != "vertex_positions" or (faces := f"{owner}.faces") not in params:
-        raise PathreplayError(f"Parameter '{key}' is no mesh's vertex_positions; leave 'smooth' out")
-    return Surface(parameters.get_array(params[key]), np.array(params[faces]), entry.smooth)
+        raise PathreplayError(f"Parameter '{key}' is no mesh's vertex_positions; leave '{option}' out")
+    return np.array(params[faces])
 
 
-def _penalty(key: str, entry: Parameter, start: Array) -> Penalty | None:
-    if entry.total_variation is not None and start.ndim < 3:
-        raise PathreplayError(
-            f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'total_variation' out"
-        )
-    if entry.total_variation is None and entry.prior is None:
-        return None
-    return Penalty(entry.total_variation or 0.0, entry.prior or 0.0, start)
+def _penalty(params: mi.SceneParameters, key: str, entry: Parameter, start: Array, base: Path) -> Penalty | None:
+    """What the entry asks for; it was computed once. Raises PathreplayError for what cannot be."""
+    terms: list[Term] = []
+    if entry.total_variation is not None:
+        if start.ndim < 3:
+            raise PathreplayError(
+                f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'total_variation' out"
+            )
+        terms.append(TotalVariation(entry.total_variation))
+    if entry.prior is not None:
+        terms.append(Prior(entry.prior, start))
+    if entry.laplacian is not None:
+        faces = _faces(params, key, "laplacian")
+        terms.append(Laplacian(entry.laplacian, parameters.get_array(params[key]), faces))
+    if entry.penalty is not None:
+        terms.append(Own(imported("Penalty", entry.penalty, base, "values")))
+        terms[-1](start)
+    return Penalty(tuple(terms)) if terms else None
+
+
+def _numbers(key: str, shape: list[int]) -> Any:
+    """Zeros that nobody has written down. Raises PathreplayError where memory has no room for them."""
+    limits.require_values({key: prod(shape)})
+    return dr.zeros(mi.TensorXf, shape)
 
 
 def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> Levels | None:

@@ -46,11 +46,12 @@ def export_run(run: Path, output: Path | None = None) -> str:
     backend.set_variant(job.config.variant)
     values = _result(run)
     source = _source(job, values)
-    of_pictures = {EXPOSURE: values.pop(EXPOSURE)} if EXPOSURE in values else {}
+    free = [EXPOSURE, *(entry.key for entry in job.config.parameters if entry.shape is not None)]
+    others = {key: values.pop(key) for key in free if key in values}
     found = exported(source, values, job.config.integrator.model_dump())
     with whole_folder(folder, _OPTION) as part:
         write_files(found, part)
-        for name, data in _beside(found, values | of_pictures).items():
+        for name, data in _beside(found, values | others).items():
             (part / name).write_bytes(data)
         require_same(found.scene, part)
     files = sorted([*found.files, *found.copies])
@@ -105,7 +106,7 @@ def _source(job: Job, values: Arrays) -> Source:
 def _beside(found: Exported, values: Arrays) -> dict[str, bytes]:
     """Files that the scene does not name: PNG, OBJ, cameras and numbers."""
     params, files = mi.traverse(found.scene), {"transforms.json": _json(_cameras(found.scene))}
-    names = file_names([*params.keys(), *(shape.id() for shape in found.scene.shapes())])
+    names = file_names([*params.keys(), *(shape.id() for shape in found.scene.shapes()), *values])
     numbers: dict[str, Any] = {}
     for key, value in values.items():
         if value.ndim == 3 and value.shape[2] <= 4:
