@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import re
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pathreplay import memory
 from pathreplay.inverse import iterate, make_config
 from pathreplay.inverse.images import exr_bytes
 
@@ -43,6 +45,25 @@ def _peak_since() -> float:
     return peak
 
 
+class Watching(threading.Thread):
+    """Looks, some hundred times a second, at what a process takes besides pages of files, until it is told the end."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.most, self._end = 0, threading.Event()
+
+    def run(self) -> None:
+        """See the class."""
+        while not self._end.wait(0.005):
+            self.most = max(self.most, memory.taken())
+
+    def ended(self) -> float:
+        """The most that was seen (MiB)."""
+        self._end.set()
+        self.join()
+        return self.most / 2**20
+
+
 class WholeRun(Measure):
     """`pathreplay optimize` from beginning to end, previews, checkpoint and report included."""
 
@@ -55,17 +76,21 @@ class WholeRun(Measure):
 
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
         """Seconds, and the last loss."""
-        begun = time.perf_counter()
+        begun, watching = time.perf_counter(), Watching()
+        watching.start()
         with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR") or "/var/tmp") as folder:
             session = iterate(make_config(self._written(Path(folder))), output=Path(folder) / "run")
             for state in session:
                 self.peaks.append(_peak_since())
                 loss = state.loss
-            self.peaks.append(_peak_since())
+            self.peaks += [_peak_since(), watching.ended()]
             return time.perf_counter() - begun, np.array([loss])
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """The peaks (MiB) until the first step was done, of each later one, and while the end was written."""
+        """The peaks (MiB) until the first step was done, of each later one, and while the end was written.
+
+        And behind them that of all without pages of files.
+        """
         return {name: {"values": tuple(self.peaks)} for name in kept}
 
     def _written(self, folder: Path) -> dict[str, Any]:

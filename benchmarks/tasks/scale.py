@@ -1,4 +1,4 @@
-"""Task `scale`: memory against views, parameters and samples, and time against shapes."""
+"""Task `scale`: memory against views, parameters and samples, and time against shapes, traced and recorded."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import statistics as st
 from dataclasses import replace
 
 from ..measures.job import Job, Point, Record
+from ..measures.methods import OWN, USUAL
 from ..measures.scale import name_of
 from ..scenes.wide import COLOUR, SHAPES, SKY, shapes_name
 from ..tables import comparison, groups, markdown, method_cell
 
 TITLE = "scale"
-TAKES = (60, 900)
+TAKES = (60, 780)
 VIEWS, TEXELS = (1, 50, 200), (100, 1000, 3162, 10000)
 QUICK_VIEWS, QUICK_TEXELS = (1, 4), (100, 500)
 BUDGET = "4 GiB"
@@ -51,7 +52,10 @@ def jobs(quick: bool) -> list[Job]:
         )
         for n in (SHAPES[:2] if quick else SHAPES)
     ]  # fmt: skip
-    return [*views, *texels, *both, *sums, *shapes]
+    ways = f"prb, {USUAL}", f"sweep, {OWN}"
+    # The median is that of recorded steps: the first two are traced.
+    steps = [replace(job, methods=ways, measure="step", warm_up=0, rounds=7) for job in shapes]
+    return [*views, *texels, *both, *sums, *shapes, *steps]
 
 
 def table(record: Record) -> str:
@@ -59,28 +63,32 @@ def table(record: Record) -> str:
     runs = [p for p in record.points if p.measure == "whole run"]
     sums = [p for p in record.points if p.measure == "sum"]
     shapes = [p for p in record.points if p.measure == "gradient"]
-    return "\n\n".join(part for part in (_runs(runs), _sums(sums), _shapes(shapes)) if part)
+    steps = [p for p in record.points if p.measure == "step"]
+    traced, recorded = "shapes and BSDFs: a gradient that is traced", "shapes and BSDFs: a step of a job"
+    tables = _runs(runs), _sums(sums), _shapes(traced, "prb", shapes), _shapes(recorded, f"prb, {USUAL}", steps)
+    return "\n\n".join(part for part in tables if part)
 
 
 def _runs(points: list[Point]) -> str:
     if not points:
         return ""
-    least = min((max(p.values) for p in points if p.values), default=0.0)
+    least = min((p.values[-1] for p in points if p.values), default=0.0)
     rows = []
     for point in points:
         if point.error or not point.values:
-            rows.append([point.scene, str(point.paths), point.error or "", "", "", ""])
+            rows.append([point.scene, str(point.paths), point.error or "", "", "", "", ""])
             continue
         texels = int(point.scene.split(", ")[1].split(" ")[0]) ** 2
         views = int(point.scene.split(" ")[0])
         pixels = point.paths // 4 * views
-        more = (max(point.values) - least) * 2**20
+        more = (point.values[-1] - least) * 2**20
         rows.append(
             [
                 point.scene,
                 f"{pixels / 1e6:.2f}",
                 f"{st.median(point.seconds):.0f}",
-                " ".join(f"{peak:.0f}" for peak in point.values),
+                " ".join(f"{peak:.0f}" for peak in point.values[:-1]),
+                f"{point.values[-1]:.0f}",
                 f"{more / pixels:.0f}" if views > 2 else "",
                 f"{more / texels / BYTES:.2f}" if texels >= 10**6 else "",
             ]
@@ -90,6 +98,7 @@ def _runs(points: list[Point]) -> str:
         "million pixels of all views",
         "seconds",
         "peak MiB: first step, later ones, end",
+        "without pages of files",
         "bytes a pixel",
         "x (values + Adam's state)",
     ]
@@ -110,10 +119,10 @@ def _sums(points: list[Point]) -> str:
     return markdown(head, rows) if rows else ""
 
 
-def _shapes(points: list[Point]) -> str:
+def _shapes(what: str, peer: str, points: list[Point]) -> str:
     rows = [
-        [point.scene, method_cell(point), *comparison(point, methods.get("prb"))[:2]]
+        [point.scene, method_cell(point), *comparison(point, methods.get(peer))[:2]]
         for methods in groups(points).values()
         for point in methods.values()
     ]
-    return markdown(["shapes and BSDFs", "method", "seconds (median)", "time / prb"], rows) if rows else ""
+    return markdown([what, "method", "seconds (median)", "time / prb"], rows) if rows else ""
