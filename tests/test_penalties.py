@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.imported import Imported, imported
+from pathreplay.inverse.imported import Imported, Modules
 from pathreplay.inverse.penalties import Laplacian, Own, Penalty, Prior, Term, TotalVariation
 from pathreplay.scenes.bodies import ball
 
@@ -93,7 +93,6 @@ WRONG = {
     "two": (lambda x: dr.gather(type(x.array), x.array, [0, 1]), "gives 2 numbers"),
     "none": (lambda x: None, "cannot be computed"),
     "raises": (lambda x: 1 / 0, "cannot be computed (division by zero); mend it"),
-    "constant": (lambda x: 1.0, "does not depend on the values"),
     "infinite": (lambda x: dr.sum(1 / (x - x), axis=None), "no finite number"),
 }
 
@@ -108,8 +107,8 @@ def test_what_is_no_penalty_is_told_in_one_line(name: str) -> None:
 
 def test_a_module_is_looked_for_in_the_folder_first(tmp_path: Path) -> None:
     (tmp_path / "json.py").write_text("def loads(v):\n    return 7\n")
-    assert imported("Penalty", "json:loads", tmp_path, "values")(int, "1") == 7
-    assert imported("Penalty", "json:loads", None, "values")(int, "1") == 1
+    assert Modules(tmp_path).function("Penalty", "json:loads", "values")(int, "1") == 7
+    assert Modules().function("Penalty", "json:loads", "values")(int, "1") == 1
 
 
 def test_terms_are_added() -> None:

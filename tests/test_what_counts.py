@@ -14,6 +14,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.batches import batch
 from pathreplay.inverse.images import exr_bytes, read_image
+from pathreplay.inverse.imported import Modules
 from pathreplay.inverse.likeness import MOST_DB, Likeness
 from pathreplay.inverse.losses import find_loss
 from pathreplay.threads import spare_thread
@@ -249,5 +250,5 @@ def test_losses_of_one_name_in_two_folders_are_two(tmp_path: Path) -> None:
     for k in (1, 3):
         (tmp_path / str(k)).mkdir()
         (tmp_path / str(k) / "mine.py").write_text(f"def loss(image, target):\n    return {k} * (image - target)\n")
-    found = [find_loss("mine:loss", tmp_path / str(k)) for k in (1, 3)]
+    found = [find_loss("mine:loss", Modules(tmp_path / str(k))) for k in (1, 3)]
     assert [each(mi.TensorXf([2.0]), mi.TensorXf([1.0])).array[0] for each in found] == [1, 3]

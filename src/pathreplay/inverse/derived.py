@@ -10,19 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import Derivation
-from pathreplay.inverse.imported import Imported, imported
+from pathreplay.inverse.grids import resampled
+from pathreplay.inverse.imported import Imported, Modules
 from pathreplay.inverse.values import Array, seen
 from pathreplay.inverse.variables import Variable
-from pathreplay.scenes.parameters import get_array, is_transform
+from pathreplay.scenes.parameters import is_transform
 from pathreplay.scenes.stored import Form, form_of
 
 
@@ -49,12 +48,21 @@ class Derived:
         found = self.function(
             (lambda value: kind(_matrix(kind, value))) if is_transform(self.first) else kind,
             kind(self.first),
-            *(variables[name] for name in self.of),
+            *(type(variables[name])(variables[name]) for name in self.of),  # which the function may change
         )
         shapes = [dr.shape(value.matrix if is_transform(value) else value) for value in (found, self.first)]
         if shapes[0] != shapes[1]:
             raise PathreplayError(
                 f"{self.function} gives the shape {shapes[0]} for '{self.key}', which has {shapes[1]}; return that"
+            )
+        return found
+
+    def require_finite(self, variables: Mapping[str, Any]) -> Any:
+        """The value. Raises PathreplayError where it is NaN or infinite."""
+        found = self.value(variables)
+        if not dr.all(dr.isfinite(dr.ravel(found.matrix if is_transform(found) else found)))[0]:
+            raise PathreplayError(
+                f"{self.function} gives NaN or infinite numbers for '{self.key}'; mend it, or bound what it is made of"
             )
         return found
 
@@ -65,23 +73,57 @@ def _matrix(kind: Any, value: Any) -> Any:
 
 
 def make_derived(
-    params: mi.SceneParameters, keys: Mapping[str, Derivation], variables: list[Variable], base: Path
+    params: mi.SceneParameters, keys: Mapping[str, Derivation], variables: list[Variable], modules: Modules
 ) -> tuple[Derived, ...]:
-    """The derived parameters, each computed once. Raises PathreplayError for what cannot be; truths are not known."""
-    starts = {v.key: v.held(v.start) for v in variables}
+    """The derived parameters, computed in each resolution. Raises PathreplayError for what cannot be.
+
+    Truths are not known.
+    """
     made = []
     for key, entry in keys.items():
-        for name in entry.of:
-            if name not in starts:
-                raise PathreplayError(
-                    f"Parameter '{key}' is derived of '{name}', which is none that the job recovers; name one of "
-                    f"{', '.join(starts)}, or add [[parameters]] with key = '{name}' and a 'shape'"
-                )
+        taken = [_named(name, key, keys, params, variables) for name in entry.of]
         form, value = form_of(params, key), seen(params, key)
         # A copy: the map hands out a reference to what the scene holds, and the scene is about to change.
-        first = type(value)(dr.detach(value))
-        found = Derived(key, imported("Derivation", entry.function, base, "values"), tuple(entry.of), first, form)
-        if not np.isfinite(get_array(found.value(starts))).all():
-            raise PathreplayError(f"{found.function} gives NaN or infinite numbers for '{key}'; mend it, or its start")
+        first, function = type(value)(dr.detach(value)), modules.function("Derivation", entry.function, "values")
+        found = Derived(key, function, tuple(entry.of), first, form)
+        for k in range(max(len(v.levels.shapes) if v.levels else 1 for v in taken)):
+            _require(found, {v.key: v.held(_at_level(v, k)) for v in taken})
         made.append(found)
     return tuple(made)
+
+
+def _named(
+    name: str, key: str, keys: Mapping[str, Derivation], params: mi.SceneParameters, variables: list[Variable]
+) -> Variable:
+    """The variable of a name. Raises PathreplayError if there is none."""
+    known = {v.key: v for v in variables}
+    if name in known:
+        return known[name]
+    if name in keys:
+        way_out = f"which is derived itself; name what that is derived from, {', '.join(keys[name].of)}"
+    elif name in params:
+        way_out = f"which the job does not recover; add [[parameters]] with key = '{name}'"
+    else:
+        names = ", ".join(known) or "none"
+        way_out = f"which is none of the job's parameters ({names}); add [[parameters]] with this key and a 'shape'"
+    raise PathreplayError(f"Parameter '{key}' is derived of '{name}', {way_out}")
+
+
+def _at_level(variable: Variable, k: int) -> Array:
+    """Its start in its k-th resolution, or the last one."""
+    if variable.levels is None:
+        return variable.start
+    return resampled(variable.start, variable.levels.shapes[min(k, len(variable.levels.shapes) - 1)])
+
+
+def _require(derived: Derived, variables: dict[str, Any]) -> None:
+    """Raise PathreplayError unless a value is finite, and depends on all that it is made of."""
+    derived.require_finite(variables)
+    for name, variable in variables.items():
+        dr.enable_grad(variable)
+        if not dr.grad_enabled(derived.value(variables)):
+            raise PathreplayError(
+                f"{derived.function} gives '{derived.key}' a value that does not depend on '{name}'; compute it with "
+                "Dr.Jit, without leaving its arrays, or leave the name out of 'of'"
+            )
+        dr.disable_grad(variable)

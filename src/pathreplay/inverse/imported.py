@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,33 +33,58 @@ class Imported:
             raise PathreplayError(f"{self} cannot be computed ({_why(error)}); mend it, or name another") from error
 
 
-def imported(kind: str, name: str, base: Path | None, takes: str) -> Imported:
-    """The function ``name``, whose module may be in the folder ``base``; it is to be one that ``takes`` something.
+class Modules:
+    """The modules that a job names: those of the folder ``base`` first, each run once, then installed ones."""
 
-    The module is run. Raises PathreplayError if there is none, if it fails, or has no such function.
-    """
-    module, _, function = name.partition(":")
-    try:
-        found = getattr(_module(module, base), function)
-    except Exception as error:  # whatever the module does when it is imported
-        raise PathreplayError(f"{kind} '{name}' cannot be imported ({_why(error)}); write module:function") from None
-    if not callable(found):
-        raise PathreplayError(f"{kind} '{name}' is no function of {takes}, but {shown(found)}; name another")
-    return Imported(kind, name, found)
+    def __init__(self, base: Path | None = None) -> None:
+        self._base = base
+        self._known: dict[str, Any] = {}
+
+    def function(self, kind: str, name: str, takes: str) -> Imported:
+        """The function ``name``, which is to be one that ``takes`` something; ``kind`` is what it is for.
+
+        Its module is run. Raises PathreplayError if there is none, if it fails, or has no such function.
+        """
+        module, _, function = name.partition(":")
+        try:
+            if module not in self._known:
+                self._known[module] = self._loaded(module)
+            found = getattr(self._known[module], function)
+        except (Exception, SystemExit) as error:  # whatever the module does when it is imported
+            why = f"{kind} '{name}' cannot be imported ({_why(error)}); write module:function"
+            raise PathreplayError(why) from None
+        if not callable(found):
+            raise PathreplayError(f"{kind} '{name}' is no function of {takes}, but {shown(found)}; name another")
+        return Imported(kind, name, found)
+
+    def _loaded(self, name: str) -> Any:
+        """The module in the folder, anew, since other folders may have others of that name; else an installed one.
+
+        While it is run it finds itself and its neighbours, as it would if Python had been started in its folder.
+        """
+        path = None if self._base is None else self._base / f"{name}.py"
+        if self._base is None or path is None or not path.is_file():
+            return importlib.import_module(name)
+        spec = importlib.util.spec_from_file_location(name, path)
+        if spec is None or spec.loader is None:
+            raise ImportError(f"{path} is no module")
+        module = importlib.util.module_from_spec(spec)
+        folder, before = str(self._base.resolve()), dict(sys.modules)
+        sys.path.insert(0, folder)
+        sys.modules[name] = module
+        try:
+            spec.loader.exec_module(module)
+        finally:
+            sys.path.remove(folder)
+            for each, found in list(sys.modules.items()):
+                if each not in before and Path(getattr(found, "__file__", None) or "").parent == Path(folder):
+                    del sys.modules[each]
+            if name in before:
+                sys.modules[name] = before[name]
+            else:
+                sys.modules.pop(name, None)
+        return module
 
 
-def _why(error: Exception) -> str:
+def _why(error: BaseException) -> str:
     return one_line(error) or type(error).__name__
-
-
-def _module(name: str, base: Path | None) -> Any:
-    """The module in the folder, anew, since other folders may have others of that name; else an installed one."""
-    path = None if base is None else base / f"{name}.py"
-    if path is None or not path.is_file():
-        return importlib.import_module(name)
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{path} is no module")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

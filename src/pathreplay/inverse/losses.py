@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.imported import imported
+from pathreplay.inverse.imported import Modules
 from pathreplay.inverse.picture_losses import lpips, scale_invariant, ssim
 
 Loss = Callable[..., Any]
@@ -90,22 +89,22 @@ def mean_loss(loss: Loss, image: Any, target: Any, weight: Any = None) -> mi.Ten
     return dr.mean(found if weight is None else found * weight, axis=None)
 
 
-def find_loss(name: str, base: Path | None = None) -> Loss:
-    """The loss called ``name``, or ``module:function``, whose module may be in the folder ``base``.
+def find_loss(name: str, modules: Modules | None = None) -> Loss:
+    """The loss called ``name``, or ``module:function``, which ``modules`` have (default: installed ones).
 
     Raises PathreplayError with the nearest name and the list, or why there is no such function.
     """
     if name in LOSSES:
         return LOSSES[name]
     if ":" in name:
-        return _imported(name, base)
+        return _imported(name, modules or Modules())
     close = difflib.get_close_matches(name, LOSSES, n=1)
     hint = f"; did you mean '{close[0]}'?" if close else ""
     raise PathreplayError(f"No loss '{name}'{hint} (losses: {', '.join(LOSSES)}, or module:function)")
 
 
-def _imported(name: str, base: Path | None) -> Loss:
-    own = imported("Loss", name, base, "image and target")
+def _imported(name: str, modules: Modules) -> Loss:
+    own = modules.function("Loss", name, "image and target")
 
     def loss(image: Any, target: Any) -> Any:
         value = own(mi.TensorXf, image, target)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -104,6 +105,8 @@ class Recovered:
     rival: Array | None = None
     faces: NDArray[np.integer] | None = None
     """Of a mesh whose vertices these are (3 m numbers)."""
+    derived: bool = False
+    """From others, which are recovered."""
 
     def known(self, *kinds: str) -> dict[str, Array]:
         """What there is of these kinds: 'start', 'result', 'rival', 'truth'."""
@@ -157,6 +160,11 @@ class Recovered:
         if self.truth is not None:
             table |= {"rmse": self.error(), "rmse_at_start": self.error("start")}
         return table
+
+
+def number_of(items: Iterable[Recovered]) -> int:
+    """How many were recovered: what is derived from others does not count."""
+    return sum(not item.derived for item in items)
 
 
 @dataclass(frozen=True)

@@ -106,23 +106,22 @@ class Laplacian:
 
 @dataclass(frozen=True)
 class Own:
-    """A user's function of the values, a tensor in their shape, to one number; its derivative is Dr.Jit's."""
+    """A user's function of the values, a tensor in their shape, to one number; its derivative is Dr.Jit's.
+
+    Where that does not depend on them, as a plain 0 where nothing is wrong, it is zero.
+    """
 
     function: Imported
 
     def __call__(self, values: Array) -> tuple[float, NDArray[np.floating]]:
-        """See `Term`. Raises PathreplayError for what is no differentiable number."""
+        """See `Term`. Raises PathreplayError for what is no number."""
         v: Any = mi.TensorXf(np.ascontiguousarray(values))
         dr.enable_grad(v)
-        value = self.function(_flat, v)
+        value = self.function(_flat, mi.TensorXf(v))  # which it may change
         if dr.width(value) != 1:
             raise PathreplayError(f"{self.function} gives {dr.width(value)} numbers; return one, such as a mean")
-        if not dr.grad_enabled(value):
-            raise PathreplayError(
-                f"{self.function} gives a number that does not depend on the values; compute it with Dr.Jit, without "
-                "leaving its arrays"
-            )
-        dr.backward(value)
+        if dr.grad_enabled(value):
+            dr.backward(value)
         found, gradient = float(value[0]), np.array(dr.grad(v))
         if not (np.isfinite(found) and np.isfinite(gradient).all()):
             raise PathreplayError(

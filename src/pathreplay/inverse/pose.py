@@ -25,6 +25,8 @@ from pathreplay.errors import PathreplayError
 from pathreplay.scenes.parameters import get_array, is_transform
 
 PoseKind = Literal["translation", "rotation", "rigid"]
+PART_NAMES = (":translation", ":rotation")
+"""How names of the variables of a pose end."""
 PARTS = {"translation": ("translation",), "rotation": ("rotation",), "rigid": ("translation", "rotation")}
 
 # θ² below which series stand in for a and b: their next terms, θ⁴ / 120 and θ⁴ / 720, are below float32 rounding there.
@@ -48,6 +50,11 @@ class Pose:
     def parts(self) -> dict[str, str]:
         """'translation' and/or 'rotation' -> name of that variable in the optimiser."""
         return {part: f"{self.key}:{part}" for part in PARTS[self.kind]}
+
+    @property
+    def of(self) -> tuple[str, ...]:
+        """Names of the variables that make it."""
+        return tuple(self.parts().values())
 
     def value(self, variables: Mapping[str, Any]) -> Any:
         """The parameter's value for the optimiser's variables; derivatives flow to them.

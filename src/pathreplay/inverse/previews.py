@@ -26,7 +26,7 @@ from pathreplay.inverse.events import Event, Notes, Started, Stepped, Stopped
 from pathreplay.inverse.images import Image, displayed, exposure_for
 from pathreplay.inverse.likeness import Likeness
 from pathreplay.inverse.loop import answer_of, picture_of
-from pathreplay.inverse.outcome import DIFFERENCE_GAIN, Recovered, ViewPictures, resume_command
+from pathreplay.inverse.outcome import DIFFERENCE_GAIN, Recovered, ViewPictures, number_of, resume_command
 from pathreplay.inverse.page_parts import (
     about,
     common_exposure,
@@ -253,7 +253,7 @@ class Previews:
         shown = films(self.folder.path)
         return Page(
             title=self.folder.path.name,
-            lead=lead(config, len(config.parameters), learned, len(self.problem.views) - learned),
+            lead=lead(config, self._count(), learned, len(self.problem.views) - learned),
             notices=stopping + dropped_notice(history),
             facts=((f"{done} of {wanted}", first), *others),
             views=tuple(self._view(view, shown) for view in self._views),
@@ -282,6 +282,10 @@ class Previews:
         )
         film = shown.get(f"view-{view.name}", ())
         return pages.View(view.name, pictures, stored, it.exposure, view.held_out, note, film)
+
+    def _count(self) -> int:
+        items = recovered_of(self.problem, self.run)
+        return number_of(items) + len(self.problem.poses)
 
     def _parameters(self, shown: Mapping[str, tuple[Still, ...]]) -> tuple[Parameter, ...]:
         found = []

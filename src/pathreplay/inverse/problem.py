@@ -24,6 +24,7 @@ from pathreplay.inverse.exposures import EXPOSURE, Factors, fixed_rows
 from pathreplay.inverse.exposures import start as start_of_exposures
 from pathreplay.inverse.grids import rmse
 from pathreplay.inverse.images import picture_size
+from pathreplay.inverse.imported import Modules
 from pathreplay.inverse.losses import Loss, find_loss
 from pathreplay.inverse.pose import Pose
 from pathreplay.inverse.targets import (
@@ -93,9 +94,12 @@ class Problem:
 
     def moves(self, moving: frozenset[str]) -> set[str]:
         """The keys of the scene whose values are others when these variables are."""
-        made = {each.key for each in self.derived if not moving.isdisjoint(each.of)}
-        posed = {pose.key for pose in self.poses if not moving.isdisjoint(pose.parts().values())}
-        return {key for key in moving if key in self.params} | made | posed
+        made = {each.key for each in self.made() if not moving.isdisjoint(each.of)}
+        return {key for key in moving if key in self.params} | made
+
+    def made(self) -> tuple[Pose | Derived, ...]:
+        """What is made of variables."""
+        return *self.poses, *self.derived
 
     def trained(self) -> dict[int, View]:
         """The views that are learned from, by their place."""
@@ -124,13 +128,17 @@ def put_values(problem: Problem, values: Arrays) -> None:
 
 
 def errors_of(problem: Problem, values: Arrays) -> dict[str, float]:
-    """How far all whose truth is known are from it, by key: root mean squares; of poses by name, see `PoseError.of`."""
+    """How far all whose truth is known are from it, by key: root mean squares; of poses by name, see `PoseError.of`.
+
+    Raises PathreplayError where a derived parameter is no longer finite.
+    """
     found = {v.key: rmse(values[v.key], v.truth) for v in problem.variables if v.truth is not None}
-    made = [(each, each.truth) for each in problem.derived if each.truth is not None]
     poses = [pose for pose in problem.poses if pose.truth is not None]
-    variables = problem.held.variables(problem, values) if made or poses else {}
-    for each, truth in made:
-        found[each.key] = rmse(parameters.get_array(each.value(variables)), truth)
+    variables = problem.held.variables(problem, values) if problem.derived or poses else {}
+    for each in problem.derived:
+        value = each.require_finite(variables)
+        if each.truth is not None:
+            found[each.key] = rmse(parameters.get_array(value), each.truth)
     for pose in poses:
         if error := pose.error(parameters.get_array(pose.value(variables))):
             found |= error.of(pose.key)
@@ -144,8 +152,10 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     Raises PathreplayError for whatever in the job cannot work.
     """
     album = Album.of(config.budget)
-    loss = find_loss(config.loss, base)
-    wanted = [entry.key for entry in config.parameters] + [entry.key for entry in config.derived]
+    modules = Modules(base)
+    loss = find_loss(config.loss, modules)
+    wanted = [entry.key for entry in config.parameters if entry.shape is None]
+    wanted += [entry.key for entry in config.derived]
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
     cameras = {name: shot.camera for name, shot in shots.items()}
@@ -170,8 +180,8 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     if config.target.alpha == "scene":
         require_known(scene, params, keys)
     limits.require_films(scene, sensors, {"spp": config.most_spp, "picture_spp": config.picture_spp})
-    unsolved, moved = make_variables(scene, params, named | free, config, base)
-    derived = make_derived(params, made, unsolved, base)
+    unsolved, moved = make_variables(scene, params, named | free, config, base, modules)
+    derived = make_derived(params, made, unsolved, modules)
     limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
     truth: dict[str, Array] = {}

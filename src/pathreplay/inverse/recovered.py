@@ -21,15 +21,17 @@ VERTICES = ".vertex_positions"
 
 def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
     """The parameters that are no poses, those that are derived behind those that they are derived from."""
-    parts = {name for pose in problem.poses for name in pose.parts().values()}
+    parts = {name for pose in problem.poses for name in pose.of}
     known = [(v.key, v.truth) for v in problem.variables if v.key not in parts and v.key != EXPOSURE]
-    known += [(each.key, each.truth) for each in problem.derived]
+    made = {each.key: each.truth for each in problem.derived}
+    known += made.items()
     starts = with_scene(problem, {v.key: v.start for v in problem.variables})
     values = with_scene(problem, run.values)
     theirs = with_scene(problem, run.rival.values) if run.rival else {}
-    files_of = file_names([*(v.key for v in problem.variables), *(each.key for each in problem.derived)])
+    files_of = file_names([*(v.key for v in problem.variables), *made])
     return tuple(
-        Recovered(key, files_of[key], starts[key], values[key], truth, theirs.get(key)) for key, truth in known
+        Recovered(key, files_of[key], starts[key], values[key], truth, theirs.get(key), derived=key in made)
+        for key, truth in known
     )
 
 
@@ -55,15 +57,12 @@ def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:
 
 def with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
     """The values of the variables, and what they make of poses and of derived parameters, as people see it."""
-    used = {name for pose in problem.poses for name in pose.parts().values()}
-    used |= {name for each in problem.derived for name in each.of}
+    used = {name for each in problem.made() for name in each.of}
     if not used:
         return dict(values)
     few = replace(problem, variables=tuple(v for v in problem.variables if v.key in used))
     variables = variables_of(few, values)
-    placed = {pose.key: pose.value(variables) for pose in problem.poses}
-    placed |= {each.key: each.value(variables) for each in problem.derived}
-    return {key: get_array(value) for key, value in placed.items()} | dict(values)
+    return {each.key: get_array(each.value(variables)) for each in problem.made()} | dict(values)
 
 
 def _parts(pose: Pose, values: Arrays) -> dict[str, Array]:

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.grids import shown
 from pathreplay.inverse.images import Image, displayed, png_bytes, resized
-from pathreplay.inverse.outcome import Contestant, Outcome, Recovered, ViewPictures
+from pathreplay.inverse.outcome import Contestant, Outcome, Recovered, ViewPictures, number_of
 from pathreplay.inverse.page_parts import (
     about,
     common_exposure,
@@ -73,7 +73,7 @@ def report_page(
     ended = f"Stopped after {len(history)} of {config.iterations} iterations."
     if why := outcome.run.optimiser.finished:
         ended = f"No more steps after {len(history)} of {config.iterations} iterations: {why}."
-    held_out, count = len(outcome.held_out()), len(outcome.recovered) + len(outcome.poses)
+    held_out, count = len(outcome.held_out()), number_of(outcome.recovered) + len(outcome.poses)
     exposure = common_exposure([view.target for view in outcome.views])
     return Page(
         title=outcome.folder.name,

@@ -74,14 +74,17 @@ def _moving(problem: Problem, stage: Stage) -> list[str]:
     keys = [v.key for v in problem.variables]
     if stage.parameters is None:
         return keys
-    # A pose is named by the parameter that it moves.
-    owners = {part: pose.key for pose in problem.poses for part in pose.parts().values()}
-    known = dict.fromkeys([*keys, *owners.values()])
+    # What makes a pose or a derived parameter is named by that, too.
+    owners: dict[str, set[str]] = {key: {key} for key in keys}
+    for each in problem.made():
+        for part in each.of:
+            owners[part].add(each.key)
+    known = dict.fromkeys(name for names in owners.values() for name in names)
     try:
         named = parameters.resolve_keys(known, stage.parameters)
     except PathreplayError as error:
         raise PathreplayError(f"stages: {error}; name parameters that the job recovers") from None
-    return [key for key in keys if key in named or owners.get(key) in named]
+    return [key for key in keys if not owners[key].isdisjoint(named)]
 
 
 def require_stages(problem: Problem, config: Config) -> None:

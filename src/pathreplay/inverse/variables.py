@@ -15,15 +15,19 @@ from numpy.typing import NDArray
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import limits
 from pathreplay.inverse.config import Config, Derivation, Parameter
+from pathreplay.inverse.exposures import EXPOSURE
 from pathreplay.inverse.grids import Levels, make_levels, resampled
-from pathreplay.inverse.imported import imported
+from pathreplay.inverse.imported import Modules
 from pathreplay.inverse.penalties import Laplacian, Own, Penalty, Prior, Term, TotalVariation
-from pathreplay.inverse.pose import Pose, make_pose
+from pathreplay.inverse.pose import PART_NAMES, Pose, make_pose
 from pathreplay.inverse.surface import Surface
 from pathreplay.inverse.transforms import Coordinates, Transform
 from pathreplay.inverse.values import Array, make_value, seen
 from pathreplay.scenes import parameters
 from pathreplay.scenes.stored import AS_STORED, Form, form_of
+
+RESERVED = frozenset({EXPOSURE, "__metadata__"})
+"""Names that mean something else where values are kept."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +85,15 @@ def keys_of(
 
 
 def free_of(params: mi.SceneParameters, config: Config) -> dict[str, Parameter]:
-    """The entries with a shape of their own, by key. Raises PathreplayError where the scene has such a parameter."""
+    """The entries with a shape of their own, by key. Raises PathreplayError for names that are others'."""
     free: dict[str, Parameter] = {}
     for entry in config.parameters:
         if entry.shape is None:
             continue
         if entry.key in params:
             raise PathreplayError(f"Parameter '{entry.key}' is one of the scene; leave 'shape' out, or rename it")
+        if entry.key in RESERVED or entry.key.endswith(PART_NAMES):
+            raise PathreplayError(f"Parameter '{entry.key}' with a 'shape' has the name of something else; rename it")
         if entry.key in free:
             raise PathreplayError(f"Parameter '{entry.key}' is named twice; remove one")
         free[entry.key] = entry
@@ -95,7 +101,12 @@ def free_of(params: mi.SceneParameters, config: Config) -> dict[str, Parameter]:
 
 
 def make_variables(
-    scene: mi.Scene, params: mi.SceneParameters, keys: dict[str, Parameter], config: Config, base: Path
+    scene: mi.Scene,
+    params: mi.SceneParameters,
+    keys: dict[str, Parameter],
+    config: Config,
+    base: Path,
+    modules: Modules,
 ) -> tuple[list[Variable], list[Pose]]:
     """Of each key a variable, or a pose with those of its parts; truths are not known yet.
 
@@ -122,7 +133,7 @@ def make_variables(
                 start = resampled(start, levels.shapes[0])
             if dr.is_tensor_v(like):
                 like = dr.zeros(type(like), start.shape)  # which nobody writes down
-            penalty = _penalty(params, key, entry, start, base)
+            penalty = _penalty(params, key, entry, start, levels, modules)
             variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
             continue
         limits.require_near(scene, key, parameters.get_array(params[key]), entry)
@@ -159,8 +170,10 @@ def _faces(params: mi.SceneParameters, key: str, option: str) -> NDArray[np.inte
     return np.array(params[faces])
 
 
-def _penalty(params: mi.SceneParameters, key: str, entry: Parameter, start: Array, base: Path) -> Penalty | None:
-    """What the entry asks for; it was computed once. Raises PathreplayError for what cannot be."""
+def _penalty(
+    params: mi.SceneParameters, key: str, entry: Parameter, start: Array, levels: Levels | None, modules: Modules
+) -> Penalty | None:
+    """What the entry asks for. Raises PathreplayError for what cannot be computed, in some resolution."""
     terms: list[Term] = []
     if entry.total_variation is not None:
         if start.ndim < 3:
@@ -174,8 +187,9 @@ def _penalty(params: mi.SceneParameters, key: str, entry: Parameter, start: Arra
         faces = _faces(params, key, "laplacian")
         terms.append(Laplacian(entry.laplacian, parameters.get_array(params[key]), faces))
     if entry.penalty is not None:
-        terms.append(Own(imported("Penalty", entry.penalty, base, "values")))
-        terms[-1](start)
+        terms.append(Own(modules.function("Penalty", entry.penalty, "values")))
+        for shape in levels.shapes if levels else [start.shape]:
+            terms[-1](resampled(start, shape))
     return Penalty(tuple(terms)) if terms else None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import shutil
@@ -19,6 +20,7 @@ from pathreplay.files import file_names
 from pathreplay.inverse.capture import FACING, read_capture
 from pathreplay.inverse.exposures import EXPOSURE
 from pathreplay.inverse.images import picture_size, png_bytes
+from pathreplay.inverse.pose import PART_NAMES
 from pathreplay.inverse.run_folder import Job, read_job, require_writable_name
 from pathreplay.inverse.values import Arrays
 from pathreplay.output.scene_folder import SCENE, Exported, Source, exported, require_same
@@ -35,7 +37,7 @@ def export_run(run: Path, output: Path | None = None) -> str:
 
     Into ``output``, or the folder ``export`` of the run, which must be new or empty: `scene.xml` with its files
     (textures as EXR, grids as `.vol`, meshes as PLY), PNG and OBJ beside EXR and PLY of what was recovered, the cameras
-    as `transforms.json`, and numbers as `values.json`. The run's variant becomes the active one.
+    as `transforms.json`, and numbers as `values.json`, many of them as NPY. The run's variant becomes the active one.
 
     Raises PathreplayError for what is no run folder, holds no result, or cannot be exported; nothing is written then.
     """
@@ -46,12 +48,13 @@ def export_run(run: Path, output: Path | None = None) -> str:
     backend.set_variant(job.config.variant)
     values = _result(run)
     source = _source(job, values)
-    free = [EXPOSURE, *(entry.key for entry in job.config.parameters if entry.shape is not None)]
-    others = {key: values.pop(key) for key in free if key in values}
+    of_pictures = {EXPOSURE: values.pop(EXPOSURE)} if EXPOSURE in values else {}
+    free = {entry.key: values.pop(entry.key) for entry in job.config.parameters if entry.shape is not None}
     found = exported(source, values, job.config.integrator.model_dump())
     with whole_folder(folder, _OPTION) as part:
         write_files(found, part)
-        for name, data in _beside(found, values | others).items():
+        for name, data in _beside(found, values | of_pictures, free).items():
+            (part / name).parent.mkdir(exist_ok=True)
             (part / name).write_bytes(data)
         require_same(found.scene, part)
     files = sorted([*found.files, *found.copies])
@@ -86,7 +89,7 @@ def _result(run: Path) -> dict[str, np.ndarray]:
     except (safetensors.SafetensorError, OSError, ValueError) as error:
         raise PathreplayError(f"Result {path} cannot be read ({error}); go on with the run, which writes it") from None
     # Parts of poses; the transform or the vertices that they make are there by their own key.
-    return {k: v for k, v in found.items() if not k.endswith((":translation", ":rotation"))}
+    return {k: v for k, v in found.items() if not k.endswith(PART_NAMES)}
 
 
 def _source(job: Job, values: Arrays) -> Source:
@@ -103,21 +106,32 @@ def _source(job: Job, values: Arrays) -> Source:
     return Source(path, as_xml_has_them(config.scene_parameters), plugins, cameras)
 
 
-def _beside(found: Exported, values: Arrays) -> dict[str, bytes]:
-    """Files that the scene does not name: PNG, OBJ, cameras and numbers."""
+def _beside(found: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:
+    """Files that the scene does not name: PNG, OBJ, cameras and numbers; NPY of those that are ``free`` and many."""
     params, files = mi.traverse(found.scene), {"transforms.json": _json(_cameras(found.scene))}
-    names = file_names([*params.keys(), *(shape.id() for shape in found.scene.shapes()), *values])
+    names = file_names([*params.keys(), *(shape.id() for shape in found.scene.shapes())])
     numbers: dict[str, Any] = {}
     for key, value in values.items():
         if value.ndim == 3 and value.shape[2] <= 4:
             files[f"textures/{names[key]}.png"] = png_bytes(value)
         elif value.size <= 16 or key == EXPOSURE:
             numbers[key] = value.tolist()
+    for key, name in file_names(free).items():
+        if free[key].size <= 16:
+            numbers[key] = free[key].tolist()
+        else:
+            files[f"values/{name}.npy"] = _npy(free[key])
     files["values.json"] = _json(numbers)
     for shape in found.scene.shapes():
         if shape.is_mesh() and f"meshes/{names[shape.id()]}.ply" in found.files:
             files[f"meshes/{names[shape.id()]}.obj"] = obj_bytes(shape)
     return files
+
+
+def _npy(value: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, value)
+    return stream.getvalue()
 
 
 def _json(table: Any) -> bytes:
