@@ -298,9 +298,9 @@ def test_summaries_count_and_compare() -> None:
     assert "| sweep | 1 | 1 | 0 | 0 | 0 |" in told and "| prb_basic | 1 | 0 | 1 | 0 | 0 |" in told
     assert "| prb | 1 | 0 | 0 | 0 | 1 |" in told
     told = summaries.SUMMARIES["surface-summary"][1](record(point("prb"), point("sweep", 0.5)))
-    assert told.splitlines()[2].startswith(("| box, texture | 0.5", "| box, texture | 0.4"))
+    assert told.splitlines()[2].startswith(("| box, texture | scene | 0.5", "| box, texture | scene | 0.4"))
     steps = [point(name, 0.5 if "own" in name else 1, scene="cloud") for name in iteration.MEDIA]
-    assert "| cloud | 0." in summaries.SUMMARIES["iteration-summary"][1](record(*steps))
+    assert "| cloud | scene | 0." in summaries.SUMMARIES["iteration-summary"][1](record(*steps))
     clouds = [point(m, parameters=(media.DENSITY,)) for m in ("prbvolpath", "score")]
     assert "| density: box | " in summaries.SUMMARIES["media-summary"][1](record(*clouds))
 

@@ -12,6 +12,7 @@ METHODS: dict[str, dict[str, object]] = {
     "rb linear": {"type": "pathreplay_rb", "linear": True},
     "sweep": {"type": "pathreplay", "driver": "sweep"},
     "replay": {"type": "pathreplay", "driver": "replay"},
+    "even": {"type": "pathreplay", "numbers": "even"},
     "film edges": {"type": "pathreplay", "edges": "film"},
     "all edges": {"type": "pathreplay", "edges": "all"},
     "prb_projective": {"type": "prb_projective"},

@@ -3,9 +3,10 @@
 What a loss wants of a path is known only when its pixel is. So a lane walks all N paths of a pixel and records them
 one behind the other, as `sweep` does for one path; then it goes back through all of them. With I the mean of their
 radiances L_s, a loss with derivative f'(I) must not judge a path by itself, or the gradient would be biased by the
-covariance of L_s and its derivative. Each is judged by the others:
+covariance of L_s and its derivative; nor by paths that know of it, as those do that fill the pixel evenly with it. So
+paths come in sets S whose random numbers know nothing of each other, and each is judged by those of the other sets:
 
-    δL_s = f'(I_{-s}) / N,    I_{-s} = (N I - L_s) / (N - 1),    f'(I) = offset + slope · I.
+    δL_s = f'(I_{-S}) / N,    I_{-S} = (N I - Σ_S L) / (N - |S|),    f'(I) = offset + slope · I.
 
 The gradient's mean is that with an image of other paths. Its variance differs by the covariance of f'(I) dL_s and the
 change of f' with L_s: to the better where the loss asks for more light, to the worse where it asks for less; and, of
@@ -16,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -29,6 +30,60 @@ from .adjoint import LostPaths, RayDerivative
 from .record import Layout, record_type, room_for
 from .two_walks import first_walk, walk_back
 
+SETS = 4
+"""Of even numbers, where a pixel has so many paths: fewer are judged by fewer others, more are less even."""
+
+
+class PixelNumbers(Protocol):
+    """Random numbers of all paths of each lane's pixel."""
+
+    def together(self, paths: int) -> int:
+        """How many of so many paths make a set."""
+
+    def first(self) -> Any:
+        """What the first path draws from: a sampler, or what takes its place."""
+
+    def of(self, before: Any, place: mi.UInt32, size: int, number: mi.UInt32) -> Any:
+        """What a path draws from, by its place in the set of that number, and what the path ``before`` drew from."""
+
+
+@dataclass(frozen=True)
+class Alone:
+    """Those of a sampler whose numbers know nothing of each other: each path is a set of its own."""
+
+    sampler: mi.Sampler
+
+    def together(self, paths: int) -> int:
+        """See `PixelNumbers`."""
+        return 1
+
+    def first(self) -> Any:
+        """See `PixelNumbers`."""
+        return self.sampler
+
+    def of(self, before: Any, place: mi.UInt32, size: int, number: mi.UInt32) -> Any:
+        """See `PixelNumbers`: its numbers go on."""
+        return before
+
+
+@dataclass(frozen=True)
+class EvenSets:
+    """Even ones, in up to `SETS` sets."""
+
+    numbers: Callable[[mi.UInt32, int, mi.UInt32], Any]
+
+    def together(self, paths: int) -> int:
+        """See `PixelNumbers`."""
+        return -(-paths // min(SETS, paths))
+
+    def first(self) -> Any:
+        """See `PixelNumbers`."""
+        return self.numbers(mi.UInt32(0), 1, mi.UInt32(0))
+
+    def of(self, before: Any, place: mi.UInt32, size: int, number: mi.UInt32) -> Any:
+        """See `PixelNumbers`."""
+        return self.numbers(place, size, number)
+
 
 @dataclass(frozen=True)
 class PixelLoss:
@@ -40,7 +95,7 @@ class PixelLoss:
 
 @dr.syntax
 def pixel_sweep(
-    walk: Walk, sampler: mi.Sampler, camera: Callable[..., Any], paths: int, loss: PixelLoss, lost: LostPaths
+    walk: Walk, numbers: PixelNumbers, camera: Callable[..., Any], paths: int, loss: PixelLoss, lost: LostPaths
 ) -> tuple[bool, mi.Spectrum]:
     """Walk ``paths`` paths (two or more) in every lane and back-propagate the loss.
 
@@ -48,29 +103,35 @@ def pixel_sweep(
     detached, and their weights: (sampler, active) -> (Ray3f, Spectrum). For scenes without media. What is not
     differentiated, what is counted as ``lost`` and what is raised: see `sweep`.
     """
-    room = room_for(walk)
+    room, size = room_for(walk), numbers.together(paths)
     total = mi.Spectrum(0)  # radiance of all paths
     with dr.suspend_grad():
+        sampler = numbers.first()
         ray0, _ = camera(sampler.clone(), mi.Bool(True))
         start = CameraStart(ray0, sampler, mi.Bool(True))
         layout = Layout.of(walk, path_moves(walk, start, PathState.begin(walk, start).at))
     records = dr.alloc_local(record_type(layout), paths * room)
-    ends = dr.alloc_local(mi.Spectrum, paths)  # of each path the radiance, and the number of its records
-    counts = dr.alloc_local(mi.UInt32, paths)
+    counts = dr.alloc_local(mi.UInt32, paths)  # of each path the number of its records
+    sets = dr.alloc_local(mi.Spectrum, -(-paths // size), dr.zeros(mi.Spectrum))  # of each set the sum of its radiances
     s = mi.UInt32(0)  # number of the path
 
-    while dr.hint(s < paths, exclude=[walk, camera, layout, start, lost], label="pathreplay: paths of a pixel"):
+    while dr.hint(
+        s < paths, exclude=[walk, numbers, camera, layout, start, lost], label="pathreplay: paths of a pixel"
+    ):
+        sampler = numbers.of(sampler, s % size, size, s // size)
         ray, β = camera(sampler, mi.Bool(walk.max_depth > 0))
         path = PathState.begin(walk, CameraStart(ray, sampler, mi.Bool(True)), sustained=True)
         path.β, path.β_alive = mi.Spectrum(β), mi.Spectrum(β)
         records, count, L, _branch = first_walk(walk, sampler, path, layout, records, s * room, lost)
-        ends[s], counts[s] = L, count
+        counts[s] = count
+        sets[s // size] += L
         total += L
         s += 1
 
     while dr.hint(s > 0, exclude=[walk, ray0, lost, loss, layout, start], label="pathreplay: pixel, backwards"):
         s -= 1
-        δL = (loss.offset + loss.slope * ((total - ends[s]) / (paths - 1))) / paths
+        others = mi.Float(paths - dr.minimum(size, paths - s // size * size))
+        δL = (loss.offset + loss.slope * ((total - sets[s // size]) / others)) / paths
         none, still = mi.Spectrum(0), RayDerivative.zero()
         first, count = s * room, mi.UInt32(counts[s])
         walk_back(walk, layout, records, first, count, first + count - 1, ray0, δL, none, still, lost)

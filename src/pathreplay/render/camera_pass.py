@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 
+from ..gradient.pixel_sweep import Alone, EvenSets, PixelNumbers
 from ..plugins import mitsuba_integrator
+from ..transport.even import Even, in_order, key_of
 from ..transport.start import CameraStart
 
 Seed: TypeAlias = "int | mi.UInt32"
@@ -33,10 +35,29 @@ class Rays:
 
 
 @dataclass(frozen=True)
+class _Counted:
+    """Numbers, as Mitsuba's integrators want them to draw camera rays."""
+
+    numbers: Even
+    count: int
+
+    def sample_count(self) -> int:
+        """Paths of a pixel."""
+        return self.count
+
+    def next_1d(self) -> mi.Float:
+        return self.numbers.next_1d()
+
+    def next_2d(self) -> mi.Point2f:
+        return self.numbers.next_2d()
+
+
+@dataclass(frozen=True)
 class Pass:
     """Everything that decides which paths are walked, but for the integrator's options. Gives the same rays each time.
 
-    ``spp`` of 0 are the samples per pixel of the sensor's sampler.
+    ``spp`` of 0 are the samples per pixel of the sensor's sampler. If that is an `independent` one, ``even`` numbers
+    can take its place; other samplers are taken as they are.
     """
 
     scene: mi.Scene
@@ -44,12 +65,14 @@ class Pass:
     seed: Seed
     spp: int = 0
     share: float = 1.0  # of a larger pass, whose part this is: see `parts`
+    even: bool = False
 
     @staticmethod
-    def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Pass:
+    def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int, even: bool = False) -> Pass:
         """A pass by the arguments of Mitsuba's integrators: the sensor may be an index."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        return Pass(scene, sensor, seed, spp or sensor.sampler().sample_count())
+        even = even and sensor.sampler().class_name() == "IndependentSampler"
+        return Pass(scene, sensor, seed, spp or sensor.sampler().sample_count(), even=even)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -61,14 +84,30 @@ class Pass:
         """The camera rays, as Mitsuba's integrators draw them; makes the film ready for their samples."""
         mitsuba = mitsuba_integrator()
         sampler, spp = mitsuba.prepare(None, self.sensor, self.seed, self.spp, [])
+        if self.even:
+            film = self.sensor.film()
+            border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+            i = dr.arange(mi.UInt32, (self.size[0] + border) * (self.size[1] + border) * spp)
+            sampler = _Counted(self.numbers(i // spp, self.size[0] + border, i % spp, spp), spp)
         ray, weight, position = mitsuba.sample_rays(None, self.scene, self.sensor, sampler)
-        return Rays(sampler, ray, weight, position, spp)
+        return Rays(getattr(sampler, "numbers", sampler), ray, weight, position, spp)
 
-    def pixel_sampler(self, pixels: int) -> mi.Sampler:
-        """Random numbers for a lane per pixel, each of which draws its own camera rays."""
+    def numbers(self, pixel: mi.UInt32, width: int, path: mi.UInt32, paths: int, of: int | mi.UInt32 = 0) -> Even:
+        """Even numbers of a path in a pixel (row by row, of that width) that has so many; ``of`` keeps sets apart."""
+        bits = (paths - 1).bit_length()
+        place = in_order(pixel % width, pixel // width)
+        # What does not fit into 32 bits tells sets apart, too.
+        beyond = place >> (32 - bits) if bits else mi.UInt32(0)
+        return Even.of((place << bits) | path, key_of(mi.UInt32(self.seed), mi.UInt32(of), beyond))
+
+    def of_pixels(self, pixel: mi.UInt32) -> PixelNumbers:
+        """Random numbers for a lane per pixel (row by row), which walks all paths of it."""
+        if self.even:
+            width, _ = self.size
+            return EvenSets(partial(self.numbers, pixel, width))
         sampler = self.sensor.sampler().clone()
-        sampler.seed(self.seed, pixels)
-        return sampler
+        sampler.seed(self.seed, dr.width(pixel))
+        return Alone(sampler)
 
     @cached_property
     def keys(self) -> tuple[tuple[int, int, int], ...]:

@@ -88,7 +88,8 @@ class PathReplay:
         width, height = view.size
         lost, pixel = LostPaths(), dr.arange(mi.UInt32, width * height) if some is None else some
         lanes = dr.width(pixel)
-        moves, L = pixel_sweep(walk, view.pixel_sampler(lanes), pixel_camera(view.sensor, pixel), view.spp, loss, lost)
+        numbers, camera = view.of_pixels(pixel), pixel_camera(view.sensor, pixel)
+        moves, L = pixel_sweep(walk, numbers, camera, view.spp, loss, lost)
         dr.eval(L)  # in one kernel with the gradients
         image = mi.TensorXf(dr.ravel(L), (height, width, 3) if some is None else (lanes, 1, 3))
         return Found(image, lost=lost.count, paths=lanes * view.spp, moves=True) if moves else Found(image)

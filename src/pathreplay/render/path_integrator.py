@@ -90,6 +90,7 @@ class PathIntegrator:
 
     name = ""
     attach = "none"
+    even = False  # whether even numbers take the place of independent ones
     interior: Term
     max_depth: int  # these are Mitsuba's
     rr_depth: int
@@ -194,7 +195,7 @@ class PathIntegrator:
     def _parts(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> list[Pass]:
         """The pass that is asked for, in parts where its samples are too many for one: see `parts`."""
         self._require_active(scene)
-        return parts(Pass.of(scene, sensor, seed, spp))
+        return parts(Pass.of(scene, sensor, seed, spp, self.even))
 
     def _require_active(self, scene: mi.Scene) -> None:
         """Raise PathreplayError if scene or integrator are none of the active variant."""
