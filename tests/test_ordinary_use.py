@@ -135,6 +135,23 @@ def test_batches_of_pixels(write: Write, tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.slow
 @pytest.mark.parametrize("write", [pytest.param(s, id=s.__name__) for s in SCENES])
+def test_even_numbers(write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    """Jobs go as far with them."""
+    monkeypatch.chdir(tmp_path)
+    use = write(tmp_path)
+    (tmp_path / "scene.xml").write_text(use.xml, encoding="utf-8")
+    job = job_of(use)
+    job["integrator"] = {**job["integrator"], "numbers": "even"}
+    (tmp_path / "job.toml").write_text(toml(job), encoding="utf-8")
+    status, words = command(use.variant, "optimize", "job.toml", "--quiet")
+    assert status == 0, words
+    history = (tmp_path / "runs" / "job" / "history.jsonl").read_text().splitlines()
+    losses = [json.loads(line)["loss"] for line in history]
+    assert np.isfinite(losses).all() and losses[-1] < losses[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("write", [pytest.param(s, id=s.__name__) for s in SCENES])
 def test_derived_parameters(write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
     """What is half as much as in the pictures finds back, by the one factor that it is derived from."""
     monkeypatch.chdir(tmp_path)

@@ -25,8 +25,8 @@ KEYS: dict[str, Mapping[str, Any]] = {
     **dict.fromkeys(
         (
             "scene scene_parameters sensors variant integrator integrator.type integrator.max_depth "
-            "integrator.rr_depth integrator.hide_emitters integrator.driver integrator.noise rival parameters "
-            "parameters.0 parameters.0.key parameters.0.lower parameters.0.upper parameters.0.learning_rate "
+            "integrator.rr_depth integrator.hide_emitters integrator.driver integrator.noise integrator.numbers rival "
+            "parameters parameters.0 parameters.0.key parameters.0.lower parameters.0.upper parameters.0.learning_rate "
             "parameters.0.initial parameters.0.initial.image parameters.0.resolutions parameters.0.refine_at "
             "parameters.0.pose target target.images loss spp picture_spp seed learning_rate learning_rate_decay "
             "views_per_step pixels_per_step held_out capture capture.transforms capture.colmap exposure "
