@@ -139,5 +139,5 @@ def changed(values: Any, where: list[str], value: Any) -> Any:
     if isinstance(values, list):
         at = int(where[0])
         return [changed(old, where[1:], value) if i == at else old for i, old in enumerate(values)]
-    inner = values.get(where[0], {}) if isinstance(values, Mapping) else {}
-    return {**values, where[0]: changed(inner, where[1:], value)}
+    known = values if isinstance(values, Mapping) else {}
+    return {**known, where[0]: changed(known.get(where[0], {}), where[1:], value)}
