@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.gradient.pixel_sweep import SETS
+from pathreplay.gradient.pixel_numbers import SETS
 from pathreplay.inverse import make_config, optimize
 from pathreplay.render.camera_pass import Pass
 from pathreplay.transport.even import Even, in_order, key_of

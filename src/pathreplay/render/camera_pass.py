@@ -9,7 +9,7 @@ from typing import TypeAlias
 import drjit as dr
 import mitsuba as mi
 
-from ..gradient.pixel_sweep import Alone, EvenSets, PixelNumbers
+from ..gradient.pixel_numbers import Alone, EvenSets, PixelNumbers
 from ..plugins import mitsuba_integrator
 from ..transport.even import Even, in_order, key_of
 from ..transport.start import CameraStart
