@@ -74,6 +74,13 @@ def job_of(use: Use) -> dict[str, Any]:
     }
 
 
+def losses_of(run: Path) -> list[float]:
+    """By iteration; all are finite."""
+    losses = [json.loads(line)["loss"] for line in (run / "history.jsonl").read_text().splitlines()]
+    assert np.isfinite(losses).all()
+    return losses
+
+
 def optimize(folder: Path, use: Use, command: Command) -> None:
     """Five iterations lower the loss, and everything that the run folder should hold is there."""
     job = job_of(use)
@@ -82,9 +89,8 @@ def optimize(folder: Path, use: Use, command: Command) -> None:
     assert status == 0, words
 
     run = folder / "runs" / "job"
-    losses = [json.loads(line)["loss"] for line in (run / "history.jsonl").read_text().splitlines()]
+    losses = losses_of(run)
     assert len(losses) == ITERATIONS
-    assert np.isfinite(losses).all()
     assert losses[-1] < losses[0]
     for kind in ("target", "start", "result"):
         assert len(list((run / "images").glob(f"{kind}-*.exr"))) == len(use.views)
@@ -128,9 +134,8 @@ def test_batches_of_pixels(write: Write, tmp_path: Path, monkeypatch: pytest.Mon
         assert status == 2 and NOT_BY_PIXELS[write.__name__] in words and not (tmp_path / "runs" / "job").exists()
         return
     assert status == 0, words
-    run = tmp_path / "runs" / "job"
-    losses = [json.loads(line)["loss"] for line in (run / "history.jsonl").read_text().splitlines()]
-    assert np.isfinite(losses).all() and np.mean(losses[-3:]) < np.mean(losses[:3])
+    losses = losses_of(tmp_path / "runs" / "job")
+    assert np.mean(losses[-3:]) < np.mean(losses[:3])
 
 
 @pytest.mark.slow
@@ -145,9 +150,8 @@ def test_even_numbers(write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (tmp_path / "job.toml").write_text(toml(job), encoding="utf-8")
     status, words = command(use.variant, "optimize", "job.toml", "--quiet")
     assert status == 0, words
-    history = (tmp_path / "runs" / "job" / "history.jsonl").read_text().splitlines()
-    losses = [json.loads(line)["loss"] for line in history]
-    assert np.isfinite(losses).all() and losses[-1] < losses[0]
+    losses = losses_of(tmp_path / "runs" / "job")
+    assert losses[-1] < losses[0]
 
 
 @pytest.mark.slow

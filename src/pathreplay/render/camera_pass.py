@@ -35,7 +35,7 @@ class Rays:
 
 
 @dataclass(frozen=True)
-class _Counted:
+class _ForCamera:
     """Numbers, as Mitsuba's integrators want them to draw camera rays."""
 
     numbers: Even
@@ -87,10 +87,12 @@ class Pass:
         if self.even:
             film = self.sensor.film()
             border = 2 * film.rfilter().border_size() if film.sample_border() else 0
-            i = dr.arange(mi.UInt32, (self.size[0] + border) * (self.size[1] + border) * spp)
-            sampler = _Counted(self.numbers(i // spp, self.size[0] + border, i % spp, spp), spp)
-        ray, weight, position = mitsuba.sample_rays(None, self.scene, self.sensor, sampler)
-        return Rays(getattr(sampler, "numbers", sampler), ray, weight, position, spp)
+            width, height = (n + border for n in self.size)
+            i = dr.arange(mi.UInt32, width * height * spp)
+            sampler = self.numbers(i // spp, width, i % spp, spp)
+        camera = _ForCamera(sampler, spp) if self.even else sampler
+        ray, weight, position = mitsuba.sample_rays(None, self.scene, self.sensor, camera)
+        return Rays(sampler, ray, weight, position, spp)
 
     def numbers(self, pixel: mi.UInt32, width: int, path: mi.UInt32, paths: int, of: int | mi.UInt32 = 0) -> Even:
         """Even numbers of a path in a pixel (row by row, of that width) that has so many; ``of`` keeps sets apart."""
