@@ -15,7 +15,7 @@ def _surface(record: Record) -> str:
     """The sweep next to `prb`, and what is done where only lights have gradients; then the same with even numbers."""
     rows = [
         [f"{key.scene}, {surface.what(key.parameters)}", numbers, str(v.time()), str(v.variance())]
-        for numbers, ours in (("scene", "sweep"), ("scene", "default"), ("even", "even"))
+        for numbers, ours in (("scene", "sweep"), ("scene", "auto"), ("even", "even"))
         for key, v in _pairs(record, ours, "prb")
     ]
     return markdown(["gradient, pathreplay / prb", "`numbers`", "time", "variance"], rows)

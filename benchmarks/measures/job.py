@@ -23,6 +23,7 @@ Kind = Literal[
     "transmittance",  # and through it, with its squared error
     "whole run",  # an optimisation from beginning to end
     "sum",  # a backward pass, and the error of its sum over samples
+    "iterations",  # of a job with many views, by this process or by actors
 ]
 
 

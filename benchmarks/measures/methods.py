@@ -3,27 +3,28 @@
 A method is the name of an integrator, or that and a way: `sweep`, `prb, own loop`. It imports nothing: see `first.py`.
 """
 
-#: What `mi.load_dict` makes of it. One that does not load is a row that says so.
+#: What `mi.load_dict` makes of it. One that does not load is a row that says so. Ours draw the numbers that Mitsuba's
+#: draw, so that estimators are compared and nothing else, but for `even`: that is what people get who choose nothing.
 METHODS: dict[str, dict[str, object]] = {
     "prb": {"type": "prb"},
     "prb_basic": {"type": "prb_basic"},
     "tape": {"type": "pathreplay_tape"},
     "rb": {"type": "pathreplay_rb"},
     "rb linear": {"type": "pathreplay_rb", "linear": True},
-    "sweep": {"type": "pathreplay", "driver": "sweep"},
-    "replay": {"type": "pathreplay", "driver": "replay"},
-    "even": {"type": "pathreplay", "numbers": "even"},
-    "film edges": {"type": "pathreplay", "edges": "film"},
-    "all edges": {"type": "pathreplay", "edges": "all"},
+    "sweep": {"type": "pathreplay", "driver": "sweep", "numbers": "scene"},
+    "replay": {"type": "pathreplay", "driver": "replay", "numbers": "scene"},
+    "film edges": {"type": "pathreplay", "edges": "film", "numbers": "scene"},
+    "all edges": {"type": "pathreplay", "edges": "all", "numbers": "scene"},
     "prb_projective": {"type": "prb_projective"},
     "edge list": {"type": "prb_projective", "sppc": 0, "sppi": 0},
     "projective inner": {"type": "prb_projective", "sppc": 0, "sppp": 0},
     "unguided inner": {"type": "prb_projective", "sppc": 0, "sppp": 0, "guiding": "none"},
     "volpath": {"type": "volpath"},
     "prbvolpath": {"type": "prbvolpath"},
-    "score": {"type": "pathreplay"},
-    "default": {"type": "pathreplay"},
-    "no branch": {"type": "pathreplay", "branch": False},
+    "score": {"type": "pathreplay", "numbers": "scene"},
+    "auto": {"type": "pathreplay", "numbers": "scene"},
+    "even": {"type": "pathreplay"},
+    "no branch": {"type": "pathreplay", "branch": False, "numbers": "scene"},
     "listing": {"type": "pathreplay_listing"},
 }
 

@@ -38,6 +38,7 @@ MEASURES: dict[Kind, tuple[str, str]] = {
     "transmittance": ("grids", "Transmittance"),
     "whole run": ("scale", "WholeRun"),
     "sum": ("scale", "Sum"),
+    "iterations": ("actors", "Iterations"),
 }
 
 #: What a process may allocate: a method whose memory grows without bound dies of it before the machine swaps.

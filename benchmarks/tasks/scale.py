@@ -1,10 +1,11 @@
-"""Task `scale`: memory against views, parameters and samples, and time against shapes, traced and recorded."""
+"""Task `scale`: memory against views, parameters and samples, and time against shapes (traced, recorded) and actors."""
 
 from __future__ import annotations
 
 import statistics as st
 from dataclasses import replace
 
+from ..measures import actors
 from ..measures.job import Job, Point, Record
 from ..measures.methods import OWN, USUAL
 from ..measures.scale import name_of
@@ -12,11 +13,12 @@ from ..scenes.wide import COLOUR, SHAPES, SKY, shapes_name
 from ..tables import comparison, groups, markdown, method_cell
 
 TITLE = "scale"
-TAKES = (60, 780)
+TAKES = (90, 1000)
 VIEWS, TEXELS = (1, 50, 200), (100, 1000, 3162, 10000)
 QUICK_VIEWS, QUICK_TEXELS = (1, 4), (100, 500)
 BUDGET = "4 GiB"
 SAMPLES = (20, 24, 28, 32, 33)
+ACTORS = (1, 2)
 BYTES = 12
 """Of a parameter and what Adam remembers of it."""
 
@@ -55,17 +57,29 @@ def jobs(quick: bool) -> list[Job]:
     ways = f"prb, {USUAL}", f"sweep, {OWN}"
     # The median is that of recorded steps: the first two are traced.
     steps = [replace(job, methods=ways, measure="step", warm_up=0, rounds=7) for job in shapes]
-    return [*views, *texels, *both, *sums, *shapes, *steps]
+    return [*views, *texels, *both, *sums, *shapes, *steps, *_by_actors(run, quick)]
+
+
+def _by_actors(run: Job, quick: bool) -> list[Job]:
+    """As many cores as actors are wanted, and `pip install 'pathreplay[ray]'`: rows say so where it is missing."""
+    ways = actors.PROCESS, *(actors.many(n) for n in ACTORS[: 1 if quick else None])
+    job = replace(run, parameters=(), methods=ways, measure="iterations", threads=1)
+    views = 4 if quick else 32
+    return [
+        replace(job, scene=actors.name_of("surfaces", views), resolution=16 if quick else 64, spp=16),
+        replace(job, scene=actors.name_of("cloud", views), resolution=8 if quick else 24, spp=8),
+    ]
 
 
 def table(record: Record) -> str:
-    """Memory of whole runs, of passes of many samples with the error of their sum, and time of many shapes."""
+    """Memory of whole runs, of passes of many samples with the error of their sum, and time of shapes and actors."""
     runs = [p for p in record.points if p.measure == "whole run"]
     sums = [p for p in record.points if p.measure == "sum"]
     shapes = [p for p in record.points if p.measure == "gradient"]
     steps = [p for p in record.points if p.measure == "step"]
     traced, recorded = "shapes and BSDFs: a gradient that is traced", "shapes and BSDFs: a step of a job"
     tables = _runs(runs), _sums(sums), _shapes(traced, "prb", shapes), _shapes(recorded, f"prb, {USUAL}", steps)
+    tables += (_actors([p for p in record.points if p.measure == "iterations"]),)
     return "\n\n".join(part for part in tables if part)
 
 
@@ -126,3 +140,17 @@ def _shapes(what: str, peer: str, points: list[Point]) -> str:
         for point in methods.values()
     ]
     return markdown([what, "method", "seconds (median)", "time / prb"], rows) if rows else ""
+
+
+def _actors(points: list[Point]) -> str:
+    one = {p.scene: st.median(p.values) for p in points if p.method == actors.many(1) and p.values}
+    rows = []
+    for point in points:
+        if point.error or not point.values:
+            rows.append([point.scene, point.method, point.error or "", ""])
+            continue
+        seconds = st.median(point.values)
+        share = f"{seconds / one[point.scene]:.2f}" if point.scene in one else ""
+        rows.append([point.scene, point.method, f"{seconds:.3f}", share])
+    head = ["an iteration of a job, one thread each", "computed by", "seconds (median)", "of one actor's"]
+    return markdown(head, rows) if rows else ""

@@ -12,7 +12,7 @@ FLOOR = ("floor.bsdf.base_color.data",)
 METHODS = ("prb", "sweep", "replay", "even")
 SKY = ("environment.data",)
 LAMP = ("light.emitter.radiance.value",)
-LIGHTS = ("prb", "default", "even")  # no driver is chosen: where only lights have gradients, one of their own is
+LIGHTS = ("prb", "auto", "even")  # no driver is chosen: where only lights have gradients, one of their own is
 
 
 def jobs(quick: bool) -> list[Job]:
