@@ -16,9 +16,9 @@ from pathreplay.render.camera_pass import Pass
 from pathreplay.transport.even import Even, in_order, key_of
 
 METHODS: dict[str, dict[str, Any]] = {
-    "even": {"type": "pathreplay", "numbers": "even"},
-    "scene": {"type": "pathreplay"},
-    "replay": {"type": "pathreplay", "numbers": "even", "driver": "replay"},
+    "even": {"type": "pathreplay"},
+    "scene": {"type": "pathreplay", "numbers": "scene"},
+    "replay": {"type": "pathreplay", "driver": "replay"},
     "path": {"type": "path"},
 }
 POINTS = 256
@@ -243,12 +243,12 @@ def test_media_have_the_same_means(depth: int) -> None:
     require_same_mean(even, plain)
 
 
-def test_jobs_may_have_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_have_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     job = {
         "scene": "cornell-box",
         "scene_parameters": {"resolution": 16},
-        "integrator": {"type": "pathreplay", "max_depth": 3, "numbers": "even"},
+        "integrator": {"type": "pathreplay", "max_depth": 3},
         "parameters": [{"key": "red.reflectance.value", "initial": 0.5}],
         "target": {"values": {"red.reflectance.value": [0.6, 0.1, 0.1]}, "spp": 256,
                    "integrator": {"type": "path", "max_depth": 3}},

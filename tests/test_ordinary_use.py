@@ -140,13 +140,13 @@ def test_batches_of_pixels(write: Write, tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.slow
 @pytest.mark.parametrize("write", [pytest.param(s, id=s.__name__) for s in SCENES])
-def test_even_numbers(write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
-    """Jobs go as far with them."""
+def test_numbers_of_the_scene(write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    """Jobs go as far with them as with even ones."""
     monkeypatch.chdir(tmp_path)
     use = write(tmp_path)
     (tmp_path / "scene.xml").write_text(use.xml, encoding="utf-8")
     job = job_of(use)
-    job["integrator"] = {**job["integrator"], "numbers": "even"}
+    job["integrator"] = {**job["integrator"], "numbers": "scene"}
     (tmp_path / "job.toml").write_text(toml(job), encoding="utf-8")
     status, words = command(use.variant, "optimize", "job.toml", "--quiet")
     assert status == 0, words

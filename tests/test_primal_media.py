@@ -368,4 +368,6 @@ def test_glow_of_a_slab() -> None:
     medium.update(type="gridmedium", emission={"type": "constvolume", "value": glow})
     scene = straight_through(cloud(medium, sky={"type": "constant", "radiance": sky}))
     expected = glow / σ * (1 - np.exp(-2 * σ)) + sky * np.exp(-2 * σ)
-    assert against(pictures(mi.load_dict(scene), "pathreplay", 1, max_depth=8), np.float64(expected)) < Z_LIMIT
+    # With even numbers a pixel has nearly always the same number of collisions: no normal distribution.
+    found = pictures(mi.load_dict(scene), "pathreplay", 1, max_depth=8, numbers="scene")
+    assert against(found, np.float64(expected)) < Z_LIMIT

@@ -114,7 +114,7 @@ def test_terms_add_up(load, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_sample_gives_what_it_says(load) -> None:
     """As Mitsuba's `aov` asks for it, it is the radiance of the image; nothing is learned, and it is no pass."""
     scene, _ = load(foggy(), DENSITY)
-    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "numbers": "scene"})
     rays = Pass.of(scene, 0, 3, SPP).rays()
     L, _, aovs, _ = integrator.sample(dr.ADMode.Primal, scene, rays.sampler, rays.ray)
     image = np.array(integrator.render(scene, seed=3, spp=SPP))

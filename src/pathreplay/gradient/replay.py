@@ -40,7 +40,7 @@ def replay(
     visibility, weights that are exactly zero (the sweep driver keeps their derivatives) and, with ``attach='none'``,
     everything that moves.
     """
-    path = PathState.begin(walk, start)
+    path = PathState.begin(walk, start, sustained=walk.branch)  # so that branches get the numbers of other drivers
     moves = path_moves(walk, start, path.at)
     if not moves:
         _replay_still(walk, start, path, δL)

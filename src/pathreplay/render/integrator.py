@@ -70,8 +70,8 @@ class PathReplayIntegrator(PathIntegrator):
     Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
     (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``, ``none``), ``noise``
     (0.01; of ray adjoints with the replay driver: see `Recovery`), ``branch`` (``auto``, True, False), ``edges``
-    (``none``, ``film``, ``all``: see `Boundary`), ``edge_spp`` (0: the samples of the pass) and ``numbers`` (``scene``:
-    those of its sampler; ``even``: those of `Even` instead of independent ones). ``auto`` drivers sweep
+    (``none``, ``film``, ``all``: see `Boundary`), ``edge_spp`` (0: the samples of the pass) and ``numbers`` (``even``:
+    those of `Even` instead of independent ones; ``scene``: those of its sampler). ``auto`` drivers sweep
     unless ``max_depth`` is more than the sweep can hold, or only lights have gradients (see `lights`).
     Forward mode is the same whatever the driver.
 
@@ -96,7 +96,7 @@ class PathReplayIntegrator(PathIntegrator):
         self.moves_rays = self.attach != "none"  # gradients reach cameras, and lights that move
         self.interior = _interior(self.name, props, self.max_depth)
         self.driver, self.branch = self.interior.driver, self.interior.branch
-        self.even = choice(props, self.name, "numbers", "scene", NUMBERS) == "even"
+        self.even = choice(props, self.name, "numbers", "even", NUMBERS) == "even"
         self.edges = choice(props, self.name, "edges", "none", EDGE_TERMS)
         self.edge_spp = whole_number(props, self.name, "edge_spp", 0, lowest=0, kind="number of lines per pixel")
         if self.edges != "none" and self.attach != "delta":
