@@ -6,6 +6,7 @@ variance, and whether the standard deviation of few passes is that of many.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -40,6 +41,7 @@ PASSES = 48
 LARGEST = 0.5
 # The standard deviation of 12 normal numbers is within a factor of 2 of that of 48, but for one set in ten thousand.
 FEW, GROWTH = 12, 2.0
+INDEPENDENT = {"numbers": "scene"}  # where ways to take a derivative are compared, and nothing else
 
 
 # ------------------------------ Scenes that people have ------------------------------
@@ -96,11 +98,11 @@ SCENES = {
 }
 
 
-def gradients(folder: Path, name: str, passes: int = PASSES) -> np.ndarray:
+def gradients(folder: Path, name: str, **options: str) -> np.ndarray:
     """The gradient of each of so many passes of 32 samples per pixel."""
     make, key, move = SCENES[name]
     bench = Bench(Case(name, lambda: make(folder), key, move, spp=32))
-    found = bench.backwards(bench.integrator(), passes)
+    found = bench.backwards(bench.integrator(**options), PASSES)
     bench.release()
     return found
 
@@ -131,9 +133,9 @@ def test_held_points_alone_are_noisier(
     name: str, least: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What the blend is for: the standard deviation without it, over that with it, is at least so much."""
-    blended = gradients(tmp_path, name).std(ddof=1)
+    blended = gradients(tmp_path, name, **INDEPENDENT).std(ddof=1)
     monkeypatch.setattr(velocity, "BLEND", 0.0)
-    held = gradients(tmp_path, name).std(ddof=1)
+    held = gradients(tmp_path, name, **INDEPENDENT).std(ddof=1)
     print(f"{name}: standard deviation {held:.4f} held, {blended:.4f} blended")
     assert held > least * blended
 
@@ -144,8 +146,8 @@ def test_a_longer_blend_is_less_noisy(tmp_path: Path, monkeypatch: pytest.Monkey
     noise_of = {}
     for blend in (0.003, 0.01, 0.03, 0.1):
         monkeypatch.setattr(velocity, "BLEND", blend)
-        noise_of[blend] = gradients(tmp_path, "camera moves sideways in the Cornell box").std(ddof=1)
-        row = measure(EDGES)[-1]
+        noise_of[blend] = gradients(tmp_path, "camera moves sideways in the Cornell box", **INDEPENDENT).std(ddof=1)
+        row = measure(replace(EDGES, options=INDEPENDENT))[-1]
         print(f"{blend}: standard deviation {noise_of[blend]:.4f}; lamp close to the floor: {row.gradient:.4f} "
               f"for {row.reference:.4f} ± {row.error:.4f}")  # fmt: skip
     assert noise_of[0.003] > noise_of[0.03]
@@ -266,10 +268,10 @@ LOBES = {
 }
 
 
-def variance(lobe: str, alpha: float, plugin: str = "pathreplay") -> float:
+def variance(lobe: str, alpha: float, plugin: str, **options: str) -> float:
     make, key, move = LOBES[lobe]
     bench = Bench(Case(lobe, lambda: make(alpha), key, move, spp=64))
-    found = bench.backwards(bench.integrator(plugin), PASSES)
+    found = bench.backwards(bench.integrator(plugin, **options), PASSES)
     bench.release()
     return float(np.var(found, ddof=1))
 
@@ -278,7 +280,7 @@ def variance(lobe: str, alpha: float, plugin: str = "pathreplay") -> float:
 @pytest.mark.parametrize("lobe", LOBES)
 def test_narrow_lobes_follow_their_samples(lobe: str) -> None:
     """Variance over that of prb, which holds the direction: far below 1 for narrow lobes, 1 for wide ones."""
-    shares = {alpha: variance(lobe, alpha) / variance(lobe, alpha, "prb") for alpha in ROUGHNESS}
+    shares = {a: variance(lobe, a, "pathreplay", **INDEPENDENT) / variance(lobe, a, "prb") for a in ROUGHNESS}
     print(f"{lobe}: variance / prb " + ", ".join(f"{share:.2g} at roughness {a}" for a, share in shares.items()))
     assert shares[0.05] < 0.01
     assert shares[0.2] < 0.3
