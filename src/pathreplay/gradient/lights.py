@@ -4,9 +4,12 @@ L = Σ β_i e_i is linear in what lights emit, and β knows nothing of it. So δ
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.arrive import background
 from ..transport.emitters import relight
 from ..transport.motion import path_moves, weights_vary
 from ..transport.path import PathState
@@ -40,14 +43,23 @@ def lights_or(other: Driver) -> Driver:
 def lights(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into what lights emit. Of any depth; for `lights_alone`.
 
-    At each vertex what was hit, and an emitter sample, by the weights of the picture. Returns that paths do not move.
+    At each vertex what was hit, and an emitter sample, by the weights of the picture; in the end what is around the
+    scene, which each path meets once. Returns that paths do not move.
     Not differentiated: all but what lights emit. Raises PathreplayError when no parameter reaches the paths.
     """
+    walk = replace(walk, leaves=True)
     sampler, path = start.sampler, PathState.begin(walk, start)
+    left = path.leave()
 
     while dr.hint(path.active, exclude=[walk], label="pathreplay: lights"):
         u, step = path.choose(walk, sampler)
         with dr.resume_grad():
             backward(dr.sum(δL * path.β * relight(walk, path.at, step.lighting)))
         path = path.advance(walk, u, step)[0]
+        left |= path.leave()
+
+    with dr.resume_grad():
+        beyond = background(walk, path.at, left)
+        if dr.grad_enabled(beyond):
+            backward(dr.sum(δL * path.β * beyond))
     return False

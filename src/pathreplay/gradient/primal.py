@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.arrive import background
 from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
@@ -27,13 +30,20 @@ def walk_on(walk: Walk, sampler: mi.Sampler, path: PathState) -> tuple[mi.Spectr
 
     Relative to its throughput, which has to be one.
     """
+    walk = replace(walk, leaves=walk.media is None)
     L = mi.Spectrum(0)  # radiance so far
-    valid = mi.Bool(False)
+    valid, left = mi.Bool(False), mi.Bool(False)
+    if dr.hint(walk.leaves, mode="scalar"):
+        left = path.leave()
 
     while dr.hint(path.active, exclude=[walk], label="pathreplay: primal"):
         u, step = path.choose(walk, sampler)
         L += path.β * step.e
         valid |= path.active & step.seen
         path = path.advance(walk, u, step)[0]
+        if dr.hint(walk.leaves, mode="scalar"):
+            left |= path.leave()
 
+    if dr.hint(walk.leaves, mode="scalar"):
+        L += path.β * background(walk, path.at, left)
     return L, valid

@@ -84,6 +84,15 @@ def repeat(walk: Walk, again: Replayed, attached: bool, active: mi.Bool) -> Vert
     return _in_medium(walk, at, si, kept.media.flight, flown, attached, active)
 
 
+def background(walk: Walk, at: Arrival, left: mi.Bool) -> mi.Spectrum:
+    """Radiance along rays that ``left`` the scene, MIS weighted; differentiable in the environment's radiance."""
+    if walk.scene.environment() is None:
+        return mi.Spectrum(0)
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.t, si.wi, si.time, si.wavelengths = dr.inf, -at.ray.d, at.ray.time, at.ray.wavelengths
+    return emission(walk.scene, at, si, False, sees_lights(walk, at, si, left))
+
+
 def sees_lights(walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
     """Where what is emitted at the end of a ray counts: with ``hide_emitters`` no camera ray sees the environment."""
     return active & (~at.camera | si.is_valid()) if walk.hide_emitters else active
@@ -93,7 +102,8 @@ def _on_surface(
     walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool, glow: mi.Spectrum = None
 ) -> Vertex:
     if glow is None:
-        glow = emission(walk.scene, at, si, attached, sees_lights(walk, at, si, active))
+        seen = sees_lights(walk, at, si, active)
+        glow = emission(walk.scene, at, si, attached, seen) if walk.vertices_glow else mi.Spectrum(0)
     return Vertex(si, si.bsdf(at.ray), active & si.is_valid(), si, glow)
 
 

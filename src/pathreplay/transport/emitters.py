@@ -30,7 +30,7 @@ def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached
 
 def relight(walk: Walk, at: Arrival, lighting: Lighting) -> mi.Spectrum:
     """The e of a vertex once more (Spectrum), differentiable in what emitters emit alone: all else is as it was."""
-    glow = emission(walk.scene, at, lighting.si, False, lighting.seen)
+    glow = emission(walk.scene, at, lighting.si, False, lighting.seen) if walk.vertices_glow else mi.Spectrum(0)
     return glow + lighting.w * walk.scene.eval_emitter_direction(lighting.si, lighting.light, lighting.lit)
 
 

@@ -41,6 +41,12 @@ class PathState:
         β = self.β if self.β_alive is None else self.β_alive
         return u, choose_step(walk, self.at, u, sampler, β, self.depth + 1 < walk.max_depth, self.active)
 
+    def leave(self) -> mi.Bool:
+        """End where the ray that arrives has hit nothing; tells where that is so. ``at`` stays what it is there."""
+        left = self.active & ~self.at.hit.is_valid()
+        self.active &= ~left
+        return left
+
     def passed(self, walk: Walk, step: Chosen) -> mi.UInt32:
         """Vertices before the next: one more, but with media not so at null boundaries."""
         return self.depth + (1 if walk.media is None else dr.select(step.null, mi.UInt32(0), 1))

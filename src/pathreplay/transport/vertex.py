@@ -43,6 +43,8 @@ class Walk:
     clear: bool = False
     # Shading frames of meshes are `steady` ones.
     steady: bool = False
+    # A ray that leaves the scene arrives at no vertex: whoever walks so asks for the `background` when all paths ended.
+    leaves: bool = False
 
     @property
     def resamples(self) -> bool:
@@ -54,6 +56,11 @@ class Walk:
         """Whether smooth lobes may be sampled attached: all that can be, or where nothing has an outline the narrow."""
         narrow = self.attach == "delta" and not self.traits.outlines
         return bool(self.traits.attachables) and (narrow or self.attach == "all")
+
+    @property
+    def vertices_glow(self) -> bool:
+        """Whether a vertex may emit by itself."""
+        return not self.leaves or self.traits.area_lights
 
     @property
     def branch(self) -> bool:
