@@ -44,7 +44,7 @@ class PathState:
     def leave(self) -> mi.Bool:
         """End where the ray that arrives has hit nothing; tells where that is so. ``at`` stays what it is there."""
         left = self.active & ~self.at.hit.is_valid()
-        self.active &= ~left
+        self.active = self.active & ~left  # not in place: somebody else may have the array, too
         return left
 
     def passed(self, walk: Walk, step: Chosen) -> mi.UInt32:
