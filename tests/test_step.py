@@ -170,7 +170,7 @@ def back(scene: mi.Scene, L: float, q: RayDerivative, δL: float) -> mi.Spectrum
         layout = Layout.of(walk, path_moves(walk, start, path.at))
         records = dr.alloc_local(record_type(layout), room_for(walk))
         lost, first = LostPaths(), mi.UInt32(0)
-        records, count, _, _ = first_walk(walk, start.sampler, path, layout, records, first, lost)
+        records, count, _, _, _ = first_walk(walk, start.sampler, path, layout, records, first, lost)
         given = mi.Spectrum(δL), mi.Spectrum(L), q
         L, _ = walk_back(walk, layout, records, first, mi.UInt32(1), count - 1, dr.detach(ray), *given, lost)
         dr.eval(L)

@@ -59,6 +59,7 @@ def pixel_sweep(
         layout = Layout.of(walk, path_moves(walk, start, PathState.begin(walk, start).at))
     records = dr.alloc_local(record_type(layout), paths * room)
     counts = dr.alloc_local(mi.UInt32, paths)  # of each path the number of its records
+    ends = dr.alloc_local(mi.Spectrum, paths)  # what comes from beyond them
     sets = dr.alloc_local(mi.Spectrum, -(-paths // size), dr.zeros(mi.Spectrum))  # of each set the sum of its radiances
     s = mi.UInt32(0)  # number of the path
 
@@ -69,8 +70,8 @@ def pixel_sweep(
         ray, β = camera(sampler, mi.Bool(walk.max_depth > 0))
         path = PathState.begin(walk, CameraStart(ray, sampler, mi.Bool(True)), sustained=True)
         path.β, path.β_alive = mi.Spectrum(β), mi.Spectrum(β)
-        records, count, L, _branch = first_walk(walk, sampler, path, layout, records, s * room, lost)
-        counts[s] = count
+        records, count, L, beyond, _branch = first_walk(walk, sampler, path, layout, records, s * room, lost)
+        counts[s], ends[s] = count, beyond
         sets[s // size] += L
         total += L
         s += 1
@@ -79,8 +80,7 @@ def pixel_sweep(
         s -= 1
         others = mi.Float(paths - dr.minimum(size, paths - s // size * size))
         δL = (loss.offset + loss.slope * ((total - sets[s // size]) / others)) / paths
-        none, still = mi.Spectrum(0), RayDerivative.zero()
-        first, count = s * room, mi.UInt32(counts[s])
-        walk_back(walk, layout, records, first, count, first + count - 1, ray0, δL, none, still, lost)
+        first, count, still = s * room, mi.UInt32(counts[s]), RayDerivative.zero()
+        walk_back(walk, layout, records, first, count, first + count - 1, ray0, δL, mi.Spectrum(ends[s]), still, lost)
 
     return layout.moves, total / paths

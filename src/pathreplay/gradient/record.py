@@ -62,7 +62,8 @@ class Layout:
     variant: str
     moves: bool  # the path moves with the parameters
     resamples: bool  # BSDFs are sampled once more
-    fixed: bool  # what emitters bring to surfaces is known
+    fixed: bool  # what emitters bring to surfaces is known, and rays that leave the scene arrive at no vertex
+    glows: bool  # of these emitters some are surfaces
     media: bool
     chromatic: bool
     emissive: bool
@@ -81,7 +82,8 @@ class Layout:
         media = walk.media is not None
         fixed = not media and not moves and not walk.traits.lights_vary
         kinds = {name: media and getattr(walk.media, name) for name in ("chromatic", "emissive", "passes")}
-        return Layout(mi.variant(), moves, walk.resamples or media, fixed, media=media, branch=walk.branch, **kinds)
+        glows, resamples = fixed and walk.traits.area_lights, walk.resamples or media
+        return Layout(mi.variant(), moves, resamples, fixed, glows, media=media, branch=walk.branch, **kinds)
 
 
 # Where it stands in a Replayed, its type in Mitsuba, and what of the layout has it remembered.
@@ -94,7 +96,7 @@ FIELDS = (
     ("at.hit.shape_index", "UInt32", "always"),
     ("at.hit.shape", "ShapePtr", "always"),
     ("at.hit.instance", "ShapePtr", "always"),
-    ("at.pdf", "Float", "always"),
+    ("at.pdf", "Float", "varies"),
     ("at.medium", "MediumPtr", "media"),
     ("at.behind", "Float", "media"),
     ("β", "Spectrum", "always"),
@@ -102,9 +104,11 @@ FIELDS = (
     ("u.light", "Point2f", "varies"),
     ("u.lobe", "Float", "resamples"),
     ("u.direction", "Point2f", "resamples"),
-    ("kept.known.glow", "Spectrum", "fixed"),
+    ("kept.known.glow", "Spectrum", "glows"),
     ("kept.known.d", "Vector3f", "fixed"),
     ("kept.known.w", "Spectrum", "fixed"),
+    ("kept.d", "Vector3f", "fixed"),
+    ("kept.pdf", "Float", "fixed"),
     ("kept.pdf", "Float", "passes"),
     ("kept.media.flight.t", "Float", "media"),
     ("kept.media.flight.density", "Float", "media"),
@@ -123,14 +127,16 @@ FIELDS = (
 # Dr.Jit's local memory cannot hold Bool: these share a word, one bit each, and the lobe takes the bits above.
 BITS = (
     ("at.hit.valid", "always"),
-    ("at.delta", "always"),
+    ("at.delta", "varies"),
     ("at.camera", "always"),
     ("kept.lit", "always"),
     ("kept.black", "always"),
+    ("kept.delta", "fixed"),
+    ("go_on", "fixed"),
     ("kept.media.flight.event", "media"),
     ("kept.media.null", "media"),
 )
-LOBE_SHIFT = 8
+LOBE_SHIFT = 16
 
 
 @cache
@@ -160,6 +166,8 @@ def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, r
     ``last`` is the index of the path's last vertex; time and wavelengths are those of the ray ``ray0``.
     """
     v = _read(layout, records[index], ray0)
+    if layout.fixed:
+        return v
     onward = _read(layout, records[dr.minimum(index + 1, last)], ray0).at
     # The next vertex remembers how the path came to it.
     kept = replace(v.kept, d=onward.ray.d, delta=onward.delta)

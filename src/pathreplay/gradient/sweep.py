@@ -40,9 +40,9 @@ def sweep(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths, see
     moves = path_moves(walk, start, path.at)
     layout = Layout.of(walk, moves)
     records = dr.alloc_local(record_type(layout), room_for(walk))
-    records, count, _, branch = first_walk(walk, start.sampler, path, layout, records, mi.UInt32(0), lost)
+    records, count, _, L, branch = first_walk(walk, start.sampler, path, layout, records, mi.UInt32(0), lost)
 
-    first, L, q = mi.UInt32(0), mi.Spectrum(0), RayDerivative.zero()
+    first, q = mi.UInt32(0), RayDerivative.zero()
     _, q = walk_back(walk, layout, records, first, count, count - 1, ray0, δL, L, q, lost, seen)
     if walk.branch:
         if seen is not None:

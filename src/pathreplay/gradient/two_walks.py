@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.arrive import background
 from ..transport.path import PathState
 from ..transport.vertex import Walk
 from .adjoint import LostPaths, RayDerivative, backward_step
@@ -18,14 +20,18 @@ from .record import Layout, read_back, record, room_for
 @dr.syntax
 def first_walk(
     walk: Walk, sampler: mi.Sampler, path: PathState, layout: Layout, records: Any, first: mi.UInt32, lost: LostPaths
-) -> tuple[Any, mi.UInt32, mi.Spectrum, Branch]:
-    """Record a path from ``first`` on; gives the records, their number, the radiance, and the branch.
+) -> tuple[Any, mi.UInt32, mi.Spectrum, mi.Spectrum, Branch]:
+    """Record a path from ``first`` on; gives the records, their number, the radiance, what comes of it from beyond the
+    records (relative to the throughput there), and the branch.
 
     All lanes of a packet write to the same place: elsewhere writes to local memory get lost (Dr.Jit 1.5).
     """
-    L = mi.Spectrum(0)  # radiance so far
+    walk = replace(walk, leaves=layout.fixed)
+    L, beyond = mi.Spectrum(0), mi.Spectrum(0)  # radiance so far
     count = mi.UInt32(0)  # vertices, and null boundaries
-    branch = Branch.none()
+    branch, left = Branch.none(), mi.Bool(False)
+    if dr.hint(layout.fixed, mode="scalar"):
+        left = path.leave()
 
     while dr.hint(path.active, exclude=[walk, layout, lost], label="pathreplay: record"):
         u, step = path.choose(walk, sampler)
@@ -40,8 +46,13 @@ def first_walk(
             full = path.active & (count >= room_for(walk))
             lost.add(full)
             path.active &= ~full
+        if dr.hint(layout.fixed, mode="scalar"):
+            left |= path.leave()
 
-    return records, count, L, branch
+    if dr.hint(layout.fixed, mode="scalar"):
+        beyond = background(walk, path.at, left)
+        L += path.β * beyond
+    return records, count, L, beyond, branch
 
 
 @dr.syntax
