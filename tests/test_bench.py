@@ -22,7 +22,7 @@ from benchmarks.compare import Row, compare  # noqa: E402
 from benchmarks.measures.job import Job, Machine, Point, Record  # noqa: E402
 from benchmarks.measures.replay_error import SWEEP  # noqa: E402
 from benchmarks.measures.worker import MEASURES, told  # noqa: E402
-from benchmarks.tasks import depth, iteration, media, noise, surface, truth  # noqa: E402
+from benchmarks.tasks import depth, iteration, media, noise, scale, surface, truth  # noqa: E402
 
 MACHINE = Machine("a processor", 2, 2, "Linux", "3.11", "3.9.1", "1.5.0", "0.1.0", "23.1.4", "llvm_ad_rgb")
 ROUNDS = 12
@@ -339,6 +339,26 @@ def test_two_records_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[
     wrong = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert (wrong.returncode, wrong.stdout) == (2, "")
     assert "new.json is no record of a benchmark" in wrong.stderr and wrong.stderr.count("\n") == 1
+
+
+def test_actors_are_compared_with_one_of_them() -> None:
+    more = {"scene": "cloud, 32 views", "parameters": (), "measure": "iterations"}
+    found = [
+        replace(point(method, **more), values=values)
+        for method, values in (
+            ("this process", (1.5, 1.7, 1.6)),
+            ("1 actor", (1.8, 2.2, 2.0)),
+            ("2 actors", (1.2, 1.0)),
+        )
+    ]
+    failed = replace(point("2 actors", **{**more, "scene": "surfaces, 32 views"}), error="no Ray here", values=())
+    lines = scale.table(record(*found, failed, task="scale")).splitlines()
+    assert [line.split(" | ")[2:] for line in lines[2:5]] == [
+        ["1.600", "0.80 |"],
+        ["2.000", "1.00 |"],
+        ["1.100", "0.55 |"],
+    ]
+    assert "no Ray here" in lines[5]
 
 
 def test_saved_records_can_be_read_and_tabled() -> None:

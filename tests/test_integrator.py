@@ -15,7 +15,7 @@ from pathreplay.check.statistics import gap
 from pathreplay.check.verdict import Z_LIMIT
 from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.scenes.substitute import load_dict_with
-from truth import bitmap, lit_room, noise, random, rgb, translate, under_sky
+from truth import bitmap, camera, lit_room, noise, random, rgb, translate, under_sky
 
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}
 
@@ -126,6 +126,25 @@ def test_images_are_those_of_path(max_depth: int, hide_emitters: bool) -> None:
     ours = means(scene, type="pathreplay", max_depth=max_depth, hide_emitters=hide_emitters)
     assert_equal_means(ours, means(scene, type="path", max_depth=max_depth, hide_emitters=hide_emitters))
     assert (ours.mean() > 0) == (max_depth > 0)
+
+
+@pytest.mark.parametrize("max_depth", [0, 1, 3])
+@pytest.mark.parametrize("hide_emitters", [False, True])
+@pytest.mark.parametrize("light", ["sky", "sky and lamp", "lamp"])
+def test_what_is_around_the_scene_is_that_of_path(light: str, hide_emitters: bool, max_depth: int) -> None:
+    """In colour and alpha, where rays leave the scene at once and later."""
+    scene = lit_room(DIFFUSE)
+    scene["camera"] = {**camera(fov=60), "film": {**camera()["film"], "pixel_format": "rgba"}}
+    del scene["floor"]
+    for name, plugin in (("sky", "sky"), ("lamp", "light")):
+        if name not in light:
+            del scene[plugin]
+    made = mi.load_dict(scene)
+    options = {"max_depth": max_depth, "hide_emitters": hide_emitters}
+    ours = means(made, type="pathreplay", **options)
+    assert_equal_means(ours, means(made, type="path", **options))
+    covered = 0 < max_depth and "sky" in light and not hide_emitters
+    assert ours[:, 3] == pytest.approx(1) if covered else (ours[:, 3] < 0.9).all()
 
 
 def test_a_sphere_behind_a_hidden_lamp_is_where_it_is() -> None:

@@ -15,6 +15,7 @@ from pathreplay.gradient.sweep import sweep
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.path_integrator import careful
 from test_architecture import BALL, FLOOR, LAMP, SEED, SIZE, SPP, attached, close, driven, ours, rgb, world
+from truth import camera
 
 SKY = "sky.radiance.value"
 PAINT = {"type": "diffuse", "reflectance": rgb(0.5, 0.4, 0.3)}
@@ -68,6 +69,18 @@ def test_the_camera_sees_no_hidden_sky() -> None:
     with attached(scene, SKY) as params:
         mi.load_dict(hidden).render_backward(scene, params, even(), seed=SEED, spp=SPP)
         assert dr.all(dr.grad(params[SKY]) == 0)
+
+
+@pytest.mark.parametrize("hide_emitters", [False, True])
+def test_a_sky_around_nothing_has_its_gradient(hide_emitters: bool) -> None:
+    """That of the mean of a picture of it: a third of it by each channel."""
+    sky = {"type": "constant", "radiance": rgb(1, 1, 1)}
+    view = camera() | {"film": camera()["film"] | {"width": SIZE, "height": SIZE}}
+    scene = mi.load_dict({"type": "scene", "camera": view, "sky": sky})
+    with attached(scene, SKY) as params:
+        integrator = mi.load_dict({"type": "pathreplay", "hide_emitters": hide_emitters})
+        integrator.render_backward(scene, params, even(), seed=SEED, spp=SPP)
+        assert np.array(dr.grad(params[SKY])) == pytest.approx(0 if hide_emitters else 1 / 3, rel=1e-4)
 
 
 def test_it_knows_when_it_will_do() -> None:

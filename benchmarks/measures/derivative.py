@@ -61,7 +61,7 @@ class Derivative:
 
     def _integrator(self, method: str) -> Any:
         if method not in self.integrators:
-            plugin = {"type": "pathreplay"} if method == "forward" else METHODS[method]
+            plugin = METHODS["auto" if method == "forward" else method]
             self.integrators[method] = mi.load_dict(plugin | self.limits)
         return self.integrators[method]
 

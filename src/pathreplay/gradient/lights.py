@@ -26,6 +26,8 @@ def lights_alone(walk: Walk, start: CameraStart) -> bool:
     """
     if walk.media is not None or not walk.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
         return False
+    if not walk.scene.shapes():  # nothing that could be lit is traced, and so nothing met
+        return False
     at = PathState.begin(walk, start).at
     return not path_moves(walk, start, at) and not weights_vary(walk, at)
 
@@ -49,14 +51,15 @@ def lights(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) ->
     """
     walk = replace(walk, leaves=True)
     sampler, path = start.sampler, PathState.begin(walk, start)
-    left = path.leave()
+    path, left = path.leave()
 
     while dr.hint(path.active, exclude=[walk], label="pathreplay: lights"):
         u, step = path.choose(walk, sampler)
         with dr.resume_grad():
             backward(dr.sum(δL * path.β * relight(walk, path.at, step.lighting)))
         path = path.advance(walk, u, step)[0]
-        left |= path.leave()
+        path, gone = path.leave()
+        left |= gone
 
     with dr.resume_grad():
         beyond = background(walk, path.at, left)

@@ -34,7 +34,7 @@ def walk_on(walk: Walk, sampler: mi.Sampler, path: PathState) -> tuple[mi.Spectr
     L = mi.Spectrum(0)  # radiance so far
     valid, left = mi.Bool(False), mi.Bool(False)
     if dr.hint(walk.leaves, mode="scalar"):
-        left = path.leave()
+        path, left = path.leave()
 
     while dr.hint(path.active, exclude=[walk], label="pathreplay: primal"):
         u, step = path.choose(walk, sampler)
@@ -42,7 +42,8 @@ def walk_on(walk: Walk, sampler: mi.Sampler, path: PathState) -> tuple[mi.Spectr
         valid |= path.active & step.seen
         path = path.advance(walk, u, step)[0]
         if dr.hint(walk.leaves, mode="scalar"):
-            left |= path.leave()
+            path, gone = path.leave()
+            left |= gone
 
     if dr.hint(walk.leaves, mode="scalar"):
         L += path.β * background(walk, path.at, left)

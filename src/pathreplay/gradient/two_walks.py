@@ -31,7 +31,7 @@ def first_walk(
     count = mi.UInt32(0)  # vertices, and null boundaries
     branch, left = Branch.none(), mi.Bool(False)
     if dr.hint(layout.fixed, mode="scalar"):
-        left = path.leave()
+        path, left = path.leave()
 
     while dr.hint(path.active, exclude=[walk, layout, lost], label="pathreplay: record"):
         u, step = path.choose(walk, sampler)
@@ -47,7 +47,8 @@ def first_walk(
             lost.add(full)
             path.active &= ~full
         if dr.hint(layout.fixed, mode="scalar"):
-            left |= path.leave()
+            path, gone = path.leave()
+            left |= gone
 
     if dr.hint(layout.fixed, mode="scalar"):
         beyond = background(walk, path.at, left)

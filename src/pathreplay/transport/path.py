@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -41,11 +41,10 @@ class PathState:
         β = self.β if self.β_alive is None else self.β_alive
         return u, choose_step(walk, self.at, u, sampler, β, self.depth + 1 < walk.max_depth, self.active)
 
-    def leave(self) -> mi.Bool:
-        """End where the ray that arrives has hit nothing; tells where that is so. ``at`` stays what it is there."""
+    def leave(self) -> tuple[PathState, mi.Bool]:
+        """The path, ended where the ray that arrives has hit nothing, and where that is so. ``at`` stays what it is."""
         left = self.active & ~self.at.hit.is_valid()
-        self.active = self.active & ~left  # not in place: somebody else may have the array, too
-        return left
+        return replace(self, active=self.active & ~left), left
 
     def passed(self, walk: Walk, step: Chosen) -> mi.UInt32:
         """Vertices before the next: one more, but with media not so at null boundaries."""
