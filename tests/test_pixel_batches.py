@@ -195,7 +195,7 @@ def test_the_mean_of_batches_is_the_whole_where_all_is_rendered_alike(edges: str
     problem = build_problem(config, tmp_path)
     evaluate = Evaluator(problem, problem.integrator)
     values = new_run(problem, problem.integrator).values
-    some, whole = ([evaluate(values, Shard((0,), 4, (seed,), 0, n), {}) for seed in range(400)] for n in (64, None))
+    some, whole = ([evaluate(values, Shard((0,), 4, (seed,), 0, n), {}) for seed in range(800)] for n in (64, None))
     losses, gradients = [[each.loss for each in found] for found in (some, whole)], []
     for found in (some, whole):
         gradients.append([float(np.sum(each.gradients[problem.variables[0].key])) for each in found])

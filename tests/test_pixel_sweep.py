@@ -244,5 +244,5 @@ def test_steps_that_were_recorded_are_those_that_are_traced(
     recorded, traced = steps(problem, config, "recorded"), steps(problem, config, "traced")
     np.testing.assert_allclose(recorded, traced, rtol=1e-4)
     # Every step has seeds and values of its own: one that was launched with those of another would show.
-    assert (np.abs(np.diff(traced, axis=0)) / traced.max(axis=0)).min() > 1e-3
+    assert (np.abs(np.diff(traced, axis=0)) / traced.max(axis=0)).min() > 3e-4  # three times what is allowed above
     assert bool(calls) == swept

@@ -154,7 +154,8 @@ PLACES = [
          random(0.5)),
     cell("in glass, index", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", GLASS), ETA, add(),
          **GLASSY),
-    cell("in glass, index, homogeneous", lambda: cloud(homogeneous(1.0), "sphere", GLASS), ETA, add(), **GLASSY),
+    cell("in glass, index, homogeneous", lambda: cloud(homogeneous(1.0), "sphere", GLASS), ETA, add(),
+         **{**GLASSY, "spp": 1536}),
     # Where a sample of the rough glass fails, the replay driver ends the path, and its branch draws other numbers.
     cell("in rough glass, density", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", ROUGH),
          DENSITY, random(1.0), drivers=("sweep",)),
