@@ -218,7 +218,7 @@ def test_two_swept_views_add_up(changes: dict, tmp_path) -> None:
     ("changes", "swept"),
     [
         pytest.param({}, False, id="gaussian filter"),
-        pytest.param({"loss": "l1"}, False, id="l1", marks=SLOW),
+        pytest.param({"loss": "l1", "learning_rate": 0.1}, False, id="l1", marks=SLOW),
         pytest.param({"integrator": {"type": "pathreplay", "driver": "replay"}}, False, id="replay", marks=SLOW),
         pytest.param({"integrator": {"type": "prb", "max_depth": 3}}, False, id="prb", marks=SLOW),
         pytest.param({"integrator": {"type": "prb_basic", "max_depth": 3}}, False, id="prb_basic", marks=SLOW),
@@ -244,5 +244,5 @@ def test_steps_that_were_recorded_are_those_that_are_traced(
     recorded, traced = steps(problem, config, "recorded"), steps(problem, config, "traced")
     np.testing.assert_allclose(recorded, traced, rtol=1e-4)
     # Every step has seeds and values of its own: one that was launched with those of another would show.
-    assert (np.abs(np.diff(traced, axis=0)) / traced.max(axis=0)).min() > 3e-4  # three times what is allowed above
+    assert (np.abs(np.diff(traced, axis=0)) / traced.max(axis=0)).min() > 1e-3
     assert bool(calls) == swept

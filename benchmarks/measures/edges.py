@@ -84,7 +84,7 @@ class EdgePass:
 
     def _integrator(self, name: str) -> Any:
         if name not in self.integrators:
-            plugin = METHODS["auto"] if name in PARTS else METHODS[name]
+            plugin = METHODS["auto" if name in PARTS else name]
             self.integrators[name] = mi.load_dict(plugin | self.job.limits)
             if name in PARTS:
                 self.integrators[name].interior = Boundary(**PARTS[name])

@@ -30,7 +30,7 @@ def first_walk(
     L, beyond = mi.Spectrum(0), mi.Spectrum(0)  # radiance so far
     count = mi.UInt32(0)  # vertices, and null boundaries
     branch, left = Branch.none(), mi.Bool(False)
-    if dr.hint(layout.fixed, mode="scalar"):
+    if dr.hint(walk.leaves, mode="scalar"):
         path, left = path.leave()
 
     while dr.hint(path.active, exclude=[walk, layout, lost], label="pathreplay: record"):
@@ -46,11 +46,11 @@ def first_walk(
             full = path.active & (count >= room_for(walk))
             lost.add(full)
             path.active &= ~full
-        if dr.hint(layout.fixed, mode="scalar"):
+        if dr.hint(walk.leaves, mode="scalar"):
             path, gone = path.leave()
             left |= gone
 
-    if dr.hint(layout.fixed, mode="scalar"):
+    if dr.hint(walk.leaves, mode="scalar"):
         beyond = background(walk, path.at, left)
         L += path.β * beyond
     return records, count, L, beyond, branch

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .emitters import emission
+from .emitters import emission, vertex_glow
 from .flight import Flown, fly, fly_again
 from .media import interaction
 from .surface import met, steady
@@ -99,12 +99,11 @@ def sees_lights(walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, active: mi
 
 
 def _on_surface(
-    walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool, glow: mi.Spectrum = None
+    walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool, known: mi.Spectrum = None
 ) -> Vertex:
-    if glow is None:
-        seen = sees_lights(walk, at, si, active)
-        glow = emission(walk.scene, at, si, attached, seen) if walk.vertices_glow else mi.Spectrum(0)
-    return Vertex(si, si.bsdf(at.ray), active & si.is_valid(), si, glow)
+    if known is None:
+        known = vertex_glow(walk, at, si, attached, sees_lights(walk, at, si, active))
+    return Vertex(si, si.bsdf(at.ray), active & si.is_valid(), si, known)
 
 
 def _in_medium(

@@ -28,10 +28,17 @@ def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached
     return mis * ds.emitter.eval(si, active)
 
 
+def vertex_glow(walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool) -> mi.Spectrum:
+    """The `emission` at a vertex: none where what is around the scene is none, and no surface emits."""
+    if walk.leaves and not walk.traits.area_lights:
+        return mi.Spectrum(0)
+    return emission(walk.scene, at, si, attached, active)
+
+
 def relight(walk: Walk, at: Arrival, lighting: Lighting) -> mi.Spectrum:
     """The e of a vertex once more (Spectrum), differentiable in what emitters emit alone: all else is as it was."""
-    glow = emission(walk.scene, at, lighting.si, False, lighting.seen) if walk.vertices_glow else mi.Spectrum(0)
-    return glow + lighting.w * walk.scene.eval_emitter_direction(lighting.si, lighting.light, lighting.lit)
+    own = vertex_glow(walk, at, lighting.si, False, lighting.seen)
+    return own + lighting.w * walk.scene.eval_emitter_direction(lighting.si, lighting.light, lighting.lit)
 
 
 def draw_emitter(

@@ -58,11 +58,6 @@ class Walk:
         return bool(self.traits.attachables) and (narrow or self.attach == "all")
 
     @property
-    def vertices_glow(self) -> bool:
-        """Whether a vertex may emit by itself."""
-        return not self.leaves or self.traits.area_lights
-
-    @property
     def branch(self) -> bool:
         """Whether a null collision of each path is kept."""
         return self.branching is not None
