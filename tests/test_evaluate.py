@@ -15,6 +15,7 @@ from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard, total
 from pathreplay.inverse.events import Refined, Started, Stepped, Stopped
 from pathreplay.inverse.loop import iterate, new_run, take_step
 from pathreplay.inverse.problem import Problem, build_problem
+from pathreplay.inverse.targets import Targets
 from pathreplay.threads import one_thread
 from test_deterministic import CLOUD
 from test_inverse_run import JOB, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
@@ -114,6 +115,20 @@ def test_each_view_is_recorded_once(changes: dict[str, Any]) -> None:
         take_step(problem, config, run, i)
     recordings = run.executor.evaluate._recordings[config.spp]._frozen.values()  # type: ignore[attr-defined]
     assert [each.n_recordings for each in recordings] == [1, 1]
+
+
+@pytest.mark.parametrize(
+    "changes", [SWEEP, {}, {**SWEEP, "loss": "l1"}, KINDS["medium"]], ids=["sweep", "prb", "l1", "medium"]
+)
+def test_a_view_that_comes_later_leaves_recordings_as_they_are(changes: dict[str, Any]) -> None:
+    """Its first evaluation changes its sensor, which all recordings hold. Actors take views from each other."""
+    problem = build_problem(make_config({**JOB, **BOX, **changes}), Path.cwd())
+    problem = build_problem(make_config({**JOB, **BOX, **changes}), Path.cwd(), Targets.of(problem.views))
+    values, learned = new_run(problem, problem.integrator).values, {}
+    evaluate = Evaluator(problem, problem.integrator)
+    for seed, view in enumerate((0, 0, 0, 1, 0, 1, 0, 1)):
+        learned = evaluate(values, Shard((view,), 4, (seed,)), learned).learned
+    assert [each.n_recordings for each in evaluate._recordings[4]._frozen.values()] == [1, 1]  # type: ignore[attr-defined]
 
 
 def test_views_are_not_recorded_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:

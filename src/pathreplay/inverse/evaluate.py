@@ -20,8 +20,9 @@ from pathreplay.inverse.pixel_batches import Batch, obstacle, refused
 from pathreplay.inverse.problem import Problem, scene_values
 from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.values import Array, Arrays
+from pathreplay.inverse.views import View
 from pathreplay.render.facts import SceneFacts
-from pathreplay.render.film import fit_film
+from pathreplay.render.film import fit_film, make_ready
 from pathreplay.render.path_integrator import plain_errors
 from pathreplay.scenes.parameters import get_array
 
@@ -184,6 +185,11 @@ class Evaluator:
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
         self.freezes = known and record and is_recordable(integrator, has_media) and problem.loss not in ELSEWHERE
+        if self.freezes:
+            for about in problem.views:
+                self._fit_film(about)
+            for sensor in problem.scene.sensors():
+                make_ready(sensor)
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
         # Of each view and number of samples that was seen, whole or a batch of it: whether pixels can be swept.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
@@ -211,9 +217,12 @@ class Evaluator:
         self.integrator.restore_learned(self.problem.scene, learned)
         self._learned = learned
 
+    def _fit_film(self, view: View) -> None:
+        fit_film(self.problem.scene.sensors()[view.sensor], view.target.shape)
+
     def _view(self, values: Arrays, view: int, seed: int, spp: int, pixels: int | None) -> Evaluation:
         about = self.problem.views[view]
-        fit_film(self.problem.scene.sensors()[about.sensor], about.target.shape)
+        self._fit_film(about)
         variables = self.problem.held.variables(self.problem, values)
         moving = {key: value for key, value in variables.items() if key in self._moving}
         dr.enable_grad(moving)

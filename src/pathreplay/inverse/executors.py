@@ -270,10 +270,7 @@ def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Te
     wanted = max(cores, threads * (config.ray.actors or 1))
     with connected(config.ray, wanted) as (ray, own):
         count = _count(ray, config, threads, problem)
-        targets = Targets(
-            {view.name: view.target for view in problem.views},
-            {view.name: view.weight for view in problem.views if view.weight is not None},
-        )
+        targets = Targets.of(problem.views)
         parcel = ray.put(Parcel(config, base.resolve(), targets, mi.variant(), threads))
         kind = ray.remote(**_needs(threads), max_restarts=config.ray.max_restarts, max_task_retries=-1)(RayActor)
         actors = {number: kind.remote() for number in range(count)}

@@ -30,6 +30,7 @@ from pathreplay.inverse.images import (
 from pathreplay.inverse.lens import Lens
 from pathreplay.inverse.patterns import matching
 from pathreplay.inverse.values import Array, adapted_image, make_value, require_finite_array, seen
+from pathreplay.inverse.views import View
 from pathreplay.render.film import picture_shape
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator, told
@@ -46,6 +47,13 @@ class Targets:
 
     images: dict[str, Image]
     weights: dict[str, Image]
+
+    @staticmethod
+    def of(views: Iterable[View]) -> Targets:
+        """Those that views have."""
+        views = tuple(views)
+        weights = {view.name: view.weight for view in views if view.weight is not None}
+        return Targets({view.name: view.target for view in views}, weights)
 
 
 def target_scene(config: Config, base: Path) -> mi.Scene:

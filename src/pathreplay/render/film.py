@@ -97,6 +97,15 @@ def fit_film(sensor: mi.Sensor, shape: Sequence[int]) -> None:
         params.update()
 
 
+def make_ready(sensor: mi.Sensor) -> None:
+    """Give a sensor now what it is given when it is first rendered: storage of its film, and a state of its sampler.
+
+    Recorded passes hold all sensors of a scene, and have to be recorded again when one of them changes.
+    """
+    sensor.film().prepare([])
+    sensor.sampler().seed(0, 1)  # as `mi.render` leaves it
+
+
 def picture_shape(sensor: mi.Sensor) -> tuple[int, int, int]:
     """Height, width and channels of the pictures that a sensor's film develops."""
     film = sensor.film()
