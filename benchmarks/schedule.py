@@ -120,8 +120,8 @@ class _Devices:
         fetched, asleep = self.now, np.inf  # when the process that adds has added what it was given
         while len(step.done) < len(step.kinds):
             waiting = list(idle)
-            for k in idle:
-                if (index := step.next(k, self.now)) is None:
+            for k in step.in_turn(idle):
+                if (index := step.next(k, self.now, range(n))) is None:
                     break  # as jobs do it
                 waiting.remove(k)
                 seconds, lives = self._seconds(k)

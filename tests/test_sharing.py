@@ -10,6 +10,8 @@ import pytest
 from pathreplay.inverse.evaluate import Shard
 from pathreplay.inverse.sharing import LATE, Sharing, Step, kind_of
 
+BOTH = (0, 1)
+
 
 def shards_of(count: int) -> list[Shard]:
     return [Shard((view,), 4, (view,)) for view in range(count)]
@@ -22,8 +24,8 @@ def played(sharing: Sharing, shards: list[Shard], speeds: dict[int, float], cost
     idle, now = sorted(speeds), 0.0
     while len(step.done) < len(shards):
         waiting = []
-        for actor in idle:
-            index = step.next(actor, now)
+        for actor in step.in_turn(idle):
+            index = step.next(actor, now, speeds)
             if index is None:
                 waiting.append(actor)
             else:
@@ -76,38 +78,38 @@ def test_what_is_late_is_given_to_an_idle_actor_as_well() -> None:
     for _ in range(4):
         played(sharing, shards, {0: 1, 1: 1}, [1.0, 1.0])
     step = Step(sharing, shards)
-    first, second = step.next(0, 0.0), step.next(1, 0.0)
+    first, second = step.next(0, 0.0, BOTH), step.next(1, 0.0, BOTH)
     assert {first, second} == {0, 1}
     assert step.finished(first, 0, 1.0)
-    assert step.next(0, 1.0) is None
+    assert step.next(0, 1.0, BOTH) is None
     assert step.patience() == pytest.approx(LATE)
-    assert step.next(0, LATE) == second
-    assert step.patience() is None and step.next(2, 10 * LATE) is None, "a third one is not asked"
+    assert step.next(0, LATE, BOTH) == second
+    assert step.patience() is None and step.next(2, 10 * LATE, BOTH) is None, "a third one is not asked"
     assert step.finished(second, 0, 1.0) and not step.finished(second, 1, 3.0), "the first result counts"
 
 
 def test_what_was_never_done_is_not_late() -> None:
     step = Step(Sharing(), shards_of(1))
-    assert step.next(0, 0.0) == 0
-    assert step.patience() is None and step.next(1, 100.0) is None
+    assert step.next(0, 0.0, BOTH) == 0
+    assert step.patience() is None and step.next(1, 100.0, BOTH) is None
 
 
 def test_what_is_lost_waits_again() -> None:
     sharing, shards = Sharing(), shards_of(3)
     step = Step(sharing, shards)
-    index = step.next(0, 0.0)
+    index = step.next(0, 0.0, BOTH)
     assert index is not None
     sharing.forget(0)
     step.lost(index, 0)
     assert index in step.waiting[None]
-    assert sorted(step.next(1, now) for now in (1.0, 2.0, 3.0)) == [0, 1, 2]  # type: ignore[type-var]
+    assert sorted(step.next(1, now, BOTH) for now in (1.0, 2.0, 3.0)) == [0, 1, 2]  # type: ignore[type-var]
 
 
 def test_a_loss_after_another_has_taken_over_is_none() -> None:
     sharing, shards = Sharing(), shards_of(1)
     played(sharing, shards, {0: 1}, [1.0])
     step = Step(sharing, shards)
-    assert step.next(0, 0.0) == 0 and step.next(1, 10.0) == 0
+    assert step.next(0, 0.0, BOTH) == 0 and step.next(1, 10.0, BOTH) == 0
     step.lost(0, 0)
     assert not any(step.waiting.values())
     step.finished(0, 1, 1.0)
@@ -123,3 +125,37 @@ def test_the_views_of_a_lost_actor_are_nobodys() -> None:
     assert set(sharing.owner.values()) == {1}
     kind = kind_of(shards[0])
     assert sharing.expected(0, kind) == sharing.seconds[kind] + sharing.extra
+
+
+def known(views: int) -> Sharing:
+    """Actor 0 has done all views, a second each; one that has not would take ten more."""
+    kinds = [kind_of(shard) for shard in shards_of(views)]
+    times = {(0, kind): 3 for kind in kinds}
+    return Sharing(dict.fromkeys(kinds, 1.0), 10.0, dict.fromkeys(kinds, 0), times)
+
+
+def test_what_would_take_longer_is_not_taken_from_one_that_is_about_to_go_on() -> None:
+    """Both are idle: actor 0 is asked first, and actor 1 has nothing to do for six seconds that takes it eleven."""
+    step = Step(known(6), shards_of(6))
+    assert step.in_turn([1, 0]) == [0, 1]
+    assert step.next(1, 0.0, BOTH) is None
+    assert step.next(0, 0.0, BOTH) == 0 and step.next(1, 0.0, BOTH) is None
+
+
+def test_what_takes_less_than_waiting_is_taken() -> None:
+    step = Step(known(20), shards_of(20))
+    assert step.next(0, 0.0, BOTH) == 0 and step.next(1, 0.0, BOTH) is not None
+
+
+def test_the_shards_of_one_that_is_gone_are_taken_at_any_price() -> None:
+    step = Step(known(2), shards_of(2))
+    assert step.next(1, 0.0, {1}) == 0
+
+
+def test_an_actor_that_was_asked_again_is_at_its_next_shard() -> None:
+    """It is asked before its answer is heard, so that it need not wait: it can be late there, too."""
+    step = Step(known(2), shards_of(2))
+    first, second = step.next(0, 0.0, BOTH), step.next(0, 1.0, BOTH)
+    assert first is not None and second is not None and step.finished(first, 0, 1.0)
+    assert step.patience() == 1.0 + LATE
+    assert step.next(1, 1.0 + LATE, BOTH) == second

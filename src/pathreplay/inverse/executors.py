@@ -197,9 +197,9 @@ class RayExecutor:
                 crew.say_once("ray: no actor is ready yet; is there room for them? 'ray status' tells")
 
     def _hand_out(self, step: Step, shards: Sequence[Shard], values: Any, learned: Any) -> None:
-        for number in self.crew.idle():
+        for number in step.in_turn(self.crew.idle()):
             late = len(step.again)
-            index = step.next(number, time.monotonic())
+            index = step.next(number, time.monotonic(), self.crew.ready)
             if index is None:
                 break  # what is nothing for one is nothing for the others
             self.crew.counts.twice += len(step.again) - late

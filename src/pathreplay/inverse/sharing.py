@@ -7,7 +7,7 @@ a shard that takes much longer than expected is computed by an idle actor as wel
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from pathreplay.inverse.evaluate import Shard
@@ -94,8 +94,12 @@ class Step:
         """Begun by a second actor, since they were late."""
         self._wait(range(len(shards)))
 
-    def next(self, actor: Actor, now: float) -> int | None:
-        """The shard that an idle actor begins; None if it has nothing to do for now."""
+    def in_turn(self, idle: Iterable[Actor]) -> list[Actor]:
+        """Idle actors in the order in which they are asked: nobody takes from one that is about to go on by itself."""
+        return sorted(idle, key=lambda actor: not self.waiting.get(actor))
+
+    def next(self, actor: Actor, now: float, there: Collection[Actor]) -> int | None:
+        """The shard that an idle actor begins; None if it has nothing to do for now. ``there`` are all that live."""
         for owner in (actor, None):
             if self.waiting.get(owner):
                 return self._begin(actor, owner, -1, now)
@@ -105,7 +109,7 @@ class Step:
             # It goes without help where it would be ready sooner by itself, as long as it is there.
             for place in reversed(range(len(self.waiting[other]))):
                 kind = self.kinds[self.waiting[other][place]]
-                if other not in self.running or (self.sharing.expected(actor, kind) or 0.0) < left:
+                if other not in there or (self.sharing.expected(actor, kind) or 0.0) < left:
                     return self._begin(actor, other, place, now)
         late = self._latest()
         if late is None or late[0] > now:
@@ -115,8 +119,8 @@ class Step:
         return late[1]
 
     def finished(self, index: int, actor: Actor, seconds: float) -> bool:
-        """A result is there; whether it is the first of its shard."""
-        self.running.pop(actor, None)
+        """A result is there; whether it is the first of its shard. The actor may be at its next one already."""
+        self._leave(index, actor)
         self.sharing.measured(actor, self.kinds[index], seconds)
         first = index not in self.done
         self.done.add(index)
@@ -124,7 +128,7 @@ class Step:
 
     def lost(self, index: int, actor: Actor) -> None:
         """An actor has gone without a result; if no other is at the shard, it waits again. Its others are nobody's."""
-        self.running.pop(actor, None)
+        self._leave(index, actor)
         self.left.pop(actor, None)
         theirs = self.waiting.pop(actor, [])
         if index not in self.done and all(index != other for other, _ in self.running.values()):
@@ -136,6 +140,10 @@ class Step:
         """When the next shard is late, for whoever waits; None if none will be."""
         late = None if any(self.waiting.values()) else self._latest()
         return None if late is None else late[0]
+
+    def _leave(self, index: int, actor: Actor) -> None:
+        if actor in self.running and self.running[actor][0] == index:
+            del self.running[actor]
 
     def _wait(self, indices: Iterable[int]) -> None:
         seconds, touched = self.sharing.seconds, set()
