@@ -157,5 +157,5 @@ def test_an_actor_that_was_asked_again_is_at_its_next_shard() -> None:
     step = Step(known(2), shards_of(2))
     first, second = step.next(0, 0.0, BOTH), step.next(0, 1.0, BOTH)
     assert first is not None and second is not None and step.finished(first, 0, 1.0)
-    assert step.patience() == 1.0 + LATE
-    assert step.next(1, 1.0 + LATE, BOTH) == second
+    late = 1.0 + LATE * (1.0 + 10.0)
+    assert step.patience() == late and step.next(1, late, BOTH) == second

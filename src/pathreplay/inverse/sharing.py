@@ -16,7 +16,10 @@ Actor = int
 """The number of an actor; one that was started again keeps it."""
 
 LATE = 2.0
-"""A shard is late when it has taken so many times what it takes otherwise: noise of a shared machine is less."""
+"""A shard is late when it has taken so many times what it would take one who has never done it.
+
+Noise of a shared machine is less, and whoever begins it as well can then be the first.
+"""
 
 WARM = 2
 """Evaluations of a view by an actor after which its kernels are there: one is traced, the next one is recorded."""
@@ -181,8 +184,8 @@ class Step:
     def _latest(self) -> tuple[float, int] | None:
         """When the first of the shards that are at one actor alone is late, and which that is."""
         late = []
-        for actor, (index, since) in self.running.items():
-            expected = self.sharing.expected(actor, self.kinds[index])
-            if expected is not None and index not in self.again and index not in self.done:
-                late.append((since + LATE * expected, index))
+        for index, since in self.running.values():
+            known = self.sharing.seconds.get(self.kinds[index])
+            if known is not None and index not in self.again and index not in self.done:
+                late.append((since + LATE * (known + self.sharing.extra), index))
         return min(late, default=None)
