@@ -208,19 +208,21 @@ def test_nobody_else_listens_and_nothing_stays(monkeypatch: pytest.MonkeyPatch, 
 @SLOW
 @with_ray
 def test_actors_that_are_killed_change_nothing(capfd: pytest.CaptureFixture[str]) -> None:
-    expected = run("surfaces")
+    many = 200  # iterations: the run goes on while actors are started again
+    expected = run("surfaces", iterations=many)
     over, killed = threading.Event(), []
 
     def kill() -> None:
-        while not over.wait(1.5) and len(killed) < 3:
+        while not over.wait(0.01) and len(killed) < 3:
             if there := [p for p in actors() if "evaluate" in p.name()]:
                 there[0].kill()
                 killed.append(there[0].pid)
+                over.wait(1.5)
 
     killer = threading.Thread(target=kill)
     killer.start()
     try:
-        config = make_config(job_of("surfaces", executor="ray", ray={"actors": 2}))
+        config = make_config(job_of("surfaces", iterations=many, executor="ray", ray={"actors": 2}))
         found = bits(optimize(config, progress=True).folder)
     finally:
         over.set()

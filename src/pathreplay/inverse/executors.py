@@ -1,7 +1,7 @@
 """Shards evaluated by actors of Ray, which hold scene and kernels: on this machine or on a cluster, with the same bits.
 
-Values are sent once in a step. Who computes what is up to `Sharing`; an evaluation is a function of values, shard and
-what was learned, and evaluations are added up in the order of the shards, so that it does not matter.
+Large values are sent once in a step. Who computes what is up to `Sharing`; an evaluation is a function of values, shard
+and what was learned, and evaluations are added up in the order of the shards, so that it does not matter.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ from pathreplay.scenes.descriptions import one_line
 
 THREADS = 4
 """Cores of an actor at most, if the job does not say: its Python, which traces kernels, keeps one of them busy."""
+
+SMALL = 2**16
+"""Bytes that take less time to go with each question than to be fetched: a sixth of a shard of 4 ms was seen to go."""
 
 SOON_S = 60.0
 """Seconds after which it is told that no actor is there yet: loading Mitsuba and a scene takes some."""
@@ -94,6 +97,10 @@ class Crew:
     def ask(self, number: int, call: _Call, *question: Any) -> None:
         """Have an actor evaluate a shard."""
         self.calls[self.actors[number].evaluate.options(max_task_retries=0).remote(*question)] = call
+
+    def sent(self, arrays: Arrays) -> Any:
+        """What actors are asked with: what is large is sent now, and they get it from the store of their machine."""
+        return arrays if sum(array.nbytes for array in arrays.values()) < SMALL else self.ray.put(arrays)
 
     def answered(self, patience: float) -> list[tuple[_Call, Any]]:
         """Calls that have been answered, and the references to fetch the answers by; waits at most so many seconds."""
@@ -174,8 +181,7 @@ class RayExecutor:
         if not shards:
             return
         crew, step = self.crew, Step(self.sharing, shards)
-        # Sent once: actors get it from the object store of their machine.
-        sent = [crew.ray.put(dict(each)) for each in (values, learned)]
+        sent = [crew.sent(dict(each)) for each in (values, learned)]
         found: dict[int, Evaluation] = {}
         losses: dict[int, int] = {}
         begin, given = time.monotonic(), 0
