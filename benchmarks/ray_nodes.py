@@ -31,7 +31,7 @@ JOINED = """import ray, sys, time
 ray.init(address=sys.argv[1], log_to_driver=False, logging_level="error")
 while sum(node["Alive"] for node in ray.nodes()) < int(sys.argv[2]):
     time.sleep(0.2)"""
-"""Ends when so many nodes are there: they join some time after they were started."""
+"""Ends when so many nodes are there: of two that start at once, one may take the other's ports, and never come."""
 
 
 def main(
@@ -51,9 +51,8 @@ def main(
             what = [*head, f"--temp-dir={folder}/ray"] if number == 0 else [f"--address={address}"]
             stack.callback(_stop, _node(what, environment))
             _wait_for(host, port)
-        subprocess.run(
-            [sys.executable, "-c", JOINED, address, str(nodes)], env=environment, check=True, timeout=START_S
-        )
+            joined = [sys.executable, "-c", JOINED, address, str(number + 1)]
+            subprocess.run(joined, env=environment, check=True, timeout=START_S)
         begin = time.perf_counter()
         ray = [f"-Dray.address={address}", f"-Dray.actors={nodes}"]
         _run([*shorter, *ray, "--output", f"{name}/cluster"], environment)

@@ -57,18 +57,23 @@ def pooled(points: Iterable[Point]) -> list[Point]:
     return list(found.values())
 
 
-def comparison(point: Point, rival: Point | None) -> list[str]:
-    """Cells: median seconds, then time, variance and time x variance relative to a rival."""
+def time_cells(point: Point, rival: Point | None) -> list[str]:
+    """Cells: median seconds, then time relative to a rival."""
     if point.error:
-        return [point.error, "", "", ""]
-    seconds = median_seconds(point)
+        return [point.error, ""]
     if rival is None or rival.error or rival is point:
-        return [seconds, "1" if rival is point else "", *[("1" if rival is point else "")] * 2]
-    versus = Versus(point, rival)
+        return [median_seconds(point), "1" if rival is point else ""]
+    return [median_seconds(point), str(Versus(point, rival).time())]
+
+
+def comparison(point: Point, rival: Point | None) -> list[str]:
+    """Cells: those of `time_cells`, then variance and time x variance relative to a rival."""
+    times = time_cells(point, rival)
     # Both have squared errors, or (a single round) neither.
-    if not (point.squared_errors and rival.squared_errors):
-        return [seconds, str(versus.time()), "", ""]
-    return [seconds, str(versus.time()), str(versus.variance()), str(versus.cost())]
+    if point.error or rival is None or rival is point or not (point.squared_errors and rival.squared_errors):
+        return [*times, *["1" if rival is point and not point.error else ""] * 2]
+    versus = Versus(point, rival)
+    return [*times, str(versus.variance()), str(versus.cost())]
 
 
 def brief_footnote(record: Record) -> str:

@@ -10,7 +10,7 @@ from ..measures.job import Job, Point, Record
 from ..measures.methods import OWN, USUAL
 from ..measures.scale import name_of
 from ..scenes.wide import COLOUR, SHAPES, SKY, shapes_name
-from ..tables import comparison, groups, markdown, method_cell
+from ..tables import groups, markdown, method_cell, time_cells
 
 TITLE = "scale"
 TAKES = (90, 1000)
@@ -56,7 +56,9 @@ def jobs(quick: bool) -> list[Job]:
     ]  # fmt: skip
     ways = f"prb, {USUAL}", f"sweep, {OWN}"
     # The median is that of recorded steps: the first two are traced.
-    steps = [replace(job, methods=ways, measure="step", warm_up=0, rounds=7) for job in shapes]
+    steps = [
+        replace(job, methods=ways, measure="step", warm_up=0, rounds=7 if job is shapes[-1] else 15) for job in shapes
+    ]
     return [*views, *texels, *both, *sums, *shapes, *steps, *_by_actors(run, quick)]
 
 
@@ -135,7 +137,7 @@ def _sums(points: list[Point]) -> str:
 
 def _shapes(what: str, peer: str, points: list[Point]) -> str:
     rows = [
-        [point.scene, method_cell(point), *comparison(point, methods.get(peer))[:2]]
+        [point.scene, method_cell(point), *time_cells(point, methods.get(peer))]
         for methods in groups(points).values()
         for point in methods.values()
     ]
