@@ -126,7 +126,7 @@ def _sums(points: list[Point]) -> str:
     for point in points:
         samples = f"2^{point.paths.bit_length() - 1}"
         if point.error:
-            rows.append([samples, point.method, point.error[:90], "", ""])
+            rows.append([samples, point.method, point.error.split(". ")[0], "", ""])
             continue
         rows.append(
             [samples, point.method, f"{point.seconds[0]:.1f}", f"{point.peak_mib or 0:.0f}", f"{point.mean or 0:.1e}"]
