@@ -13,7 +13,7 @@ from pathreplay.interrupts import Stop
 from pathreplay.inverse import make_config
 from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard, total
 from pathreplay.inverse.events import Refined, Started, Stepped, Stopped
-from pathreplay.inverse.loop import iterate, new_run, take_step
+from pathreplay.inverse.loop import iterate, new_run, render_views, take_step
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.targets import Targets
 from pathreplay.threads import one_thread
@@ -129,6 +129,20 @@ def test_a_view_that_comes_later_leaves_recordings_as_they_are(changes: dict[str
     for seed, view in enumerate((0, 0, 0, 1, 0, 1, 0, 1)):
         learned = evaluate(values, Shard((view,), 4, (seed,)), learned).learned
     assert [each.n_recordings for each in evaluate._recordings[4]._frozen.values()] == [1, 1]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("changes", [SWEEP, {}, KINDS["medium"]], ids=["sweep", "prb", "medium"])
+def test_pictures_leave_recordings_as_they_are(changes: dict[str, Any]) -> None:
+    """Those of previews."""
+    config = make_config({**JOB, **BOX, **changes})
+    problem = build_problem(config, Path.cwd())
+    run = new_run(problem, problem.integrator)
+    for i in range(6):
+        take_step(problem, config, run, i)
+        if i % 2:
+            render_views(problem, config, run.values)
+    recordings = run.executor.evaluate._recordings[config.spp]._frozen.values()  # type: ignore[attr-defined]
+    assert [each.n_recordings for each in recordings] == [1, 1]
 
 
 def test_views_are_not_recorded_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:

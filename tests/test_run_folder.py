@@ -264,6 +264,9 @@ DAMAGE: dict[str, Callable[[Path], Any]] = {
     "start of other channels": picture("start", lambda image: image[:, :, :1]),
     "start is NaN": picture("start", bad_pixel),
     "target of another size": picture("target", lambda image: image[:, 1:]),
+    "target and start of another size": lambda run: [
+        picture(name, lambda image: image[1:])(run) for name in ("start", "target")
+    ],
     "target is NaN": picture("target", bad_pixel),
     "start missing": lambda run: (run / "images/start-left.exr").unlink(),
     "target missing": lambda run: (run / "images/target-left.exr").unlink(),
@@ -287,7 +290,9 @@ def test_damage_gets_one_line(case: str, finished: Path, tmp_path: Path) -> None
         (run / "run.json").write_text(json.dumps({"base": str(tmp_path / "copy"), "config": None}))
     DAMAGE[case](run)
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file() and path.name != LOCK}
-    assert one_line(lambda: optimize(resume=run, progress=False))
+    line = one_line(lambda: optimize(resume=run, progress=False))
+    if case.endswith("of another size"):
+        assert f"{case.split()[0]}-left.exr has shape" in line
     assert before == {path: path.read_bytes() for path in before}
 
 

@@ -185,18 +185,18 @@ class Evaluator:
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
         self.freezes = known and record and is_recordable(integrator, has_media) and problem.loss not in ELSEWHERE
-        if self.freezes:
-            for about in problem.views:
-                self._fit_film(about)
-            for sensor in problem.scene.sensors():
-                make_ready(sensor)
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
         # Of each view and number of samples that was seen, whole or a batch of it: whether pixels can be swept.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
         self._learned: Arrays = {}  # what the integrator knows
+        self._begun = False
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`. Raises what the integrator raises; warns as it does."""
+        if self.freezes and not self._begun:
+            for about in self.problem.views:
+                make_ready(self._fitted(about))
+        self._begun = True
 
         def each() -> Iterator[Evaluation]:
             for view, seed in zip(shard.views, shard.seeds, strict=True):
@@ -217,12 +217,15 @@ class Evaluator:
         self.integrator.restore_learned(self.problem.scene, learned)
         self._learned = learned
 
-    def _fit_film(self, view: View) -> None:
-        fit_film(self.problem.scene.sensors()[view.sensor], view.target.shape)
+    def _fitted(self, view: View) -> mi.Sensor:
+        """The sensor of a view, whose film has the size of its picture."""
+        sensor = self.problem.scene.sensors()[view.sensor]
+        fit_film(sensor, view.target.shape)
+        return sensor
 
     def _view(self, values: Arrays, view: int, seed: int, spp: int, pixels: int | None) -> Evaluation:
         about = self.problem.views[view]
-        self._fit_film(about)
+        self._fitted(about)
         variables = self.problem.held.variables(self.problem, values)
         moving = {key: value for key, value in variables.items() if key in self._moving}
         dr.enable_grad(moving)

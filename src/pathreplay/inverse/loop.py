@@ -309,7 +309,9 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
 
 
 def _picture(problem: Problem, view: View, integrator: mi.Integrator, spp: int, seed: int) -> Image:
-    fit_film(problem.scene.sensors()[view.sensor], view.target.shape)
+    sensor = problem.scene.sensors()[view.sensor]
+    fit_film(sensor, view.target.shape)
     with dr.suspend_grad():
         image = mi.render(problem.scene, sensor=view.sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
+    sensor.film().clear()  # recorded passes hold it, and would be recorded again
     return np.array(image, dtype=np.float32)
