@@ -121,7 +121,7 @@ class _Devices:
         while len(step.done) < len(step.kinds):
             waiting = list(idle)
             for k in step.in_turn(idle):
-                if (index := step.next(k, self.now, range(n))) is None:
+                if (index := step.next(k, self.now, idle)) is None:
                     break  # as jobs do it
                 waiting.remove(k)
                 seconds, lives = self._seconds(k)

@@ -25,7 +25,7 @@ def played(sharing: Sharing, shards: list[Shard], speeds: dict[int, float], cost
     while len(step.done) < len(shards):
         waiting = []
         for actor in step.in_turn(idle):
-            index = step.next(actor, now, speeds)
+            index = step.next(actor, now, idle)
             if index is None:
                 waiting.append(actor)
             else:
@@ -131,7 +131,7 @@ def known(views: int) -> Sharing:
     """Actor 0 has done all views, a second each; one that has not would take ten more."""
     kinds = [kind_of(shard) for shard in shards_of(views)]
     times = {(0, kind): 3 for kind in kinds}
-    return Sharing(dict.fromkeys(kinds, 1.0), 10.0, dict.fromkeys(kinds, 0), times)
+    return Sharing(dict.fromkeys(kinds, 1.0), set(kinds), 10.0, dict.fromkeys(kinds, 0), times)
 
 
 def test_what_would_take_longer_is_not_taken_from_one_that_is_about_to_go_on() -> None:
@@ -139,7 +139,7 @@ def test_what_would_take_longer_is_not_taken_from_one_that_is_about_to_go_on() -
     step = Step(known(6), shards_of(6))
     assert step.in_turn([1, 0]) == [0, 1]
     assert step.next(1, 0.0, BOTH) is None
-    assert step.next(0, 0.0, BOTH) == 0 and step.next(1, 0.0, BOTH) is None
+    assert step.next(0, 0.0, BOTH) == 0 and step.next(1, 0.0, [1]) is None
 
 
 def test_what_takes_less_than_waiting_is_taken() -> None:
@@ -148,8 +148,50 @@ def test_what_takes_less_than_waiting_is_taken() -> None:
 
 
 def test_the_shards_of_one_that_is_gone_are_taken_at_any_price() -> None:
+    """It is lost, or still at a shard of the step before."""
     step = Step(known(2), shards_of(2))
-    assert step.next(1, 0.0, {1}) == 0
+    assert step.next(1, 0.0, [1]) == 0
+
+
+def test_the_shards_of_one_that_is_stuck_are_taken_at_any_price() -> None:
+    step = Step(known(3), shards_of(3))
+    late = LATE * (1.0 + 10.0)
+    assert step.next(0, 0.0, BOTH) == 0 and step.next(1, 1.0, [1]) is None
+    assert step.patience() == late and step.next(1, late, [1]) == 0
+    assert step.finished(0, 1, 11.0)
+    assert step.next(1, 2 * late, [1]) == 1, "who is at the first one may never go on"
+
+
+def test_an_actor_that_comes_late_has_its_share_after_a_while() -> None:
+    """Each step is shorter than it takes to make kernels, a run of them is not."""
+    sharing, taken = known(8), []
+    for _ in range(3):
+        step = Step(sharing, shards_of(8))
+        assert step.next(0, 0.0, BOTH) == 0
+        taken.append(step.next(1, 0.0, [1]))
+    assert taken[0] is None and taken[1] is not None
+    assert taken[2] is None, "it has had its turn"
+
+
+def test_a_shard_that_was_answered_late_is_not_done_again() -> None:
+    step = Step(known(1), shards_of(1))
+    assert step.next(0, 0.0, BOTH) == 0
+    step.heard(0, 0)
+    assert step.next(0, 100.0, BOTH) is None and step.patience() is None
+    assert step.finished(0, 0, 100.0)
+
+
+def test_kernels_cost_what_warm_evaluations_do_not() -> None:
+    """A first evaluation, and one that records, are both slow: their difference is no price."""
+    sharing, (shard,) = Sharing(), shards_of(1)
+    kind = kind_of(shard)
+    for seconds in (3.0, 5.0):
+        sharing.measured(0, kind, seconds)
+    assert sharing.extra == 0.0
+    sharing.measured(0, kind, 1.0)
+    assert sharing.seconds[kind] == 1.0 and sharing.extra == pytest.approx(1.0)
+    sharing.measured(1, kind, 4.0)
+    assert sharing.extra == pytest.approx(2.0) and sharing.expected(1, kind) == pytest.approx(3.0)
 
 
 def test_an_actor_that_was_asked_again_is_at_its_next_shard() -> None:

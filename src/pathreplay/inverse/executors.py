@@ -64,7 +64,6 @@ class _Call:
     actor: int
     step: Step | None = None
     index: int = 0
-    sharing: Sharing | None = None
 
 
 @dataclass
@@ -80,6 +79,8 @@ class Crew:
     status: Tell = lambda text: None
     """Told how far a step is, again and again."""
     counts: Counts = field(default_factory=Counts)
+    sharings: list[Sharing] = field(default_factory=list)
+    """What is known of them for each who asks."""
     calls: dict[Any, _Call] = field(default_factory=dict)
     """By Ray's reference to the answer."""
     ready: dict[int, Hello] = field(default_factory=dict)
@@ -175,6 +176,7 @@ class RayExecutor:
     def __init__(self, crew: Crew, names: Sequence[str] = (), rival: bool = False) -> None:
         self.crew, self.names, self.rival = crew, names, rival
         self.sharing = Sharing()
+        crew.sharings.append(self.sharing)
 
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
         """See `Executor`. Raises PathreplayError where actors are lost for good, and what evaluations raise."""
@@ -191,9 +193,12 @@ class RayExecutor:
                 given += 1
                 continue
             self._hand_out(step, shards, *sent)
-            late = step.patience()
+            late = step.patience() if crew.idle() else None
             patience = SOON_S if late is None else min(SOON_S, max(0.0, late - time.monotonic()))
             answered = crew.answered(patience)
+            for call, _ in answered:
+                if call.step is not None:
+                    call.step.heard(call.index, call.actor)
             self._hand_out(step, shards, *sent)
             for call, reference in answered:
                 answer = crew.fetch(call, reference)
@@ -203,13 +208,14 @@ class RayExecutor:
                 crew.say_once("ray: no actor is ready yet; is there room for them? 'ray status' tells")
 
     def _hand_out(self, step: Step, shards: Sequence[Shard], values: Any, learned: Any) -> None:
-        for number in step.in_turn(self.crew.idle()):
+        idle = self.crew.idle()
+        for number in step.in_turn(idle):
             late = len(step.again)
-            index = step.next(number, time.monotonic(), self.crew.ready)
+            index = step.next(number, time.monotonic(), idle)
             if index is None:
-                break  # what is nothing for one is nothing for the others
+                break  # what is nothing for one is hardly anything for the others, of whom there may be many
             self.crew.counts.twice += len(step.again) - late
-            call = _Call(number, step, index, self.sharing)
+            call = _Call(number, step, index)
             self.crew.ask(number, call, self.rival, values, shards[index], learned)
 
     def _heard(
@@ -222,9 +228,10 @@ class RayExecutor:
         losses: dict[int, int],
     ) -> None:
         """Take in what has become of a call, which may be one of a step before."""
-        assert call.step is not None and call.sharing is not None
+        assert call.step is not None
         if answer is None:
-            call.sharing.forget(call.actor)
+            for sharing in self.crew.sharings:
+                sharing.forget(call.actor)
             call.step.lost(call.index, call.actor)
             if call.step is step:
                 self.crew.counts.again += 1

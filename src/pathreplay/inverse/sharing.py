@@ -40,13 +40,25 @@ class Sharing:
     """What is known of shards and actors from step to step."""
 
     seconds: dict[Kind, float] = field(default_factory=dict)
-    """Of an evaluation by an actor that has done it before."""
+    """Of an evaluation by an actor that has done it before; of any, until one is ``warm``."""
+    warm: set[Kind] = field(default_factory=set)
+    """Those whose seconds are of an actor that had their kernels."""
     extra: float = 0.0
     """More seconds of one that has not."""
     owner: dict[Kind, Actor] = field(default_factory=dict)
     """Who did it last."""
     times: dict[tuple[Actor, Kind], int] = field(default_factory=dict)
     """How often an actor has done it."""
+    waited: dict[Actor, float] = field(default_factory=dict)
+    """Seconds that an actor went without work in steps before, since what was left would have taken it longer."""
+    refused: dict[Actor, float] = field(default_factory=dict)
+    """The same of this step."""
+
+    def begin(self) -> None:
+        """A step begins."""
+        for actor, seconds in self.refused.items():
+            self.waited[actor] = self.waited.get(actor, 0.0) + seconds
+        self.refused.clear()
 
     def expected(self, actor: Actor, kind: Kind) -> float | None:
         """Seconds that the actor will take; None where such a shard has never been done."""
@@ -62,22 +74,25 @@ class Sharing:
         known = self.seconds.get(kind)
         if known is None:
             self.seconds[kind] = seconds
-        elif times >= WARM:
-            # What was measured before it was warm is not mixed in.
-            warm = times > WARM or any(self.times.get((a, kind), 0) > WARM for a in self.actors() if a != actor)
+        elif times < WARM:
+            if kind in self.warm:
+                self._learn(seconds - known)
+        elif kind in self.warm:
             seconds = min(seconds, LATE * known)  # an accident shall not make the next one seem early
-            self.seconds[kind] = SMOOTHING * known + (1 - SMOOTHING) * seconds if warm else seconds
+            self.seconds[kind] = SMOOTHING * known + (1 - SMOOTHING) * seconds
         else:
-            self.extra = SMOOTHING * self.extra + (1 - SMOOTHING) * max(0.0, seconds - known)
+            self._learn(known - seconds)
+            self.seconds[kind] = seconds
+            self.warm.add(kind)
 
-    def actors(self) -> set[Actor]:
-        """Those that have done something."""
-        return {actor for actor, _ in self.times}
+    def _learn(self, extra: float) -> None:
+        self.extra = SMOOTHING * self.extra + (1 - SMOOTHING) * max(0.0, extra)
 
     def forget(self, actor: Actor) -> None:
         """The actor was lost with all that it held."""
         self.times = {key: n for key, n in self.times.items() if key[0] != actor}
         self.owner = {kind: other for kind, other in self.owner.items() if other != actor}
+        self.waited.pop(actor, None)
 
 
 class Step:
@@ -85,11 +100,13 @@ class Step:
 
     def __init__(self, sharing: Sharing, shards: Sequence[Shard]) -> None:
         self.sharing = sharing
+        sharing.begin()
         self.kinds = [kind_of(shard) for shard in shards]
         self.waiting: dict[Actor | None, list[int]] = {}
         """By who had them last, if that is known: the longest comes last, of some that are alike the first."""
         self.left: dict[Actor | None, float] = {}
-        """Seconds that each will take for those."""
+        """Seconds that each will take for those, which are the ``cost`` of all of them."""
+        self.cost: dict[int, float] = {}
         self.running: dict[Actor, tuple[int, float]] = {}
         """Who is at which shard, since when."""
         self.done: set[int] = set()
@@ -98,22 +115,28 @@ class Step:
         self._wait(range(len(shards)))
 
     def in_turn(self, idle: Iterable[Actor]) -> list[Actor]:
-        """Idle actors in the order in which they are asked: nobody takes from one that is about to go on by itself."""
-        return sorted(idle, key=lambda actor: not self.waiting.get(actor))
+        """Idle actors in the order in which they are asked: those that go on by themselves, who has waited longest."""
+        return sorted(idle, key=lambda actor: (not self.waiting.get(actor), -self.sharing.waited.get(actor, 0.0)))
 
-    def next(self, actor: Actor, now: float, there: Collection[Actor]) -> int | None:
-        """The shard that an idle actor begins; None if it has nothing to do for now. ``there`` are all that live."""
+    def next(self, actor: Actor, now: float, idle: Collection[Actor]) -> int | None:
+        """The shard that an idle actor begins; None if it has nothing to do for now. ``idle`` are all that are so."""
         for owner in (actor, None):
             if self.waiting.get(owner):
                 return self._begin(actor, owner, -1, now)
+        for other, indices in self.waiting.items():
+            if indices and other is not None and not self._goes_on(other, idle):
+                return self._begin(actor, other, -1, now)
         most = self._busiest(now)
         if most is not None:
             other, left = most
-            # It goes without help where it would be ready sooner by itself, as long as it is there.
+            # It goes without help where it would be ready sooner by itself. But who has waited longer for others than
+            # it takes to make kernels may do so, or one that comes late would never have any.
+            worth = left + self.sharing.waited.get(actor, 0.0)
             for place in reversed(range(len(self.waiting[other]))):
-                kind = self.kinds[self.waiting[other][place]]
-                if other not in there or (self.sharing.expected(actor, kind) or 0.0) < left:
+                if (self.sharing.expected(actor, self.kinds[self.waiting[other][place]]) or 0.0) < worth:
+                    self.sharing.waited.pop(actor, None)
                     return self._begin(actor, other, place, now)
+            self.sharing.refused.setdefault(actor, left)
         late = self._latest()
         if late is None or late[0] > now:
             return None
@@ -121,9 +144,18 @@ class Step:
         self.running[actor] = late[1], now
         return late[1]
 
+    def _goes_on(self, actor: Actor, idle: Collection[Actor]) -> bool:
+        """Whether it is known when: not of one that is lost, or still busy with a step before, or stuck."""
+        return self.running[actor][0] not in self.again if actor in self.running else actor in idle
+
+    def heard(self, index: int, actor: Actor) -> None:
+        """An actor is not at a shard any more, whatever has become of it, and may begin another one."""
+        if actor in self.running and self.running[actor][0] == index:
+            del self.running[actor]
+
     def finished(self, index: int, actor: Actor, seconds: float) -> bool:
         """A result is there; whether it is the first of its shard. The actor may be at its next one already."""
-        self._leave(index, actor)
+        self.heard(index, actor)
         self.sharing.measured(actor, self.kinds[index], seconds)
         first = index not in self.done
         self.done.add(index)
@@ -131,7 +163,7 @@ class Step:
 
     def lost(self, index: int, actor: Actor) -> None:
         """An actor has gone without a result; if no other is at the shard, it waits again. Its others are nobody's."""
-        self._leave(index, actor)
+        self.heard(index, actor)
         self.left.pop(actor, None)
         theirs = self.waiting.pop(actor, [])
         if index not in self.done and all(index != other for other, _ in self.running.values()):
@@ -141,12 +173,8 @@ class Step:
 
     def patience(self) -> float | None:
         """When the next shard is late, for whoever waits; None if none will be."""
-        late = None if any(self.waiting.values()) else self._latest()
+        late = self._latest()
         return None if late is None else late[0]
-
-    def _leave(self, index: int, actor: Actor) -> None:
-        if actor in self.running and self.running[actor][0] == index:
-            del self.running[actor]
 
     def _wait(self, indices: Iterable[int]) -> None:
         seconds, touched = self.sharing.seconds, set()
@@ -154,13 +182,14 @@ class Step:
             owner = self.sharing.owner.get(self.kinds[i])
             touched.add(owner)
             self.waiting.setdefault(owner, []).append(i)
-            self.left[owner] = self.left.get(owner, 0.0) + self._seconds(owner, i)
+            self.cost[i] = self._seconds(owner, i)
+            self.left[owner] = self.left.get(owner, 0.0) + self.cost[i]
         for owner in touched:
             self.waiting[owner].sort(key=lambda i: (seconds.get(self.kinds[i], 0.0), -i))
 
     def _begin(self, actor: Actor, owner: Actor | None, place: int, now: float) -> int:
         index = self.waiting[owner].pop(place)
-        self.left[owner] -= self._seconds(owner, index)
+        self.left[owner] -= self.cost[index]
         self.running[actor] = index, now
         return index
 
