@@ -103,9 +103,18 @@ BOX = {
 }
 
 
-@pytest.mark.parametrize(
+RECORDED = pytest.mark.parametrize(
     "changes", [SWEEP, {}, {**SWEEP, "loss": "l1"}, KINDS["medium"]], ids=["sweep", "prb", "l1", "medium"]
 )
+
+
+def times_recorded(evaluate: Any) -> list[int]:
+    """Of each view, by an evaluator that was asked for one number of samples."""
+    (recordings,) = evaluate._recordings.values()
+    return [each.n_recordings for each in recordings._frozen.values()]
+
+
+@RECORDED
 def test_each_view_is_recorded_once(changes: dict[str, Any]) -> None:
     """Whatever memory NumPy has put the values in, which differs from step to step."""
     config = make_config({**JOB, **BOX, **changes})
@@ -113,13 +122,10 @@ def test_each_view_is_recorded_once(changes: dict[str, Any]) -> None:
     run = new_run(problem, problem.integrator)
     for i in range(6):
         take_step(problem, config, run, i)
-    recordings = run.executor.evaluate._recordings[config.spp]._frozen.values()  # type: ignore[attr-defined]
-    assert [each.n_recordings for each in recordings] == [1, 1]
+    assert times_recorded(run.executor.evaluate) == [1, 1]  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize(
-    "changes", [SWEEP, {}, {**SWEEP, "loss": "l1"}, KINDS["medium"]], ids=["sweep", "prb", "l1", "medium"]
-)
+@RECORDED
 def test_a_view_that_comes_later_leaves_recordings_as_they_are(changes: dict[str, Any]) -> None:
     """Its first evaluation changes its sensor, which all recordings hold. Actors take views from each other."""
     problem = build_problem(make_config({**JOB, **BOX, **changes}), Path.cwd())
@@ -128,10 +134,10 @@ def test_a_view_that_comes_later_leaves_recordings_as_they_are(changes: dict[str
     evaluate = Evaluator(problem, problem.integrator)
     for seed, view in enumerate((0, 0, 0, 1, 0, 1, 0, 1)):
         learned = evaluate(values, Shard((view,), 4, (seed,)), learned).learned
-    assert [each.n_recordings for each in evaluate._recordings[4]._frozen.values()] == [1, 1]  # type: ignore[attr-defined]
+    assert times_recorded(evaluate) == [1, 1]
 
 
-@pytest.mark.parametrize("changes", [SWEEP, {}, KINDS["medium"]], ids=["sweep", "prb", "medium"])
+@RECORDED
 def test_pictures_leave_recordings_as_they_are(changes: dict[str, Any]) -> None:
     """Those of previews."""
     config = make_config({**JOB, **BOX, **changes})
@@ -141,8 +147,7 @@ def test_pictures_leave_recordings_as_they_are(changes: dict[str, Any]) -> None:
         take_step(problem, config, run, i)
         if i % 2:
             render_views(problem, config, run.values)
-    recordings = run.executor.evaluate._recordings[config.spp]._frozen.values()  # type: ignore[attr-defined]
-    assert [each.n_recordings for each in recordings] == [1, 1]
+    assert times_recorded(run.executor.evaluate) == [1, 1]  # type: ignore[attr-defined]
 
 
 def test_views_are_not_recorded_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,12 +17,11 @@ from pathreplay.inverse.exposures import EXPOSURE, factor_of
 from pathreplay.inverse.exposures import gradient as exposure_gradient
 from pathreplay.inverse.losses import ELSEWHERE
 from pathreplay.inverse.pixel_batches import Batch, obstacle, refused
-from pathreplay.inverse.problem import Problem, scene_values
+from pathreplay.inverse.problem import Problem, scene_values, sensor_of
 from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.values import Array, Arrays
-from pathreplay.inverse.views import View
 from pathreplay.render.facts import SceneFacts
-from pathreplay.render.film import fit_film, make_ready
+from pathreplay.render.film import make_ready
 from pathreplay.render.path_integrator import plain_errors
 from pathreplay.scenes.parameters import get_array
 
@@ -195,7 +194,7 @@ class Evaluator:
         """See `Evaluate`. Raises what the integrator raises; warns as it does."""
         if self.freezes and not self._begun:
             for about in self.problem.views:
-                make_ready(self._fitted(about))
+                make_ready(sensor_of(self.problem, about))
         self._begun = True
 
         def each() -> Iterator[Evaluation]:
@@ -217,15 +216,9 @@ class Evaluator:
         self.integrator.restore_learned(self.problem.scene, learned)
         self._learned = learned
 
-    def _fitted(self, view: View) -> mi.Sensor:
-        """The sensor of a view, whose film has the size of its picture."""
-        sensor = self.problem.scene.sensors()[view.sensor]
-        fit_film(sensor, view.target.shape)
-        return sensor
-
     def _view(self, values: Arrays, view: int, seed: int, spp: int, pixels: int | None) -> Evaluation:
         about = self.problem.views[view]
-        self._fitted(about)
+        sensor_of(self.problem, about)
         variables = self.problem.held.variables(self.problem, values)
         moving = {key: value for key, value in variables.items() if key in self._moving}
         dr.enable_grad(moving)

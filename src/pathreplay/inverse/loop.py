@@ -24,13 +24,12 @@ from pathreplay.inverse.images import Image
 from pathreplay.inverse.line_search import LineSearch
 from pathreplay.inverse.optimiser import DrJitOptimiser, Optimiser
 from pathreplay.inverse.optimizer_options import Optimizer
-from pathreplay.inverse.problem import Problem, errors_of, put_values
+from pathreplay.inverse.problem import Problem, errors_of, put_values, sensor_of
 from pathreplay.inverse.schedules import rate
 from pathreplay.inverse.stage_options import place
 from pathreplay.inverse.stages import Part, part_at
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.inverse.views import View
-from pathreplay.render.film import fit_film
 from pathreplay.scenes.parameters import get_array, to_value
 
 # How often the pictures are judged in a job with a rival: enough for a curve, at some per cent of its time.
@@ -309,8 +308,7 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
 
 
 def _picture(problem: Problem, view: View, integrator: mi.Integrator, spp: int, seed: int) -> Image:
-    sensor = problem.scene.sensors()[view.sensor]
-    fit_film(sensor, view.target.shape)
+    sensor = sensor_of(problem, view)
     with dr.suspend_grad():
         image = mi.render(problem.scene, sensor=view.sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
     sensor.film().clear()  # recorded passes hold it, and would be recorded again

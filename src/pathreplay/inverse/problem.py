@@ -42,6 +42,7 @@ from pathreplay.inverse.values import Array, Arrays
 from pathreplay.inverse.variables import Variable, free_of, keys_of, make_variables
 from pathreplay.inverse.views import View, held_out_of, named_views, sensors_of, shares_of
 from pathreplay.render.edge_notes import edges_note, moves_edges
+from pathreplay.render.film import fit_film
 from pathreplay.render.integrator import EDGES
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator
@@ -120,6 +121,13 @@ def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, An
     plain = {v.key: v.form.store(variables[v.key]) for v in problem.variables if v.key in problem.params}
     made = {each.key: each.form.store(each.value(variables)) for each in problem.derived}
     return plain | made | {pose.key: pose.value(variables) for pose in problem.poses}
+
+
+def sensor_of(problem: Problem, view: View) -> mi.Sensor:
+    """The sensor of a view, whose film has the size of its picture."""
+    sensor = problem.scene.sensors()[view.sensor]
+    fit_film(sensor, view.target.shape)
+    return sensor
 
 
 def put_values(problem: Problem, values: Arrays) -> None:
