@@ -115,7 +115,9 @@ class _Devices:
         self.now += float(np.ceil(np.log2(n + 1))) * costs.send(self.parameters) if n > 1 else 0.0
         one_back = (costs.send(self.parameters) if n > 1 else 0.0) + costs.add * self.parameters
         idle = [k for k in range(n) if self.free[k] <= self.now]
-        events = [(self.free[k], k, -1, 0.0, True) for k in range(n) if self.free[k] > self.now]
+        # When, who, which shards (none: it is ready for any), in how many seconds, and whether it lives.
+        events: list[tuple[float, int, list[int], float, bool]]
+        events = [(self.free[k], k, [], 0.0, True) for k in range(n) if self.free[k] > self.now]
         heapq.heapify(events)
         fetched, asleep = self.now, np.inf  # when the process that adds has added what it was given
         while len(step.done) < len(step.kinds):
@@ -124,31 +126,34 @@ class _Devices:
                 if (index := step.next(k, self.now, idle)) is None:
                     break  # as jobs do it
                 waiting.remove(k)
-                seconds, lives = self._seconds(k)
+                indices = [index, *step.along(k, int(BYTES * self.parameters), n)]
+                seconds, lives = self._seconds(k, len(indices))
                 self.free[k] = self.now + seconds + (0 if lives else self.trouble.back_after)
-                heapq.heappush(events, (self.now + seconds, k, index, seconds, lives))
+                heapq.heappush(events, (self.now + seconds, k, indices, seconds, lives))
             late = step.patience() if waiting else None
             asleep = np.inf if late is None else max(self.now, late)
             if asleep < (events[0][0] if events else np.inf):
                 self.now, idle = asleep, waiting
                 continue
-            self.now, k, index, seconds, lives = heapq.heappop(events)
+            self.now, k, indices, seconds, lives = heapq.heappop(events)
             idle = waiting
             if not lives:
                 step.sharing.forget(k)
-                step.lost(index, k)
-                heapq.heappush(events, (self.free[k], k, -1, 0.0, True))
+                for index in indices:
+                    step.lost(index, k)
+                heapq.heappush(events, (self.free[k], k, [], 0.0, True))
                 continue
             idle = [*waiting, k]
-            if index >= 0 and step.finished(index, k, seconds):
-                fetched = max(fetched, self.now) + one_back
+            for index in indices:
+                if step.finished(index, k, seconds / len(indices)):
+                    fetched = max(fetched, self.now) + one_back
         self.now = max(self.now, fetched) + costs.step * self.parameters
         return self.now - begin
 
-    def _seconds(self, k: int) -> tuple[float, bool]:
-        """Of a shard by a device, and whether that lives to see its end."""
-        stuck = 10.0 if self.random.random() < self.trouble.stuck else 1.0
-        seconds = self.costs.latency + self.costs.shard * stuck / float(self.speeds[k])
+    def _seconds(self, k: int, shards: int) -> tuple[float, bool]:
+        """Of so many shards by a device, and whether that lives to see their end."""
+        times = sum(10.0 if self.random.random() < self.trouble.stuck else 1.0 for _ in range(shards))
+        seconds = self.costs.latency + self.costs.shard * times / float(self.speeds[k])
         lost = (
             float(self.random.exponential(self.trouble.lost_after)) if np.isfinite(self.trouble.lost_after) else np.inf
         )

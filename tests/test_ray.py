@@ -230,7 +230,7 @@ def test_actors_that_are_killed_change_nothing(capfd: pytest.CaptureFixture[str]
     out, told = capfd.readouterr()
     assert "raylet" not in out + told, "Ray's own words are not for users"
     assert killed and found == expected
-    assert "was lost and is started again; its shard is computed again" in told
+    assert "was lost and is started again; its shards are computed again" in told
     (restarts,) = re.findall(r"(\d+) restarts", told)
     assert 1 <= int(restarts) <= len(killed), "one that is killed while it starts is started without a word"
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pathreplay.inverse.evaluate import Shard
-from pathreplay.inverse.sharing import LATE, Sharing, Step, kind_of
+from pathreplay.inverse.sharing import LATE, TOGETHER, Sharing, Step, kind_of
 
 BOTH = (0, 1)
 
@@ -20,7 +20,7 @@ def shards_of(count: int) -> list[Shard]:
 def played(sharing: Sharing, shards: list[Shard], speeds: dict[int, float], costs: list[float]) -> tuple[float, dict]:
     """A step in which actors take cost/speed seconds: when it ended, and who began what."""
     step, begun = Step(sharing, shards), {actor: [] for actor in speeds}
-    events: list[tuple[float, int, int, float]] = []
+    events: list[tuple[float, int, list[int]]] = []
     idle, now = sorted(speeds), 0.0
     while len(step.done) < len(shards):
         waiting = []
@@ -29,15 +29,16 @@ def played(sharing: Sharing, shards: list[Shard], speeds: dict[int, float], cost
             if index is None:
                 waiting.append(actor)
             else:
-                begun[actor].append(index)
-                seconds = costs[index] / speeds[actor]
-                heapq.heappush(events, (now + seconds, actor, index, seconds))
+                indices = [index, *step.along(actor, 4, len(speeds))]
+                begun[actor] += indices
+                heapq.heappush(events, (now + sum(costs[i] for i in indices) / speeds[actor], actor, indices))
         late = step.patience()
         if waiting and late is not None and (not events or late < events[0][0]):
             now, idle = max(now, late), waiting
             continue
-        now, actor, index, seconds = heapq.heappop(events)
-        step.finished(index, actor, seconds)
+        now, actor, indices = heapq.heappop(events)
+        for index in indices:
+            step.finished(index, actor, costs[index] / speeds[actor])
         idle = [*waiting, actor]
     return now, begun
 
@@ -61,10 +62,11 @@ def test_actors_keep_their_views() -> None:
         }
 
 
+@pytest.mark.parametrize("seconds", [1.0, 0.02])
 @pytest.mark.parametrize("speeds", [{0: 1.0, 1: 1.0}, {0: 1.0, 1: 3.0}, {0: 1.0, 1: 1.0, 2: 0.5, 3: 2.0}])
-def test_all_end_together(speeds: dict[int, float]) -> None:
+def test_all_end_together(speeds: dict[int, float], seconds: float) -> None:
     """Views of unequal costs, actors of unequal speeds: within the longest shard of the best that can be."""
-    costs = list(np.random.default_rng(3).uniform(0.5, 2.0, 40))
+    costs = list(seconds * np.random.default_rng(3).uniform(0.5, 2.0, 40))
     sharing = Sharing()
     for _ in range(8):
         end, _ = played(sharing, shards_of(40), speeds, costs)
@@ -127,11 +129,11 @@ def test_the_views_of_a_lost_actor_are_nobodys() -> None:
     assert sharing.expected(0, kind) == sharing.seconds[kind] + sharing.extra
 
 
-def known(views: int) -> Sharing:
+def known(views: int, seconds: float = 1.0) -> Sharing:
     """Actor 0 has done all views, a second each; one that has not would take ten more."""
     kinds = [kind_of(shard) for shard in shards_of(views)]
     times = {(0, kind): 3 for kind in kinds}
-    return Sharing(dict.fromkeys(kinds, 1.0), set(kinds), 10.0, dict.fromkeys(kinds, 0), times)
+    return Sharing(dict.fromkeys(kinds, seconds), set(kinds), 10 * seconds, dict.fromkeys(kinds, 0), times)
 
 
 def test_what_would_take_longer_is_not_taken_from_one_that_is_about_to_go_on() -> None:
@@ -201,3 +203,88 @@ def test_an_actor_that_was_asked_again_is_at_its_next_shard() -> None:
     assert first is not None and second is not None and step.finished(first, 0, 1.0)
     late = 1.0 + LATE * (1.0 + 10.0)
     assert step.patience() == late and step.next(1, late, BOTH) == second
+
+
+def asked(step: Step, actor: int, size: int = 4, actors: int = 1) -> list[int]:
+    """The shards of the actor's next question."""
+    first = step.next(actor, 0.0, BOTH)
+    return [] if first is None else [first, *step.along(actor, size, actors)]
+
+
+def questions(views: int, seconds: float, size: int = 4) -> list[list[int]]:
+    """What actor 0 is asked one after the other, if nobody takes anything from it."""
+    step, found = Step(known(views, seconds), shards_of(views)), []
+    while indices := asked(step, 0, size):
+        found.append(indices)
+        for index in indices:
+            assert step.finished(index, 0, seconds)
+    return found
+
+
+def test_short_shards_go_with_one_question() -> None:
+    """Seven tenths of what is left, or a tenth of a second, or a hundredth: each shard once, in their order."""
+    assert [len(indices) for indices in questions(16, 0.005)] == [11, 3, 2]
+    assert [len(indices) for indices in questions(16, 0.02)] == [5, 5, 4, 1, 1]
+    assert [len(indices) for indices in questions(4, 1.0)] == [1, 1, 1, 1]
+    assert [index for indices in questions(16, 0.005) for index in indices] == list(range(16))
+
+
+def test_large_gradients_come_by_themselves() -> None:
+    assert [len(indices) for indices in questions(16, 0.005, TOGETHER // 4)] == [4, 4, 4, 2, 2]
+    assert [len(indices) for indices in questions(3, 0.005, 2 * TOGETHER)] == [1, 1, 1]
+
+
+def test_shards_without_kernels_come_by_themselves() -> None:
+    """Actor 1 takes from 0, and does first and second evaluations, which may take long."""
+    sharing = known(40, 0.02)
+    step = Step(sharing, shards_of(40))
+    assert len(asked(step, 0)) == 5 and len(asked(step, 1)) == 1
+    sharing.owner.clear()
+    assert len(asked(Step(sharing, shards_of(40)), 0)) == 1, "nobody's"
+
+
+def test_a_question_that_is_lost_waits_again_but_for_what_another_has_done() -> None:
+    sharing = known(16, 0.005)
+    step = Step(sharing, shards_of(16))
+    indices = asked(step, 0)
+    late = step.patience()
+    assert late is not None and step.next(1, late, []) == 0 and step.finished(0, 1, 0.05)
+    sharing.forget(0)
+    for index in indices:
+        step.lost(index, 0)
+    assert sorted(step.waiting[None]) == list(range(1, 16))
+
+
+def test_a_question_is_late_when_all_of_it_might_be_done() -> None:
+    """Its shards are answered together. Then others do them one after the other, until that answer comes."""
+    step = Step(known(2, 0.005), shards_of(2))
+    assert asked(step, 0) == [0, 1]
+    late = step.patience()
+    assert late == pytest.approx(LATE * (0.01 + 0.05)) and step.next(1, late - 0.001, [1]) is None
+    assert step.next(1, late, [1]) == 0 and step.finished(0, 1, 0.055)
+    assert step.patience() == late and step.next(1, late + 0.055, [1]) == 1
+    assert step.finished(1, 1, 0.055) and not step.finished(0, 0, 1.0)
+
+
+def test_a_question_has_no_more_than_an_even_share() -> None:
+    """Parts of a view are of one kind, and wait for whoever had one of them last: the others are idle."""
+    sharing, shards = known(1, 0.005), [Shard((0,), 4, (part,)) for part in range(16)]
+    step = Step(sharing, shards)
+    assert len(asked(step, 0, actors=16)) == 1 and len(asked(Step(sharing, shards), 0, actors=8)) == 2
+    for actor in range(8):
+        sharing.times[actor, kind_of(shards[0])] = 3
+    for _ in range(3):
+        end, begun = played(sharing, shards, dict.fromkeys(range(8), 1.0), [0.005] * 16)
+        assert end == pytest.approx(0.01) and all(len(indices) == 2 for indices in begun.values())
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_what_one_of_two_has_lost_can_be_late_again(lost: int) -> None:
+    """The other one may be stuck."""
+    step = Step(known(1), shards_of(1))
+    late = LATE * (1.0 + 10.0)
+    assert step.next(0, 0.0, BOTH) == 0 and step.next(1, late, [1]) == 0 and step.patience() is None
+    step.lost(0, lost)
+    again = step.patience()
+    assert again == (late + late if lost == 0 else late)
+    assert step.next(2, again, [2]) == 0 and step.patience() is None

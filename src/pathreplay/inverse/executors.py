@@ -31,7 +31,7 @@ THREADS = 4
 """Cores of an actor at most, if the job does not say: its Python, which traces kernels, keeps one of them busy."""
 
 SMALL = 2**16
-"""Bytes that take less time to go with each question than to be fetched: a sixth of a shard of 4 ms was seen to go."""
+"""Bytes that take less time to go with each question than to be fetched."""
 
 SOON_S = 60.0
 """Seconds after which it is told that no actor is there yet: loading Mitsuba and a scene takes some."""
@@ -63,7 +63,8 @@ class _Call:
 
     actor: int
     step: Step | None = None
-    index: int = 0
+    indices: tuple[int, ...] = ()
+    """Of shards of the step."""
 
 
 @dataclass
@@ -96,12 +97,12 @@ class Crew:
         return [number for number in self.ready if number not in busy]
 
     def ask(self, number: int, call: _Call, *question: Any) -> None:
-        """Have an actor evaluate a shard."""
+        """Have an actor evaluate shards."""
         self.calls[self.actors[number].evaluate.options(max_task_retries=0).remote(*question)] = call
 
     def sent(self, arrays: Arrays) -> Any:
         """What actors are asked with: what is large is sent now, and they get it from the store of their machine."""
-        return arrays if sum(array.nbytes for array in arrays.values()) < SMALL else self.ray.put(arrays)
+        return arrays if _bytes_of(arrays) < SMALL else self.ray.put(arrays)
 
     def answered(self, patience: float) -> list[tuple[_Call, Any]]:
         """Calls that have been answered, and the references to fetch the answers by; waits at most so many seconds."""
@@ -109,8 +110,8 @@ class Crew:
         ready, _ = self.ray.wait(list(self.calls), num_returns=1, timeout=patience, fetch_local=False)
         return [(self.calls.pop(reference), reference) for reference in ready]
 
-    def fetch(self, call: _Call, reference: Any) -> Answer | None:
-        """What was answered to a shard; None where there is nothing, since the actor was lost, or to a greeting.
+    def fetch(self, call: _Call, reference: Any) -> list[Answer] | None:
+        """What was answered to each shard; None where there is nothing, since the actor was lost, or to a greeting.
 
         Raises PathreplayError where no actor is left; what an evaluation raised.
         """
@@ -158,9 +159,9 @@ class Crew:
             self.say_once(f"ray: actor {number + 1} is lost for good; {len(self.actors)} are left")
             return
         if any(other.actor == number and other.step is None for other in self.calls.values()):
-            return  # known: it was given another shard meanwhile
+            return  # known: it was given other shards meanwhile
         self.counts.restarts += 1
-        self.tell(f"ray: actor {number + 1} on {host} was lost and is started again; its shard is computed again")
+        self.tell(f"ray: actor {number + 1} on {host} was lost and is started again; its shards are computed again")
         self._greet(number)
 
     def say_once(self, line: str) -> None:
@@ -184,6 +185,7 @@ class RayExecutor:
             return
         crew, step = self.crew, Step(self.sharing, shards)
         sent = [crew.sent(dict(each)) for each in (values, learned)]
+        size = _bytes_of(values)
         found: dict[int, Evaluation] = {}
         losses: dict[int, int] = {}
         begin, given = time.monotonic(), 0
@@ -192,69 +194,75 @@ class RayExecutor:
                 yield found.pop(given)
                 given += 1
                 continue
-            self._hand_out(step, shards, *sent)
+            self._hand_out(step, shards, size, *sent)
             late = step.patience() if crew.idle() else None
             patience = SOON_S if late is None else min(SOON_S, max(0.0, late - time.monotonic()))
             answered = crew.answered(patience)
             for call, _ in answered:
                 if call.step is not None:
-                    call.step.heard(call.index, call.actor)
-            self._hand_out(step, shards, *sent)
+                    call.step.heard(call.indices[0], call.actor)
+            self._hand_out(step, shards, size, *sent)
             for call, reference in answered:
-                answer = crew.fetch(call, reference)
-                if call.step is not None:
-                    self._heard(call, answer, step, shards, found, losses)
+                answers = crew.fetch(call, reference)
+                if call.step is None:
+                    continue
+                if answers is None:
+                    self._lost(call, step, shards, losses)
+                    continue
+                for index, answer in zip(call.indices, answers, strict=True):
+                    if call.step.finished(index, call.actor, answer.seconds) and call.step is step:
+                        found[index] = self._taken(answer)
+                crew.status(f"{len(crew.ready)} actors, shard {len(step.done)} of {len(shards)}")
             if not crew.ready and time.monotonic() - begin > SOON_S:
                 crew.say_once("ray: no actor is ready yet; is there room for them? 'ray status' tells")
 
-    def _hand_out(self, step: Step, shards: Sequence[Shard], values: Any, learned: Any) -> None:
+    def _hand_out(self, step: Step, shards: Sequence[Shard], size: int, values: Any, learned: Any) -> None:
+        """Give idle actors what they have to do. Values, and so gradients, have ``size`` bytes."""
         idle = self.crew.idle()
         for number in step.in_turn(idle):
             late = len(step.again)
-            index = step.next(number, time.monotonic(), idle)
-            if index is None:
+            first = step.next(number, time.monotonic(), idle)
+            if first is None:
                 break  # what is nothing for one is hardly anything for the others, of whom there may be many
             self.crew.counts.twice += len(step.again) - late
-            call = _Call(number, step, index)
-            self.crew.ask(number, call, self.rival, values, shards[index], learned)
+            indices = (first, *step.along(number, size, len(self.crew.ready)))
+            self.crew.ask(
+                number, _Call(number, step, indices), self.rival, values, [shards[i] for i in indices], learned
+            )
 
-    def _heard(
-        self,
-        call: _Call,
-        answer: Answer | None,
-        step: Step,
-        shards: Sequence[Shard],
-        found: dict[int, Evaluation],
-        losses: dict[int, int],
-    ) -> None:
-        """Take in what has become of a call, which may be one of a step before."""
+    def _lost(self, call: _Call, step: Step, shards: Sequence[Shard], losses: dict[int, int]) -> None:
+        """An actor was lost at a call, which may be one of a step before."""
         assert call.step is not None
-        if answer is None:
-            for sharing in self.crew.sharings:
-                sharing.forget(call.actor)
-            call.step.lost(call.index, call.actor)
-            if call.step is step:
-                self.crew.counts.again += 1
-                losses[call.index] = losses.get(call.index, 0) + 1
-                if losses[call.index] > self.crew.retries:
-                    raise PathreplayError(
-                        f"ray: {self._name(shards[call.index])} has ended {losses[call.index]} actors, one after the "
-                        "other; give them more memory, or raise ray.max_task_retries"
-                    )
-            return
-        first = call.step.finished(call.index, call.actor, answer.seconds)
-        if call.step is not step or not first:
-            return
-        found[call.index] = answer.evaluation
+        for sharing in self.crew.sharings:
+            sharing.forget(call.actor)
+        for index in call.indices:
+            call.step.lost(index, call.actor)
+            if call.step is not step or index in step.done:
+                continue
+            self.crew.counts.again += 1
+            losses[index] = losses.get(index, 0) + 1
+            if losses[index] > self.crew.retries:
+                raise PathreplayError(
+                    f"ray: {self._name([shards[i] for i in call.indices])} has ended {losses[index]} actors, one "
+                    "after the other; give them more memory, or raise ray.max_task_retries"
+                )
+
+    def _taken(self, answer: Answer) -> Evaluation:
+        """What the first answer to a shard has found."""
         self.crew.counts.shards += 1
         for line in answer.warnings:
             if line not in self.crew.said:
                 self.crew.said.add(line)
                 mi.Log(mi.LogLevel.Warn, line)
-        self.crew.status(f"{len(self.crew.ready)} actors, shard {len(step.done)} of {len(shards)}")
+        return answer.evaluation
 
-    def _name(self, shard: Shard) -> str:
-        return "the shard of view " + ", ".join(self.names[n] if self.names else str(n) for n in shard.views)
+    def _name(self, shards: Sequence[Shard]) -> str:
+        views = ", ".join(self.names[n] if self.names else str(n) for shard in shards for n in shard.views)
+        return f"the shard of view {views}" if len(shards) == 1 else f"one of the shards of views {views}"
+
+
+def _bytes_of(arrays: Arrays) -> int:
+    return sum(array.nbytes for array in arrays.values())
 
 
 def _cause(error: Any) -> BaseException:

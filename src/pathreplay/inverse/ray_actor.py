@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -80,10 +81,11 @@ class RayActor:
         machine = f"{_processor()}, LLVM {'.'.join(map(str, backend.loaded_version()))}"
         return Hello(platform.node(), os.getpid(), versions(), machine)
 
-    def evaluate(self, rival: bool, values: Arrays, shard: Shard, learned: Arrays) -> Answer | None:
-        """A shard by the job's integrator, or by that of its rival; None where this actor was started again since."""
-        if self.problem is None:
-            return None
+    def evaluate(self, rival: bool, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Answer] | None:
+        """Shards by the job's integrator, or by that of its rival; None where this actor was started again since."""
+        return None if self.problem is None else [self._answer(rival, values, shard, learned) for shard in shards]
+
+    def _answer(self, rival: bool, values: Arrays, shard: Shard, learned: Arrays) -> Answer:
         config = self.config
         plugin = config.rival if rival and config.rival is not None else config.integrator
         self.log.lines.clear()

@@ -3,6 +3,7 @@
 Every actor goes on with the views that it had before, whose kernels it holds. One that has nothing left takes from
 whoever has most left; so the shares of the actors become such that all end together. When nothing is left to begin,
 a shard that takes much longer than expected is computed by an idle actor as well, and the first result counts.
+Short shards go together in one question, since asking has a price.
 """
 
 from __future__ import annotations
@@ -16,13 +17,22 @@ Actor = int
 """The number of an actor; one that was started again keeps it."""
 
 LATE = 2.0
-"""A shard is late when it has taken so many times what it would take one who has never done it.
+"""A question is late when it has taken so many times what it would take one who has never done its first shard.
 
 Noise of a shared machine is less, and whoever begins it as well can then be the first.
 """
 
 WARM = 2
 """Evaluations of a view by an actor after which its kernels are there: one is traced, the next one is recorded."""
+
+SHORTEST_S, LONGEST_S = 0.01, 0.1
+"""Short shards go with one question, as many as take so long: a call has a price (`benchmarks.schedule --measure`)."""
+
+AHEAD = 0.7
+"""Of what an actor has left, how much goes with one question at most: the rest can still be taken by others."""
+
+TOGETHER = 2**26
+"""Bytes of gradients that an actor has for one question at most, unless one shard has more."""
 
 SMOOTHING = 0.5
 """How much of what was known of a view's seconds stays when they are measured again."""
@@ -65,7 +75,11 @@ class Sharing:
         known = self.seconds.get(kind)
         if known is None:
             return None
-        return known if self.times.get((actor, kind), 0) >= WARM else known + self.extra
+        return known if self.holds(actor, kind) else known + self.extra
+
+    def holds(self, actor: Actor, kind: Kind) -> bool:
+        """Whether the actor has the kernels of such a shard."""
+        return self.times.get((actor, kind), 0) >= WARM
 
     def measured(self, actor: Actor, kind: Kind, seconds: float) -> None:
         """An actor has taken so many seconds."""
@@ -95,6 +109,16 @@ class Sharing:
         self.waited.pop(actor, None)
 
 
+@dataclass
+class Question:
+    """What an actor is at: shards that are answered together."""
+
+    shards: list[int]
+    since: float
+    more: float = 0.0
+    """Seconds of those that went along with the first one."""
+
+
 class Step:
     """The shards of one step: which wait, who is at which, which are done. Costs little for each, however many."""
 
@@ -107,12 +131,13 @@ class Step:
         self.left: dict[Actor | None, float] = {}
         """Seconds that each will take for those, which are the ``cost`` of all of them."""
         self.cost: dict[int, float] = {}
-        self.running: dict[Actor, tuple[int, float]] = {}
-        """Who is at which shard, since when."""
+        self.running: dict[Actor, Question] = {}
         self.done: set[int] = set()
         self.again: set[int] = set()
         """Begun by a second actor, since they were late."""
         self._wait(range(len(shards)))
+        self.all = sum(self.left.values())
+        """Seconds of all of them, as far as that is known."""
 
     def in_turn(self, idle: Iterable[Actor]) -> list[Actor]:
         """Idle actors in the order in which they are asked: those that go on by themselves, who has waited longest."""
@@ -141,16 +166,36 @@ class Step:
         if late is None or late[0] > now:
             return None
         self.again.add(late[1])
-        self.running[actor] = late[1], now
+        self.running[actor] = Question([late[1]], now)
         return late[1]
+
+    def along(self, actor: Actor, size: int, actors: int) -> list[int]:
+        """Shards that an actor begins with the one that was its `next`: of its own, if they are short.
+
+        They are a share of what it has left, and no more than each of so many ``actors`` would have, so that questions
+        become shorter and actors still end together. A gradient has ``size`` bytes.
+        """
+        waiting, question = self.waiting.get(actor, []), self.running[actor]
+        if not self.sharing.holds(actor, self.kinds[question.shards[0]]):
+            return []
+        room, first = TOGETHER // max(1, size), self._seconds(actor, question.shards[0])
+        even = self.all / actors * (1 + 1e-6)  # of shards that are alike all have as many, in spite of rounding
+        limit = min(LONGEST_S, even, max(SHORTEST_S, AHEAD * (first + self.left.get(actor, 0.0))))
+        while waiting and len(question.shards) < room and self.sharing.holds(actor, self.kinds[waiting[-1]]):
+            more = question.more + self.cost[waiting[-1]]
+            if first + more > limit:
+                break
+            question.shards.append(self._take(actor, -1))
+            question.more = more
+        return question.shards[1:]
 
     def _goes_on(self, actor: Actor, idle: Collection[Actor]) -> bool:
         """Whether it is known when: not of one that is lost, or still busy with a step before, or stuck."""
-        return self.running[actor][0] not in self.again if actor in self.running else actor in idle
+        return self.again.isdisjoint(self.running[actor].shards) if actor in self.running else actor in idle
 
     def heard(self, index: int, actor: Actor) -> None:
-        """An actor is not at a shard any more, whatever has become of it, and may begin another one."""
-        if actor in self.running and self.running[actor][0] == index:
+        """An actor is not at a shard any more, nor at those of the same question; it may begin others."""
+        if actor in self.running and index in self.running[actor].shards:
             del self.running[actor]
 
     def finished(self, index: int, actor: Actor, seconds: float) -> bool:
@@ -166,9 +211,10 @@ class Step:
         self.heard(index, actor)
         self.left.pop(actor, None)
         theirs = self.waiting.pop(actor, [])
-        if index not in self.done and all(index != other for other, _ in self.running.values()):
+        if index not in self.done:
             self.again.discard(index)
-            theirs.append(index)
+            if all(index not in other.shards for other in self.running.values()):
+                theirs.append(index)
         self._wait(theirs)
 
     def patience(self) -> float | None:
@@ -188,9 +234,13 @@ class Step:
             self.waiting[owner].sort(key=lambda i: (seconds.get(self.kinds[i], 0.0), -i))
 
     def _begin(self, actor: Actor, owner: Actor | None, place: int, now: float) -> int:
+        index = self._take(owner, place)
+        self.running[actor] = Question([index], now)
+        return index
+
+    def _take(self, owner: Actor | None, place: int) -> int:
         index = self.waiting[owner].pop(place)
         self.left[owner] -= self.cost[index]
-        self.running[actor] = index, now
         return index
 
     def _seconds(self, owner: Actor | None, index: int) -> float:
@@ -204,17 +254,21 @@ class Step:
                 continue
             left = self.left[owner]
             if owner in self.running:
-                index, since = self.running[owner]
-                left += max(0.0, self._seconds(owner, index) - (now - since))
+                at = self.running[owner]
+                left += max(0.0, self._seconds(owner, at.shards[0]) + at.more - (now - at.since))
             if found is None or (left, -owner) > (found[1], -found[0]):
                 found = owner, left
         return found
 
     def _latest(self) -> tuple[float, int] | None:
         """When the first of the shards that are at one actor alone is late, and which that is."""
-        late = []
-        for index, since in self.running.values():
-            known = self.sharing.seconds.get(self.kinds[index])
-            if known is not None and index not in self.again and index not in self.done:
-                late.append((since + LATE * (known + self.sharing.extra), index))
+        late, seconds, extra = [], self.sharing.seconds, self.sharing.extra
+        for question in self.running.values():
+            known = seconds.get(self.kinds[question.shards[0]])
+            if known is None:
+                continue
+            for index in question.shards:
+                if index not in self.again and index not in self.done:
+                    late.append((question.since + LATE * (known + question.more + extra), index))
+                    break
         return min(late, default=None)
