@@ -13,7 +13,7 @@ from pathreplay.inverse import iterate, make_config
 from .job import Job, Measure
 
 PROCESS = "this process"
-COMPILING = {"surfaces": 4, "cloud": 1}
+COMPILING = {"surfaces": 6, "cloud": 1}
 """Iterations: kernels are traced, then recorded; an actor that takes a view of another does both once more."""
 
 SENSOR = """<sensor type="perspective"><float name="fov" value="40"/><transform name="to_world">
@@ -39,9 +39,9 @@ def name_of(scene: str, views: int) -> str:
 
 
 class Iterations(Measure):
-    """One run by each method. The first iterations compile and record kernels, and are not counted."""
+    """A run by a method in each round. The first iterations compile and record kernels, and are not counted."""
 
-    ITERATIONS = 12
+    ITERATIONS = 20
 
     def __init__(self, job: Job) -> None:
         self.scene, views = job.scene.split(", ")
@@ -51,8 +51,9 @@ class Iterations(Measure):
     def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
         """Seconds of the median iteration, and the last loss."""
         seconds, loss = self._run({} if method == PROCESS else _ray(int(method.split()[0])))
-        self.seconds[method] = seconds[COMPILING[self.scene] :]
-        return float(np.median(self.seconds[method])), np.array([loss])
+        counted = seconds[COMPILING[self.scene] :]
+        self.seconds.setdefault(method, []).extend(counted)
+        return float(np.median(counted)), np.array([loss])
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """Seconds of each iteration that counts."""

@@ -13,7 +13,7 @@ from ..scenes.wide import COLOUR, SHAPES, SKY, shapes_name
 from ..tables import groups, markdown, method_cell, time_cells
 
 TITLE = "scale"
-TAKES = (90, 1000)
+TAKES = (90, 1100)
 VIEWS, TEXELS = (1, 50, 200), (100, 1000, 3162, 10000)
 QUICK_VIEWS, QUICK_TEXELS = (1, 4), (100, 500)
 BUDGET = "4 GiB"
@@ -65,7 +65,8 @@ def jobs(quick: bool) -> list[Job]:
 def _by_actors(run: Job, quick: bool) -> list[Job]:
     """As many cores as actors are wanted, and `pip install 'pathreplay[ray]'`: rows say so where it is missing."""
     ways = actors.PROCESS, *(actors.many(n) for n in ACTORS[: 1 if quick else None])
-    job = replace(run, parameters=(), methods=ways, measure="iterations", threads=1)
+    # In turn, since processors that others use as well are slower for minutes.
+    job = replace(run, parameters=(), methods=ways, measure="iterations", threads=1, rounds=1 if quick else 3)
     views = 4 if quick else 32
     return [
         replace(job, scene=actors.name_of("surfaces", views), resolution=16 if quick else 64, spp=16),
