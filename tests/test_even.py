@@ -265,7 +265,7 @@ def test_another_word_is_refused() -> None:
 
 
 def test_another_seed_is_no_other_kernel() -> None:
-    gc.collect()  # of other scenes, which Dr.Jit traces calls through: one that goes between the two makes another kernel
+    gc.collect()  # Dr.Jit traces calls through all scenes alive: one that goes between the two makes another kernel
     made, integrator = scene(4), mi.load_dict({**METHODS["even"], "max_depth": 3})
     dr.eval(mi.render(made, integrator=integrator, spp=4, seed=1))
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
