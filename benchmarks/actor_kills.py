@@ -5,7 +5,7 @@
 runs a job in one process (`deterministic = true`), then by actors of Ray, of which a random one is killed (SIGKILL) now
 and then, whatever it is doing, until that has been done as often as asked. Prints what was told of it; ends with status
 1 if the run came to anything else, or ended before all kills were done (then it wants more `--iterations`). Takes
-about two minutes on two quiet cores. Wants `pip install 'pathreplay[ray]'`.
+about three minutes on two quiet cores. Wants `pip install 'pathreplay[ray]'`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LONGEST_S = 6.0
 def main(
     kills: Annotated[int, typer.Option(help="How many.")] = 20,
     actors: Annotated[int, typer.Option(help="Actors, of one thread each.")] = 2,
-    iterations: Annotated[int, typer.Option(help="Of each of the two stages of the run.")] = 400,
+    iterations: Annotated[int, typer.Option(help="Of each of the two stages of the run.")] = 800,
     seed: Annotated[int, typer.Option(help="Chooses the moments, and the actors.")] = 0,
 ) -> None:
     """Kill actors of a run, and compare."""
