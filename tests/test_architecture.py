@@ -25,7 +25,7 @@ from pathreplay.inverse.evaluate import Evaluator, Executor, Local, Shard
 from pathreplay.inverse.loop import new_run
 from pathreplay.inverse.problem import build_problem
 from pathreplay.render.camera_pass import Pass
-from pathreplay.render.path_integrator import careful
+from pathreplay.render.lifetimes import careful
 from pathreplay.render.term import Term
 from pathreplay.scenes.parameters import get_array
 from pathreplay.threads import one_thread

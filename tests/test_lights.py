@@ -13,7 +13,7 @@ from pathreplay.gradient import lights as module
 from pathreplay.gradient.lights import lights, lights_alone
 from pathreplay.gradient.sweep import sweep
 from pathreplay.render.camera_pass import Pass
-from pathreplay.render.path_integrator import careful
+from pathreplay.render.lifetimes import careful
 from test_architecture import BALL, FLOOR, LAMP, SEED, SIZE, SPP, attached, close, driven, ours, rgb, world
 from truth import camera
 

@@ -15,7 +15,7 @@ from media_scenes import constant, grid
 from pathreplay.gradient.adjoint import LostPaths, RayDerivative
 from pathreplay.gradient.record import Layout, record_type, room_for
 from pathreplay.gradient.two_walks import first_walk, walk_back
-from pathreplay.render.path_integrator import careful
+from pathreplay.render.lifetimes import careful
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart

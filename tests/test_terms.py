@@ -18,7 +18,7 @@ from pathreplay import PathreplayError
 from pathreplay.gradient.baseline import Baseline, Seen
 from pathreplay.render.boundary import Boundary
 from pathreplay.render.camera_pass import Pass
-from pathreplay.render.facts import SceneFacts
+from pathreplay.render.facts import SceneFacts, facts_of
 from pathreplay.render.term import Found, Term
 from truth import lit_room, rgb
 
@@ -169,7 +169,7 @@ def test_facts_are_found_once_and_keep_up_with_the_scene(load) -> None:
     scene, params = load(glow, COLOUR)
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
     before = integrator._walk(scene, None)
-    facts = integrator.facts
+    facts = facts_of(scene)
     assert not before.traits.lights_vary
     light = "light.emitter.radiance.value"
     dr.enable_grad(params[light])
@@ -178,7 +178,7 @@ def test_facts_are_found_once_and_keep_up_with_the_scene(load) -> None:
     dr.disable_grad(params[light])
     params.update()
     after = integrator._walk(scene, None).traits
-    assert integrator.facts is facts
+    assert facts_of(scene) is facts
     changed = [f.name for f in fields(after) if getattr(after, f.name) is not getattr(before.traits, f.name)]
     assert changed == []
     # A shape that grows: the distance within which directions are held grows with it.
@@ -193,7 +193,7 @@ def test_facts_are_found_once_and_keep_up_with_the_scene(load) -> None:
     assert integrator._walk(scene, None).traits.lobes == 1
     other = mi.load_dict(lit_room({"type": "smoothdielectric"}))
     assert integrator._walk(other, None).traits.lobes == 2
-    assert not integrator.facts.are_about(scene)
+    assert facts_of(other) is not facts_of(scene)
 
 
 def test_facts_tell_of_gradients_and_values_of_media(load) -> None:
@@ -214,7 +214,7 @@ def test_a_scene_is_released_with_an_integrator_of_its_own() -> None:
     """Which knows facts about it."""
     scene = mi.load_dict({**lit_room(DIFFUSE), "integrator": {"type": "pathreplay", "max_depth": 2}})
     dr.eval(scene.integrator().render(scene, spp=1))
-    assert scene.integrator().facts.are_about(scene)
+    assert facts_of(scene).are_about(scene)
     integrator = weakref.ref(scene.integrator())
     assert integrator() is not None
     del scene

@@ -13,10 +13,15 @@ from pathreplay.errors import PathreplayError
 
 __version__ = "0.1.0"
 
-__all__ = ["PathreplayError", "__version__", "check_gradient", "iterate", "optimize"]
+__all__ = ["PathreplayError", "__version__", "check_gradient", "exclusive", "iterate", "optimize"]
 
 #: Public names that live in rooms which need more time to import than `import pathreplay` should take.
-_LAZY = {"check_gradient": "pathreplay.check", "iterate": "pathreplay.inverse", "optimize": "pathreplay.inverse"}
+_LAZY = {
+    "check_gradient": "pathreplay.check",
+    "exclusive": "pathreplay.render.lifetimes",
+    "iterate": "pathreplay.inverse",
+    "optimize": "pathreplay.inverse",
+}
 
 
 def _set_up() -> None:

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.render.facts import SceneFacts
+from pathreplay.render.facts import facts_of
 from pathreplay.render.path_integrator import UNBOUNDED
 from pathreplay.scenes.descriptions import load_integrator
 
@@ -107,6 +107,6 @@ def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> 
             "the same image, such as reference={'type': 'path', 'max_depth': 6}"
         )
     short = 0 <= limits.max_depth <= LONGEST_WITHOUT_ROULETTE
-    name = spec or ("volpath" if SceneFacts(scene).has_media else "path")
+    name = spec or ("volpath" if facts_of(scene).has_media else "path")
     rr_depth = NO_ROULETTE if short else limits.rr_depth
     return load_integrator({"type": name, **vars(limits), "rr_depth": rr_depth})

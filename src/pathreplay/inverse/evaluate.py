@@ -20,9 +20,9 @@ from pathreplay.inverse.pixel_batches import Batch, obstacle, refused
 from pathreplay.inverse.problem import Problem, scene_values, sensor_of
 from pathreplay.inverse.recorded import NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.values import Array, Arrays
-from pathreplay.render.facts import SceneFacts
+from pathreplay.render.facts import facts_of
 from pathreplay.render.film import make_ready
-from pathreplay.render.path_integrator import plain_errors
+from pathreplay.render.lifetimes import plain_errors
 from pathreplay.scenes.parameters import get_array
 
 LARGE = 2**22
@@ -180,7 +180,7 @@ class Evaluator:
     ) -> None:
         self.problem, self.integrator = problem, integrator
         self._moving = {v.key for v in problem.variables} if moving is None else set(moving)
-        has_media = SceneFacts(problem.scene).has_media
+        has_media = facts_of(problem.scene).has_media
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
         self.freezes = known and record and is_recordable(integrator, has_media) and problem.loss not in ELSEWHERE

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.media import Media, scene_media, wants_branch
+from ..transport.nodes import nodes_of, with_gradients
 from ..transport.traits import (
     INSTANCE,
     MASK,
@@ -16,24 +17,21 @@ from ..transport.traits import (
     fixed_traits,
     is_null,
     lamp_balls,
-    nodes_of,
     pieces_of,
-    with_gradients,
+    tables_of,
 )
 from ..transport.traits import Tables as Tables
+from .lifetimes import scene_memory
 
 
 class SceneFacts:
-    """Of one scene.
-
-    It holds objects of the scene, so that none can take their place in memory unseen, but not the scene itself: who
-    has the facts may be owned by the scene. While they are kept, so are those objects.
-    """
+    """Of one scene: they hold objects of it, so that none can take their place in memory unseen (see `facts_of`)."""
 
     def __init__(self, scene: mi.Scene) -> None:
         nodes = nodes_of(scene)
         self._parts = _parts(scene)
         self._traits = fixed_traits(nodes, scene)
+        self._tables: Tables | None = None
         self._shapes = [node for node in nodes if isinstance(node, mi.Shape)]
         self._boxes = [shape.bbox() for shape in self._shapes]
         self._sizes = _sizes(self._shapes)
@@ -68,7 +66,7 @@ class SceneFacts:
         return wants_branch(self._media)
 
     def traits(self, tables: Tables | None = None) -> Traits:
-        """What the drivers want to know now; ``tables`` are those of this scene, where they cannot be made."""
+        """What the drivers want to know now, with these ``tables``, or with `tables`."""
         return replace(
             self._traits,
             tables=self.tables() if tables is None else tables,
@@ -80,19 +78,29 @@ class SceneFacts:
 
     def tables(self) -> Tables:
         """Those of the scene as it is now, made anew as far as it has changed."""
-        boxes = [shape.bbox() for shape in self._shapes]
-        if boxes != self._boxes:
-            tables = replace(self._traits.tables, blend_lengths=blend_lengths(self._shapes))
-            self._traits, self._boxes = replace(self._traits, tables=tables), boxes
+        boxes, sizes = [shape.bbox() for shape in self._shapes], _sizes(self._shapes)
+        if self._tables is None:
+            self._tables = tables_of(self._traits.attachables, self._shapes, self._lights)
+        elif boxes != self._boxes:
+            self._tables = replace(self._tables, blend_lengths=blend_lengths(self._shapes))
         if self._traits.mesh_lights:  # whose vertices may move within a box
             balls = lamp_balls(self._lights, self._shapes)
-            if not np.array_equal(np.array(balls), np.array(self._traits.tables.lamp_balls)):
-                self._traits = replace(self._traits, tables=replace(self._traits.tables, lamp_balls=balls))
-        if (sizes := _sizes(self._shapes)) != self._sizes:
+            if not np.array_equal(np.array(balls), np.array(self._tables.lamp_balls)):
+                self._tables = replace(self._tables, lamp_balls=balls)
+        if sizes != self._sizes:
             begins, pieces = pieces_of(self._shapes)
-            tables = replace(self._traits.tables, pieces_at=begins, pieces=pieces)
-            self._traits, self._sizes = replace(self._traits, tables=tables), sizes
-        return self._traits.tables
+            self._tables = replace(self._tables, pieces_at=begins, pieces=pieces)
+        self._boxes, self._sizes = boxes, sizes
+        return self._tables
+
+    def recorded_tables(self, known: Tables | None, edges: bool) -> Tables:
+        """Those of a pass that `dr.freeze` records: the ``known`` ones, if they are of this scene, as they are.
+
+        Else the recording writes them, as they are now; with those of pieces only if it looks for ``edges``.
+        """
+        if known is not None and known is self._tables:
+            return known
+        return tables_of(self._traits.attachables, self._shapes, self._lights, edges)
 
 
 def _sizes(shapes: list[mi.Shape]) -> list[tuple[int, int]]:
@@ -103,3 +111,11 @@ def _parts(scene: mi.Scene) -> list[mi.Object]:
     """Objects that no two scenes share all of, and all that can be exchanged."""
     shapes = scene.shapes()
     return [*scene.sensors(), *scene.emitters(), *shapes, *(shape.bsdf() for shape in shapes)]
+
+
+_FACTS = scene_memory()
+
+
+def facts_of(scene: mi.Scene) -> SceneFacts:
+    """The facts about a scene, found once; anew where the scene has become another."""
+    return _FACTS.about(scene, lambda facts: facts.are_about(scene), lambda: SceneFacts(scene))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from weakref import ReferenceType, ref
 
 import drjit as dr
 import mitsuba as mi
@@ -17,7 +18,7 @@ from ..transport.vertex import Walk
 from .boundary import Boundary
 from .camera_pass import Pass, Seed, Which
 from .diagnostics import doubts, lost_note, missing_edges, used_before_note
-from .facts import SceneFacts
+from .facts import SceneFacts, facts_of
 from .interior import PathReplay
 from .path_integrator import UNBOUNDED, Handed, PathIntegrator
 from .pixels import among, obstacle, pixel_loss
@@ -106,7 +107,7 @@ class PathReplayIntegrator(PathIntegrator):
             )
         self.told: set[str] = set()  # what has been said in the log
         self.untold = Found()  # of passes whose lost paths have not been told
-        self.baseline: tuple[SceneFacts, Baseline] | None = None  # and the scene that it belongs to
+        self.baseline: tuple[ReferenceType[SceneFacts], Baseline] | None = None  # and the scene that it belongs to
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -132,7 +133,7 @@ class PathReplayIntegrator(PathIntegrator):
         view = Pass.of(scene, sensor, 0, spp)
         if self.driver != "sweep":
             return f"driver = '{self.driver}' walks paths one by one; take 'sweep'"
-        if self._facts(scene).has_media:
+        if facts_of(scene).has_media:
             return "the scene has media; leave them out"
         return obstacle(view.sensor, self.max_depth, view.spp, some)
 
@@ -179,9 +180,9 @@ class PathReplayIntegrator(PathIntegrator):
             return None
         if dr.flag(dr.JitFlag.FreezingScope):
             return None if self.handed is None else self.handed.guess
-        # Not by the facts of the last pass: other scenes may have been rendered between.
-        if self.baseline is None or not self.baseline[0].are_about(walk.scene):
-            self.baseline = self._facts(walk.scene), Baseline.fresh(walk.scene.bbox())
+        facts = facts_of(walk.scene)
+        if self.baseline is None or self.baseline[0]() is not facts:
+            self.baseline = ref(facts), Baseline.fresh(walk.scene.bbox())
         baseline = self.baseline[1]
         if baseline.passes.intersection(view.keys):
             self._tell_once(used_before_note(view.keys[0][0]))
@@ -200,7 +201,8 @@ class PathReplayIntegrator(PathIntegrator):
     def restore_learned(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
         """Go on with what `learned` told of the same scene; where that is nothing, anew. Raises PathreplayError."""
         box = scene.bbox()
-        self.baseline = self._facts(scene), Baseline.restored(box, learned) if learned else Baseline.fresh(box)
+        baseline = Baseline.restored(box, learned) if learned else Baseline.fresh(box)
+        self.baseline = ref(facts_of(scene)), baseline
 
     def _told(self, view: Pass, walk: Walk, found: Found) -> None:
         """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,8 +20,9 @@ from ..transport.start import CameraStart
 from ..transport.traits import Tables
 from ..transport.vertex import Walk
 from .camera_pass import Pass, Seed, Which
-from .facts import SceneFacts
+from .facts import facts_of
 from .interior import image
+from .lifetimes import careful, is_recording
 from .parts import Sums, parts
 from .properties import flag, whole_number
 from .term import Found, Term
@@ -37,37 +37,6 @@ def _sum(total: Any, image: Any, share: float) -> Any:
     total = image * share if total is None else total + image * share
     dr.eval(total)
     return total
-
-
-@contextmanager
-def plain_errors() -> Iterator[None]:
-    """Within this block a PathreplayError that Dr.Jit wrapped in others, on the way out of a loop, is itself again."""
-    try:
-        yield
-    except RuntimeError as error:
-        cause: BaseException | None = error
-        while cause is not None and not isinstance(cause, PathreplayError):
-            cause = cause.__cause__
-        if cause is None:
-            raise
-        raise cause from None
-
-
-@contextmanager
-def careful() -> Iterator[None]:
-    """Within this block, a pass, errors are plain and no garbage is collected.
-
-    Should an old scene vanish between two virtual calls, Dr.Jit counts their instances differently and writes functions
-    that both call twice ("invalid redefinition").
-    """
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
-        with plain_errors():
-            yield
-    finally:
-        if collecting:
-            gc.enable()
 
 
 @dataclass
@@ -90,6 +59,7 @@ class PathIntegrator:
 
     name = ""
     attach = "none"
+    edges = "none"  # those that are looked for
     even = False  # whether even numbers take the place of independent ones
     interior: Term
     max_depth: int  # these are Mitsuba's
@@ -109,7 +79,7 @@ class PathIntegrator:
         mitsuba_integrator().__init__(self, props)
         self.hide_emitters = hide_emitters
         self.handed: Handed | None = None  # in a frozen function
-        self.facts: SceneFacts | None = None  # about the scene that was rendered last
+        self.tables: Tables | None = None  # of the scene that was rendered last: there `dr.freeze` finds them
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -213,11 +183,17 @@ class PathIntegrator:
 
     def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> Walk:
         """How the scene is walked through; the sensor may be in a medium."""
-        facts = self._facts(scene)
+        facts, handed = facts_of(scene), self.handed
+        if handed is not None:
+            tables = handed.tables
+        elif is_recording():
+            tables = facts.recorded_tables(self.tables, self.edges != "none")
+        else:
+            tables = self.tables = facts.tables()
         return Walk(
             scene=scene,
-            traits=facts.traits(None if self.handed is None else self.handed.tables),
-            media=facts.media(sensor, None if self.handed is None else self.handed.branches),  # type: ignore[arg-type]
+            traits=facts.traits(tables),
+            media=facts.media(sensor, None if handed is None else handed.branches),  # type: ignore[arg-type]
             attach=self.attach,
             hide_emitters=self.hide_emitters,
             max_depth=self.max_depth,
@@ -227,14 +203,8 @@ class PathIntegrator:
 
     def to_hand(self, scene: mi.Scene) -> Handed:
         """What passes over this scene are to be handed if they are recorded."""
-        facts = self._facts(scene)
+        facts = facts_of(scene)
         return Handed(facts.tables(), facts.branches(), facts.constants())
-
-    def _facts(self, scene: mi.Scene) -> SceneFacts:
-        """The facts about a scene, those of its last pass if it has not become another."""
-        if self.facts is None or not self.facts.are_about(scene):
-            self.facts = SceneFacts(scene)
-        return self.facts
 
     def _described(self, **more: Any) -> str:
         depth = -1 if self.max_depth == UNBOUNDED else self.max_depth

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .traits import nodes_of, with_gradients
+from .nodes import nodes_of, with_gradients
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,10 @@ def wants_branch(media: Sequence[mi.Medium]) -> bool:
 
 
 def _misses(medium: mi.Medium) -> bool:
-    """Whether the extinction has gradients, and varies in space or is zero."""
+    """Whether the extinction has gradients, and varies in space or is zero, or may be while `dr.freeze` records."""
     moving = with_gradients(medium, "sigma_t", "scale")
-    return bool(moving) and not (
-        medium.is_homogeneous() and all(dr.all(dr.detach(value) != 0, axis=None) for value in moving)
-    )
+    known = medium.is_homogeneous() and not dr.flag(dr.JitFlag.FreezingScope)
+    return bool(moving) and not (known and all(dr.all(dr.detach(value) != 0, axis=None) for value in moving))
 
 
 def interaction(medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float) -> mi.MediumInteraction3f:

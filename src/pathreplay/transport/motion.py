@@ -7,8 +7,8 @@ import mitsuba as mi
 
 from . import scatter
 from .arrive import Vertex
+from .nodes import nodes_of
 from .start import CameraStart
-from .traits import nodes_of
 from .vertex import Arrival, Kept, Numbers, Replayed, Walk
 
 FEW = 8

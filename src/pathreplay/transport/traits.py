@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import PathreplayError
+from .nodes import nodes_of
 from .pieces import mesh_pieces
 from .velocity import blend_length
 
@@ -27,6 +30,9 @@ WHOLE, FACETS = 0, 0xFFFFFFFF
 COARSE = 1.0
 """Degrees between triangles and shading normals from which on it matters that they are not the same."""
 
+MOST_RUNS = 4096
+"""Of equal values, that a recording writes one by one."""
+
 T = TypeVar("T")
 V = TypeVar("V")
 
@@ -35,7 +41,7 @@ V = TypeVar("V")
 class Tables:
     """Facts about BSDFs and shapes by registry index, in arrays for kernels to look them up.
 
-    A frozen function cannot make such arrays: it has to be handed them.
+    A frozen function is handed them, or finds them with the integrator; else it has to write them: see `_array`.
     """
 
     attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: nowhere)
@@ -64,7 +70,7 @@ class Traits:
     masks_mirrors: bool  # a mask lies over delta lobes
     glossy: bool  # a surface may have a narrow smooth lobe, and no texture has seams
     outlines: bool  # a point of a surface may see where a shape, a lamp or a texture ends
-    tables: Tables  # of single BSDFs and shapes
+    tables: Tables = None  # type: ignore[assignment]  # of single BSDFs and shapes; of now, as all that follows
     # What has gradients:
     lights_deform: bool = False  # vertex positions of a mesh that emits
     instances_move: bool = False  # the to_world of an instance
@@ -76,8 +82,8 @@ class Traits:
 def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     """Look at all BSDFs and shapes of a scene, those nested in other BSDFs and in instanced shapes included.
 
-    What depends on gradients is left at False: see `SceneFacts`. With media, null boundaries are not mirrors: the step
-    sends light straight through them.
+    Tables and what depends on gradients are left out: see `SceneFacts`. With media, null boundaries are not mirrors:
+    the step sends light straight through them.
     """
     media = any(isinstance(node, mi.Medium) for node in nodes)
     bsdfs = [node for node in nodes if isinstance(node, mi.BSDF) and not (media and is_null(node))]
@@ -101,18 +107,47 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         glossy=_is_glossy(bsdfs, nodes),
         outlines=not _seamless(shapes, nodes),
-        tables=Tables(
-            mi.Bool(_by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)) if attachables else None,
-            blend_lengths(shapes),
-            *pieces_of(shapes),
-            lamp_balls(scene.emitters(), shapes),
-        ),
     )
+
+
+def tables_of(
+    attachables: Iterable[mi.BSDF], shapes: list[mi.Shape], emitters: list[mi.Emitter], edges: bool = True
+) -> Tables:
+    """The tables of a scene, as it is now; without ``edges`` those of pieces, which may be long, are left out."""
+    attachable = _by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)
+    return Tables(
+        _array(mi.Bool, attachable) if attachables else None,
+        blend_lengths(shapes),
+        *(pieces_of(shapes) if edges else (mi.UInt32(WHOLE), mi.UInt32(0))),
+        lamp_balls(emitters, shapes),
+    )
+
+
+def _array(kind: type, values: Any) -> Any:
+    """An array of these values.
+
+    While `dr.freeze` records, arrays from the host are unknown to it. Then the recording writes them, in runs of equal
+    values.
+    """
+    if not dr.flag(dr.JitFlag.FreezingScope):
+        return kind(values)
+    values = np.asarray(values)
+    begins = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1), len(values)]
+    if len(begins) > MOST_RUNS:
+        raise PathreplayError(
+            f"pathreplay: dr.freeze records a pass over a scene that was not rendered before, and would have to write "
+            f"{len(begins)} facts about it: call the function once outside of dr.freeze, with the same integrator"
+        )
+    array = dr.full(kind, values[0].item(), len(values))
+    for begin, end in pairwise(begins[1:]):
+        dr.scatter(array, kind(values[begin].item()), int(begin) + dr.arange(mi.UInt32, int(end - begin)))
+    dr.eval(array)
+    return array
 
 
 def blend_lengths(shapes: list[mi.Shape]) -> mi.Float:
     """The table of each shape's `blend_length`."""
-    return mi.Float(_by_index(mi.ShapePtr, shapes, blend_length, 0.0))
+    return _array(mi.Float, _by_index(mi.ShapePtr, shapes, blend_length, 0.0))
 
 
 def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
@@ -131,7 +166,7 @@ def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
         return sum(map(len, found[:-1]))
 
     begins = _by_index(mi.ShapePtr, shapes, begin, WHOLE)
-    return mi.UInt32(begins), mi.UInt32(np.concatenate(found).astype(np.uint32))
+    return _array(mi.UInt32, begins), _array(mi.UInt32, np.concatenate(found).astype(np.uint32))
 
 
 def is_coarse(mesh: mi.Mesh) -> bool:
@@ -162,7 +197,7 @@ def lamp_balls(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:
     """For each emitter, in the order of the scene, a ball around its mesh: centre, and radius, 0 without one."""
     lamps = {lamp.emitter(): lamp for lamp in _mesh_lamps(shapes)}
     balls = [_ball(lamps[emitter]) if emitter in lamps else np.zeros(4) for emitter in emitters]
-    return mi.Float(np.ravel(balls or [np.zeros(4)]))  # an empty array would end the process
+    return _array(mi.Float, np.ravel(balls or [np.zeros(4)]))  # an empty array would end the process
 
 
 def _mesh_lamps(shapes: list[mi.Shape]) -> list[mi.Shape]:
@@ -197,20 +232,6 @@ def _attachables(nodes: set[mi.Object], shapes: list[mi.Shape]) -> list[mi.BSDF]
     seen = {shape.bsdf() for shape in shapes if not shape.is_emitter()}
     bsdfs = {node for node in nodes if isinstance(node, mi.BSDF)} - (of_lamps - seen)
     return [bsdf for bsdf in bsdfs if _is_attachable(bsdf)]
-
-
-def nodes_of(root: mi.Object) -> set[mi.Object]:
-    """All objects of a scene, or below one of its objects."""
-    seen: set[mi.Object] = set()
-
-    class Collector(mi.TraversalCallback):  # type: ignore[misc, name-defined]
-        def put(self, name: str, value: object, flags: int, cpptype: type | None = None) -> None:
-            if isinstance(value, mi.Object) and value not in seen:
-                seen.add(value)
-                value.traverse(Collector())  # one callback per node: Mitsuba forbids re-entry
-
-    root.traverse(Collector())
-    return seen
 
 
 def is_painted(emitter: mi.Emitter | mi.EmitterPtr) -> bool | mi.Bool:
@@ -250,14 +271,3 @@ def _is_attachable(bsdf: mi.BSDF) -> bool:
     if name in FRAMES:
         return all(_is_attachable(nested) for nested in nodes_of(bsdf) if isinstance(nested, mi.BSDF))
     return name in ATTACHABLE
-
-
-def with_gradients(node: mi.Object, *names: str) -> list[Any]:
-    """The parameters of a node, and of those below it, that have gradients; with names, those that are called so.
-
-    What goes on after a name with a dot is called so, too.
-    """
-    params = mi.traverse(node)
-    found = [params[key] for key in params.keys() if not names or any(f"{key}.".startswith(f"{n}.") for n in names)]
-    with dr.resume_grad():
-        return [value for value in found if dr.grad_enabled(value)]
