@@ -10,7 +10,6 @@ each of the 24 configurations how far picture, forward and reverse derivative ar
 from __future__ import annotations
 
 import argparse
-import gc
 import importlib.util
 import sys
 import time
@@ -79,7 +78,6 @@ def reference(tests: ModuleType, config: Any, kind: str) -> np.ndarray:
 
 def measure(tests: ModuleType, config: Any, options: dict[str, Any]) -> tuple[tuple[float, ...], Limits]:
     """Errors as Mitsuba's three tests take them, and what they may be."""
-    gc.collect()  # earlier scenes would be traced, too
     config.initialize()
     wanted = {key: value for key, value in config.integrator_dict.items() if key not in OTHERS}
     integrator = mi.load_dict(wanted | options)
@@ -107,7 +105,6 @@ def measure(tests: ModuleType, config: Any, options: dict[str, Any]) -> tuple[tu
 
 def made_again(tests: ModuleType, config: Any, seed: int) -> tuple[float, float]:
     """How far the forward reference is from itself, made by its own recipe with another seed."""
-    gc.collect()
     config.initialize()
     plain = mi.load_dict({"type": "path", "max_depth": config.integrator_dict["max_depth"]})
     ends = []
