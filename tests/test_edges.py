@@ -204,7 +204,7 @@ def test_edges_of_what_follows_its_samples_are_refused(attach: str) -> None:
 def test_where_nothing_moves_nothing_is_added() -> None:
     """A reflectance has no edges: the same gradient, from as many kernels."""
     found = {}
-    for edges in ("none", "all"):
+    for edges in ("none", "all", "auto"):
         scene = world()
         params = mi.traverse(scene)
         integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": edges})
@@ -219,8 +219,9 @@ def test_where_nothing_moves_nothing_is_added() -> None:
                 grad = np.array(dr.grad(params[key]))
             kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
         found[edges] = grad, len(kernels)
-    assert np.array_equal(found["none"][0], found["all"][0])
-    assert found["none"][1] == found["all"][1]
+    for edges in ("all", "auto"):
+        assert np.array_equal(found["none"][0], found[edges][0])
+        assert found["none"][1] == found[edges][1]
 
 
 def test_the_cone_around_a_mesh_lamp_follows_it() -> None:

@@ -1,4 +1,4 @@
-"""Where edges move one line says that their part of the gradient is missing, once, and only there."""
+"""Where edges move one line says, once, what they cost, or that their part of the gradient is missing; only there."""
 
 from __future__ import annotations
 
@@ -68,10 +68,16 @@ def log() -> Any:
     logger.remove_appender(kept)
 
 
-@pytest.mark.parametrize("key", ["cube.vertex_positions", "lamp.position", "sky.to_world", "sky.data"])
-def test_a_script_is_told_once(key: str, log: Any) -> None:
+WORDS = {"auto": "edges = 'none' of the integrator leaves them out", "none": "pathreplay check"}
+
+
+@pytest.mark.parametrize(
+    ("key", "edges"),
+    [("cube.vertex_positions", "none"), ("lamp.position", "none"), ("lamp.position", "auto"), ("sky.data", "auto")],
+)
+def test_a_script_is_told_once(key: str, edges: str, log: Any) -> None:
     scene = make_scene()
-    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2, "edges": edges})
     params = mi.traverse(scene)
     value = type(params[key])(params[key])
     dr.enable_grad(value)
@@ -79,9 +85,12 @@ def test_a_script_is_told_once(key: str, log: Any) -> None:
     params.update()
     for seed in (1, 2):
         dr.backward(dr.mean(mi.render(scene, params, integrator=integrator, spp=2, seed=seed), axis=None))
-    told = [line for line in log.lines if "moving edges" in line]
+    dr.disable_grad(value)  # or it would move in the kernels of other scenes
+    params[key] = value
+    params.update()
+    told = [line for line in log.lines if "edges" in line]
     assert len(told) == (key in MOVE)
-    assert all(key in line and "pathreplay check" in line for line in told)
+    assert all(WORDS[edges] in line and (key in line or edges == "auto") for line in told)
 
 
 XML = """<scene version="3.0.0">
@@ -104,17 +113,17 @@ def run(parameter: dict[str, Any], integrator: str = "pathreplay", **target: Any
 
 
 @pytest.mark.parametrize(("integrator", "parameter", "told"), [
-    ("pathreplay", MOVED, True), ("prb", MOVED, True), ("pathreplay", PAINTED, False),
+    ("pathreplay", MOVED, "edges move with"), ("prb", MOVED, "moving edges"), ("pathreplay", PAINTED, ""),
 ])  # fmt: skip
 def test_a_job_is_told_in_its_report_and_not_in_the_log_too(
-    integrator: str, parameter: dict[str, Any], told: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: Any,
+    integrator: str, parameter: dict[str, Any], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: Any,
     capfd: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.xml").write_text(XML)
     html = run(parameter, integrator).report.read_text()
-    assert html.count("moving edges") == told
-    assert not [line for line in log.lines if "moving edges" in line]
+    assert html.count("docs/edges.md") == bool(told) and told in html
+    assert not [line for line in log.lines if "edges" in line]
 
 
 def picture(folder: Path, alpha: int) -> None:

@@ -145,9 +145,9 @@ class PathIntegrator:
         tangent = None
         for part in self._parts(scene, sensor, seed, spp):
             with self._passing():
-                walk = self._walk(scene, part.sensor)
+                walk, terms = self._planned(part)
                 learned = self._learned(part, walk)
-                found = reduce(add, [term.forward(part, walk, learned) for term in self.terms])
+                found = reduce(add, [term.forward(part, walk, learned) for term in terms])
                 tangent = _sum(tangent, found.image, part.share)
             self._told(part, walk, found)
         return tangent
@@ -164,10 +164,10 @@ class PathIntegrator:
         sums = Sums(scene) if len(of_parts) > 1 else None
         for part in of_parts:
             with self._passing(), dr.isolate_grad():
-                walk = self._walk(scene, part.sensor)
+                walk, terms = self._planned(part)
                 learned = self._learned(part, walk)
                 wanted = grad_in if part.share == 1 else grad_in * part.share
-                found = reduce(add, [term.backward(part, walk, wanted, learned) for term in self.terms])
+                found = reduce(add, [term.backward(part, walk, wanted, learned) for term in terms])
             self._told(part, walk, found)
             if sums is not None:
                 sums.take()
@@ -184,6 +184,10 @@ class PathIntegrator:
         if mode != dr.ADMode.Primal:
             raise PathreplayError(f"{self.name}: sample() is not differentiated: use mi.render, or render_backward")
         return *primal(self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
+
+    def _planned(self, view: Pass) -> tuple[Walk, tuple[Term, ...]]:
+        """How a gradient pass walks, and the terms that it adds up."""
+        return self._walk(view.scene, view.sensor), self.terms
 
     def _learned(self, view: Pass, walk: Walk) -> Guess | None:
         """What earlier passes found out that this one may use."""
