@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from pathreplay.inverse import make_config, optimize
+from pathreplay.inverse.loop import new_run
 from pathreplay.inverse.movement import MOST_PARTS, SHORTEST, parts_of, still_moves
+from pathreplay.inverse.problem import build_problem
 from pathreplay.inverse.schedules import rate
-from pathreplay.inverse.trade_offs import trade_offs
+from pathreplay.inverse.trade_offs import columns_of, trade_offs
 from pathreplay.inverse.verdict import Verdict
 
 # ------------------------------ Whether values still move ------------------------------
@@ -127,6 +129,26 @@ def test_a_run_says_what_came_of_its_values(case: str, tmp_path: Path, monkeypat
     last = result.describe().splitlines()[-1]
     assert last == str(verdict) and all(key in last for pair in verdict.trade_offs for key in pair)
     assert str(verdict)[1:].replace("'", "&#39;") in result.report.read_text()
+
+
+@pytest.mark.parametrize("floor", [False, True])
+def test_what_moves_together_is_told_apart_by_what_stands_still(floor: bool, tmp_path: Path) -> None:
+    """A camera and the only thing that it sees, to the last sample; and the same above a floor."""
+    still = '<shape type="rectangle"><transform name="to_world"><translate z="1"/></transform></shape>' * floor
+    body = '<shape type="cube" id="cube"><transform name="to_world"><scale value="0.4"/></transform></shape>'
+    made = SCENE[: SCENE.index("<shape")] + still + body + '<emitter type="constant"/></scene>'
+    (tmp_path / "scene.xml").write_text(made)
+    keys = "cam.to_world", "cube.vertex_positions"
+    start = {"translation": [0.1, 0.1, 0.1]}
+    job = {
+        "scene": "scene.xml", "target": {"scene": "scene.xml", "spp": 1},
+        "integrator": {"type": "pathreplay", "max_depth": 2, "edges": "none"},
+        "parameters": [{"key": key, "pose": "translation", "start": start} for key in keys],
+    }  # fmt: skip
+    problem = build_problem(make_config(job), tmp_path)
+    columns, unseen = columns_of(problem, new_run(problem, problem.integrator).values)
+    pair = tuple(f"{key}:translation" for key in keys)
+    assert unseen == () and trade_offs(columns) == (() if floor else (pair,))
 
 
 def test_a_verdict_is_one_line_that_names_what_to_do() -> None:

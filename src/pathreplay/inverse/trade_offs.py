@@ -1,7 +1,8 @@
 """What pictures do not determine: parameters that change nothing, and pairs of which one undoes what the other does.
 
-The columns of J, the derivative of all pictures by a few numbers of each parameter, are differences of renderings with
-the same random numbers. Between the spaces that the columns of two parameters span is a smallest angle: where it is
+The columns of J, the derivative of all pictures by a few numbers of each parameter, are central differences of
+renderings with the same random numbers, so that what moves a camera back and what moves all else forth give the same
+column, noise and all. Between the spaces that the columns of two parameters span is a smallest angle: where it is
 zero, some change of the one looks as some change of the other, and the pictures know only what both make together. The
 light of a lamp and the reflectance of what it lights are such a pair.
 """
@@ -23,7 +24,7 @@ from pathreplay.inverse.variables import Variable
 FEW = 4
 """Numbers of a variable that are changed one by one; those of larger ones, all in proportion."""
 MOST_COLUMNS, MOST_VIEWS, MOST_SAMPLES = 16, 4, 16
-"""That this may cost: renderings of each view, views, and samples per pixel."""
+"""That this may cost: pairs of renderings of each view, views, and samples per pixel."""
 STEP = 0.01
 """Of a value and of how far it has come, and of a step: so much is changed."""
 UNDONE = 0.05
@@ -55,11 +56,11 @@ def columns_of(problem: Problem, values: Arrays) -> tuple[Columns, tuple[str, ..
         changes = {v.key: _changes(v, values[v.key], few=0) for v in variables}
     if len(variables) > MOST_COLUMNS:
         return {}, ()
-    render = _renderer(problem)
-    still = render(values)
+    render, bounds = _renderer(problem), {v.key: v.bounds for v in variables}
     found, unseen = {}, []
     for key, each in changes.items():
-        columns = np.stack([render({**values, key: values[key] + change}) - still for change in each], axis=1)
+        ends = [[np.clip(values[key] + sign * change, *bounds[key]) for sign in (1, -1)] for change in each]
+        columns = np.stack([render({**values, key: a}) - render({**values, key: b}) for a, b in ends], axis=1)
         seen = np.linalg.norm(columns, axis=0) > 0
         if seen.any():
             found[key] = columns[:, seen]
@@ -84,14 +85,12 @@ def _renderer(problem: Problem) -> Callable[[Arrays], NDArray[np.float64]]:
 
 
 def _changes(variable: Variable, value: Array, few: int = FEW) -> list[Array]:
-    """Small changes of a value, away from the bound that is near: of each number, or of all in proportion."""
-    size = STEP * (_length(value) + _length(value - variable.start)) if value.size <= few else 0.0
-    size += STEP * variable.learning_rate
+    """Small changes of a value: of each number, or of all in proportion."""
+    size = STEP * variable.learning_rate
     if value.size <= few:
-        steps = [size * one.reshape(value.shape).astype(np.float32) for one in np.eye(value.size)]
-    else:
-        steps = [np.float32(STEP) * value if value.any() else np.full_like(value, size)]
-    return [-step if (value + step > variable.bounds[1]).any() else step for step in steps]
+        size += STEP * (_length(value) + _length(value - variable.start))
+        return [size * one.reshape(value.shape).astype(np.float32) for one in np.eye(value.size)]
+    return [np.float32(STEP) * value if value.any() else np.full_like(value, size)]
 
 
 def _length(value: Array) -> float:
