@@ -89,6 +89,18 @@ def test_all_edges_are_differentiated_where_one_moves() -> None:
     assert np.array_equal(default, every) and not np.allclose(default, none, rtol=1e-2)
 
 
+def test_a_single_sample_of_a_single_pixel_is_enough() -> None:
+    """One line: a meter of light is a sensor, too."""
+    film = {**FILM, "width": 1, "height": 1}
+    meter = {"type": "radiancemeter", "origin": [0.9, 0, -4], "direction": [0, 0, 1], "film": film}
+    scene = mi.load_dict({"type": "scene", "cam": meter, "card": {"type": "rectangle"}, "sky": {"type": "constant"}})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    for spp in (1, 2, 16):
+        with attached(scene, "card.to_world") as value:
+            integrator.render_backward(scene, mi.traverse(scene), dr.ones(mi.TensorXf, (1, 1, 3)), spp=spp)
+            assert np.isfinite(np.array(dr.grad(value.matrix))).all()
+
+
 def test_nothing_is_traced_where_only_paint_moves(room: mi.Scene) -> None:
     """The same bits from as many kernels, for texture coordinates too, with which paths do move."""
     for key in ("wall.bsdf.reflectance.value", "card.vertex_texcoords"):
