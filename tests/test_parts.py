@@ -32,7 +32,7 @@ def room(side: int = 4, sampler: str = "independent", rfilter: str = "box", move
 
 
 def integrator(**options: Any) -> Any:
-    return mi.load_dict({"type": "pathreplay", "max_depth": 3, **options})
+    return mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": "none", **options})
 
 
 def gradient(scene: mi.Scene, key: str, seed: Any, spp: int, grad_in: np.ndarray, **options: Any) -> np.ndarray:
