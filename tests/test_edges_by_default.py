@@ -68,6 +68,23 @@ def gradient(scene: mi.Scene, key: str, **options: Any) -> tuple[np.ndarray, int
     return array, kernels
 
 
+@pytest.fixture
+def log() -> Iterator[list[str]]:
+    lines: list[str] = []
+
+    class Log(mi.Appender):  # type: ignore[misc]
+        def append(self, level: Any, text: str) -> None:
+            lines.append(text)
+
+        def log_progress(self, *_: Any) -> None:
+            pass
+
+    kept = Log()
+    mi.logger().add_appender(kept)
+    yield lines
+    mi.logger().remove_appender(kept)
+
+
 def test_what_moves_edges_is_what_can_hide_light_or_is_seen_from(room: mi.Scene) -> None:
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
     found = {}
@@ -89,8 +106,8 @@ def test_all_edges_are_differentiated_where_one_moves() -> None:
     assert np.array_equal(default, every) and not np.allclose(default, none, rtol=1e-2)
 
 
-def test_a_single_sample_of_a_single_pixel_is_enough() -> None:
-    """One line: a meter of light is a sensor, too."""
+def test_a_single_sample_of_a_single_pixel_is_enough(log: list[str]) -> None:
+    """One line: a meter of light is a sensor, too. What edges cost is told once, and how to switch them off."""
     film = {**FILM, "width": 1, "height": 1}
     meter = {"type": "radiancemeter", "origin": [0.9, 0, -4], "direction": [0, 0, 1], "film": film}
     scene = mi.load_dict({"type": "scene", "cam": meter, "card": {"type": "rectangle"}, "sky": {"type": "constant"}})
@@ -99,6 +116,7 @@ def test_a_single_sample_of_a_single_pixel_is_enough() -> None:
         with attached(scene, "card.to_world") as value:
             integrator.render_backward(scene, mi.traverse(scene), dr.ones(mi.TensorXf, (1, 1, 3)), spp=spp)
             assert np.isfinite(np.array(dr.grad(value.matrix))).all()
+    assert len([line for line in log if "edges = 'none' of the integrator leaves them out" in line]) == 1
 
 
 def test_nothing_is_traced_where_only_paint_moves(room: mi.Scene) -> None:
@@ -112,23 +130,6 @@ def test_nothing_is_traced_where_only_paint_moves(room: mi.Scene) -> None:
 def test_other_ways_to_attach_have_no_edges(attach: str) -> None:
     integrator = mi.load_dict({"type": "pathreplay", "attach": attach})
     assert integrator.edges == "none" and len(integrator.terms) == 1
-
-
-@pytest.fixture
-def log() -> Iterator[list[str]]:
-    lines: list[str] = []
-
-    class Log(mi.Appender):  # type: ignore[misc]
-        def append(self, level: Any, text: str) -> None:
-            lines.append(text)
-
-        def log_progress(self, *_: Any) -> None:
-            pass
-
-    kept = Log()
-    mi.logger().add_appender(kept)
-    yield lines
-    mi.logger().remove_appender(kept)
 
 
 def test_a_batch_of_sensors_goes_without_and_that_is_told_once(log: list[str]) -> None:

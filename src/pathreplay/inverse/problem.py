@@ -166,14 +166,9 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     album = Album.of(config.budget)
     modules = Modules(base)
     loss = find_loss(config.loss, modules)
-    wanted = [entry.key for entry in config.parameters if entry.shape is None]
-    wanted += [entry.key for entry in config.derived]
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
-    cameras = {name: shot.camera for name, shot in shots.items()}
-    scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
-    config, differences = completed(config, scene)
-    notes += differences
+    scene, config, notes = _loaded(config, base, shots)
     params = mi.traverse(scene)
     parameters.require_finite(params)
     integrator = _gradient_integrator(config.integrator)
@@ -239,6 +234,16 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     return Problem(
         config, scene, params, integrator, rival, judge, variables, poses, views, loss, notes, derived, known, album
     )
+
+
+def _loaded(config: Config, base: Path, shots: Mapping[str, Shot]) -> tuple[mi.Scene, Config, tuple[str, ...]]:
+    """The scene, the job with what it leaves to the scene (see `completed`), and what is to be said about both."""
+    wanted = [entry.key for entry in config.parameters if entry.shape is None]
+    wanted += [entry.key for entry in config.derived]
+    cameras = {name: shot.camera for name, shot in shots.items()}
+    scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
+    config, differences = completed(config, scene)
+    return scene, config, notes + differences
 
 
 def _kept(album: Album, variable: Variable) -> Variable:
