@@ -132,7 +132,9 @@ def test_a_run_says_what_came_of_its_values(case: str, tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("floor", [False, True])
-def test_what_moves_together_is_told_apart_by_what_stands_still(floor: bool, tmp_path: Path) -> None:
+def test_what_moves_together_is_told_apart_by_what_stands_still(
+    floor: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A camera and the only thing that it sees, to the last sample; and the same above a floor."""
     still = '<shape type="rectangle"><transform name="to_world"><translate z="1"/></transform></shape>' * floor
     body = '<shape type="cube" id="cube"><transform name="to_world"><scale value="0.4"/></transform></shape>'
@@ -146,9 +148,12 @@ def test_what_moves_together_is_told_apart_by_what_stands_still(floor: bool, tmp
         "parameters": [{"key": key, "pose": "translation", "start": start} for key in keys],
     }  # fmt: skip
     problem = build_problem(make_config(job), tmp_path)
-    columns, unseen = columns_of(problem, new_run(problem, problem.integrator).values)
+    values = new_run(problem, problem.integrator).values
+    columns, unseen = columns_of(problem, values)
     pair = tuple(f"{key}:translation" for key in keys)
     assert unseen == () and trade_offs(columns) == (() if floor else (pair,))
+    monkeypatch.setattr("pathreplay.inverse.trade_offs.FREE_SAMPLES", 100)  # of 64 pixels, by 12 pictures
+    assert columns_of(problem, values) == ({}, ()) and columns_of(problem, values, taken=10 * 64 * 12)[0]
 
 
 def test_a_verdict_is_one_line_that_names_what_to_do() -> None:

@@ -9,12 +9,13 @@ light of a lamp and the reflectance of what it lights are such a pair.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pathreplay.inverse.evaluate import LARGE
 from pathreplay.inverse.exposures import EXPOSURE
 from pathreplay.inverse.loop import picture_of
 from pathreplay.inverse.problem import Problem
@@ -23,8 +24,10 @@ from pathreplay.inverse.variables import Variable
 
 FEW = 4
 """Numbers of a variable that are changed one by one; those of larger ones, all in proportion."""
-MOST_COLUMNS, MOST_VIEWS, MOST_SAMPLES = 16, 4, 16
-"""That this may cost: pairs of renderings of each view, views, and samples per pixel."""
+MOST_COLUMNS, MOST_PIXELS, MOST_ROWS = 16, 2**23, 2**20
+"""Of all variables, of all views, and what of these is compared, evenly chosen."""
+MOST_SAMPLES, FREE_SAMPLES, SHARE = 16, 2**22, 0.1
+"""Of a pixel; of all renderings, where the run took few; and next to those that the run took."""
 STEP = 0.01
 """Of a value and of how far it has come, and of a step: so much is changed."""
 UNDONE = 0.05
@@ -45,43 +48,46 @@ def trade_offs(columns: Columns) -> tuple[tuple[str, str], ...]:
     return tuple(found)
 
 
-def columns_of(problem: Problem, values: Arrays) -> tuple[Columns, tuple[str, ...]]:
+def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Columns, tuple[str, ...]]:
     """Derivatives of the pictures by the variables, and the variables that change nothing in them.
 
-    Exposures are left out. Nothing where there are too many variables.
+    Exposures are left out. Nothing where there are too many or too large variables, or where to look at all views would
+    cost too much beside a run that took so many samples (``taken``).
     """
     variables = [v for v in problem.variables if v.key != EXPOSURE]
+    if any(values[v.key].size >= LARGE for v in variables) or len(variables) > MOST_COLUMNS:
+        return {}, ()
     changes = {v.key: _changes(v, values[v.key]) for v in variables}
     if sum(map(len, changes.values())) > MOST_COLUMNS:
         changes = {v.key: _changes(v, values[v.key], few=0) for v in variables}
-    if len(variables) > MOST_COLUMNS:
+    pixels = sum(view.target[..., 0].size for view in problem.trained().values())
+    pictures = 2 * pixels * sum(map(len, changes.values()))
+    spp = min(problem.config.most_spp, MOST_SAMPLES, int(max(FREE_SAMPLES, SHARE * taken) / pictures))
+    if spp < 1 or pixels > MOST_PIXELS:
         return {}, ()
-    render, bounds = _renderer(problem), {v.key: v.bounds for v in variables}
+    bounds = {v.key: v.bounds for v in variables}
     found, unseen = {}, []
     for key, each in changes.items():
-        ends = [[np.clip(values[key] + sign * change, *bounds[key]) for sign in (1, -1)] for change in each]
-        columns = np.stack([render({**values, key: a}) - render({**values, key: b}) for a, b in ends], axis=1)
-        seen = np.linalg.norm(columns, axis=0) > 0
-        if seen.any():
-            found[key] = columns[:, seen]
+        columns = []
+        for change in each:
+            ahead, behind = (np.clip(values[key] + sign * change, *bounds[key]) for sign in (1, -1))
+            column = _rendered(problem, {**values, key: ahead}, spp) - _rendered(problem, {**values, key: behind}, spp)
+            if column.any():
+                columns.append(column[:: max(1, column.size // MOST_ROWS)])
+        if columns:
+            found[key] = np.stack(columns, axis=1).astype(np.float64)
         else:
             unseen.append(key)
-    return found, tuple(unseen)
+    return {key: column for key, column in found.items() if column.any(axis=0).all()}, tuple(unseen)
 
 
-def _renderer(problem: Problem) -> Callable[[Arrays], NDArray[np.float64]]:
-    """All pixels that count, of the pictures with some values in the scene, always with the same random numbers."""
-    config, views = problem.config, list(problem.trained().values())[:MOST_VIEWS]
-    spp = min(config.most_spp, MOST_SAMPLES)
-
-    def render(values: Arrays) -> NDArray[np.float64]:
-        pictures = []
-        for view in views:
-            picture = picture_of(problem, config, values, view, spp).astype(np.float64)
-            pictures.append((picture if view.weight is None else picture * np.sqrt(view.weight)).ravel())
-        return np.concatenate(pictures)
-
-    return render
+def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
+    """All that counts of the pictures with these values in the scene, always by the same random numbers."""
+    pictures = []
+    for view in problem.trained().values():
+        picture = picture_of(problem, problem.config, values, view, spp)
+        pictures.append((picture if view.weight is None else picture * np.sqrt(view.weight)).ravel())
+    return np.concatenate(pictures)
 
 
 def _changes(variable: Variable, value: Array, few: int = FEW) -> list[Array]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.movement import SHORTEST, still_moves
 from pathreplay.inverse.problem import Problem
@@ -59,7 +61,9 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
     arrived = tuple(key for key in known if key not in moving)
     if stopped or not known:
         return Verdict(moving, arrived)
-    columns, unseen = columns_of(problem, run.values)
+    pixels = np.mean([view.target[..., 0].size for view in problem.trained().values()])
+    views = problem.config.views_per_step or len(problem.trained())
+    columns, unseen = columns_of(problem, run.values, float(pixels) * views * sum(entry.spp for entry in run.history))
     return Verdict(moving, arrived, trade_offs(columns), unseen)
 
 
