@@ -153,7 +153,7 @@ def test_what_moves_together_is_told_apart_by_what_stands_still(
     pair = tuple(f"{key}:translation" for key in keys)
     assert unseen == () and trade_offs(columns) == (() if floor else (pair,))
     monkeypatch.setattr("pathreplay.inverse.trade_offs.FREE_SAMPLES", 100)  # of 64 pixels, by 12 pictures
-    assert columns_of(problem, values) == ({}, ()) and columns_of(problem, values, taken=10 * 64 * 12)[0]
+    assert columns_of(problem, values) == ({}, ()) and columns_of(problem, values, taken=160 * 64 * 12)[0]
 
 
 def test_a_verdict_is_one_line_that_names_what_to_do() -> None:

@@ -64,7 +64,9 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
     pixels = np.mean([view.target[..., 0].size for view in problem.trained().values()])
     views = problem.config.views_per_step or len(problem.trained())
     columns, unseen = columns_of(problem, run.values, float(pixels) * views * sum(entry.spp for entry in run.history))
-    return Verdict(moving, arrived, trade_offs(columns), unseen)
+    # An outline may stay where it is among few samples; edges pull all the same.
+    pulled = {key for entry in run.history for key, slopes in entry.slopes.items() if any(slopes)}
+    return Verdict(moving, arrived, trade_offs(columns), tuple(key for key in unseen if key not in pulled))
 
 
 def _begin(problem: Problem, key: str, run: Run) -> int:
