@@ -72,6 +72,7 @@ def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Colu
         for change in each:
             ahead, behind = (np.clip(values[key] + sign * change, *bounds[key]) for sign in (1, -1))
             column = _rendered(problem, {**values, key: ahead}, spp) - _rendered(problem, {**values, key: behind}, spp)
+            column = np.where(np.isfinite(column), column, 0)
             if column.any():
                 columns.append(column[:: max(1, column.size // MOST_ROWS)])
         if columns:

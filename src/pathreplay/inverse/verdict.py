@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pathreplay.errors import PathreplayError
 from pathreplay.inverse.checkpoint import Run
 from pathreplay.inverse.movement import SHORTEST, still_moves
 from pathreplay.inverse.problem import Problem
@@ -63,7 +64,11 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
         return Verdict(moving, arrived)
     pixels = np.mean([view.target[..., 0].size for view in problem.trained().values()])
     views = problem.config.views_per_step or len(problem.trained())
-    columns, unseen = columns_of(problem, run.values, float(pixels) * views * sum(entry.spp for entry in run.history))
+    taken = float(pixels) * views * sum(entry.spp for entry in run.history)
+    try:
+        columns, unseen = columns_of(problem, run.values, taken)
+    except PathreplayError:  # a function of the user's may not take what is beside the values: the run is done
+        return Verdict(moving, arrived)
     # An outline may stay where it is among few samples; edges pull all the same.
     pulled = {key for entry in run.history for key, slopes in entry.slopes.items() if any(slopes)}
     return Verdict(moving, arrived, trade_offs(columns), tuple(key for key in unseen if key not in pulled))
