@@ -56,9 +56,12 @@ def attached(scene: mi.Scene, key: str) -> Iterator[Any]:
     params.update()
 
 
-def gradient(scene: mi.Scene, key: str, **options: Any) -> tuple[np.ndarray, int]:
+def ours(**options: Any) -> Any:
+    return mi.load_dict({"type": "pathreplay", "max_depth": 2, **options})
+
+
+def gradient(scene: mi.Scene, key: str, integrator: Any) -> tuple[np.ndarray, int]:
     """By a pass in one thread, which adds in one order; and how many kernels that took."""
-    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2, **options})
     with attached(scene, key) as value, one_thread(True), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.eval()
         dr.kernel_history_clear()
@@ -87,8 +90,7 @@ def log() -> Iterator[list[str]]:
 
 
 def test_what_moves_edges_is_what_can_hide_light_or_is_seen_from(room: mi.Scene) -> None:
-    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
-    found = {}
+    integrator, found = ours(), {}
     for key in MOVES + STAYS:
         with attached(room, key), dr.suspend_grad():
             view = Pass.of(room, 0, 0, 1)
@@ -98,33 +100,23 @@ def test_what_moves_edges_is_what_can_hide_light_or_is_seen_from(room: mi.Scene)
     assert found == dict.fromkeys(MOVES, True) | dict.fromkeys(STAYS, False)
 
 
-def test_all_edges_are_differentiated_where_one_moves() -> None:
-    """The same bits as with `all`, which are others than with `none`."""
+def test_all_edges_are_differentiated_where_one_moves(log: list[str]) -> None:
+    """The same bits as with `all`, which are others than with `none`. What it costs is told once."""
     sky = {"type": "constant"}
     scene = mi.load_dict({"type": "scene", "cam": ROOM["cam"], "card": {"type": "rectangle"}, "sky": sky})
-    ways = {}, {"edges": "all"}, {"edges": "none"}
-    default, every, none = (gradient(scene, "card.to_world", **options)[0] for options in ways)
-    assert np.array_equal(default, every) and not np.allclose(default, none, rtol=1e-2)
-
-
-def test_a_single_sample_of_a_single_pixel_is_enough(log: list[str]) -> None:
-    """One line: a meter of light is a sensor, too. What edges cost is told once, and how to switch them off."""
-    film = {**FILM, "width": 1, "height": 1}
-    meter = {"type": "radiancemeter", "origin": [0.9, 0, -4], "direction": [0, 0, 1], "film": film}
-    scene = mi.load_dict({"type": "scene", "cam": meter, "card": {"type": "rectangle"}, "sky": {"type": "constant"}})
-    integrator, quiet = (mi.load_dict({"type": "pathreplay", "max_depth": 2}) for _ in range(2))
-    quiet.told.add(EDGES)  # as a job does, which says it in its report
-    for which, spp in ((integrator, 1), (integrator, 16), (quiet, 16)):
-        with attached(scene, "card.to_world") as value:
-            which.render_backward(scene, mi.traverse(scene), dr.ones(mi.TensorXf, (1, 1, 3)), spp=spp)
-            assert np.isfinite(np.array(dr.grad(value.matrix))).all()
+    by_itself, told = ours(), ours()
+    told.told.add(EDGES)  # as in a job, which says it in its report
+    ways = by_itself, by_itself, told, ours(edges="all"), ours(edges="none")
+    default, again, quiet, every, none = (gradient(scene, "card.to_world", way)[0] for way in ways)
+    assert all(np.array_equal(default, same) for same in (again, quiet, every))
+    assert not np.allclose(default, none, rtol=1e-2)
     assert len([line for line in log if "edges = 'none' of the integrator leaves them out" in line]) == 1
 
 
 def test_nothing_is_traced_where_only_paint_moves(room: mi.Scene) -> None:
     """The same bits from as many kernels, for texture coordinates too, with which paths do move."""
     for key in ("wall.bsdf.reflectance.value", "card.vertex_texcoords"):
-        (default, few), (none, as_few) = (gradient(room, key, **o) for o in ({}, {"edges": "none"}))
+        (default, few), (none, as_few) = (gradient(room, key, way) for way in (ours(), ours(edges="none")))
         assert np.array_equal(default, none) and few == as_few
 
 
@@ -138,9 +130,8 @@ def test_a_batch_of_sensors_goes_without_and_that_is_told_once(log: list[str]) -
     cameras = {f"cam{n}": {**ROOM["cam"], "to_world": T().translate([n / 4, 0, -4])} for n in range(2)}
     batch = {"type": "batch", "film": {**FILM, "width": 16}, **cameras}
     scene = mi.load_dict({**ROOM, "cam": batch}, optimize=False)
-    integrators = [mi.load_dict({"type": "pathreplay", "max_depth": 2, **o}) for o in ({}, {"edges": "none"})]
     found = []
-    for integrator in integrators:
+    for integrator in (ours(), ours(edges="none")):
         with attached(scene, "card.vertex_positions") as value, one_thread(True):
             for _ in range(2):
                 dr.clear_grad(value)
