@@ -34,11 +34,11 @@ VARIANT = "llvm_ad_rgb"
 LIMIT = 1e-5
 """Of the relative L1 error of an array: float32 sums in another order stay well below."""
 PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
-    "primal": ("pathreplay", {}),
-    "sweep": ("pathreplay", {"driver": "sweep"}),
-    "replay": ("pathreplay", {"driver": "replay"}),
-    "forward": ("pathreplay", {}),
-    "pixels": ("pathreplay", {"driver": "sweep"}),
+    "primal": ("pathreplay", {"edges": "none"}),
+    "sweep": ("pathreplay", {"driver": "sweep", "edges": "none"}),
+    "replay": ("pathreplay", {"driver": "replay", "edges": "none"}),
+    "forward": ("pathreplay", {"edges": "none"}),
+    "pixels": ("pathreplay", {"driver": "sweep", "edges": "none"}),
     "tape": ("pathreplay_tape", {}),
     "tape-forward": ("pathreplay_tape", {}),
     "rb": ("pathreplay_rb", {}),

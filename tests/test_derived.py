@@ -144,7 +144,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def config(parameters: list[dict[str, Any]], derived: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
     return {
         "scene": "room.xml",
-        "integrator": {"type": "pathreplay", "max_depth": 3},
+        "integrator": {"type": "pathreplay", "max_depth": 3, "edges": "none"},
         "spp": 8,
         "picture_spp": 16,
         "iterations": 4,

@@ -195,6 +195,16 @@ def test_lines_are_picked_as_often_as_they_count() -> None:
     assert dr.all(Picked.of(dr.zeros(mi.Float, 100), 50, mi.UInt32(1)).weight == 0)
 
 
+def test_one_line_of_one_pixel_finds_its_place() -> None:
+    """As a meter of light has it: Dr.Jit gives numbers in place of arrays where tables have one entry."""
+    (x, y), one = quasi_random(mi.UInt32(0), 1, mi.UInt32(5)), dr.ones(mi.Float, 1)
+    assert 0 <= x[0] < 1 and 0 <= y[0] < 1
+    place, density = Centres(1, 1, 0.0).refined(mi.Point2f(0.5), one).draw(mi.Point2f(x, y))
+    assert dr.all((place >= 0) & (place < 1)) and dr.allclose(density, 1)
+    picked = Picked.of(one, 1, dr.opaque(mi.UInt32, 3))
+    assert picked.index == 0 and picked.weight == 1
+
+
 @pytest.mark.parametrize("attach", ["all", "none"])
 def test_edges_of_what_follows_its_samples_are_refused(attach: str) -> None:
     with pytest.raises(RuntimeError, match=f"edges = 'film' with attach = '{attach}'"):
@@ -204,7 +214,7 @@ def test_edges_of_what_follows_its_samples_are_refused(attach: str) -> None:
 def test_where_nothing_moves_nothing_is_added() -> None:
     """A reflectance has no edges: the same gradient, from as many kernels."""
     found = {}
-    for edges in ("none", "all"):
+    for edges in ("none", "all", "auto"):
         scene = world()
         params = mi.traverse(scene)
         integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": edges})
@@ -219,8 +229,9 @@ def test_where_nothing_moves_nothing_is_added() -> None:
                 grad = np.array(dr.grad(params[key]))
             kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
         found[edges] = grad, len(kernels)
-    assert np.array_equal(found["none"][0], found["all"][0])
-    assert found["none"][1] == found["all"][1]
+    for edges in ("all", "auto"):
+        assert np.array_equal(found["none"][0], found[edges][0])
+        assert found["none"][1] == found[edges][1]
 
 
 def test_the_cone_around_a_mesh_lamp_follows_it() -> None:

@@ -55,7 +55,7 @@ def run(**changes: Any) -> Any:
 
 BAD = {
     "of another integrator": ({"type": "prb", "edges": "all"}, "'edges' is an option of the integrator 'pathreplay'"),
-    "unknown": ({"type": "pathreplay", "edges": "outline"}, "edges = 'outline' is unknown: use one of 'none', 'film'"),
+    "unknown": ({"type": "pathreplay", "edges": "outline"}, "edges = 'outline' is unknown: use one of 'auto', 'none'"),
     "below zero": (
         {"type": "pathreplay", "edges": "all", "edge_spp": -1},
         "edge_spp = -1: use a number of lines per pixel >= 0",
@@ -103,19 +103,22 @@ def test_the_depth_of_a_check_leaves_the_edges_of_the_scene() -> None:
 @pytest.mark.slow
 def test_a_check_of_an_outline_passes_with_edges_and_fails_without() -> None:
     scene = ["check", "silhouettes", "--param", KEY, "--seeds", "6", "--spp", "256", "--fd-spp", "2048"]
-    passed = CliRunner().invoke(app, [*scene, "--edges", "film"])
-    assert passed.exit_code == 0 and "pathreplay, edges film (backward)" in passed.output
-    assert CliRunner().invoke(app, scene).exit_code == 1
+    passed = CliRunner().invoke(app, scene)
+    assert passed.exit_code == 0 and "pathreplay (backward)" in passed.output
+    failed = CliRunner().invoke(app, [*scene, "--edges", "none"])
+    assert failed.exit_code == 1 and "pathreplay, edges none (backward)" in failed.output
 
 
 # ------------------------------ What is told ------------------------------
 
 
-@pytest.mark.parametrize(("edges", "told"), [("none", "silhouettes, shadows"), ("film", "soft shadows"), ("all", "")])
-def test_a_job_says_what_its_edges_leave_out(edges: str, told: str) -> None:
+@pytest.mark.parametrize(("edges", "told"), [
+    ("none", "silhouettes, shadows"), ("film", "soft shadows"), ("all", ""), ("auto", "several times as long"),
+])  # fmt: skip
+def test_a_job_says_what_its_edges_leave_out_or_cost(edges: str, told: str) -> None:
     job = {**JOB, "integrator": {**JOB["integrator"], "edges": edges}}
     notes = " ".join(build_problem(make_config(job), Path.cwd()).notes)
-    assert notes.count("moving edges") == bool(told) and told in notes
+    assert notes.count("docs/edges.md") == bool(told) and told in notes
 
 
 @pytest.mark.slow

@@ -41,13 +41,13 @@ FILTERS = {"image first": "", "with the image": '<rfilter type="box"/>'}
 @pytest.mark.slow
 @pytest.mark.parametrize("way", FILTERS)
 def test_steps_with_edges_that_were_recorded_are_those_that_are_traced(way: str, tmp_path: Path) -> None:
-    """`steps` sees that one thing was recorded. Without edges the gradient is another."""
+    """`steps` sees that one thing was recorded. Edges are on by themselves; without them the gradient is another."""
     (tmp_path / "scene.xml").write_text(SCENE.format(filter=FILTERS[way]))
     found = {}
-    for edges, passes in (("all", "recorded"), ("all", "traced"), ("none", "traced")):
+    for edges, passes in (("auto", "recorded"), ("all", "traced"), ("none", "traced")):
         config = make_config({**JOB, "integrator": {"type": "pathreplay", "max_depth": 2, "edges": edges}})
         found[edges, passes] = steps(build_problem(config, tmp_path), config, passes)
-    recorded = found["all", "recorded"]
+    recorded = found["auto", "recorded"]
     np.testing.assert_allclose(recorded, found["all", "traced"], rtol=1e-3)
     without = found["none", "traced"]
     assert (np.abs(recorded - without)[:, 1] > 0.1 * recorded[:, 1]).all()

@@ -135,7 +135,7 @@ JOB: dict[str, Any] = {
     "spp": 4,
     "iterations": 3,
     "scene_parameters": {"resolution": 16},
-    "integrator": {"type": "pathreplay", "max_depth": 3},
+    "integrator": {"type": "pathreplay", "max_depth": 3, "edges": "none"},
     "pixels_per_step": 40,
 }
 

@@ -167,7 +167,7 @@ JOB = {
     "target": {"values": {"red.reflectance.value": 0.7}, "spp": 16},
     "spp": 8,
     "iterations": 4,
-    "integrator": {"type": "pathreplay", "max_depth": 3},
+    "integrator": {"type": "pathreplay", "max_depth": 3, "edges": "none"},
 }
 
 

@@ -128,7 +128,7 @@ EYE = {
 }
 JOB = {
     "scene": "sheet.xml",
-    "integrator": {"type": "pathreplay", "max_depth": 2},
+    "integrator": {"type": "pathreplay", "max_depth": 2, "edges": "none"},  # paint shows it
     "iterations": 4,
     "spp": 8,
     "picture_spp": 16,

@@ -12,6 +12,7 @@ import pytest
 from pathreplay.inverse import progress
 from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.result import RunResult
+from pathreplay.inverse.verdict import Verdict
 
 
 def lines(total: int) -> None:
@@ -78,5 +79,7 @@ def test_a_signal_that_comes_while_a_line_is_printed_ends_nothing(monkeypatch: p
 def test_a_result_prints_short() -> None:
     history = tuple(Entry(i, 0.5, 1.0, {"a": 1.0}) for i in range(1000))
     values = {"a": np.zeros((100, 100, 3), np.float32)}
-    result = RunResult(Path("runs/x"), Path("runs/x/report.html"), 1000, False, None, history, values, {}, {}, {}, ())
+    result = RunResult(
+        Path("runs/x"), Path("runs/x/report.html"), 1000, False, None, history, values, {}, {}, {}, (), Verdict()
+    )
     assert repr(result) == "<RunResult: 1000 iterations, loss 0.5, 1 parameters, runs/x/report.html>"

@@ -108,7 +108,14 @@ def gradient(
     """Derivative of a weighted image by three shifts and a turn of each of ``keys`` (number of keys x 4)."""
     keys = keys or ("obj.to_world",)
     integrator = mi.load_dict(
-        {"type": "pathreplay", "max_depth": depth, "rr_depth": 1000, "driver": driver, "attach": attach}
+        {
+            "type": "pathreplay",
+            "max_depth": depth,
+            "rr_depth": 1000,
+            "driver": driver,
+            "attach": attach,
+            "edges": "none",
+        }
     )
     if recovery is not None:
         integrator.interior = replace(integrator.interior, recovery=recovery)

@@ -85,7 +85,7 @@ def test_what_is_masked_does_not_reach_smaller_pictures() -> None:
 
 def test_a_job_goes_through_its_stages() -> None:
     values, batches = [], []
-    session = iterate(staged())
+    session = iterate(staged(learning_rate_decay=0.1))
     for state in session:
         values.append({key: value.copy() for key, value in state.values.items()})
         batches.append(set(state.gradient_norms))

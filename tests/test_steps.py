@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,7 @@ def by_hand(opt: drjit.opt.Optimizer, rates: Any = None) -> np.ndarray:
     params = mi.traverse(scene)
     params[key] = mi.Color3f(JOB["target"]["values"][key])
     params.update()
-    judge = mi.load_dict({"type": "path", "max_depth": 6})
+    judge = mi.load_dict({"type": "path", "max_depth": 2})  # as the job renders
     target = mi.render(scene, integrator=judge, spp=16, seed=config.seeds(1, 0)[0])
     opt[key] = mi.Color3f(JOB["parameters"][0]["initial"])
     integrator = mi.load_dict({"type": "prb", "max_depth": 2})
@@ -75,7 +76,7 @@ def by_hand(opt: drjit.opt.Optimizer, rates: Any = None) -> np.ndarray:
             scene, params, integrator=integrator, spp=JOB["spp"], seed=mi.UInt32(config.seeds(ITERATION, 0, i)[0])
         )
         dr.backward(dr.mean(dr.square(image - target), axis=None))
-        opt.set_learning_rate(0.02 * rates(i) if rates else 0.02 * 0.1 ** (i / JOB["iterations"]))
+        opt.set_learning_rate(0.02 * rates(i) if rates else 0.02)
         opt.step()
     return np.array(dr.detach(opt[key])).ravel()
 
@@ -99,6 +100,15 @@ def test_rates_follow_their_schedule() -> None:
     assert all_of("cosine") == pytest.approx([1, 0.55 + half, 0.55, 0.55 - half, 0.1])
     assert all_of("constant") == [1] * 5
     assert all_of("constant", 3) == pytest.approx([0.25, 0.5, 0.75, 1, 1])
+
+
+def test_rates_are_constant_where_no_decay_is_given() -> None:
+    decay = {"learning_rate_decay": 0.01}
+    plain, falling = (make_config({**JOB, **change}) for change in ({}, decay))
+    named = make_config({**JOB, **decay, "learning_rate_schedule": "linear"})
+    assert [each.learning_rate_schedule for each in (plain, falling, named)] == ["constant", "exponential", "linear"]
+    again = json.loads(falling.model_dump_json(exclude_unset=True))  # as the run folder has it
+    assert "learning_rate_schedule" not in again and make_config(again).learning_rate_schedule == "exponential"
 
 
 @pytest.mark.slow

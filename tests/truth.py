@@ -147,7 +147,8 @@ class Bench(Objective):
         self.weigh(np.random.default_rng(0).uniform(0, 1, (RES, RES, 3)).astype(np.float32) / RES**2)
 
     def integrator(self, plugin: str = "pathreplay", **options: Any) -> mi.Integrator:
-        made = mi.load_dict({"type": plugin, "max_depth": self.case.depth, **options})
+        held = {"edges": "none"} if plugin == "pathreplay" else {}  # most cases are about the interior alone
+        made = mi.load_dict({"type": plugin, "max_depth": self.case.depth, **held, **options})
         if plugin.startswith("pathreplay"):
             made.rr_depth = dr.opaque(mi.UInt32, made.rr_depth)  # with roulette and without it: the same kernels
         return made

@@ -115,8 +115,10 @@ def check(
     step: Annotated[float | None, typer.Option(help="Step of the differences (default: 1 % of the parameter).")] = None,
     max_depth: Annotated[int | None, typer.Option(help="Path length (default: the scene's).")] = None,
     edges: Annotated[
-        Literal["none", "film", "all"] | None,
-        typer.Option(help="Which edges 'pathreplay' differentiates (default: the scene's, else none)."),
+        Literal["auto", "none", "film", "all"] | None,
+        typer.Option(
+            help="Which edges 'pathreplay' differentiates (default: the scene's, else auto: where they move)."
+        ),
     ] = None,
     edge_spp: Annotated[int | None, typer.Option(help="Lines per pixel that look for edges (default: --spp).")] = None,
     mode: Annotated[

@@ -177,9 +177,9 @@ def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
 
 
 def integrator_name(integrator: mi.Integrator) -> str:
-    """The integrator as its user writes it, from the name of its class: 'PRBIntegrator' is 'prb'; and its edges."""
+    """The integrator as its user writes it, from its class: 'PRBIntegrator' is 'prb'; and edges that are asked for."""
     # For Python plugins Mitsuba's class_name() is that of the C++ base.
     name = type(integrator).__name__ if isinstance(integrator, mi.CppADIntegrator) else str(integrator.class_name())
     name = name.removesuffix("Integrator").replace("VolumetricPath", "Volpath").lower()
-    edges = getattr(integrator, "edges", "none")
-    return name if edges == "none" else f"{name}, edges {edges}"
+    edges = getattr(integrator, "edges", "auto")
+    return name if edges == "auto" else f"{name}, edges {edges}"

@@ -6,16 +6,14 @@ read off the integrator under test.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 from pathreplay.render.facts import facts_of
-from pathreplay.render.path_integrator import UNBOUNDED
+from pathreplay.render.path_limits import read_limits
 from pathreplay.scenes.descriptions import load_integrator
 
 Spec: TypeAlias = "mi.Integrator | Mapping[str, Any] | str | None"
@@ -26,27 +24,6 @@ NO_ROULETTE = 2**30
 
 LONGEST_WITHOUT_ROULETTE = 64
 """Above this length the reference keeps Russian roulette: without it, no path of a closed room ends before its time."""
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What decides the image that an integrator estimates. ``max_depth`` -1: no bound."""
-
-    max_depth: int
-    rr_depth: int
-    hide_emitters: bool
-
-
-def read_limits(integrator: mi.Integrator) -> Limits | None:
-    """The limits of an integrator of Mitsuba's or ours, or None where it has no path length to read."""
-    # Python integrators have attributes; C++ ones only print them.
-    printed = dict(re.findall(r"(max_depth|rr_depth) = (-?\d+)", str(integrator)))
-    max_depth = getattr(integrator, "max_depth", printed.get("max_depth"))
-    rr_depth: Any = getattr(integrator, "rr_depth", printed.get("rr_depth", 5))
-    if max_depth is None:
-        return None
-    depth = int(max_depth)  # Mitsuba's Python integrators keep -1 as UNBOUNDED
-    return Limits(-1 if depth >= UNBOUNDED else depth, int(rr_depth), bool(getattr(integrator, "hide_emitters", False)))
 
 
 def integrator_under_test(

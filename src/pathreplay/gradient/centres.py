@@ -54,7 +54,7 @@ class Centres:
         if self.until is None:
             return u * mi.Point2f(self.width, self.height), mi.Float(1 / n)
         below = lambda i: dr.gather(mi.Float, self.until, i) <= u.x  # noqa: E731
-        i = dr.minimum(dr.binary_search(0, n - 1, below), n - 1)
+        i = mi.UInt32(dr.minimum(dr.binary_search(0, n - 1, below), n - 1))  # a number where there is one pixel
         begin = dr.select(i > 0, dr.gather(mi.Float, self.until, i - 1, i > 0), 0)
         share = dr.gather(mi.Float, self.until, i) - begin
         x = dr.clip((u.x - begin) / share, 0, dr.one_minus_epsilon(mi.Float))

@@ -158,7 +158,8 @@ class Picked:
         total = dr.gather(mi.Float64, until, n - 1)
         lane = dr.arange(mi.UInt32, lanes)
         x = (mi.Float64(lane) + mi.Float64(mi.sample_tea_float32(seed, lane, ROUNDS))) * (total / lanes)
-        index = dr.minimum(dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float64, until, i) <= x), n - 1)
+        found = dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float64, until, i) <= x)
+        index = mi.UInt32(dr.minimum(found, n - 1))  # a number where there is one line
         own = dr.gather(mi.Float, mass, index)
         return Picked(index, dr.select(own > 0, mi.Float(total / lanes) / own, 0))
 

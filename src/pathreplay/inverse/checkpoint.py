@@ -32,6 +32,8 @@ class Entry:
     the root mean square errors, after the step, of the variables whose truth is known, and how far poses are from
     theirs (see `PoseError.of`); ``picture_error`` is that of the pictures without their noise, in the iterations in
     which it was measured (jobs with a rival). Neither costs ``seconds``. ``penalty`` is what values add to the loss.
+    ``slopes`` are sums of each gradient over parts of its variable, and ``means`` those of its values after the step
+    (see `movement`).
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
@@ -47,6 +49,8 @@ class Entry:
     spp: NonNegativeInt = 0
     noise_norms: dict[str, float] = field(default_factory=dict)
     dropped_shares: dict[str, float] = field(default_factory=dict)
+    slopes: dict[str, list[float]] = field(default_factory=dict)
+    means: dict[str, list[float]] = field(default_factory=dict)
 
 
 @dataclass

@@ -188,7 +188,8 @@ class Target(Table):
     scene: str | None = None
     scene_parameters: dict[str, Argument] | None = None
     values: dict[str, Value] = Field(default_factory=dict)
-    integrator: Plugin = Plugin(type="path", max_depth=6)  # type: ignore[call-arg]
+    integrator: Plugin | None = None
+    """None: `path`, or `volpath`, with the limits of the job's integrator (see `completed`)."""
     spp: Count = 512
 
     @model_validator(mode="after")
@@ -207,7 +208,7 @@ class Target(Table):
             raise ValueError(f"target: alpha = '{self.alpha}' is about 'images'; leave it out, or name them")
         elif not self.values and self.scene is None:
             raise ValueError(NOTHING)
-        if self.integrator.type == "pathreplay":
+        if self.integrator is not None and self.integrator.type == "pathreplay":
             raise ValueError(
                 "target: integrator 'pathreplay' would grade itself; render targets with another, such as 'path'"
             )
@@ -230,6 +231,7 @@ class Config(Table):
     held_out: list[Whole | str] = Field(default_factory=list)
     variant: str | None = None
     integrator: Plugin = Plugin(type="pathreplay")
+    """Where it is left out, with what the scene's own integrator says (see `completed`)."""
     rival: Plugin | None = None
     parameters: Annotated[list[Parameter], Field(min_length=1)]
     derived: list[Derivation] = Field(default_factory=list)
@@ -249,7 +251,8 @@ class Config(Table):
     seed: Annotated[Whole, Field(ge=0, le=10**18)] = 0
     learning_rate: Positive = 0.02
     learning_rate_decay: Annotated[Positive, Field(le=1)] = 0.1
-    learning_rate_schedule: Schedule = "exponential"
+    learning_rate_schedule: Schedule = "constant"
+    """With a decay, and left out: exponential."""
     warm_up: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 0
     optimizer: Optimizer = Optimizer()
     stages: Annotated[list[Stage], Field(min_length=1)] | None = None
@@ -341,6 +344,8 @@ class Config(Table):
 
     @model_validator(mode="after")
     def _scheduled(self) -> Config:
+        if "learning_rate_decay" in self.model_fields_set and "learning_rate_schedule" not in self.model_fields_set:
+            self.__dict__["learning_rate_schedule"] = "exponential"  # not to be written down as if it had been given
         if self.learning_rate_schedule == "constant" and "learning_rate_decay" in self.model_fields_set:
             raise ValueError("learning_rate_decay does not go with learning_rate_schedule = 'constant'; leave one out")
         if self.warm_up >= self.iterations:

@@ -22,6 +22,7 @@ from pathreplay.inverse.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.grids import resampled
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.line_search import LineSearch
+from pathreplay.inverse.movement import parts_of
 from pathreplay.inverse.optimiser import DrJitOptimiser, Optimiser
 from pathreplay.inverse.optimizer_options import Optimizer
 from pathreplay.inverse.problem import Problem, errors_of, put_values, sensor_of
@@ -166,6 +167,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
         if key in gradients:
             gradients[key] = gradients[key] + slope
     penalty = sum(value for value, _ in penalties.values())
+    slopes = {key: parts_of(gradient) for key, gradient in gradients.items()}
     norms, sizes = _norms(gradients), {key: gradient.size for key, gradient in gradients.items()}
     release(values)
     run.whole = False
@@ -183,6 +185,8 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
         spp=spp,
         noise_norms=noise_norms,
         dropped_shares={key: n / (sizes[key] * len(shards)) for key, n in found.dropped.items()},
+        slopes=slopes,
+        means={key: parts_of(run.values[key], mean=True) for key in slopes},
     )
     run.history.append(entry)
     run.whole = True

@@ -19,6 +19,7 @@ from pathreplay.inverse.images import Image, difference
 from pathreplay.inverse.likeness import Likeness
 from pathreplay.inverse.pose import Pose, PoseError, error_names
 from pathreplay.inverse.values import Array
+from pathreplay.inverse.verdict import Verdict
 
 # Differences are shown brighter than the pictures: a converged one would be black otherwise.
 DIFFERENCE_GAIN = 4.0
@@ -231,6 +232,7 @@ class Outcome:
     values: dict[str, Array]
     """Variables as people see them, and what poses make of the scene, by key."""
     notes: tuple[str, ...]
+    verdict: Verdict
 
     @property
     def complete(self) -> bool:

@@ -156,4 +156,6 @@ def target_row(config: Config) -> Row:
         return Row("targets", (config.capture.source,))
     if target.images is not None:
         return Row("targets", (target.images if isinstance(target.images, str) else ", ".join(target.images),))
-    return Row("targets", (f"rendered by {target.integrator.type}, {target.spp} samples per pixel",))
+    options = {} if target.integrator is None else target.integrator.model_dump()
+    renderer = ", ".join(str(value) if name == "type" else f"{name} = {value}" for name, value in options.items())
+    return Row("targets", (f"rendered by {renderer}, {target.spp} samples per pixel",))

@@ -18,6 +18,7 @@ from pathreplay.inverse import limits
 from pathreplay.inverse.album import Album
 from pathreplay.inverse.background import require_known
 from pathreplay.inverse.capture import Shot, fingerprint, read_capture
+from pathreplay.inverse.completed import completed
 from pathreplay.inverse.config import Config, Plugin
 from pathreplay.inverse.derived import Derived, make_derived
 from pathreplay.inverse.exposures import EXPOSURE, Factors, fixed_rows
@@ -41,6 +42,7 @@ from pathreplay.inverse.targets import (
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.inverse.variables import Variable, free_of, keys_of, make_variables
 from pathreplay.inverse.views import View, held_out_of, named_views, sensors_of, shares_of
+from pathreplay.render.diagnostics import COST_OF_EDGES
 from pathreplay.render.edge_notes import edges_note, moves_edges
 from pathreplay.render.film import fit_film
 from pathreplay.render.integrator import EDGES
@@ -73,6 +75,8 @@ class Held:
 class Problem:
     """min over the variables of the mean over views of loss(render(scene, view), target of the view)."""
 
+    config: Config
+    """The job, with what it leaves to others: see `completed`."""
     scene: mi.Scene
     params: mi.SceneParameters
     integrator: mi.Integrator
@@ -162,12 +166,9 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     album = Album.of(config.budget)
     modules = Modules(base)
     loss = find_loss(config.loss, modules)
-    wanted = [entry.key for entry in config.parameters if entry.shape is None]
-    wanted += [entry.key for entry in config.derived]
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
-    cameras = {name: shot.camera for name, shot in shots.items()}
-    scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
+    scene, config, notes = _loaded(config, base, shots)
     params = mi.traverse(scene)
     parameters.require_finite(params)
     integrator = _gradient_integrator(config.integrator)
@@ -179,7 +180,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     if rival is not None:
         keys_of(params, config, rival)
         _edges(params, keys, rival)  # for its log: one note is enough
-    judge = integrator if config.brings_pictures else load_integrator(config.target.integrator.model_dump())
+    judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
     # Before any target is rendered: the cheap mistakes first.
     sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
     taken = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
@@ -230,7 +231,19 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     params = mi.traverse(scene)
     parameters.keep_only(params, keys)
     known = fingerprint(taken.values()) if taken else None
-    return Problem(scene, params, integrator, rival, judge, variables, poses, views, loss, notes, derived, known, album)
+    return Problem(
+        config, scene, params, integrator, rival, judge, variables, poses, views, loss, notes, derived, known, album
+    )
+
+
+def _loaded(config: Config, base: Path, shots: Mapping[str, Shot]) -> tuple[mi.Scene, Config, tuple[str, ...]]:
+    """The scene, the job with what it leaves to the scene (see `completed`), and what is to be said about both."""
+    wanted = [entry.key for entry in config.parameters if entry.shape is None]
+    wanted += [entry.key for entry in config.derived]
+    cameras = {name: shot.camera for name, shot in shots.items()}
+    scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
+    config, differences = completed(config, scene)
+    return scene, config, notes + differences
 
 
 def _kept(album: Album, variable: Variable) -> Variable:
@@ -296,4 +309,4 @@ def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integ
         return ()
     if hasattr(integrator, "told"):
         integrator.told.add(EDGES)
-    return (edges_note(moving, edges),)
+    return (COST_OF_EDGES if edges == "auto" else edges_note(moving, edges),)

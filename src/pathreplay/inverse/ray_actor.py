@@ -75,8 +75,9 @@ class RayActor:
         """Build the problem: before anything else. Raises PathreplayError for what this machine has not."""
         backend.set_variant(parcel.variant)
         dr.set_thread_count(parcel.threads)
-        self.config, self.evaluators = parcel.config, {}
+        self.evaluators = {}
         self.problem = build_problem(parcel.config, parcel.base, parcel.targets)
+        self.config = self.problem.config
         self.log = _kept_log()
         machine = f"{_processor()}, LLVM {'.'.join(map(str, backend.loaded_version()))}"
         return Hello(platform.node(), os.getpid(), versions(), machine)

@@ -78,7 +78,7 @@ def report_page(
     return Page(
         title=outcome.folder.name,
         lead=lead(config, count, len(outcome.views) - held_out, held_out),
-        notices=((ended,) if len(history) < config.iterations else ()) + dropped_notice(history),
+        notices=((ended,) if len(history) < config.iterations else ()) + dropped_notice(history) + _verdict(outcome),
         facts=facts(config, history),
         comparison=_comparison(outcome, contestants, drawings["comparison"]) if contestants else None,
         views=_views(outcome, exposure, films),
@@ -101,8 +101,13 @@ def report_page(
     )
 
 
+def _verdict(outcome: Outcome) -> tuple[str, ...]:
+    said = str(outcome.verdict)
+    return (f"{said[0].upper()}{said[1:]}.",)
+
+
 def _comparison(outcome: Outcome, contestants: Sequence[Contestant], drawing: str) -> Comparison:
-    judge = (outcome.config if outcome.config.brings_pictures else outcome.config.target).integrator.type
+    judge = (outcome.config.target.integrator or outcome.config.integrator).type
     heads = [Head(text) for text in ("", "iterations", "seconds", "error of the pictures")]
     heads += [Head("error of", key) for key in contestants[0].errors]
     rows = []

@@ -22,6 +22,7 @@ from pathreplay.inverse.report import Film, report_files
 from pathreplay.inverse.run_folder import Job
 from pathreplay.inverse.tensor_files import safetensors_chunks
 from pathreplay.inverse.values import Array
+from pathreplay.inverse.verdict import Verdict
 from pathreplay.media.volume_files import vol_bytes
 from pathreplay.whole_files import Content, made
 
@@ -48,6 +49,8 @@ class RunResult:
     """How alike each view is to its target."""
     held_out: tuple[str, ...]
     """The views that were not learned from."""
+    verdict: Verdict
+    """Which values still move, have arrived, or are not determined by the pictures."""
 
     def __repr__(self) -> str:
         """Short: a notebook prints it, and the history may have thousands of entries."""
@@ -57,7 +60,7 @@ class RunResult:
         return f"<RunResult: {self.iterations} iterations{loss}{stopped}, {count}, {self.report}>"
 
     def describe(self) -> str:
-        """A few lines for the terminal: loss, errors, where the report is, how to go on."""
+        """A few lines for the terminal: loss, errors, where the report is, how to go on; the verdict on the values."""
         lines = []
         if self.history:
             first, last = self.history[0].loss, self.history[-1].loss
@@ -75,6 +78,7 @@ class RunResult:
         lines.append(f"report: {self.report}")
         if self.stopped:
             lines.append(f"stopped early by {self.stopped_by}; go on with: {resume_command(self.folder)}")
+        lines.append(str(self.verdict))
         return "\n".join(lines)
 
 
@@ -86,6 +90,7 @@ def outcome_of(
     before: dict[str, Image],
     after: dict[str, Image],
     rivals: dict[str, Image],
+    verdict: Verdict,
 ) -> Outcome:
     """All that is told of a run; ``before``, ``after`` and the ``rivals`` are pictures by view."""
     views = tuple(
@@ -104,7 +109,9 @@ def outcome_of(
     )
     recovered, poses = with_faces(problem, recovered_of(problem, run)), poses_of(problem, run)
     values = with_scene(problem, run.values)
-    return Outcome(job.config, job.source, job.changes, folder, views, recovered, poses, run, values, problem.notes)
+    return Outcome(
+        job.config, job.source, job.changes, folder, views, recovered, poses, run, values, problem.notes, verdict
+    )
 
 
 def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Content]:
@@ -146,6 +153,7 @@ def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
         poses={item.pose.key: errors["error"] for item in outcome.poses if (errors := item.errors())},
         views={view.name: view.likenesses["result"] for view in outcome.views},
         held_out=tuple(view.name for view in outcome.held_out()),
+        verdict=outcome.verdict,
     )
 
 

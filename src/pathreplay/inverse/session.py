@@ -31,6 +31,7 @@ from pathreplay.inverse.run_folder import Job, RunFolder, create_run_folder
 from pathreplay.inverse.saving import Saving, first_files, go_on, saved_targets
 from pathreplay.inverse.stages import Staged, require_single_pixels, require_stages
 from pathreplay.inverse.values import Array
+from pathreplay.inverse.verdict import verdict_of
 from pathreplay.scenes.descriptions import told
 from pathreplay.threads import one_thread
 
@@ -145,6 +146,8 @@ def _states(
         stack.enter_context(bar)
         bar.say("preparing")
         problem = build_problem(config, job.base, None if resumed is None else saved_targets(resumed.path))
+        config = problem.config
+        job = replace(job, config=config)
         require_stages(problem, config)
         require_single_pixels(problem, config)
         for note in problem.notes:
@@ -191,9 +194,10 @@ def _states(
         with computing(config):
             for each in filter(None, (run, run.rival)):
                 each.values = dict(with_exposures(problem, config, each.values))
+            verdict = verdict_of(problem, run, stop.by is not None)
             after = render_views(problem, config, run.values)
             theirs = render_views(problem, config, run.rival.values) if run.rival else {}
-        outcome = outcome_of(job, folder.path, problem, run, before, after, theirs)
+        outcome = outcome_of(job, folder.path, problem, run, before, after, theirs, verdict)
         files = result_files(outcome, previews.finished(after))
         problem.album.rest()
         folder.write(files)

@@ -82,7 +82,9 @@ def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> d
 
 
 def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], album: Album) -> dict[str, Image]:
-    integrator = load_integrator(config.target.integrator.model_dump())
+    plugin = config.target.integrator
+    assert plugin is not None  # `completed`
+    integrator = load_integrator(plugin.model_dump())
     if len(scene.sensors()) <= max(sensors.values()):
         raise PathreplayError(
             f"The target scene has {len(scene.sensors())} sensors, the job uses number {max(sensors.values())} (from 0)"
@@ -91,7 +93,7 @@ def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], a
     targets: dict[str, Image] = {}
     for name, index in sensors.items():
         seed, _ = config.seeds(TARGET, index)
-        with told(f"Integrator '{config.target.integrator.type}' cannot render the target of sensor '{name}'"):
+        with told(f"Integrator '{plugin.type}' cannot render the target of sensor '{name}'"):
             image = mi.render(scene, sensor=index, integrator=integrator, spp=config.target.spp, seed=mi.UInt32(seed))
             targets[name] = np.array(image, dtype=np.float32)
             del image

@@ -50,7 +50,8 @@ def export_run(run: Path, output: Path | None = None) -> str:
     source = _source(job, values)
     of_pictures = {EXPOSURE: values.pop(EXPOSURE)} if EXPOSURE in values else {}
     free = {entry.key: values.pop(entry.key) for entry in job.config.parameters if entry.shape is not None}
-    found = exported(source, values, job.config.integrator.model_dump())
+    given = "integrator" in job.config.model_fields_set
+    found = exported(source, values, job.config.integrator.model_dump() if given else None)
     with whole_folder(folder, _OPTION) as part:
         write_files(found, part)
         for name, data in _beside(found, values | of_pictures, free).items():

@@ -79,7 +79,8 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, Any] | Non
     """The files of a scene in which parameters have these values (as people see them), by their keys.
 
     ``integrator`` is what shall render it, instead of the scene's own; of those made for gradients `path` or `volpath`
-    takes the place. Raises PathreplayError for what no scene file of Mitsuba's can hold.
+    takes the place. Where the scene has none, `pathreplay` counts as its own. Raises PathreplayError for what no scene
+    file of Mitsuba's can hold.
     """
     with told("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene = source.load()
@@ -180,7 +181,7 @@ def _plain_integrator(described: Described, wanted: Mapping[str, Any] | None) ->
     if wanted is not None:
         options = dict(wanted)
     elif own is None:
-        options = {"type": "path"}
+        options = {"type": "pathreplay"}  # as a job that names none
     else:
         props = children[own].props
         options = {"type": props.plugin_name(), **{name: props.get(name) for name in _KEPT if name in props}}

@@ -17,7 +17,7 @@ from ..gradient.counted import Counted
 from ..gradient.edges import Edges, edges_backward, edges_forward
 from ..gradient.film_edges import film_edges
 from ..gradient.inner_edges import inner_edges
-from ..transport.motion import moving_shapes, path_moves
+from ..transport.motion import edges_move, moving_shapes
 from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
@@ -49,7 +49,7 @@ class Boundary:
     def forward(self, view: Pass, walk: Walk, learned: Guess | None) -> Found:
         """Tangent of the image: see `Term`."""
         places = FilmPlaces.of(view)
-        if not _moves(walk, places):
+        if not _move(walk, places):
             return Found()
         image = None
         for edges in self._searches(view, walk, places):
@@ -61,7 +61,7 @@ class Boundary:
     def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
         """Back-propagate the adjoint of the image: see `Term`."""
         places = FilmPlaces.of(view)
-        if not _moves(walk, places):
+        if not _move(walk, places):
             return Found()
         wanted = places.undeveloped(grad_in)
 
@@ -77,13 +77,25 @@ class Boundary:
         """Nothing: see `Term`."""
         return ""
 
+    @staticmethod
+    def move(view: Pass, walk: Walk) -> bool:
+        """Whether edges move with the parameters that have gradients. Nothing is evaluated."""
+        return _move(walk, FilmPlaces.of(view))
+
+    @staticmethod
+    def obstacle(view: Pass) -> str:
+        """Why edges cannot be differentiated, with the way out; "" where they can."""
+        if view.sensor.class_name() == BATCH:
+            return (
+                f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
+                "put its sensors into the scene one by one"
+            )
+        return ""
+
     def _searches(self, view: Pass, walk: Walk, places: FilmPlaces) -> Iterator[Edges]:
         """The edges of each search."""
-        if view.sensor.class_name() == BATCH:
-            raise PathreplayError(
-                f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
-                "put its sensors into the scene one by one, or use edges = 'none'"
-            )
+        if why := self.obstacle(view):
+            raise PathreplayError(f"{why}, or use edges = 'none'")
         if walk.media is None:  # there boundaries that move are no vertices, and paths pass them unseen
             walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
         lines = lines_of(view, places, self.spp)
@@ -108,10 +120,10 @@ def lines_of(view: Pass, places: FilmPlaces, spp: int) -> int:
     return max(lines, 1)
 
 
-def _moves(walk: Walk, places: FilmPlaces) -> bool:
-    """Whether paths move with the parameters: if not, edges do not either."""
+def _move(walk: Walk, places: FilmPlaces) -> bool:
+    """Whether edges move with the parameters: see `edges_move`."""
     key = mi.UInt32(0)
     with dr.resume_grad():
         ray, _ = places.ray(mi.Point2f(0.5), key)
     start = CameraStart(ray, Counted.of(key), mi.Bool(True))
-    return path_moves(walk, start, PathState.begin(walk, start).at)
+    return edges_move(walk, start, PathState.begin(walk, start).at)

@@ -10,6 +10,13 @@ from ..errors import PathreplayError
 from ..transport.vertex import Walk
 from .edge_notes import edges_note, keys_that_move_edges
 
+COST_OF_EDGES = (
+    "edges move with the parameters (silhouettes, shadows, borders of lights) and are differentiated in a pass of "
+    "their own, which may take several times as long as the rest: edges = 'none' of the integrator leaves them out, "
+    "edges = 'film' those that only surfaces see; see docs/edges.md"
+)
+"""One line that tells what edges cost, where nobody asked for them."""
+
 
 def lost_note(lost: int, paths: int) -> str:
     """One line that tells of paths that lost a part of their gradient."""

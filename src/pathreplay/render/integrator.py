@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
+from typing import Any
 from weakref import ReferenceType, ref
 
 import drjit as dr
@@ -17,9 +20,10 @@ from ..gradient.record import MAX_DEPTH
 from ..transport.vertex import Walk
 from .boundary import Boundary
 from .camera_pass import Pass, Seed, Which
-from .diagnostics import doubts, lost_note, missing_edges, used_before_note
+from .diagnostics import COST_OF_EDGES, doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts, facts_of
 from .interior import PathReplay
+from .lifetimes import is_recording
 from .path_integrator import UNBOUNDED, Handed, PathIntegrator
 from .pixels import among, obstacle, pixel_loss
 from .properties import choice, deviation, whole_number
@@ -29,9 +33,9 @@ DRIVERS = ("auto", "sweep", "replay")
 ATTACH = ("delta", "all", "none")
 BRANCH = ("auto", True, False)
 NUMBERS = ("scene", "even")
-EDGE_TERMS = ("none", "film", "all")
+EDGE_TERMS = ("auto", "none", "film", "all")
 EDGES = "edges"
-"""In `told`: that edges move has been said."""
+"""In `told`: what there is to say of edges that move has been said."""
 
 
 def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
@@ -71,10 +75,14 @@ class PathReplayIntegrator(PathIntegrator):
     Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
     (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``, ``none``), ``noise``
     (0.01; of ray adjoints with the replay driver: see `Recovery`), ``branch`` (``auto``, True, False), ``edges``
-    (``none``, ``film``, ``all``: see `Boundary`), ``edge_spp`` (0: the samples of the pass) and ``numbers`` (``even``:
-    those of `Even` instead of independent ones; ``scene``: those of its sampler). ``auto`` drivers sweep
+    (``auto``, ``none``, ``film``, ``all``: see `Boundary`), ``edge_spp`` (0: the samples of the pass) and ``numbers``
+    (``even``: those of `Even` instead of independent ones; ``scene``: those of its sampler). ``auto`` drivers sweep
     unless ``max_depth`` is more than the sweep can hold, or only lights have gradients (see `lights`).
     Forward mode is the same whatever the driver.
+
+    ``auto`` edges are ``all`` where something moves that can hide light (see `edges_move`) and edges can be
+    differentiated, else ``none``: with another ``attach`` than ``delta`` always, and for sensors of type ``batch``,
+    which is told. Without motion no edges are traced, whatever ``edges`` is.
 
     Media are differentiated where paths went, less a baseline that is learned from earlier gradient passes of this
     integrator (with other seeds). ``branch`` walks one more path from where a medium might have scattered and did
@@ -98,8 +106,10 @@ class PathReplayIntegrator(PathIntegrator):
         self.interior = _interior(self.name, props, self.max_depth)
         self.driver, self.branch = self.interior.driver, self.interior.branch
         self.even = choice(props, self.name, "numbers", "even", NUMBERS) == "even"
-        self.edges = choice(props, self.name, "edges", "none", EDGE_TERMS)
+        self.edges = choice(props, self.name, "edges", "auto", EDGE_TERMS)
         self.edge_spp = whole_number(props, self.name, "edge_spp", 0, lowest=0, kind="number of lines per pixel")
+        if self.edges == "auto" and self.attach != "delta":
+            self.edges = "none"
         if self.edges != "none" and self.attach != "delta":
             raise PathreplayError(
                 f"{self.name}: edges = '{self.edges}' with attach = '{self.attach}': edges know what moves with "
@@ -111,18 +121,29 @@ class PathReplayIntegrator(PathIntegrator):
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """The interior, and edges where they are asked for."""
+        """The interior, and edges unless they are switched off: see `_planned`."""
         if self.edges == "none":
             return (self.interior,)
-        return self.interior, self._boundary
+        return self.interior, Boundary(inner=self.edges != "film", spp=self.edge_spp)
 
-    def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> Walk:
-        walk = PathIntegrator._walk(self, scene, sensor)
-        return replace(walk, edges=self.edges == "all" and walk.media is None)
-
-    @property
-    def _boundary(self) -> Boundary:
-        return Boundary(inner=self.edges == "all", spp=self.edge_spp)
+    def _planned(self, view: Pass) -> tuple[Walk, tuple[Term, ...]]:
+        """See `PathIntegrator`. Edges are left out where none move, and where `auto` finds that they cannot be done."""
+        walk, terms = PathIntegrator._planned(self, view)
+        if self.edges == "none":
+            return walk, terms
+        edges = Boundary.move(view, walk)
+        if edges and self.edges == "auto":
+            why = Boundary.obstacle(view)
+            if why:
+                self._tell_once(f"{why}; they are left out here")
+            elif EDGES not in self.told:
+                self._tell_once(COST_OF_EDGES)
+            edges = not why
+        if not edges:
+            return walk, tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
+        if is_recording():
+            walk = replace(walk, traits=replace(walk.traits, tables=self._tables(view.scene, edges=True)))
+        return replace(walk, edges=self.edges != "film" and walk.media is None), terms
 
     def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
         """Whether `render_and_backward` can be used, for all pixels or for ``some``: see `pixel_obstacle`."""
@@ -161,14 +182,14 @@ class PathReplayIntegrator(PathIntegrator):
         some = None if pixels is None else mi.UInt32(pixels)
         with self._passing(), dr.isolate_grad():
             loss = pixel_loss(view, self.max_depth, offset, slope, some)
-            walk = self._walk(scene, view.sensor)
+            walk, (_, *edges) = self._planned(view)
             self._learned(view, walk)
             found = self.interior.pixels(view, walk, loss, some)
-            if self.edges != "none":
+            if edges:
                 wanted = offset + slope * found.image
                 if some is not None:
                     wanted = among(some, wanted, view.size)
-                found += self._boundary.backward(view, walk, wanted, None)
+                found = reduce(add, [term.backward(view, walk, wanted, None) for term in edges], found)
         self._told(view, walk, found)
         return found.image
 
@@ -221,7 +242,7 @@ class PathReplayIntegrator(PathIntegrator):
             self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
 
     def _tell_edges(self, walk: Walk, sensor: mi.Sensor) -> None:
-        if EDGES in self.told or self.edges == "all":
+        if EDGES in self.told or self.edges in ("auto", "all"):
             return
         note, named = missing_edges(walk, sensor, self.edges)
         if named:
@@ -250,6 +271,18 @@ class PathReplayIntegrator(PathIntegrator):
             seen = Seen(self.baseline[1].cells, untold.sums, nulls, paths if counted else 0, frozenset())
             found = replace(found, seen=seen)
         self._keep(found)
+
+    def options(self) -> dict[str, Any]:
+        """The properties that this one was made of, beside those that all integrators of paths share."""
+        return {
+            "driver": "auto" if self.interior.auto else self.driver,
+            "attach": self.attach,
+            "noise": self.interior.recovery.noise,
+            "branch": self.branch,
+            "numbers": NUMBERS[self.even],
+            "edges": self.edges,
+            "edge_spp": self.edge_spp,
+        }
 
     def to_string(self) -> str:
         return self._described(

@@ -59,7 +59,6 @@ class PathIntegrator:
 
     name = ""
     attach = "none"
-    edges = "none"  # those that are looked for
     even = False  # whether even numbers take the place of independent ones
     interior: Term
     max_depth: int  # these are Mitsuba's
@@ -115,9 +114,9 @@ class PathIntegrator:
         tangent = None
         for part in self._parts(scene, sensor, seed, spp):
             with self._passing():
-                walk = self._walk(scene, part.sensor)
+                walk, terms = self._planned(part)
                 learned = self._learned(part, walk)
-                found = reduce(add, [term.forward(part, walk, learned) for term in self.terms])
+                found = reduce(add, [term.forward(part, walk, learned) for term in terms])
                 tangent = _sum(tangent, found.image, part.share)
             self._told(part, walk, found)
         return tangent
@@ -134,10 +133,10 @@ class PathIntegrator:
         sums = Sums(scene) if len(of_parts) > 1 else None
         for part in of_parts:
             with self._passing(), dr.isolate_grad():
-                walk = self._walk(scene, part.sensor)
+                walk, terms = self._planned(part)
                 learned = self._learned(part, walk)
                 wanted = grad_in if part.share == 1 else grad_in * part.share
-                found = reduce(add, [term.backward(part, walk, wanted, learned) for term in self.terms])
+                found = reduce(add, [term.backward(part, walk, wanted, learned) for term in terms])
             self._told(part, walk, found)
             if sums is not None:
                 sums.take()
@@ -154,6 +153,10 @@ class PathIntegrator:
         if mode != dr.ADMode.Primal:
             raise PathreplayError(f"{self.name}: sample() is not differentiated: use mi.render, or render_backward")
         return *primal(self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
+
+    def _planned(self, view: Pass) -> tuple[Walk, tuple[Term, ...]]:
+        """How a gradient pass walks, and the terms that it adds up."""
+        return self._walk(view.scene, view.sensor), self.terms
 
     def _learned(self, view: Pass, walk: Walk) -> Guess | None:
         """What earlier passes found out that this one may use."""
@@ -183,23 +186,27 @@ class PathIntegrator:
 
     def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> Walk:
         """How the scene is walked through; the sensor may be in a medium."""
-        facts, handed = facts_of(scene), self.handed
-        if handed is not None:
-            tables = handed.tables
-        elif is_recording():
-            tables = facts.recorded_tables(self.tables, self.edges != "none")
-        else:
-            tables = self.tables = facts.tables()
+        facts = facts_of(scene)
+        branches = None if self.handed is None else self.handed.branches
         return Walk(
             scene=scene,
-            traits=facts.traits(tables),
-            media=facts.media(sensor, None if handed is None else handed.branches),  # type: ignore[arg-type]
+            traits=facts.traits(self._tables(scene)),
+            media=facts.media(sensor, branches),  # type: ignore[arg-type]
             attach=self.attach,
             hide_emitters=self.hide_emitters,
             max_depth=self.max_depth,
             rr_depth=self.rr_depth,
             skip_area_emitters=self.skip_area_emitters,
         )
+
+    def _tables(self, scene: mi.Scene, edges: bool = False) -> Tables:
+        """Those of a pass; while `dr.freeze` records, with all that is asked for ``edges``."""
+        if self.handed is not None:
+            return self.handed.tables
+        if is_recording():
+            return facts_of(scene).recorded_tables(self.tables, edges)
+        self.tables = facts_of(scene).tables()
+        return self.tables
 
     def to_hand(self, scene: mi.Scene) -> Handed:
         """What passes over this scene are to be handed if they are recorded."""

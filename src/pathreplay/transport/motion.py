@@ -45,11 +45,26 @@ def path_moves(walk: Walk, start: CameraStart, at: Arrival) -> bool:
     ``at`` is the first arrival. Looks at the four places where motion can enter: the start, the shapes, the BSDFs whose
     directions are followed, and the emitters. Nothing is evaluated.
     """
+    return _depends(walk, start, at, painted=True)
+
+
+def edges_move(walk: Walk, start: CameraStart, at: Arrival) -> bool:
+    """Whether something that can hide light, or what is seen or lit from, depends on parameters with gradients.
+
+    As `path_moves`, but for texture coordinates and the tangents that follow them: what is painted on a surface hides
+    nothing.
+    """
+    return _depends(walk, start, at, painted=False)
+
+
+def _depends(walk: Walk, start: CameraStart, at: Arrival, painted: bool) -> bool:
     if walk.attach == "none":
         return False
     with dr.resume_grad():
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All)
-        moving = [*start.repeat(), si.p, si.n, si.sh_frame.n, si.uv, si.dp_du, si.dp_dv]
+        moving = [*start.repeat(), si.p, si.n, si.sh_frame.n]
+        if painted:
+            moving += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
         for bsdf in walk.traits.mirrors + (walk.traits.attachables if walk.follows else ()):
             sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))

@@ -1,0 +1,101 @@
+"""What a job leaves out: its integrator is as the scene says, and its targets are rendered as its own pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from pathreplay.inverse import make_config
+from pathreplay.inverse.problem import Problem, build_problem
+from pathreplay.output.export import export_run
+from pathreplay.render.path_limits import Limits, read_limits
+
+# A lamp in view, between two walls that light each other: depth and hidden emitters both show.
+SCENE = """<scene version="3.0.0">
+  <integrator type="{integrator}"><integer name="max_depth" value="2"/><boolean name="hide_emitters" value="true"/>
+    {options}</integrator>
+  <sensor type="perspective" id="cam"><transform name="to_world"><translate z="-4"/></transform>
+    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/>
+    <string name="pixel_format" value="rgb"/></film></sensor>
+  <shape type="cube" id="box"><bsdf type="diffuse" id="paint"><rgb name="reflectance" value="0.5"/></bsdf></shape>
+  <shape type="rectangle" id="floor"><bsdf type="diffuse"><rgb name="reflectance" value="0.9"/></bsdf>
+    <transform name="to_world"><scale value="4"/><rotate x="1" angle="-90"/><translate y="-1"/></transform></shape>
+  <emitter type="constant"/>
+</scene>"""
+JOB: dict[str, Any] = {
+    "scene": "scene.xml", "iterations": 1, "spp": 4, "picture_spp": 4,
+    "parameters": [{"key": "box.bsdf.reflectance.value"}], "target": {"scene": "scene.xml", "spp": 256},
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def problem(own: str = "prb", options: str = "", **changes: Any) -> Problem:
+    Path("scene.xml").write_text(SCENE.format(integrator=own, options=options))
+    return build_problem(make_config({**JOB, **changes}), Path.cwd())
+
+
+def rendered(problem: Problem, **options: Any) -> np.ndarray:
+    """What `path` shows of the scene, with other random numbers than those of the target."""
+    integrator = mi.load_dict({"type": "path", **options})
+    return np.array(mi.render(problem.scene, integrator=integrator, spp=256, seed=mi.UInt32(77)))
+
+
+def test_a_job_without_integrator_has_the_depth_and_options_of_the_scenes() -> None:
+    found = problem()
+    assert type(found.integrator).__name__ == "PathReplayIntegrator"
+    assert read_limits(found.integrator) == Limits(2, 5, True)
+    options = '<string name="edges" value="film"/><string name="driver" value="replay"/>'
+    ours = problem("pathreplay", options).integrator
+    assert (ours.edges, ours.driver, read_limits(ours)) == ("film", "replay", Limits(2, 5, True))
+    assert read_limits(problem(integrator={"type": "pathreplay"}).integrator) == Limits(6, 5, False)
+
+
+@pytest.mark.parametrize("given", [None, {"type": "pathreplay", "max_depth": 3}])
+def test_targets_are_rendered_as_the_job_renders(given: dict[str, Any] | None) -> None:
+    """Without any of their own: with the depth of the job, and emitters hidden or not. Nothing has to be told."""
+    found = problem(**({} if given is None else {"integrator": given}))
+    limits = {"max_depth": 2, "hide_emitters": True} if given is None else {"max_depth": 3}
+    assert read_limits(found.judge) == read_limits(mi.load_dict({"type": "path", **limits})) and not found.notes
+    (view,) = found.views
+    same, other = rendered(found, **limits), rendered(found, max_depth=6 if given is None else 2)
+    assert np.abs(view.target - same).mean() < 0.5 * np.abs(view.target - other).mean()
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ({"max_depth": 6, "hide_emitters": True}, "max_depth = 6 for 2"),
+        ({"max_depth": 2}, "hide_emitters = False for True"),
+        ({"max_depth": 2, "hide_emitters": True}, ""),
+    ],
+)
+def test_targets_that_show_something_else_are_told_in_one_line(asked: dict[str, Any], told: str) -> None:
+    found = problem(target={**JOB["target"], "integrator": {"type": "path", **asked}})
+    assert len(found.notes) == bool(told)
+    assert all(told in note and "\n" not in note for note in found.notes)
+
+
+def test_targets_of_a_scene_with_media_are_rendered_with_them() -> None:
+    made = {"scene": "cloud", "scene_parameters": {"resolution": 4, "grid": 2, "views": 1}}
+    key = "cloud.interior_medium.sigma_t.data"
+    config = make_config({**JOB, **made, "parameters": [{"key": key}], "target": {"scene": "cloud", "spp": 1}})
+    judge = build_problem(config, Path.cwd()).judge
+    assert judge.class_name().startswith("Volumetric") and read_limits(judge) is not None
+
+
+def test_a_run_is_exported_with_the_depth_that_it_had() -> None:
+    from pathreplay.inverse import optimize
+
+    problem()
+    folder = optimize(make_config(JOB), progress=False).folder
+    export_run(folder, Path("out"))
+    assert '<integer name="max_depth" value="2"' in Path("out/scene.xml").read_text()
