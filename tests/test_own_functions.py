@@ -40,13 +40,18 @@ for value in ("much", b"much", "", {}, {"a": 1}, {1.0}, loop, (loop,), deep, Non
         print("taken:", repr(value)[:30])
     except PathreplayError as error:
         assert str(error).startswith("Loss 'own:f' gives ") and str(error).endswith("arrays of them"), error
-print("done")
+try:
+    Imported("Loss", "own:f", lambda: mi.set_variant("scalar_rgb"))(float)
+except PathreplayError as error:
+    print(error)
+print(mi.variant())
 """
+SETS = "Loss 'own:f' sets the variant 'scalar_rgb', and the job runs in 'llvm_ad_rgb'; leave that to the job"
 
 
 def test_what_is_no_number_is_refused_by_its_type(run_python: Callable[..., Any]) -> None:
     ended = run_python(HOSTILE)
-    assert ended.stdout == "done\n", ended.stdout + ended.stderr
+    assert ended.stdout.splitlines() == [SETS, "llvm_ad_rgb"], ended.stdout + ended.stderr
 
 
 NUMBERS = {
@@ -143,3 +148,13 @@ def test_one_number_may_be_a_float_of_dr_jits(room: Path) -> None:  # noqa: F811
         optimize(make_config({**job, "loss": loss}), progress=False).history[0].loss for loss in ("own:mean", "l2")
     ]
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+
+
+def test_what_fails_in_the_first_iteration_leaves_no_folder(room: Path) -> None:  # noqa: F811
+    """Nor those that the run folder was put into; others stay."""
+    (room / "own.py").write_text(OWN)
+    (room / "kept").mkdir()
+    for output in ("runs/a/b", "kept/a/b"):
+        with pytest.raises(PathreplayError, match="no more"):
+            optimize(make_config({**JOB, "loss": "own:leaves_later", "output": output}), progress=False)
+        assert not (room / "runs").exists() and list((room / "kept").iterdir()) == []

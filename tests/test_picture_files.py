@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import io
 import re
-import struct
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
-import OpenEXR
-import PIL.Image
 import pytest
 
+from hostile.picture_bytes import HUGE, claiming, exr, picture_files, radiance
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config
 from pathreplay.inverse.images import encoded, exr_bytes, read_image
@@ -56,14 +52,6 @@ def test_pixmaps_are_read_as_their_heads_say(data: bytes, rounding: float, tmp_p
     assert image.dtype == np.float32 and image == pytest.approx(picture(image.shape[2]), abs=rounding)
 
 
-def radiance(pixels: np.ndarray, head: str) -> bytes:
-    """A Radiance picture without runs, of floats; the resolution is the last line of the head."""
-    exponents = np.frexp(pixels.max(axis=2))[1]
-    mantissas = pixels * np.exp2(8.0 - exponents)[:, :, None]
-    rgbe = np.concatenate([mantissas, exponents[:, :, None] + 128.0], axis=2).astype(np.uint8)
-    return f"#?RADIANCE\n{head}\n".encode() + rgbe.tobytes()
-
-
 FORMAT = "FORMAT=32-bit_rle_rgbe\n"
 UPRIGHT = f"-Y {HEIGHT} +X {WIDTH}"
 HEADS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
@@ -97,16 +85,6 @@ def test_radiance_pictures_of_xyz_become_rgb(tmp_path: Path) -> None:
     assert read_image(path)[3, 4] == pytest.approx(1, abs=0.02)
 
 
-def exr(*names: str) -> bytes:
-    buffer = io.BytesIO()
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(
-        header, {name: np.ascontiguousarray(picture()[:, :, "RGB".find(name[-1])]) for name in names}
-    ) as f:
-        f.write(buffer)
-    return buffer.getvalue()
-
-
 def job(file: str, where: str = "target") -> Any:
     """A job that takes a picture as a target, as a mask, or as a value."""
     target: dict[str, Any] = {"images": ["good.exr" if where != "target" else file]}
@@ -118,60 +96,24 @@ def job(file: str, where: str = "target") -> Any:
 
 
 def test_a_single_layer_is_the_picture(room: Path) -> None:  # noqa: F811
-    (room / "a.exr").write_bytes(exr("diffuse.R", "diffuse.G", "diffuse.B"))
+    (room / "a.exr").write_bytes(exr(picture(), "diffuse.R", "diffuse.G", "diffuse.B"))
     assert build_problem(job("a.exr"), room).views[0].target == pytest.approx(picture())
 
 
 def test_several_layers_are_none(room: Path) -> None:  # noqa: F811
-    (room / "a.exr").write_bytes(exr(*(f"{layer}.{c}" for layer in ("diffuse", "specular") for c in "RGB")))
+    (room / "a.exr").write_bytes(exr(picture(), *(f"{layer}.{c}" for layer in ("diffuse", "specular") for c in "RGB")))
     with pytest.raises(PathreplayError, match=r"'a\.exr' has 6 channels, sensor 'left' renders 3"):
         build_problem(job("a.exr"), room)
 
 
-def saved(kind: str, **options: Any) -> bytes:
-    stream = io.BytesIO()
-    PIL.Image.new("RGB", (WIDTH, HEIGHT)).save(stream, kind, **options)
-    return stream.getvalue()
-
-
-def png_head(data: bytes, size: bytes) -> bytes:
-    body = b"IHDR" + size + data[24:29]
-    return data[:12] + body + struct.pack(">I", zlib.crc32(body)) + data[33:]
-
-
-FRAME = re.compile(rb"(\xff[\xc0-\xc2]..\x08)....", re.DOTALL)
-WINDOW = re.compile(rb"(dataWindow\0box2i\0....)" + rb"." * 16, re.DOTALL)
-#: A file of each format, and the same with another size (width, height) in its head.
-FILES: dict[str, tuple[bytes, Callable[[bytes, int, int], bytes]]] = {
-    "a.png": (saved("PNG"), lambda data, w, h: png_head(data, struct.pack(">II", w, h))),
-    "a.jpg": (saved("JPEG"), lambda data, w, h: FRAME.sub(lambda m: m[1] + struct.pack(">HH", h, w), data, count=1)),
-    "progressive.jpg": (
-        saved("JPEG", progressive=True),
-        lambda data, w, h: FRAME.sub(lambda m: m[1] + struct.pack(">HH", h, w), data, count=1),
-    ),
-    "a.bmp": (saved("BMP"), lambda data, w, h: data[:18] + struct.pack("<ii", w, -h) + data[26:]),
-    "a.tga": (saved("TGA"), lambda data, w, h: data[:12] + struct.pack("<HH", w, h) + data[16:]),
-    "a.ppm": (saved("PPM"), lambda data, w, h: data.replace(b"12 10", b"%d %d" % (w, h), 1)),
-    "a.pfm": (
-        b"PF\n12 10\n-1.0\n" + bytes(12 * WIDTH * HEIGHT),
-        lambda data, w, h: data.replace(b"12 10", b"%d %d" % (w, h), 1),
-    ),
-    "a.hdr": (
-        radiance(picture(), f"{FORMAT}\n{UPRIGHT}"),
-        lambda data, w, h: data.replace(UPRIGHT.encode(), b"-Y %d +X %d" % (h, w), 1),
-    ),
-    "a.exr": (
-        exr_bytes(picture()),
-        lambda data, w, h: WINDOW.sub(lambda m: m[1] + struct.pack("<iiii", 0, 0, w - 1, h - 1), data, count=1),
-    ),
-}
+FILES = picture_files(picture())
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_sizes_are_told_by_heads(name: str, room: Path) -> None:  # noqa: F811
-    data, claiming = FILES[name]
-    for size in ((WIDTH, HEIGHT), (65500, 65400)):
-        (room / name).write_bytes(claiming(data, *size))
+    data = FILES[name]
+    for size in ((WIDTH, HEIGHT), HUGE):
+        (room / name).write_bytes(claiming(name, data, size))
         assert size_of_picture(room / name) == size
     (room / name).write_bytes(data)
     assert read_image(room / name).shape == (HEIGHT, WIDTH, 3)
@@ -185,8 +127,7 @@ def test_what_claims_too_much_is_refused_before_it_is_unpacked(
     room: Path,  # noqa: F811
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    data, claiming = FILES[name]
-    (room / name).write_bytes(claiming(data, 65500, 65400))
+    (room / name).write_bytes(claiming(name, FILES[name], HUGE))
     if where == "target":
         monkeypatch.setattr("pathreplay.inverse.targets.read_image", None)  # its size alone is wrong
     with pytest.raises(PathreplayError, match=rf"{re.escape(name)}.* is 65500 x 65400") as told:
@@ -195,8 +136,7 @@ def test_what_claims_too_much_is_refused_before_it_is_unpacked(
 
 
 def test_textures_of_the_scene_are_looked_at_too(room: Path) -> None:  # noqa: F811
-    data, claiming = FILES["a.png"]
-    (room / "a.png").write_bytes(claiming(data, 65500, 65400))
+    (room / "a.png").write_bytes(claiming("a.png", FILES["a.png"], HUGE))
     (room / "odd.xml").write_text(SCENE.replace("texture.exr", "a.png"))
     with pytest.raises(PathreplayError, match=r"a\.png is 65500 x 65400"):
         load_scene("odd.xml")
@@ -211,7 +151,14 @@ def test_a_mask_of_another_size_is_told_by_its_head(room: Path) -> None:  # noqa
 @pytest.mark.parametrize("name", FILES)
 def test_damaged_heads_are_told_in_one_line(name: str, room: Path) -> None:  # noqa: F811
     for cut in (3, 11, 17, 21):
-        (room / name).write_bytes(FILES[name][0][:cut])
+        (room / name).write_bytes(FILES[name][:cut])
         with pytest.raises(PathreplayError, match=re.escape(name)) as told:
             read_image(room / name)
         assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("name", sorted(FILES.keys() - {"a.exr"}))
+def test_a_picture_of_no_pixels_is_none(name: str, room: Path) -> None:  # noqa: F811
+    (room / name).write_bytes(claiming(name, FILES[name], (0, 6)))
+    with pytest.raises(PathreplayError, match=rf"{re.escape(name)} is 0 x 6"):
+        read_image(room / name)

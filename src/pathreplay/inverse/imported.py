@@ -6,12 +6,14 @@ import importlib
 import importlib.util
 import numbers
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
@@ -38,7 +40,8 @@ class Imported:
         Raises PathreplayError for whatever either of them raises, and where what is returned is not made of numbers.
         """
         try:
-            value = self.function(*args)
+            with _same_variant(str(self)):
+                value = self.function(*args)
             if wrong := _no_numbers(value):
                 raise PathreplayError(f"{self} gives {wrong}; return numbers, or Dr.Jit's arrays of them")
             return convert(value)
@@ -63,8 +66,11 @@ class Modules:
         module, _, function = name.partition(":")
         try:
             if module not in self._known:
-                self._known[module] = self._loaded(module)
+                with _same_variant(f"The module of {kind} '{name}'"):
+                    self._known[module] = self._loaded(module)
             found = getattr(self._known[module], function)
+        except PathreplayError:
+            raise
         except (Exception, SystemExit) as error:  # whatever the module does when it is imported
             why = f"{kind} '{name}' cannot be imported ({_why(error)}); write module:function"
             raise PathreplayError(why) from None
@@ -101,6 +107,18 @@ class Modules:
         return module
 
 
+@contextmanager
+def _same_variant(who: str) -> Iterator[None]:
+    """Raise PathreplayError, which names ``who``, where Mitsuba's variant is another after this block; put it back."""
+    before = mi.variant()
+    yield
+    if (after := mi.variant()) != before:
+        mi.set_variant(before)
+        raise PathreplayError(
+            f"{who} sets the variant '{after}', and the job runs in '{before}'; leave that to the job"
+        )
+
+
 def _why(error: BaseException) -> str:
     if isinstance(error, SystemExit):
         return f"it ends Python: {error!r}"
@@ -123,4 +141,4 @@ def _no_numbers(value: Any, depth: int = 0) -> str:
     others = hasattr(value, "__dlpack__") or hasattr(value, "__cuda_array_interface__")  # arrays of other packages
     if isinstance(value, numbers.Real) or dr.is_array_v(value) or transform or others:
         return ""
-    return "nothing" if value is None else f"a {type(value).__name__}, {shown(value)},"
+    return "nothing" if value is None else f"the {type(value).__name__}, {shown(value)},"

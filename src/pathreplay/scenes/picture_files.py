@@ -105,11 +105,13 @@ def size_of_picture(path: Path) -> tuple[int, int] | None:
 
 
 def require_readable_picture(path: Path, pixels: int = MOST_PIXELS) -> None:
-    """Raise PathreplayError where a picture has more than so many ``pixels``, or does not fit the memory."""
+    """Raise PathreplayError where a picture has none, or more than so many ``pixels``, or does not fit the memory."""
     size = size_of_picture(path)
     if size is None:
         return  # who reads it says what is wrong
     what = f"Image {path} is {size[0]} x {size[1]}"
+    if not prod(size):
+        raise PathreplayError(f"{what}, which is no picture; replace the file")
     if prod(size) > pixels:
         raise PathreplayError(f"{what}, and images of up to {pixels} pixels are read; scale it down")
     memory.require(prod(size) * _A_PIXEL, f"{what}, and", "scale it down")
