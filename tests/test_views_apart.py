@@ -61,7 +61,14 @@ def test_the_loss_of_a_view_that_nothing_reaches_is_that_of_its_picture() -> Non
     assert found.loss == pytest.approx(np.mean((image - problem.views[1].target) ** 2) / 2, rel=0.1)
 
 
-@pytest.mark.parametrize("changes", [{}, {"views_per_step": 1}, {"parameters": [WIDE], "views_per_step": 1}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        {"views_per_step": 1},
+        pytest.param({"parameters": [WIDE], "views_per_step": 1}, marks=pytest.mark.slow),
+    ],
+)
 def test_a_job_of_two_views_moves_one_of_its_cameras(changes: dict[str, Any]) -> None:
     assert len(optimize(make_config({**LEFT, **changes}), progress=False).history) == 4
 

@@ -46,9 +46,6 @@ for _file, _data in GOOD.items():
     def _good(room: Room, rng: np.random.Generator, file: str = _file, data: bytes = _data) -> Action:
         return use(room, pick(rng, WHERE), file, data)
 
-    def _large(room: Room, rng: np.random.Generator, file: str = _file, data: bytes = _data) -> Action:
-        return use(room, pick(rng, ("value", "truth")), file, claiming(file, data, (11000, 12000)))
-
     def _spoiled(room: Room, rng: np.random.Generator, file: str = _file, data: bytes = _data) -> Action:
         return use(room, pick(rng, WHERE), file, spoiled(data, rng))
 
@@ -60,10 +57,16 @@ for _file, _data in GOOD.items():
         return use(room, pick(rng, WHERE), file, claiming(file, data, size))
 
     add(KIND, f"{_file} as it is", _good)
-    add(KIND, f"{_file} of just what is read", _large)
     add(KIND, f"{_file}, spoiled", _spoiled, fuzz=True)
     add(KIND, f"{_file} with a spoiled head", _head, fuzz=True)
     add(KIND, f"{_file} of another size than it says", _size, fuzz=True)
+
+for _file in ("a.jpg", "a.hdr"):
+
+    def _large(room: Room, rng: np.random.Generator, file: str = _file) -> Action:
+        return use(room, "value", file, claiming(file, GOOD[file], (5000, 6000)))
+
+    add(KIND, f"{_file} of 5000 x 6000", _large)
 
 PIXMAP = bytes(range(144))
 ODD = {
