@@ -125,9 +125,8 @@ def _radiance(file: BinaryIO, head: RadianceHead) -> tuple[mi.Bitmap, Callable[[
     stream.seek(0)
 
     def arranged(image: Image) -> Image:
-        flipped = [axis for axis, sign, usual in zip((0, 1), head.signs, head.axes, strict=True)
-                   if sign != {"Y": "-", "X": "+"}[usual]]  # fmt: skip
-        image = np.flip(image, flipped) / np.float32(head.exposure)
+        flipped = [n for n in (0, 1) if head.signs[n] != {"Y": "-", "X": "+"}[head.axes[n]]]
+        image = np.flip(image, tuple(flipped)) / np.float32(head.exposure)
         return image.transpose(1, 0, 2) if head.axes == "XY" else image
 
     return mi.Bitmap(stream), arranged
@@ -143,13 +142,17 @@ def picture_size(path: Path) -> tuple[int, int]:
 def oddities(path: Path) -> list[str]:
     """What a picture says of itself that is not looked at, in words that follow its name."""
     found = []
-    # What is wrong with it is told by who reads it.
-    with contextlib.suppress(Exception), warnings.catch_warnings(action="ignore"), PIL.Image.open(path) as picture:
-        profile = picture.info.get("icc_profile") or b""
-        if profile and b"sRGB" not in profile and "sRGB".encode("utf-16-be") not in profile:
-            found.append("has a colour profile (ICC) that is not sRGB's: it is ignored, and its numbers taken as sRGB")
-        if picture.getexif().get(_ORIENTATION, 1) != 1:
-            found.append("is to be turned (Exif): it is taken as it is stored")
+    # What is wrong with it is told by who reads it; and of large pictures Pillow warns.
+    with contextlib.suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with PIL.Image.open(path) as picture:
+            profile = picture.info.get("icc_profile") or b""
+            if profile and b"sRGB" not in profile and "sRGB".encode("utf-16-be") not in profile:
+                found.append(
+                    "has a colour profile (ICC) that is not sRGB's: it is ignored, and its numbers taken as sRGB"
+                )
+            if picture.getexif().get(_ORIENTATION, 1) != 1:
+                found.append("is to be turned (Exif): it is taken as it is stored")
     return found
 
 
