@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from hostile.assets import make_room
-from hostile.battery import run_cases, table
+from hostile.battery import Lane, make_assets, run_cases, table
 from hostile.case import RECIPES, Case
 from hostile.generate import COUNT, make_case
 from hostile.judge import Ended, judge
+from hostile.pairs import KEYS, Cover, missing_keys
 from hostile.room import Room
 from hostile.snapshot import snapshot
 from pathreplay import cli
@@ -20,6 +22,9 @@ DATA = Path(__file__).parent / "data" / "vdb.zip"
 
 #: Far above what all cases take on two quiet cores, which is eight minutes.
 LIMIT_S = 2400
+
+#: Of a job with edges, a rival, stages and numbers of samples of its own, which compiles some dozens of kernels.
+MANY_KERNELS_S = 400
 
 #: Told at the end of the session: see conftest.py.
 TOLD: list[str] = []
@@ -47,6 +52,9 @@ HANDFUL = (
     "a shapegroup of nothing",
     "serialized: a face of vertex 1000, a wrong checksum",
     "serialized: 1e6 shapes",
+    "value: a.jpg of 65500 x 65400",
+    "loss: ends Python with 0",
+    "penalty: a text",
 )
 
 
@@ -81,3 +89,26 @@ def test_hostile_cases_end_with_an_answer() -> None:
     TOLD.append(table(results))
     assert len(results) >= 400
     assert not (found := [str(result) for result in results if result.verdict.findings]), "\n".join(found)
+
+
+def test_no_key_of_a_job_is_left_out_of_the_pairs() -> None:
+    assert missing_keys() == set()
+
+
+@pytest.mark.slow
+def test_every_pair_of_keys_of_a_job_runs_or_is_refused(tmp_path: Path) -> None:
+    """Two iterations on a tiny scene. What is refused is told in one line; most pairs run."""
+    assets = make_assets(tmp_path)
+    lane = Lane(tmp_path / "lane", assets)
+    try:
+        cover = Cover(partial(lane.try_case, timeout=MANY_KERNELS_S))
+        cover.run()
+    finally:
+        lane.close()
+    TOLD.append(
+        f"{len(KEYS)} keys of a job: {len(cover.ran)} pairs ran, {len(cover.refused)} were refused, in "
+        f"{len(cover.results)} jobs"
+    )
+    assert len(cover.ran) + len(cover.refused) == len(KEYS) * (len(KEYS) - 1) // 2
+    assert len(cover.ran) > 3 * len(cover.refused)
+    assert not (found := [str(result) for result in cover.results if result.verdict.findings]), "\n".join(found)

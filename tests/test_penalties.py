@@ -91,7 +91,7 @@ def test_a_function_of_ones_own() -> None:
 
 WRONG = {
     "two": (lambda x: dr.gather(type(x.array), x.array, [0, 1]), "gives 2 numbers"),
-    "none": (lambda x: None, "cannot be computed"),
+    "none": (lambda x: None, "gives nothing; return numbers"),
     "raises": (lambda x: 1 / 0, "cannot be computed (division by zero); mend it"),
     "infinite": (lambda x: dr.sum(1 / (x - x), axis=None), "no finite number"),
 }

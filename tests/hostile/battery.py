@@ -69,14 +69,14 @@ class Lane:
         words = [path.read_bytes()[: 2**22].decode("utf-8", "backslashreplace") for path in (out, err)]
         return Ended(**json.loads(answer), stdout=words[0], stderr=words[1])
 
-    def try_case(self, case: Case) -> Result:
+    def try_case(self, case: Case, timeout: float = TIMEOUT_S) -> Result:
         """Make a fresh room, spoil it, run what meets it, and judge."""
         ground = self.scratch / "ground"
         shutil.rmtree(ground, ignore_errors=True)
         room = Room.new(ground, self.assets)
         action = case.prepare(room)
         before = snapshot(ground)
-        ended = self.run(action, room.path)
+        ended = self.run(action, room.path, timeout)
         return Result(case, action, ended, judge(case.recipe, action, ended, before, snapshot(ground)))
 
     def close(self) -> None:

@@ -6,7 +6,9 @@ from . import (
     of_capture,
     of_command,
     of_config,
+    of_format,
     of_mesh,
+    of_own,
     of_picture,
     of_process,
     of_python,
@@ -26,10 +28,12 @@ KINDS = tuple(
         of_scene,
         of_mesh,
         of_picture,
+        of_format,
         of_capture,
         of_volume,
         of_run,
         of_python,
+        of_own,
         of_process,
     )
 )

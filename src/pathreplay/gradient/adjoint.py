@@ -14,6 +14,10 @@ from ..transport.step import repeat_step
 from ..transport.vertex import Arrival, Replayed, Step, Walk
 
 
+class Unreached(PathreplayError):
+    """No parameter with gradients reaches the light paths. Who knows sensor and scene says what to do."""
+
+
 @dataclass
 class RayDerivative:
     """Derivative of an arrival: the adjoint q in reverse mode, the tangent in forward mode."""
@@ -158,14 +162,10 @@ def tangents(*values: Any) -> list[Any]:
 def backward(target: mi.Float) -> None:
     """Back-propagate from a scalar per path.
 
-    Raises PathreplayError when no parameter with gradients reaches it: the gradient would silently be zero.
+    Raises Unreached when no parameter with gradients reaches it: the gradient would silently be zero.
     """
     if not dr.grad_enabled(target):
         if not dr.flag(dr.JitFlag.SymbolicLoops) and not dr.flag(dr.JitFlag.SymbolicCalls):
             return  # only what these very paths meet is called: others, or other vertices, may meet the parameter
-        raise PathreplayError(
-            "no parameter with gradients reaches the light paths: check that the key is differentiable "
-            "(mi.traverse(scene)), that params.update() was called after dr.enable_grad, and that attach is not "
-            "'none' if it moves something"
-        )
+        raise Unreached("no parameter with gradients reaches the light paths")
     dr.backward_from(target)

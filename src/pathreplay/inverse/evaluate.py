@@ -179,7 +179,8 @@ class Evaluator:
         moving: Collection[str] | None = None,
     ) -> None:
         self.problem, self.integrator = problem, integrator
-        self._moving = {v.key for v in problem.variables} if moving is None else set(moving)
+        self._moving = frozenset((v.key for v in problem.variables) if moving is None else moving)
+        self._reached = problem.reached(self._moving)
         has_media = facts_of(problem.scene).has_media
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
@@ -221,7 +222,8 @@ class Evaluator:
         sensor_of(self.problem, about)
         variables = self.problem.held.variables(self.problem, values)
         moving = {key: value for key, value in variables.items() if key in self._moving}
-        dr.enable_grad(moving)
+        if view in self._reached:
+            dr.enable_grad(moving)
         self.problem.params.update(scene_values(self.problem, variables))
         try:
             factor = factor_of(values, view, about.target.shape[2])
@@ -234,7 +236,7 @@ class Evaluator:
             return self._view(values, view, seed, spp, pixels)
         gradients = {}
         for key, value in moving.items():
-            gradients[key] = _taken(dr.grad(value))
+            gradients[key] = _taken(dr.grad(value))  # zero in a view that nothing reaches
             dr.clear_grad(value)  # which the scene holds
         release(values)
         if by_factor is not None and EXPOSURE in gradients:
@@ -262,7 +264,7 @@ class Evaluator:
             why = obstacle(problem, self.integrator, sensor, spp, batch is not None)
             if why and batch is not None:
                 raise refused(about.name, why)
-            self._sweeps[which] = not why
+            self._sweeps[which] = not why and view in self._reached
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         share = about.share / len(problem.trained())

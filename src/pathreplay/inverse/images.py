@@ -1,14 +1,17 @@
 """Images in and out: always linear radiance in memory, whatever the file holds.
 
-8- and 16-bit files (PNG, JPEG) are taken as sRGB encoded and are decoded; EXR, HDR and PFM are taken as linear. Written
-PNGs are sRGB encoded after multiplication with an exposure; written EXRs are linear float32.
+8- and 16-bit files (PNG, JPEG, BMP, TGA, PPM) are taken as sRGB encoded and are decoded; EXR, HDR and PFM are taken as
+linear. Written PNGs are sRGB encoded after multiplication with an exposure; written EXRs are linear float32.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 import mitsuba as mi
 import numpy as np
@@ -19,6 +22,16 @@ from numpy.typing import NDArray
 from pathreplay.errors import PathreplayError
 from pathreplay.files import file_problem
 from pathreplay.scenes.descriptions import one_line
+from pathreplay.scenes.picture_files import (
+    MOST_HEAD,
+    MOST_PIXELS,
+    PixmapHead,
+    RadianceHead,
+    pixmap_head,
+    radiance_head,
+    require_readable_picture,
+    size_of_picture,
+)
 from pathreplay.threads import spare_thread
 
 Image = NDArray[np.float32]
@@ -44,44 +57,102 @@ def find_image(name: str, base: Path) -> Path:
     return path
 
 
-def read_image(path: Path, *, raw: bool = False) -> Image:
+def read_image(path: Path, *, raw: bool = False, pixels: int = MOST_PIXELS) -> Image:
     """Read an image as linear float32 (height, width, channels); ``raw`` keeps stored values (normal maps, masks).
 
-    Raises PathreplayError where there is no image in the file.
+    Raises PathreplayError where there is no image in the file, or one of more than so many ``pixels``.
     """
+    require_readable_picture(path, pixels)
     try:
         with spare_thread():
-            bitmap = mi.Bitmap(str(path))
-    except RuntimeError as error:
+            bitmap, arranged = _opened(path)
+            if raw:
+                bitmap.set_srgb_gamma(False)
+            found = arranged(_linear(bitmap))
+    except (RuntimeError, ValueError, MemoryError) as error:
         raise PathreplayError(f"Image {path} cannot be read: {one_line(error)}") from None
-    if raw:
-        bitmap.set_srgb_gamma(False)
-    if bitmap.pixel_format() != mi.Bitmap.PixelFormat.MultiChannel:  # whose channels it can only convert by their names
+    return found[:, :, None] if found.ndim == 2 else found
+
+
+def _linear(bitmap: mi.Bitmap) -> Image:
+    """The pixels, decoded where they are sRGB."""
+    formats = mi.Bitmap.PixelFormat
+    if bitmap.pixel_format() in (formats.XYZ, formats.XYZA):
+        bitmap = bitmap.convert(pixel_format=formats.RGB if bitmap.channel_count() == 3 else formats.RGBA)
+    # Others are as they should be; and Mitsuba converts channels by their names, which are not always those of colours.
+    if bitmap.srgb_gamma() or bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16):
         bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
-    pixels = np.array(bitmap, dtype=np.float32)
-    return pixels[:, :, None] if pixels.ndim == 2 else pixels
+    return np.asarray(bitmap).astype(np.float32, copy=False)
+
+
+def _opened(path: Path) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
+    """A picture as it is stored, and what makes of its pixels what they mean."""
+    with path.open("rb") as file:
+        magic = file.read(2)
+        if magic in (b"P5", b"P6"):
+            return _pixmap(file, pixmap_head(magic + file.read(MOST_HEAD))), lambda image: image
+        if magic == b"#?":
+            return _radiance(file, radiance_head(magic + file.read(MOST_HEAD)))
+    return mi.Bitmap(str(path)), lambda image: image
+
+
+def _pixmap(file: BinaryIO, head: PixmapHead) -> mi.Bitmap:
+    """A PGM or PPM, of which Mitsuba knows neither comments nor the order of bytes."""
+    file.seek(head.length)
+    stored = np.dtype(">u2" if head.highest > 255 else np.uint8)
+    count = head.width * head.height * head.channels
+    data = file.read(count * stored.itemsize)
+    if len(data) < count * stored.itemsize:
+        raise ValueError("it is cut short")
+    values = np.frombuffer(data, stored).reshape(head.height, head.width, head.channels)
+    if head.highest in (255, 65535):
+        values = values.astype(stored.newbyteorder("="))
+    else:
+        values = np.minimum(np.rint(values * np.float32(65535 / head.highest)), 65535).astype(np.uint16)
+    bitmap = mi.Bitmap(values)
+    bitmap.set_srgb_gamma(True)
+    return bitmap
+
+
+def _radiance(file: BinaryIO, head: RadianceHead) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
+    """A Radiance picture, of which Mitsuba knows neither the exposure nor other orders than the usual one."""
+    lines, columns = head.counts
+    kind = "xyze" if head.xyz else "rgbe"
+    file.seek(head.length)
+    stream = mi.MemoryStream()
+    stream.write(f"#?RADIANCE\nFORMAT=32-bit_rle_{kind}\n\n-Y {lines} +X {columns}\n".encode())
+    stream.write(file.read(8 * lines * (columns + 1)))  # twice what runs of single pixels take
+    stream.seek(0)
+
+    def arranged(image: Image) -> Image:
+        flipped = [n for n in (0, 1) if head.signs[n] != {"Y": "-", "X": "+"}[head.axes[n]]]
+        image = np.flip(image, tuple(flipped)) / np.float32(head.exposure)
+        return image.transpose(1, 0, 2) if head.axes == "XY" else image
+
+    return mi.Bitmap(stream), arranged
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height of a picture, of its head alone where Pillow knows its format. Raises as `read_image`."""
-    try:
-        with PIL.Image.open(path) as picture:
-            return picture.size
-    except (OSError, ValueError, PIL.Image.DecompressionBombError):  # no format of Pillow's, or no picture
-        height, width, _ = read_image(path).shape
-        return width, height
+    """Width and height of a picture, by the head of the file. Raises PathreplayError where that is no picture's."""
+    if (size := size_of_picture(path)) is None:
+        raise PathreplayError(f"Image {path} is of no format that is read; take PNG, JPEG, EXR, HDR or PFM")
+    return size
 
 
 def oddities(path: Path) -> list[str]:
     """What a picture says of itself that is not looked at, in words that follow its name."""
     found = []
-    # What is wrong with it is told by who reads it.
-    with contextlib.suppress(Exception), PIL.Image.open(path) as picture:
-        profile = picture.info.get("icc_profile") or b""
-        if profile and b"sRGB" not in profile and "sRGB".encode("utf-16-be") not in profile:
-            found.append("has a colour profile (ICC) that is not sRGB's: it is ignored, and its numbers taken as sRGB")
-        if picture.getexif().get(_ORIENTATION, 1) != 1:
-            found.append("is to be turned (Exif): it is taken as it is stored")
+    # What is wrong with it is told by who reads it; and of large pictures Pillow warns.
+    with contextlib.suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with PIL.Image.open(path) as picture:
+            profile = picture.info.get("icc_profile") or b""
+            if profile and b"sRGB" not in profile and "sRGB".encode("utf-16-be") not in profile:
+                found.append(
+                    "has a colour profile (ICC) that is not sRGB's: it is ignored, and its numbers taken as sRGB"
+                )
+            if picture.getexif().get(_ORIENTATION, 1) != 1:
+                found.append("is to be turned (Exif): it is taken as it is stored")
     return found
 
 

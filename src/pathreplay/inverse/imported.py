@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import numbers
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.scenes.descriptions import one_line
+
+DEEPEST = 8
+"""Of lists in each other, whose numbers are looked at."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +35,19 @@ class Imported:
         return f"{self.kind} '{self.name}'"
 
     def __call__(self, convert: Callable[[Any], Any], *args: Any) -> Any:
-        """``convert`` of what it returns. Raises PathreplayError for whatever either of them raises."""
+        """``convert`` of what it returns.
+
+        Raises PathreplayError for whatever either of them raises, and where what is returned is not made of numbers.
+        """
         try:
-            return convert(self.function(*args))
-        except Exception as error:  # whatever the function does
+            with _same_variant(str(self)):
+                value = self.function(*args)
+            if wrong := _no_numbers(value):
+                raise PathreplayError(f"{self} gives {wrong}; return numbers, or Dr.Jit's arrays of them")
+            return convert(value)
+        except PathreplayError:
+            raise
+        except (Exception, SystemExit) as error:  # whatever the function does
             raise PathreplayError(f"{self} cannot be computed ({_why(error)}); mend it, or name another") from error
 
 
@@ -48,8 +66,11 @@ class Modules:
         module, _, function = name.partition(":")
         try:
             if module not in self._known:
-                self._known[module] = self._loaded(module)
+                with _same_variant(f"The module of {kind} '{name}'"):
+                    self._known[module] = self._loaded(module)
             found = getattr(self._known[module], function)
+        except PathreplayError:
+            raise
         except (Exception, SystemExit) as error:  # whatever the module does when it is imported
             why = f"{kind} '{name}' cannot be imported ({_why(error)}); write module:function"
             raise PathreplayError(why) from None
@@ -86,5 +107,38 @@ class Modules:
         return module
 
 
+@contextmanager
+def _same_variant(who: str) -> Iterator[None]:
+    """Raise PathreplayError, which names ``who``, where Mitsuba's variant is another after this block; put it back."""
+    before = mi.variant()
+    yield
+    if (after := mi.variant()) != before:
+        mi.set_variant(before)
+        raise PathreplayError(
+            f"{who} sets the variant '{after}', and the job runs in '{before}'; leave that to the job"
+        )
+
+
 def _why(error: BaseException) -> str:
+    if isinstance(error, SystemExit):
+        return f"it ends Python: {error!r}"
     return one_line(error) or type(error).__name__
+
+
+def _no_numbers(value: Any, depth: int = 0) -> str:
+    """What a value is, if it is none of what Dr.Jit's types can be made of; else "".
+
+    Those types look into whatever has entries, also into texts, whose entries are texts again: they would do so for
+    ever, and hear no signal.
+    """
+    if isinstance(value, (list, tuple)):
+        if depth == DEEPEST:
+            return f"lists in each other, more than {DEEPEST} deep"
+        return next(filter(None, (_no_numbers(each, depth + 1) for each in value)), "")
+    if isinstance(value, (np.ndarray, np.generic)):
+        return "" if value.dtype.kind in "biuf" else f"NumPy's array of {value.dtype}"
+    transform = hasattr(value, "matrix") and type(value).__module__.startswith("mitsuba")
+    others = hasattr(value, "__dlpack__") or hasattr(value, "__cuda_array_interface__")  # arrays of other packages
+    if isinstance(value, numbers.Real) or dr.is_array_v(value) or transform or others:
+        return ""
+    return "nothing" if value is None else f"the {type(value).__name__}, {shown(value)},"

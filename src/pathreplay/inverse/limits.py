@@ -115,10 +115,17 @@ def require_near(scene: mi.Scene, key: str, value: Array, entry: Parameter) -> N
 def require_finite_loss(
     loss: Loss, name: str, target: Image, weight: Image | None, picture: Image | None = None
 ) -> None:
-    """Raise PathreplayError unless loss and derivative of ``picture`` (default: black) by ``target`` are finite."""
+    """Raise PathreplayError unless loss and derivative of ``picture`` (default: black) by ``target`` are finite.
+
+    A loss that does not depend on the picture has no derivative.
+    """
     image: Any = mi.TensorXf(np.zeros_like(target) if picture is None else picture)
     dr.enable_grad(image)
     value = mean_loss(loss, image, mi.TensorXf(target), None if weight is None else mi.TensorXf(weight))
+    if not dr.grad_enabled(value):
+        raise PathreplayError(
+            f"{loss} does not depend on the image; compute it with Dr.Jit's functions, without leaving its arrays"
+        )
     dr.backward(value)
     if np.isfinite(np.array(value)).all() and np.isfinite(np.array(dr.grad(image))).all():
         return

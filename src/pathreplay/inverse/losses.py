@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.imported import Modules
+from pathreplay.inverse.imported import Imported, Modules
 from pathreplay.inverse.picture_losses import lpips, scale_invariant, ssim
 
 Loss = Callable[..., Any]
@@ -104,15 +105,23 @@ def find_loss(name: str, modules: Modules | None = None) -> Loss:
 
 
 def _imported(name: str, modules: Modules) -> Loss:
-    own = modules.function("Loss", name, "image and target")
+    return Own(modules.function("Loss", name, "image and target"))
 
-    def loss(image: Any, target: Any) -> Any:
-        value = own(mi.TensorXf, image, target)
-        if value.shape not in (image.shape, ()):
+
+@dataclass(frozen=True)
+class Own:
+    """A loss of the user's own. Raises PathreplayError where it fails, or gives neither an image nor a number."""
+
+    function: Imported
+
+    def __str__(self) -> str:
+        return str(self.function)
+
+    def __call__(self, image: Any, target: Any) -> Any:
+        value = self.function(mi.TensorXf, image, target)
+        if value.shape not in (image.shape, (), (1,)):
             raise PathreplayError(
-                f"{own} gives the shape {value.shape} for pictures of {image.shape}; return a tensor like the image, "
+                f"{self} gives the shape {value.shape} for pictures of {image.shape}; return a tensor like the image, "
                 "or one number"
             )
         return value
-
-    return loss

@@ -46,6 +46,7 @@ from pathreplay.render.diagnostics import COST_OF_EDGES
 from pathreplay.render.edge_notes import edges_note, moves_edges
 from pathreplay.render.film import fit_film
 from pathreplay.render.integrator import EDGES
+from pathreplay.render.reach import reached_sensors
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.scenes.loading import load_scene_for
@@ -101,6 +102,12 @@ class Problem:
         """The keys of the scene whose values are others when these variables are."""
         made = {each.key for each in self.made() if not moving.isdisjoint(each.of)}
         return {key for key in moving if key in self.params} | made
+
+    def reached(self, moving: frozenset[str]) -> set[int]:
+        """The places of the views whose pictures, before any exposure, depend on one of these variables."""
+        sensors = [self.scene.sensors()[view.sensor] for view in self.views]
+        found = reached_sensors(self.scene, sensors, self.params, self.moves(moving))
+        return {n for n, reached in enumerate(found) if reached}
 
     def made(self) -> tuple[Pose | Derived, ...]:
         """What is made of variables."""

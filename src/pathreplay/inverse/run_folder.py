@@ -7,7 +7,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,11 +48,14 @@ class RunFolder:
         self.path = path
         self.lock = FolderLock(path)
         self.identity = _identity(path)
+        self.made_for_it: list[Path] = []
+        """Folders that it was put into and that were not there before, the innermost first."""
 
     def remove(self) -> None:
-        """Remove it with all that is in it, where it still is the folder that was made."""
+        """Remove it with all that is in it, where it still is the folder that was made, and what was made for it."""
         if _identity(self.path) == self.identity:
             shutil.rmtree(self.path, ignore_errors=True)
+            _remove_empty(self.made_for_it)
 
     def require_in_place(self, lost: str) -> None:
         """Raise PathreplayError if the folder is no longer where it was; ``lost`` names what was not saved."""
@@ -134,10 +137,13 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content]) -> R
     }
     if job.changes:
         origin["changes"] = list(job.changes)
+    missing = [folder for folder in output.parents if not folder.exists()]
     with undisturbed(), contextlib.ExitStack() as undo:
+        undo.callback(_remove_empty, missing)
         path = _make_new(output)
         undo.callback(shutil.rmtree, path, ignore_errors=True)
         run = RunFolder(path)
+        run.made_for_it = missing
         undo.callback(run.lock.close)
         run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
         undo.pop_all()
@@ -219,6 +225,13 @@ def require_writable_name(path: Path, option: str) -> None:
     except (OSError, ValueError) as error:  # too long; a null character
         name = ascii(str(path))
         raise PathreplayError(f"Run folder {name} cannot be used ({error}); give another {option}") from None
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    """Remove folders in which nothing is; who put something into one meanwhile keeps it."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def _make_new(output: Path) -> Path:

@@ -26,6 +26,7 @@ from pathreplay.inverse.outcome import resume_command
 from pathreplay.inverse.previews import Previews
 from pathreplay.inverse.problem import Problem, build_problem
 from pathreplay.inverse.progress import Progress
+from pathreplay.inverse.reached import require_reached
 from pathreplay.inverse.result import RunResult, outcome_of, result_files, result_of
 from pathreplay.inverse.run_folder import Job, RunFolder, create_run_folder
 from pathreplay.inverse.saving import Saving, first_files, go_on, saved_targets
@@ -150,6 +151,8 @@ def _states(
         job = replace(job, config=config)
         require_stages(problem, config)
         require_single_pixels(problem, config)
+        with computing(config):
+            require_reached(problem, config)
         for note in problem.notes:
             bar.note(note)
         crew = stack.enter_context(crew_of(config, job.base, problem, bar.remark, bar.status))

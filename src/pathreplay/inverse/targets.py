@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from types import MappingProxyType
 
@@ -22,6 +23,7 @@ from pathreplay.inverse.images import (
     oddities,
     over,
     over_black,
+    picture_size,
     read_image,
     resized,
     transparent_share,
@@ -35,6 +37,7 @@ from pathreplay.render.film import picture_shape
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator, told
 from pathreplay.scenes.loading import load_scene
+from pathreplay.scenes.picture_files import MOST_PIXELS
 from pathreplay.scenes.stored import form_of
 
 
@@ -124,9 +127,10 @@ def read_targets(
     odd: dict[str, list[str]] = {}
     for name, file in files.items():
         path, what = find_image(file, base), f"Target image '{file}'"
+        shape = picture_shape(scene.sensors()[sensors[name]])
+        image = _read(what, path, name, shape, resize)
         for oddity in oddities(path):
             odd.setdefault(oddity, []).append(file)
-        image, shape = read_image(path), picture_shape(scene.sensors()[sensors[name]])
         _require_alpha(what, image, alpha, name, shape)
         # Undone and resized as it looks over black: colours of what is transparent are anything.
         image = over_black(image, path)
@@ -137,7 +141,7 @@ def read_targets(
                     f"{what} has nothing of what a pinhole would see in place of its lens; correct k1, k2, ..."
                 )
             weights[name] = _weight(f"what the lens leaves of '{file}'", resized(there, *shape[:2]).clip(0, 1), name)
-        image = _sized(what, image, name, shape, resize)
+        image = resized(image, *shape[:2])
         if alpha == "mask":
             opaque = image[:, :, -1:] * weights.get(name, np.float32(1))
             weights[name] = _weight(f"the alpha of '{file}'", opaque, name)
@@ -193,10 +197,11 @@ def read_masks(
     """The weights that masks give, by view: white counts, black does not."""
     weights: dict[str, Image] = {}
     for name, file in files.items():
-        mask = read_image(find_image(file, base), raw=True)
+        shape = picture_shape(scene.sensors()[sensors[name]])
+        mask = _read(f"Mask '{file}'", find_image(file, base), name, shape, resize, raw=True)
         if name in lenses:
             mask, _ = lenses[name].undone(mask)
-        mask = _sized(f"Mask '{file}'", mask, name, picture_shape(scene.sensors()[sensors[name]]), resize)
+        mask = resized(mask, *shape[:2])
         weights[name] = _weight(f"mask '{file}'", adapted_image(f"Mask '{file}'", mask, "a mask has", 1), name)
     return weights
 
@@ -234,17 +239,14 @@ def by_view(what: str, files: list[str] | str, sensors: dict[str, int], base: Pa
     return dict(zip(sensors, found, strict=True))
 
 
-def _sized(what: str, image: Image, name: str, shape: tuple[int, int, int], resize: bool) -> Image:
-    """The image, which must have the size of the film, or is brought to it."""
-    height, width, _ = shape
-    if resize:
-        return resized(image, height, width)
-    if image.shape[:2] != (height, width):
+def _read(what: str, path: Path, name: str, shape: tuple[int, int, int], resize: bool, *, raw: bool = False) -> Image:
+    """The image, which must have the size of the film, unless it is to be brought to it; others are not unpacked."""
+    (width, height), film = picture_size(path), (shape[1], shape[0])
+    if not resize and (width, height) != film:
         raise PathreplayError(
-            f"{what} is {image.shape[1]} x {image.shape[0]}, sensor '{name}' renders {width} x {height}; resize the "
-            "image or the film"
+            f"{what} is {width} x {height}, sensor '{name}' renders {film[0]} x {film[1]}; resize the image or the film"
         )
-    return image
+    return read_image(path, raw=raw, pixels=max(MOST_PIXELS, prod(film)))
 
 
 def _weight(what: str, mask: Image, name: str) -> Image:

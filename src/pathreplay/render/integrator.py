@@ -175,7 +175,8 @@ class PathReplayIntegrator(PathIntegrator):
         numbers, row by row, none twice) only these are rendered, and add to the loss: the tensors and what is returned
         have a row for each of them (n x 1 x 3). What is not differentiated: see `sweep`.
         Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
-        number of samples does not, a tensor has another shape, or there are no such pixels.
+        number of samples does not, a tensor has another shape, there are no such pixels, or no parameter with gradients
+        reaches the paths.
         """
         self._require_active(scene)
         view = Pass.of(scene, sensor, seed, spp, self.even)

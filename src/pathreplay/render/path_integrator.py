@@ -13,9 +13,12 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
+from ..gradient.adjoint import Unreached
 from ..gradient.baseline import Guess
 from ..gradient.primal import primal
 from ..plugins import mitsuba_integrator
+from ..transport.motion import path_moves, weights_vary
+from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.traits import Tables
 from ..transport.vertex import Walk
@@ -25,6 +28,7 @@ from .interior import image
 from .lifetimes import careful, is_recording
 from .parts import Sums, parts
 from .properties import flag, whole_number
+from .reach import unreached_note
 from .term import Found, Term
 
 UNBOUNDED = 0xFFFFFFFF
@@ -37,6 +41,16 @@ def _sum(total: Any, image: Any, share: float) -> Any:
     total = image * share if total is None else total + image * share
     dr.eval(total)
     return total
+
+
+@contextmanager
+def _reached(scene: mi.Scene, sensor: Which) -> Iterator[None]:
+    """Within this block, which differentiates, a gradient that is plainly zero is no error: see `unreached_note`."""
+    try:
+        yield
+    except Unreached as error:
+        if note := unreached_note(scene, Pass.of(scene, sensor, 0, 1).sensor):
+            raise Unreached(note) from error
 
 
 @dataclass
@@ -126,8 +140,13 @@ class PathIntegrator:
     ) -> None:
         """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
 
-        Warns of what terms tell: a part of the gradient was not finite and had to be left out, edges move.
+        Warns of what terms tell: a part of the gradient was not finite and had to be left out, edges move. Raises
+        PathreplayError where no parameter with gradients reaches the paths, unless all are those of other cameras.
         """
+        with _reached(scene, sensor):
+            self._backward(scene, grad_in, sensor, seed, spp)
+
+    def _backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: Which, seed: Seed, spp: int) -> None:
         # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
         of_parts = self._parts(scene, sensor, seed, spp)
         sums = Sums(scene) if len(of_parts) > 1 else None
@@ -207,6 +226,19 @@ class PathIntegrator:
             return facts_of(scene).recorded_tables(self.tables, edges)
         self.tables = facts_of(scene).tables()
         return self.tables
+
+    def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:
+        """Whether a parameter with gradients reaches the paths of a sensor; where there are media, this is assumed.
+
+        Traces one step and evaluates nothing.
+        """
+        view = Pass.of(scene, sensor, 0, 1)
+        with self._passing():
+            walk, start = self._walk(scene, view.sensor), view.rays().start
+            if walk.media is not None or walk.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
+                return True
+            at = PathState.begin(walk, start).at
+            return path_moves(walk, start, at) or weights_vary(walk, at)
 
     def to_hand(self, scene: mi.Scene) -> Handed:
         """What passes over this scene are to be handed if they are recorded."""

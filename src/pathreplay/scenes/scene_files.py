@@ -15,6 +15,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.files import MISSING, file_problem
 from pathreplay.media.volume_files import require_whole_vol
 from pathreplay.scenes.mesh_files import require_sound_ply, require_sound_serialized
+from pathreplay.scenes.picture_files import require_readable_picture
 
 DEEPEST = 64
 """Elements inside each other in a scene file. Real ones have ten; Mitsuba's parser runs out of stack at some 10 000."""
@@ -65,7 +66,7 @@ def require_sound_files(state: Any) -> None:
     """Raise PathreplayError where a file that a parsed scene (`mi.parser`) names cannot be given to Mitsuba.
 
     Looks for pipes and devices, where Mitsuba would wait or read for ever; at the indices of PLY and serialized meshes
-    and at the sizes of volumes; and for groups without a shape.
+    and at the sizes of volumes and pictures; and for groups without a shape.
     """
     for node in state.nodes:
         kind, name = node.props.plugin_name(), node.props.get("filename")
@@ -83,6 +84,8 @@ def require_sound_files(state: Any) -> None:
             require_sound_ply(path)
         elif kind == "gridvolume":
             require_whole_vol(path)
+        elif kind in ("bitmap", "envmap"):
+            require_readable_picture(path)
         elif kind == "serialized":
             require_sound_serialized(path, node.props.get("shape_index", 0))
 
