@@ -24,6 +24,7 @@ from pathreplay.whole_files import Content, chunks
 
 PART = ".part"
 _CONFIGS = "config.toml", "config.yaml", "config.json"
+_FOLDERS = "images", "volumes", "rival", "previews"
 CHECKPOINT = "checkpoint.safetensors"
 RIVAL_CHECKPOINT = "rival/checkpoint.safetensors"
 
@@ -157,13 +158,27 @@ class _Origin(BaseModel):
 def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
     """The job of an existing run folder, and that folder, locked.
 
+    What a killed run has left half written in it is removed.
+
     Raises PathreplayError if it is no run folder, holds no checkpoint to go on from, is damaged, or is in use.
     """
     require_writable_name(path, "--resume")
     copy = _config_in(path)
     if not (path / CHECKPOINT).is_file():
         raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start the job from its config")
-    return _job(path, copy), RunFolder(path)
+    job, run = _job(path, copy), RunFolder(path)
+    _remove_parts(path)
+    return job, run
+
+
+def _remove_parts(path: Path) -> None:
+    """Remove what a killed run has half written, in the folder and in those that a run makes in it. Raises nothing."""
+    for folder in (path, *(path / name for name in _FOLDERS)):
+        if folder.is_symlink():
+            continue
+        for part in folder.glob(f"*{PART}"):
+            with contextlib.suppress(OSError):
+                part.unlink()
 
 
 def read_job(path: Path) -> Job:
