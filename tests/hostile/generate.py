@@ -14,6 +14,7 @@ from . import (
     of_scene,
     of_stages,
     of_volume,
+    of_watch,
 )
 from .case import RECIPES, Case
 
@@ -31,6 +32,7 @@ KINDS = tuple(
         of_run,
         of_python,
         of_process,
+        of_watch,
     )
 )
 
