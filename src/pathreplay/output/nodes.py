@@ -18,6 +18,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.scenes.descriptions import require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
 from pathreplay.threads import spare_thread
+from pathreplay.traversal import traversed
 
 Node = Any
 """`mi.parser.SceneNode`."""
@@ -126,7 +127,7 @@ def _owners(config: Any, state: Any, nodes: list[Node]) -> list[Owner]:
         copy.nodes[i].props.set_id(name)
     with spare_thread():
         scene = mi.parser.instantiate(config, copy)
-    params = mi.traverse(scene)
+    params = traversed(scene)
     owners = []
     for key in params.keys():
         node, depth = params.properties[key][2], 1

@@ -26,6 +26,7 @@ from pathreplay.scenes.parameters import get_array, is_empty, to_value
 from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
 from pathreplay.threads import spare_thread
+from pathreplay.traversal import traversed
 
 SCENE = "scene.xml"
 
@@ -107,7 +108,7 @@ def require_same(original: mi.Scene, folder: Path) -> None:
     gc.collect()
     with told(f"The exported scene {folder / SCENE} cannot be loaded"), spare_thread():
         copy = mi.load_file(str(folder / SCENE), optimize=False)
-    ours, theirs = mi.traverse(original), mi.traverse(copy)
+    ours, theirs = traversed(original), traversed(copy)
     # Those without a name come in the same order.
     waiting: defaultdict[str, list[str]] = defaultdict(list)
     for key in theirs.keys():
@@ -144,7 +145,7 @@ def _numbers(value: Any) -> np.ndarray:
 
 
 def _set(scene: mi.Scene, values: Arrays) -> mi.SceneParameters:
-    params = mi.traverse(scene)
+    params = traversed(scene)
     for key, value in values.items():
         if key not in params:
             raise PathreplayError(f"The scene has no parameter '{key}' any more; export with the scene of the run")
@@ -153,7 +154,7 @@ def _set(scene: mi.Scene, values: Arrays) -> mi.SceneParameters:
         array = np.ascontiguousarray(value, np.float32)
         params[key] = form.store(type(seen)(array) if dr.is_tensor_v(seen) else to_value(seen, array))
     params.update()
-    return mi.traverse(scene)
+    return traversed(scene)
 
 
 def _file_names(keys: list[str], scene: mi.Scene) -> dict[str, str]:

@@ -19,6 +19,7 @@ from pathreplay.scenes import parameters as scene_parameters
 from pathreplay.scenes.builtin_scenes import BUILTINS, COSTS, SceneDict
 from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.substitute import Cameras, load_dict_with, load_file_with
+from pathreplay.traversal import traversed
 
 
 def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any) -> mi.Scene:
@@ -84,7 +85,7 @@ def load_scene_for(
     about. Raises what `load_scene` does.
     """
     scene, _ = load_scene_with(spec, {}, base, cameras, **parameters)
-    params = mi.traverse(scene)
+    params = traversed(scene)
     patterns = [pattern for pattern in wanted if pattern.rsplit(".", 1)[-1] == "eta"]
     keys: list[str] = []
     with suppress(PathreplayError):

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..traversal import known_values
 from .pieces import mesh_pieces
 from .velocity import blend_length
 
@@ -258,6 +259,9 @@ def with_gradients(node: mi.Object, *names: str) -> list[Any]:
     What goes on after a name with a dot is called so, too.
     """
     params = mi.traverse(node)
-    found = [params[key] for key in params.keys() if not names or any(f"{key}.".startswith(f"{n}.") for n in names)]
     with dr.resume_grad():
-        return [value for value in found if dr.grad_enabled(value)]
+        return [
+            value
+            for key, value in known_values(params)
+            if (not names or any(f"{key}.".startswith(f"{n}.") for n in names)) and dr.grad_enabled(value)
+        ]
