@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,9 @@ def export_run(run: Path, output: Path | None = None) -> str:
             (part / name).write_bytes(data)
         require_same(found.scene, part)
     files = sorted([*found.files, *found.copies])
-    lines = [f"{folder / SCENE}: render it with `mitsuba -m {mi.variant()} {folder / SCENE}`"]
+    # Not by Mitsuba's own command, which takes the system's newest LLVM, and is ended by some of them.
+    render = f"pathreplay render {shlex.quote(str(folder / SCENE))} -o scene.exr --variant {mi.variant()}"
+    lines = [f"{folder / SCENE}: render it with `{render}`"]
     lines += [f"{folder / name}" for name in files if name != SCENE and not name.startswith("files/")]
     return "\n".join([*lines, *(f"pathreplay: {note}" for note in found.notes)])
 
