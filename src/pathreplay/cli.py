@@ -141,11 +141,11 @@ def check(
     for note in notes:
         typer.echo(f"pathreplay: {plain_line(note)}", err=True)
     asked = {name: value for name, value in (("edges", edges), ("edge_spp", edge_spp)) if value is not None}
-    results = command.check_all(
+    checks = command.check_all(
         loaded, param, integrator=integrator, seeds=seeds, spp=spp, fd_spp=fd_spp, step=step,
         max_depth=max_depth, edges=asked, mode=mode, sensor=sensor, seed=seed,
     )  # fmt: skip
-    command.print_checks(results)
+    results = command.print_checks(checks)
     if json is not None:
         command.write_checks(results, json)
     raise typer.Exit(0 if all(result.passed for result in results) else 1)
