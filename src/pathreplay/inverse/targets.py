@@ -34,7 +34,7 @@ from pathreplay.inverse.views import View
 from pathreplay.render.film import picture_shape
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator, told
-from pathreplay.scenes.loading import load_scene
+from pathreplay.scenes.loading import load_scene_with_floats
 from pathreplay.scenes.stored import form_of
 from pathreplay.traversal import traversed
 
@@ -61,7 +61,8 @@ def target_scene(config: Config, base: Path) -> mi.Scene:
     target = config.target
     spec = config.scene if target.scene is None else target.scene
     arguments = config.scene_parameters if target.scene_parameters is None else target.scene_parameters
-    scene = load_scene(spec, base, **arguments)
+    wanted = [*target.values, *(entry.key for entry in (*config.parameters, *config.derived))]
+    scene = load_scene_with_floats(spec, wanted, base, **arguments)
     params = traversed(scene)
     parameters.require_finite(params)
     values = {}

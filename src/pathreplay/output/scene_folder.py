@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import re
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,12 +55,14 @@ class Source:
     """Plugins that were exchanged, old type -> new type."""
     cameras: Mapping[str, Mapping[str, Any]]
     """Sensors that join the scene, by id."""
+    floats: Collection[str] = ()
+    """Files of textures that are floating-point numbers here: see `load_file_with`."""
 
     def load(self) -> mi.Scene:
         """The scene. Raises what Mitsuba and `load_file_with` raise."""
         if isinstance(self.scene, Mapping):
-            return load_dict_with(self.scene, self.plugins, self.cameras)[0]
-        return load_file_with(self.scene, self.plugins, self.arguments, self.cameras)[0]
+            return load_dict_with(self.scene, self.plugins, self.cameras, self.floats)[0]
+        return load_file_with(self.scene, self.plugins, self.arguments, self.cameras, self.floats)[0]
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, Any] | Non
     with told("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene = source.load()
         params = _set(scene, values)
-        described, owners = describe(source.scene, source.arguments, source.plugins, source.cameras)
+        described, owners = describe(source.scene, source.arguments, source.plugins, source.cameras, source.floats)
     keys = list(params.keys())
     if len(keys) != len(owners):
         raise PathreplayError("The scene is another one at every loading, and cannot be exported")
