@@ -86,7 +86,7 @@ def half_written_files_of_a_killed_run(room: Room, rng: np.random.Generator) -> 
     room.change("iterations", 4000)
     wait = "while [ ! -e runs/job/checkpoint.safetensors ]; do sleep 0.1; done"
     kill = f"{RUN} optimize job.toml --quiet & process=$!; {wait}; sleep 0.{rng.integers(1, 9)}; kill -KILL $process"
-    half = "touch runs/job/previews/page.json.part runs/job/images/result-eye.png.part"
+    half = "touch runs/job/previews/000007-view-eye.webp.part runs/job/images/result-eye.png.part"
     raised = "sed -i 's/iterations = 4000/iterations = 3/' runs/job/config.toml"
     resume = f"{RUN} optimize --resume runs/job --quiet; status=$?"
     left = "[ -z \"$(find runs -name '*.part')\" ] || exit 77; exit $status"
