@@ -178,7 +178,7 @@ def full_disk_at(write: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(folders, "_write_through", write_through)
 
 
-# Writes of this job: 1-2 config and origin, 3-8 first pictures, checksums and checkpoint, 9-10 checkpoints, then results.
+# Writes of this job: 1-2 config and origin, 3-8 first pictures, their checksums, checkpoint, 9-10 checkpoints, results.
 @pytest.mark.parametrize(
     ("write", "resumable"),
     [(1, False), (9, True), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((5, False), (13, True)))],
