@@ -11,7 +11,9 @@ import matplotlib
 import pytest
 
 import pathreplay
+from pathreplay import cli
 from pathreplay.inverse import drawing, make_config, optimize
+from pathreplay.watch.server import RunServer
 from small_job import ERROR, write_job
 from test_inverse_run import JOB
 
@@ -89,3 +91,53 @@ def test_a_run_stays_in_its_folder_wherever_the_user_goes(room: Path) -> None:
     os.chdir(room / "elsewhere")
     assert going_on.finish().iterations == 2
     assert (room / "runs/mine-2/report.html").is_file() and not list((room / "elsewhere").iterdir())
+
+
+def test_a_program_without_a_console_has_its_runs(monkeypatch: pytest.MonkeyPatch, room: Path) -> None:
+    with monkeypatch.context() as patch:
+        for name in ("stdout", "stderr"):
+            patch.setattr(sys, name, None)
+        assert optimize("job.json", output="run", progress=True).iterations == 2
+        check = ["check", "room.xml", "--param", "floor.reflectance.value", "--seeds", "2", "--spp", "1"]
+        for arguments in (
+            ["optimize", "job.json", "--output", "other"],
+            check,
+            ["compare", "run", "other"],
+            ["--help"],
+        ):
+            patch.setattr(sys, "argv", ["pathreplay", *arguments])
+            with pytest.raises(SystemExit) as end:
+                cli.main()
+            assert end.value.code in (None, 0, 1), arguments
+
+
+def test_the_address_of_a_run_needs_no_console(monkeypatch: pytest.MonkeyPatch, room: Path) -> None:
+    run = optimize("job.json", output="run", progress=False).folder
+    served: list[RunServer] = []
+    monkeypatch.setattr("pathreplay.watch.server.serve", served.append)
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", None)
+        cli.watch(run, port=0, host="127.0.0.1")
+    served[0].server_close()
+
+
+@pytest.mark.parametrize("limit", [300_000, 450_000, 600_000])
+def test_too_few_addresses_are_told(limit: int, room: Path) -> None:
+    limited = f"import resource; resource.setrlimit(resource.RLIMIT_AS, 2 * [{limit * 1024}]); import sys; "
+    done = python(limited + "sys.argv[1:] = ['optimize', 'job.json']; from pathreplay.cli import main; main()")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith(f"{ERROR}{limit} kB of addresses (ulimit -v) are too little")
+    done = python(limited + "import pathreplay; pathreplay.optimize('job.json')")
+    assert f"PathreplayError: {limit} kB of addresses" in done.stderr.splitlines()[-1]
+
+
+def test_a_library_that_is_not_loaded_for_want_of_addresses_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def lacking(*_: object, **__: object) -> None:
+        raise ImportError("libLLVM.so: failed to map segment from shared object")
+
+    monkeypatch.setattr(cli, "app", lacking)
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2 and "libLLVM.so" in capsys.readouterr().err
