@@ -24,6 +24,7 @@ from typing import Annotated, Any
 import safetensors.numpy
 import typer
 
+from pathreplay.inverse.checksums import SEAL
 from pathreplay.inverse.run_folder import CHECKPOINT
 
 WALLS = [f"{wall}.reflectance.value" for wall in ("red", "green", "white")]
@@ -151,7 +152,7 @@ def outcome(run: Path) -> dict[str, Any]:
     files = [run / name for name in names] + sorted((run / "images").glob("*.exr"))
     return {
         **{str(path.relative_to(run)): path.read_bytes() for path in files},
-        **{f"checkpoint: {key}": value.tobytes() for key, value in tensors.items()},
+        **{f"checkpoint: {key}": value.tobytes() for key, value in tensors.items() if key != SEAL},
         "history": [{**line, "seconds": 0} for line in lines],
         "checkpoint: history": [{**line, "seconds": 0} for line in _history(run)],
     }

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from pathreplay import interrupts
 from pathreplay.inverse import make_config
+from pathreplay.inverse.checksums import SEAL
 from test_inverse_run import JOB, SCENE
 
 #: Far above what a small job takes on a loaded machine.
@@ -68,6 +70,15 @@ def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
         process.kill()
         raise
     return process.returncode, out, err
+
+
+def checkpoint_bits(folder: Path) -> dict[str, bytes]:
+    """What the checkpoint in a run folder holds, bit for bit: values, what the optimiser remembers, what was learned.
+
+    Without its seal, which knows how many seconds the run took.
+    """
+    tensors = safetensors.numpy.load_file(folder / "checkpoint.safetensors")
+    return {name: value.tobytes() for name, value in tensors.items() if name != SEAL}
 
 
 def kill_at_checkpoint(folder: Path, process: subprocess.Popen[str], which: int, number: signal.Signals) -> None:

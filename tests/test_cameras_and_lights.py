@@ -93,7 +93,7 @@ def test_other_integrators_are_told_who_can(scene: Any) -> None:
             with pytest.raises(PathreplayError, match="only 'pathreplay' differentiates cameras"):
                 require_differentiable(params, key, plugin)
     with pytest.raises(PathreplayError, match="only 'pathreplay'"):
-        check_all(scene, ["bulb.position"], integrator="prb")
+        list(check_all(scene, ["bulb.position"], integrator="prb"))
 
 
 def test_a_glob_takes_cameras_for_pathreplay_only(scene: Any) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from pathreplay import cli
-from pathreplay.check import check_gradient
+from pathreplay.check import check_gradient, command
 from pathreplay.check.direction import choose_line
 from pathreplay.check.objective import smooth_weights
 from pathreplay.check.reference import integrator_under_test, read_limits, reference_integrator
@@ -524,6 +524,29 @@ def test_command_passes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     records = json.loads((tmp_path / "out.json").read_text())
     assert [record["key"] for record in records] == ["ball.bsdf.reflectance.value", "sky.radiance.value"]
     assert all(record["passed"] and len(record["gradient_samples"]) == 8 for record in records)
+
+
+def test_each_check_is_told_when_it_is_there(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Where nobody sees a bar: what is under way, how far it is, and no verdict that waits for the last one."""
+    (tmp_path / "ball.xml").write_text(SCENE.format(bsdf="diffuse"))
+    plain, seen = command.check_gradient, []
+
+    def watched(*arguments: Any, **options: Any) -> Any:
+        seen.append(capsys.readouterr())
+        return plain(*arguments, **options)
+
+    monkeypatch.setattr(command, "check_gradient", watched)
+    monkeypatch.setattr(command, "_PAUSE_S", 0.0)
+    keys = ["ball.bsdf.reflectance.value", "sky.radiance.value"]
+    params = [option for key in keys for option in ("--param", key)]
+    run(monkeypatch, str(tmp_path / "ball.xml"), *params, "--seeds", "2", "--spp", "1")
+    seen.append(capsys.readouterr())
+    assert seen[0].err == f"pathreplay: checking {keys[0]} (1/2)\n" and seen[0].out == ""
+    assert keys[0] in seen[1].out and keys[1] not in seen[1].out
+    assert f"pathreplay: {keys[0]} (1/2): 11 of 11 renderings\n" in seen[1].err
+    assert seen[1].err.endswith(f"pathreplay: checking {keys[1]} (2/2)\n") and keys[1] in seen[2].out
 
 
 def test_command_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

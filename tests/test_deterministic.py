@@ -13,7 +13,7 @@ import pytest
 import safetensors.numpy
 
 from pathreplay.inverse import optimize
-from small_job import ended, kill_at_checkpoint, start, write_job
+from small_job import checkpoint_bits, ended, kill_at_checkpoint, start, write_job
 from test_inverse_run import TEXTURE
 
 PATHREPLAY = {"integrator": {"type": "pathreplay", "max_depth": 3}}
@@ -42,8 +42,7 @@ def outcome(folder: Path) -> tuple[dict[str, bytes], list[Any]]:
 
 
 def adam(folder: Path) -> dict[str, bytes]:
-    state = safetensors.numpy.load_file(folder / "checkpoint.safetensors")
-    return {key: value.tobytes() for key, value in state.items()}
+    return checkpoint_bits(folder)
 
 
 @SLOW

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import json
+import shlex
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from pathreplay import cli
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
 from pathreplay.inverse.capture import read_capture
@@ -242,7 +245,7 @@ def run(finished: Path, tmp_path: Path) -> Path:
 def test_a_run_comes_out_as_its_result_pictures(run: Path, tmp_path: Path) -> None:
     told = export_run(run)
     folder = run / "export"
-    assert told.splitlines()[0].startswith(f"{folder}/scene.xml: render it with `mitsuba -m llvm_ad_rgb ")
+    assert told.splitlines()[0].startswith(f"{folder}/scene.xml: render it with `pathreplay render ")
     gc.collect()
     scene = loaded(folder)
     result = [read_image(run / f"images/result-{view}.exr") for view in ("left", "right")]
@@ -261,6 +264,18 @@ def test_a_run_comes_out_as_its_result_pictures(run: Path, tmp_path: Path) -> No
     assert found == {
         "scene.xml", "values.json", "transforms.json", f"textures/{key}.exr", f"textures/{key}.png"
     }  # fmt: skip
+
+
+def test_the_command_that_is_advised_renders_what_came_out(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, command, _ = export_run(run, tmp_path / "with a space").splitlines()[0].split("`")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [*shlex.split(command), "--spp", "1", "--quiet"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code in (0, None)
+    assert read_image(tmp_path / "scene.exr").shape == (10, 12, 3)
 
 
 def test_the_cameras_of_a_run_can_be_read_as_a_capture(run: Path) -> None:

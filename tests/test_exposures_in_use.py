@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import iterate, make_config, optimize
 from pathreplay.inverse.exposures import EXPOSURE, Factors
+from small_job import checkpoint_bits
 from test_exposures import JOB, KEY, LEVELS, folder  # noqa: F401 (folder: for every test)
 
 PLAIN = {key: value for key, value in JOB.items() if key not in ("iterations", "learning_rate_decay")}
@@ -34,8 +34,7 @@ def job(kind: str, output: str) -> Any:
 
 
 def saved(run: str) -> dict[str, bytes]:
-    tensors = safetensors.numpy.load_file(Path(run) / "checkpoint.safetensors")
-    return {key: value.tobytes() for key, value in tensors.items()}
+    return checkpoint_bits(Path(run))
 
 
 @pytest.mark.slow

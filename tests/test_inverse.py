@@ -158,6 +158,8 @@ BAD_CONFIGS = {
     "zero learning rate": ({"learning_rate": 0}, "'learning_rate' is 0"),
     "nothing to match": ({"target": {}}, "nothing to match"),
     "images and values": ({"target": {"images": ["a"], "values": {"k": 1}}}, "'images' excludes 'values'"),
+    "an optimiser of Dr.Jit's": ({"optimizer": dr.opt.Adam(lr=0.1)}, "'optimizer' is Adam"),
+    "an optimiser in the place of a target": ({"target": dr.opt.SGD(lr=0.1)}, "'target' is SGD"),
     "graded by itself": ({"target": {"values": {"k": 1}, "integrator": {"type": "pathreplay"}}}, "grade itself"),
 }
 

@@ -178,10 +178,10 @@ def full_disk_at(write: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(folders, "_write_through", write_through)
 
 
-# Writes of this job: 1-2 config and origin, 3-7 first pictures and checkpoint, 8-9 checkpoints, then the results.
+# Writes of this job: 1-2 config and origin, 3-8 first pictures, their checksums, checkpoint, 9-10 checkpoints, results.
 @pytest.mark.parametrize(
     ("write", "resumable"),
-    [(1, False), (8, True), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((5, False), (12, True)))],
+    [(1, False), (9, True), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((5, False), (13, True)))],
 )
 def test_full_disk_leaves_nothing_half_written(write: int, resumable: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     earlier = run(output="runs/a", iterations=1)

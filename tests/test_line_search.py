@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import safetensors.numpy
 import scipy.optimize
 
 from pathreplay.errors import PathreplayError
@@ -15,6 +14,7 @@ from pathreplay.inverse import iterate, make_config, optimize
 from pathreplay.inverse.line_search import MOST, LineSearch
 from pathreplay.inverse.optimiser import State
 from pathreplay.inverse.optimizer_options import Optimizer
+from small_job import checkpoint_bits
 from test_protocols import bits
 from test_steps import JOB, SCENE
 
@@ -135,8 +135,7 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def saved(folder: str) -> dict[str, bytes]:
-    tensors = safetensors.numpy.load_file(Path(folder) / "checkpoint.safetensors")
-    return {key: value.tobytes() for key, value in tensors.items()}
+    return checkpoint_bits(Path(folder))
 
 
 @pytest.mark.parametrize("transform", [None, pytest.param("logit", marks=pytest.mark.slow)])

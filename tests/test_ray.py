@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-import safetensors.numpy
 
 if sys.version_info < (3, 11):
     import tomli as tomllib
@@ -30,7 +29,7 @@ from pathreplay.inverse.config import AUTO
 from pathreplay.inverse.loop import new_run, take_step
 from pathreplay.inverse.problem import build_problem
 from pathreplay.threads import one_thread
-from small_job import ERROR, TIMEOUT_S, ended, hear_signals, start, wait_for, write_job
+from small_job import ERROR, TIMEOUT_S, checkpoint_bits, ended, hear_signals, start, wait_for, write_job
 from test_deterministic import CLOUD
 from test_inverse_run import JOB, room  # noqa: F401 (room: its folder, for every test)
 
@@ -51,8 +50,7 @@ def job_of(name: str, **changes: Any) -> dict[str, Any]:
 
 def bits(folder: Path) -> dict[str, bytes]:
     """Values, what the optimiser remembers, what was learned."""
-    state = safetensors.numpy.load_file(folder / "checkpoint.safetensors")
-    return {key: value.tobytes() for key, value in state.items()}
+    return checkpoint_bits(folder)
 
 
 def run(name: str, **changes: Any) -> dict[str, bytes]:

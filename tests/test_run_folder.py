@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
 import json
 import os
 import random
@@ -18,10 +19,13 @@ import safetensors
 import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import RunResult, optimize, run_folder
+from pathreplay.inverse import RunResult, checkpoint, optimize, run_folder
+from pathreplay.inverse.checksums import SEAL, SUMS, Sums, sealed_chunks
 from pathreplay.inverse.config import load_config
 from pathreplay.inverse.folder_lock import LOCK, FolderLock
 from pathreplay.inverse.images import exr_bytes, read_image
+from pathreplay.inverse.loop import new_run
+from pathreplay.inverse.problem import build_problem
 from pathreplay.inverse.progress import Progress
 from small_job import write_job
 from test_inverse_run import TEXTURE
@@ -213,9 +217,10 @@ def tensors(run: Path, change: Callable[[dict[str, np.ndarray], dict[str, Any]],
     with safetensors.safe_open(str(path), framework="numpy") as file:
         metadata = {key: json.loads(value) for key, value in file.metadata().items()}
         arrays = {name: file.get_tensor(name).copy() for name in file.keys()}
+    arrays.pop(SEAL)
     change(arrays, metadata)
     text = {key: json.dumps(value) for key, value in metadata.items()}
-    path.write_bytes(safetensors.numpy.save(arrays, text))
+    path.write_bytes(b"".join(sealed_chunks(arrays, text)))
 
 
 def entry(key: str, value: Any) -> Callable[[Path], None]:
@@ -227,10 +232,15 @@ def tensor(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[P
 
 
 def picture(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
-    return lambda run: (
-        (run / f"images/{name}-left.exr").write_bytes(exr_bytes(change(read_image(run / f"images/{name}-left.exr"))))
-        and None
-    )
+    def put(run: Path) -> None:
+        path = run / f"images/{name}-left.exr"
+        path.write_bytes(exr_bytes(change(read_image(path))))
+        table = json.loads((run / SUMS).read_text())
+        data = path.read_bytes()
+        table[f"images/{name}-left.exr"] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        (run / SUMS).write_text(json.dumps(table))
+
+    return put
 
 
 def bad_pixel(image: np.ndarray) -> np.ndarray:
@@ -270,6 +280,9 @@ DAMAGE: dict[str, Callable[[Path], Any]] = {
     "target is NaN": picture("target", bad_pixel),
     "start missing": lambda run: (run / "images/start-left.exr").unlink(),
     "target missing": lambda run: (run / "images/target-left.exr").unlink(),
+    "another start": lambda run: shutil.copyfile(run / "images/start-right.exr", run / "images/start-left.exr"),
+    "checksums missing": lambda run: (run / SUMS).unlink(),
+    "checksums damaged": lambda run: (run / SUMS).write_text("{"),
     "start empty": lambda run: (run / "images/start-left.exr").write_bytes(b""),
     "run.json empty": lambda run: (run / "run.json").write_bytes(b""),
     "run.json is no object": lambda run: (run / "run.json").write_text("[1]"),
@@ -294,6 +307,46 @@ def test_damage_gets_one_line(case: str, finished: Path, tmp_path: Path) -> None
     if case.endswith("of another size"):
         assert f"{case.split()[0]}-left.exr has shape" in line
     assert before == {path: path.read_bytes() for path in before}
+
+
+def flipped(data: bytes, bit: int) -> bytes:
+    return data[: bit // 8] + bytes([data[bit // 8] ^ 1 << bit % 8]) + data[bit // 8 + 1 :]
+
+
+def test_every_flipped_bit_of_what_a_resume_reads_is_noticed(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All over the checkpoint, header and tensors, and all over a picture."""
+    shutil.copytree(finished, tmp_path / "copy")
+    monkeypatch.chdir(tmp_path / "copy")
+    run = Path("run")
+    problem = build_problem(load_config(run / "config.json"), Path.cwd())
+    state = new_run(problem, problem.integrator, record=False)
+    levels = {variable.key: variable.levels for variable in problem.variables}
+    checks: dict[str, Callable[[Path], Any]] = {
+        CHECKPOINT: lambda path: checkpoint.restore(path, state, levels),
+        "images/target-right.exr": Sums(run).require,
+    }
+    for name, check in checks.items():
+        path = run / name
+        check(path)
+        data = path.read_bytes()
+        for bit in (*range(0, 8 * len(data), 101), *range(8 * len(data) - 300, 8 * len(data), 7)):
+            path.write_bytes(flipped(data, bit))
+            with pytest.raises(PathreplayError):
+                check(path)
+        path.write_bytes(data)
+
+
+def test_what_a_killed_run_has_half_written_goes_when_it_is_gone_on_with(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "copy")
+    run = longer(tmp_path / "copy")
+    (run / "run.json").write_text(json.dumps({"base": str(tmp_path / "copy"), "config": None}))
+    names = ["checkpoint.safetensors", "previews/000002-view-left.webp", "previews/page.json", "images/result-left.exr"]
+    for name in names:
+        (run / f"{name}.part").write_bytes(b"half")
+    optimize(resume=run, progress=False)
+    assert not list(run.rglob("*.part"))
 
 
 def tampered(data: bytes, random_: random.Random) -> bytes:

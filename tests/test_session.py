@@ -9,11 +9,11 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
-import safetensors.numpy
 
 import pathreplay
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import RunResult, State, iterate, make_config, optimize
+from small_job import checkpoint_bits
 from test_deterministic import CLOUD
 from test_steps import JOB, SCENE
 
@@ -33,8 +33,7 @@ def job(**changes: Any) -> Any:
 
 def saved(folder: str = "run") -> dict[str, bytes]:
     """What a checkpoint holds, bit for bit."""
-    tensors = safetensors.numpy.load_file(Path(folder) / "checkpoint.safetensors")
-    return {key: value.tobytes() for key, value in tensors.items()}
+    return checkpoint_bits(Path(folder))
 
 
 @pytest.mark.parametrize("changes", [{}, pytest.param(MEDIUM, marks=pytest.mark.slow)], ids=["surface", "medium"])

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse import iterate, make_config, optimize
@@ -17,6 +16,7 @@ from pathreplay.inverse.stages import Staged, part_at, scaled
 from pathreplay.inverse.views import View
 from pathreplay.scenes.parameters import get_array
 from pathreplay.threads import one_thread
+from small_job import checkpoint_bits
 from test_deterministic import CLOUD
 from test_inverse_run import JOB, SCENE, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 
@@ -35,8 +35,7 @@ def staged(**changes: Any) -> Any:
 
 
 def saved(folder: str) -> dict[str, bytes]:
-    tensors = safetensors.numpy.load_file(Path(folder) / "checkpoint.safetensors")
-    return {key: value.tobytes() for key, value in tensors.items()}
+    return checkpoint_bits(Path(folder))
 
 
 @pytest.mark.parametrize("integrator", [pytest.param("prb", marks=pytest.mark.slow), "pathreplay"])

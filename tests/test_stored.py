@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import subprocess
 from collections.abc import Callable
@@ -15,9 +16,10 @@ import PIL.Image
 import pytest
 import safetensors.numpy
 
-from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
+from pathreplay.inverse.grids import rmse
 from pathreplay.inverse.images import exr_bytes, read_image
+from pathreplay.output.export import export_run
 from pathreplay.scenes.parameters import get_array, to_value
 from pathreplay.scenes.stored import AS_STORED, form_of
 
@@ -148,14 +150,31 @@ def test_a_sky_is_refined_by_its_own_columns(folder: Path) -> None:
     assert result.parameters["env.data"].shape == (4, 8, 3)
 
 
-def test_eight_bit_textures_take_no_values(folder: Path) -> None:
-    png = '<texture type="bitmap" name="reflectance"><string name="filename" value="t.png"/></texture>'
-    PIL.Image.new("RGB", (4, 4), (90, 120, 30)).save(folder / "t.png")
-    text = SCENE.replace('<bsdf type="diffuse"/>', f'<bsdf type="diffuse" id="paint">{png}</bsdf>')
+def test_eight_bit_textures_become_numbers_where_they_are_asked_for(folder: Path) -> None:
+    """As a parameter, in the values of a target, in a run that is gone on with, and in what is exported."""
+    png = '<texture type="bitmap" name="reflectance"><string name="filename" value="{}"/></texture>'
+    rng = np.random.default_rng(1)
+    for name in ("t.png", "u.png"):
+        PIL.Image.fromarray(rng.integers(20, 235, (4, 4, 3), np.uint8)).save(folder / name)
+    paints = [f'<bsdf type="diffuse" id="{id}">{png.format(f"{id}.png")}</bsdf>' for id in ("t", "u")]
+    text = SCENE.replace('<bsdf type="diffuse"/>', '<ref id="t"/>').replace("<shape", "".join(paints) + "<shape", 1)
     (folder / "scene.xml").write_text(text)
-    target = {"values": {"ball.*.data": 0.5}}
-    with pytest.raises(PathreplayError, match=r"data' cannot be given a value: .*8-bit .*format='variant'"):
-        optimize(make_config({**JOB, "parameters": [{"key": "env.data"}], "target": target}), progress=False)
+    key, job = "t.reflectance.data", {**JOB, "iterations": 1, "output": "run"}
+    entry = {"key": key, "initial": 0.5, "lower": 0.0, "upper": 1.0}
+    result = optimize(make_config({**job, "parameters": [entry], "target": {"scene": "scene.xml"}}), progress=False)
+    truth = (np.asarray(PIL.Image.open(folder / "t.png")) / 255.0 + 0.055) / 1.055
+    assert result.parameters[key].dtype == np.float32
+    assert result.errors[key] == pytest.approx(rmse(result.parameters[key], truth**2.4), rel=1e-3)
+    config = folder / "run/config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), "iterations": 2}))
+    assert optimize(resume=folder / "run", progress=False).iterations == 2
+    export_run(folder / "run")
+    scene = mi.traverse(mi.load_file(str(folder / "run/export/scene.xml"), optimize=False))
+    assert isinstance(scene[key], mi.TensorXf) and isinstance(scene["u.reflectance.data"], mi.TensorXu8)
+    del scene
+    gc.collect()
+    other = {**job, "parameters": [{"key": "env.data"}], "target": {"values": {"*.data": 0.5}}}
+    assert optimize(make_config(other), progress=False).iterations == 1
 
 
 SPECTRAL = """

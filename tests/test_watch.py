@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import os
 import shutil
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +24,7 @@ from pathreplay.inverse.previews import FOLDER, PAGE, PAGES, STOP, frames
 from pathreplay.inverse.progress import Progress
 from pathreplay.inverse.run_folder import RunFolder
 from pathreplay.watch import run_files
-from pathreplay.watch.server import RunServer
+from pathreplay.watch.server import MOST, RunServer
 from test_inverse_run import JOB, SCENE, TEXTURE, room  # noqa: F401
 
 SECRET = b"not for others"
@@ -132,6 +134,85 @@ def test_the_button_leaves_a_wish_where_the_loop_looks(server: RunServer, folder
 def test_a_wish_does_not_follow_a_link(server: RunServer, folder: Path) -> None:
     (folder / STOP).symlink_to(folder.parent / "new")
     assert ask(server, "/token/stop", "POST")[0] == 500 and not (folder.parent / "new").exists()
+
+
+def raw(server: RunServer, data: bytes) -> bytes:
+    """All that is answered to these bytes."""
+    with socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=10) as client:
+        client.sendall(data)
+        answer = b""
+        with contextlib.suppress(ConnectionResetError):  # what is left unread makes one of the end
+            while part := client.recv(2**16):
+                answer += part
+        return answer
+
+
+@pytest.mark.parametrize("origin", ["http://[", "http://]", "http://[::1", "null", "http://a@[b", "//", "x" * 9999])
+def test_an_origin_that_is_none_is_refused(
+    origin: str, server: RunServer, folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert ask(server, "/token/stop", "POST", Origin=origin)[0] == 403
+    assert not (folder / STOP).exists() and capfd.readouterr().err == ""
+
+
+def test_an_address_that_is_none_is_refused(server: RunServer, capfd: pytest.CaptureFixture[str]) -> None:
+    host = f"127.0.0.1:{server.server_address[1]}"
+    answer = raw(server, f"GET http://[ HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+    assert answer.startswith(b"HTTP/1.0 404") and capfd.readouterr().err == ""
+
+
+def test_a_wish_does_not_wait_for_the_reader_of_a_pipe(server: RunServer, folder: Path) -> None:
+    os.mkfifo(folder / STOP)
+    status, _, data = ask(server, "/token/stop", "POST")
+    assert status == 500 and b"is a pipe" in data and data.count(b"\n") == 1
+
+
+@pytest.mark.parametrize("method", ["GET", "HEAD", "POST", "PUT"])
+def test_what_is_sent_with_a_request_is_no_request(method: str, server: RunServer, folder: Path) -> None:
+    host = f"Host: 127.0.0.1:{server.server_address[1]}\r\n"
+    inner = f"POST /token/stop HTTP/1.1\r\n{host}\r\n"
+    where = "/token/nothing" if method == "POST" else "/token/"
+    for length in (f"Content-Length: {len(inner)}\r\n", "Transfer-Encoding: chunked\r\n", ""):
+        answer = raw(server, f"{method} {where} HTTP/1.1\r\n{host}{length}\r\n{inner}".encode())
+        assert answer.count(b"HTTP/1.") == 1 and not (folder / STOP).exists()
+
+
+def test_a_client_that_drips_is_left(server: RunServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pathreplay.watch.server.PATIENCE", 0.3)
+    end = time.monotonic() + 10
+    with socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=10) as client:
+        client.settimeout(0.02)
+        client.sendall(b"GET /token/ HTTP/1.1\r\n")
+        while time.monotonic() < end:
+            try:
+                client.sendall(b"x")
+                if client.recv(1) == b"":
+                    break
+            except TimeoutError:
+                continue
+            except OSError:
+                break
+        else:
+            pytest.fail("it is still heard")
+    assert ask(server, "/token/")[0] == 200
+
+
+def test_connections_are_limited(server: RunServer) -> None:
+    address = ("127.0.0.1", server.server_address[1])
+    silent = [socket.create_connection(address, timeout=10) for _ in range(MOST)]
+    try:
+        end = time.monotonic() + 10
+        while server.room._value and time.monotonic() < end:
+            time.sleep(0.01)
+        threads = threading.active_count()
+        assert all(raw(server, b"") == b"" for _ in range(5)) and threading.active_count() <= threads
+    finally:
+        for each in silent:
+            each.close()
+    end = time.monotonic() + 10
+    while server.room._value < MOST and time.monotonic() < end:
+        time.sleep(0.01)
+    assert ask(server, "/token/")[0] == 200
 
 
 def test_other_methods_get_nothing(server: RunServer) -> None:

@@ -54,7 +54,9 @@ def test_a_run_keeps_its_yaml_and_goes_on_from_it() -> None:
 
 REFUSED = {
     "spp: yes": "'spp' is 'yes'",
-    "spp: 0x10": "'spp' is '0x10'",
+    "spp: 0b11": "'spp' is '0b11'",
+    "spp: 0o18": "'spp' is '0o18'",
+    "spp: -0x10": "'spp' is '-0x10'",
     "spp: 1:30": "'spp' is '1:30'",
     "seed: 2001-01-01": "'seed' is '2001-01-01'",
     "warm_up: .nan": "'warm_up' is nan",
@@ -85,6 +87,12 @@ def test_what_is_no_job_is_told_in_one_line(line: str) -> None:
         load_config(Path("job.yaml"))
     assert REFUSED[line] in str(told.value) and "job.yaml" in str(told.value) and "\n" not in str(told.value)
     assert not Path("harm").exists()
+
+
+@pytest.mark.parametrize(("text", "number"), [("0o17", 15), ("0x1F", 31), ("010", 10), ("+7", 7)])
+def test_whole_numbers_are_those_of_yaml_1_2(text: str, number: int) -> None:
+    Path("job.yaml").write_text(f"{TEXT}seed: {text}\n")
+    assert load_config(Path("job.yaml")).seed == number
 
 
 def test_what_a_program_writes_comes_back() -> None:

@@ -31,6 +31,10 @@ def _set_up() -> None:
         os.getcwd()
     except OSError:
         return  # the folder was removed: Mitsuba would bring Python down at its end; the command says so
+    from pathreplay import address_space
+
+    if address_space.is_too_small():
+        return  # Mitsuba would hang; commands and functions say so
     # Before the first import of mitsuba: Dr.Jit looks for libLLVM while it is imported.
     from pathreplay import backend, interrupts, plugins
 
@@ -51,6 +55,9 @@ def __getattr__(name: str) -> Any:
     if name in _LAZY:
         import importlib
 
+        from pathreplay import address_space
+
+        address_space.require()
         return getattr(importlib.import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'pathreplay' has no attribute {name!r}")
 

@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, NoReturn
 import typer
 import typer.core
 
-from pathreplay import interrupts
+from pathreplay import address_space, interrupts
 from pathreplay.errors import PathreplayError, plain_line
 from pathreplay.watch import commands
 
@@ -143,11 +143,11 @@ def check(
     for note in notes:
         typer.echo(f"pathreplay: {plain_line(note)}", err=True)
     asked = {name: value for name, value in (("edges", edges), ("edge_spp", edge_spp)) if value is not None}
-    results = command.check_all(
+    checks = command.check_all(
         loaded, param, integrator=integrator, seeds=seeds, spp=spp, fd_spp=fd_spp, step=step,
         max_depth=max_depth, edges=asked, mode=mode, sensor=sensor, seed=seed,
     )  # fmt: skip
-    command.print_checks(results)
+    results = command.print_checks(checks)
     if json is not None:
         command.write_checks(results, json)
     raise typer.Exit(0 if all(result.passed for result in results) else 1)
@@ -194,7 +194,6 @@ def watch(
     require_run(run)
     server = RunServer(run, host, port)
     typer.echo(f"{server.address}\nWho has this address can look at the run and stop it. Ctrl-C ends this command.")
-    sys.stdout.flush()
     try:
         serve(server)
     except interrupts.Interrupted as ended:
@@ -342,6 +341,7 @@ def _run() -> NoReturn:
             stream.reconfigure(errors="backslashreplace")  # a terminal without ± should not end a run
     try:
         with interrupts.raised():
+            address_space.require()
             _require_text_and_folder(sys.argv[1:])
             status = app(sys.argv[1:] or ["--help"], prog_name="pathreplay", standalone_mode=False)
     except _UsageError as error:
@@ -351,6 +351,10 @@ def _run() -> NoReturn:
         _end(ended.__cause__ or ended)
     except PathreplayError as error:
         _fail(str(error))
+    except ImportError as error:
+        if not (line := address_space.told(error)):
+            raise
+        _fail(line)
     except MemoryError:
         _fail("out of memory: lower the resolution, the samples per pixel or the number of views")
     except OSError as error:

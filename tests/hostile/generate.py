@@ -16,6 +16,7 @@ from . import (
     of_scene,
     of_stages,
     of_volume,
+    of_watch,
 )
 from .case import RECIPES, Case
 
@@ -35,6 +36,7 @@ KINDS = tuple(
         of_python,
         of_own,
         of_process,
+        of_watch,
     )
 )
 

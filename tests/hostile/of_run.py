@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import struct
@@ -24,6 +25,7 @@ READ = (
     "checkpoint.safetensors",
     "images/target-eye.exr",
     "images/start-eye.exr",
+    "checksums.json",
 )
 WRITTEN = (
     "report.html",
@@ -62,6 +64,33 @@ def _spoil_file(run: Path, room: Room, rng: np.random.Generator) -> None:
 
 
 _run("spoiled bytes", _spoil_file, refused=False, fuzz=True)
+
+#: Files in which every bit counts: people change the others.
+SUMMED = ("checkpoint.safetensors", "images/target-eye.exr", "images/start-eye.exr", "checksums.json")
+
+
+def _flip_bits(run: Path, room: Room, rng: np.random.Generator) -> None:
+    path = run / pick(rng, SUMMED)
+    data = bytearray(path.read_bytes())
+    for bit in rng.choice(8 * len(data), int(rng.choice([1, 1, 1, 2, 8])), replace=False):
+        data[int(bit) // 8] ^= 1 << int(bit) % 8
+    path.write_bytes(data)
+
+
+for _number in range(12):
+    _run(f"flipped bits, {_number}", _flip_bits, fuzz=_number == 0)
+
+
+@recipe(KIND)
+def half_written_files_of_a_killed_run(room: Room, rng: np.random.Generator) -> Action:
+    room.change("iterations", 4000)
+    wait = "while [ ! -e runs/job/checkpoint.safetensors ]; do sleep 0.1; done"
+    kill = f"{RUN} optimize job.toml --quiet & process=$!; {wait}; sleep 0.{rng.integers(1, 9)}; kill -KILL $process"
+    half = "touch runs/job/previews/000007-view-eye.webp.part runs/job/images/result-eye.png.part"
+    raised = "sed -i 's/iterations = 4000/iterations = 3/' runs/job/config.toml"
+    resume = f"{RUN} optimize --resume runs/job --quiet; status=$?"
+    left = "[ -z \"$(find runs -name '*.part')\" ] || exit 77; exit $status"
+    return Action(shell=f"set -m; {kill}; wait $process; {half}; {raised}; {resume}; {left}")
 
 
 # ------------------------------------------------------------------------------
@@ -135,12 +164,14 @@ def _png() -> bytes:
 def _parts(path: Path) -> tuple[dict[str, Any], bytes]:
     data = path.read_bytes()
     (length,) = struct.unpack_from("<Q", data)
-    return json.loads(data[8 : 8 + length]), data[8 + length :]
+    return json.loads(data[8 : 8 + length]), data[8 + length : -hashlib.sha256().digest_size]
 
 
 def _put(path: Path, head: dict[str, Any], body: bytes) -> None:
+    """With the right checksum at its end, as somebody would do it who knows it."""
     text = json.dumps(head).encode()
-    path.write_bytes(struct.pack("<Q", len(text)) + text + body)
+    data = struct.pack("<Q", len(text)) + text + body
+    path.write_bytes(data + hashlib.sha256(data).digest())
 
 
 def _metadata(name: str, value: str, *, refused: bool = True) -> None:
@@ -233,18 +264,28 @@ def a_checkpoint_that_tells_of_terabytes(room: Room, rng: np.random.Generator) -
 #  Pictures
 # ------------------------------------------------------------------------------
 
+
+def _put_picture(run: Path, name: str, data: bytes) -> None:
+    """With the right checksum."""
+    name = f"images/{name}-eye.exr"
+    (run / name).write_bytes(data)
+    sums = json.loads((run / "checksums.json").read_text())
+    sums[name] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    (run / "checksums.json").write_text(json.dumps(sums))
+
+
 for _picture in ("target", "start"):
     for _pixel in (float("nan"), float("inf")):
 
         def _odd_pixel(
             run: Path, room: Room, rng: np.random.Generator, name: str = _picture, value: float = _pixel
         ) -> None:
-            (run / f"images/{name}-eye.exr").write_bytes(pfm(np.full((6, 8, 3), value, np.float32)))
+            _put_picture(run, name, pfm(np.full((6, 8, 3), value, np.float32)))
 
         _run(f"a {_picture} picture of {_pixel}", _odd_pixel)
 
     def _small(run: Path, room: Room, rng: np.random.Generator, name: str = _picture) -> None:
-        (run / f"images/{name}-eye.exr").write_bytes(pfm(np.full((3, 4, 3), 0.5, np.float32)))
+        _put_picture(run, name, pfm(np.full((3, 4, 3), 0.5, np.float32)))
 
     _run(f"a {_picture} picture of another size", _small)
 

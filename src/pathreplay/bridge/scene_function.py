@@ -20,6 +20,7 @@ from pathreplay.scenes.descriptions import load_integrator, told
 from pathreplay.scenes.loading import load_scene_for
 from pathreplay.scenes.parameters import get_array, is_transform, resolve_differentiable
 from pathreplay.scenes.stored import form_of
+from pathreplay.traversal import traversed
 
 
 class View(NamedTuple):
@@ -59,7 +60,7 @@ class SceneFunction:
             raise PathreplayError(
                 f"Integrator '{(integrator or {}).get('type')}' computes no gradients; use 'pathreplay'"
             )
-        self.scene, self.spp, self.params = scene, spp, mi.traverse(scene)
+        self.scene, self.spp, self.params = scene, spp, traversed(scene)
         self.keys = tuple(resolve_differentiable(self.params, patterns, self.integrator))
         self._forms = {key: form_of(self.params, key) for key in self.keys}
         seen = {key: self._forms[key].see(self.params[key]) for key in self.keys}

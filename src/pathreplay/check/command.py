@@ -1,12 +1,14 @@
-"""Checks for a reader: a progress bar while they run, a page when they are done, a JSON file for other programs."""
+"""Checks for a reader: how far they are, each when it is done, a JSON file for other programs."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,10 @@ from pathreplay.check.reference import Spec, integrator_under_test
 from pathreplay.errors import PathreplayError
 from pathreplay.files import file_problem
 from pathreplay.scenes.parameters import resolve_differentiable
+from pathreplay.traversal import traversed
 
+# Seconds between two lines where standard error is no terminal.
+_PAUSE_S = 10.0
 _STYLES = {"pass": "green", "zero": "green", "fail": "bold red", "inconclusive": "yellow"}
 
 
@@ -34,47 +39,68 @@ def check_all(
     max_depth: int | None = None,
     edges: Mapping[str, Any] | None = None,
     **options: Any,
-) -> list[GradientCheck]:
-    """``check_gradient(scene, key, **options)`` for every key that the patterns name, with a bar on standard error.
+) -> Iterator[GradientCheck]:
+    """``check_gradient(scene, key, **options)`` of each key that the patterns name, as soon as it is there.
 
-    ``edges`` are further properties of `pathreplay`. Raises what :func:`check_gradient` and
-    :func:`resolve_differentiable` do.
+    Standard error tells how far it is. ``edges`` are further properties of `pathreplay`. Raises what
+    :func:`check_gradient` and :func:`resolve_differentiable` do.
     """
     tested = integrator_under_test(integrator, scene, max_depth, edges)
-    keys = resolve_differentiable(mi.traverse(scene), patterns, tested)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    results = []
-    # Standard error, and gone when done: what is printed or piped is the result alone.
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=None)
-
-        def progress(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
-        for i, key in enumerate(keys):
-            bar.reset(task, description=escape(f"{key} ({i + 1}/{len(keys)})"))
-            results.append(check_gradient(scene, key, integrator=tested, progress=progress, **options))
-    return results
+    keys = resolve_differentiable(traversed(scene), patterns, tested)
+    for i, key in enumerate(keys):
+        with _told(f"{key} ({i + 1}/{len(keys)})") as progress:
+            result = check_gradient(scene, key, integrator=tested, progress=progress, **options)
+        yield result
 
 
-def print_checks(results: Sequence[GradientCheck]) -> None:
-    """Print what was compared, then for each parameter the verdict, the two estimates, and what the verdict means."""
-    first = results[0]
+@contextmanager
+def _told(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar on standard error that goes when all is done; where that is no terminal, a line now and then."""
+    console = Console(stderr=True, force_jupyter=False)
+    if console.is_terminal:
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console, transient=True) as bar:
+            task = bar.add_task(escape(what), total=None)
+            yield lambda done, total: bar.update(task, completed=done, total=total)
+        return
+
+    def say(line: str) -> None:
+        console.print(Text(f"pathreplay: {line}"), soft_wrap=True)
+
+    say(f"checking {what}")
+    last = [time.monotonic()]
+
+    def tell(done: int, total: int) -> None:
+        if time.monotonic() - last[0] >= _PAUSE_S:
+            last[0] = time.monotonic()
+            say(f"{what}: {done} of {total} renderings")
+
+    yield tell
+
+
+def print_checks(results: Iterable[GradientCheck]) -> list[GradientCheck]:
+    """Print what is compared, then for each parameter the verdict, the two estimates, and what the verdict means.
+
+    Each is printed when it comes. Returns them all.
+    """
     console = Console(highlight=False, soft_wrap=True)
-    console.print(
-        f"{first.integrator} ({first.mode}) against finite differences of {first.reference_integrator}: "
-        f"{first.seeds} seeds, {first.spp} spp (differences {first.fd_spp} spp)\n"
-    )
+    printed: list[GradientCheck] = []
     for result in results:
+        if not printed:
+            console.print(
+                f"{result.integrator} ({result.mode}) against finite differences of {result.reference_integrator}: "
+                f"{result.seeds} seeds, {result.spp} spp (differences {result.fd_spp} spp)\n"
+            )
+        printed.append(result)
         verdict = Text(f"{result.verdict.upper():<6}", style=_STYLES[result.verdict])
         reference_error = math.hypot(result.reference_se, result.step_error)
         console.print(verdict, Text(result.key, style="bold"))
         console.print(f"       gradient   {_with_error(result.gradient, result.gradient_se)}")
         console.print(f"       reference  {_with_error(result.reference, reference_error)}")
         console.print(f"       z = {result.z:+.2f}   {result.reason}\n")
-    counts = Counter(result.verdict for result in results)
-    console.print(f"{len(results)} checked: " + ", ".join(f"{n} {verdict}" for verdict, n in counts.items()))
+    counts = Counter(result.verdict for result in printed)
+    console.print(f"{len(printed)} checked: " + ", ".join(f"{n} {verdict}" for verdict, n in counts.items()))
+    return printed
 
 
 def _with_error(value: float, error: float) -> str:

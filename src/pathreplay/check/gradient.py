@@ -21,6 +21,7 @@ from pathreplay.errors import PathreplayError, shown
 from pathreplay.render.film import require_film
 from pathreplay.scenes.parameters import get_array, require_differentiable, require_finite
 from pathreplay.scenes.spectra import coefficient_channels
+from pathreplay.traversal import traversed
 
 _MOST_SEEDS = 1_000_000
 
@@ -121,7 +122,7 @@ def check_gradient(
     fd_spp = spp if fd_spp is None else fd_spp
     _require_types(key, loss, sensor=sensor, seeds=seeds, spp=spp, fd_spp=fd_spp, seed=seed)
     _require_arguments(scene, sensor, seeds, spp, fd_spp, seed, mode)
-    params = mi.traverse(scene)
+    params = traversed(scene)
     tested = integrator_under_test(integrator, scene, max_depth)
     line = _line(params, key, tested, step, direction, seed)
     plain = reference_integrator(reference, scene, tested)

@@ -14,10 +14,10 @@ import safetensors
 from pydantic import ConfigDict, Field, FiniteFloat, NonNegativeInt, TypeAdapter, ValidationError
 
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.checksums import SEAL, require_seal, sealed_chunks
 from pathreplay.inverse.evaluate import Executor
 from pathreplay.inverse.grids import Levels
 from pathreplay.inverse.optimiser import Optimiser, State, WhenAsked
-from pathreplay.inverse.tensor_files import safetensors_chunks
 from pathreplay.inverse.values import Array, Arrays
 from pathreplay.whole_files import Content
 
@@ -84,7 +84,7 @@ _VALUE, _LEARNED = "value:", "learned:"
 
 
 def save(run: Run) -> Content:
-    """All that is known after the iterations so far, as a safetensors file that is made while it is written."""
+    """All that is known after the iterations so far, as a sealed file that is made while it is written."""
     state = run.optimiser.state()
     plain: dict[str, Array] = {
         **{_LEARNED + name: value for name, value in run.learned.items()},
@@ -92,7 +92,7 @@ def save(run: Run) -> Content:
     }
     metadata = {"steps": json.dumps(state.steps), "history": json.dumps([asdict(entry) for entry in run.history])}
     arrays = {name: partial(each.__getitem__, name) for each in (plain, state.arrays) for name in each}
-    return partial(safetensors_chunks, WhenAsked(arrays), metadata)
+    return partial(sealed_chunks, WhenAsked(arrays), metadata)
 
 
 def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Collection[str] = ()) -> None:
@@ -100,7 +100,8 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Col
 
     ``held`` are variables that some stages do not step.
 
-    Raises PathreplayError if the file is damaged, holds what no run has written, or belongs to other variables.
+    Raises PathreplayError if a bit of the file has changed, it holds what no run has written, or belongs to other
+    variables.
     """
     try:
         values, state, history, learned = _read(path, run.values, levels, held)
@@ -122,8 +123,9 @@ def _read(
     if not path.is_file():
         raise ValueError("no such file")
     with safetensors.safe_open(str(path), framework="numpy") as file:
+        require_seal(path)
         metadata = file.metadata() or {}
-        tensors = {name: file.get_tensor(name) for name in file.keys()}
+        tensors = {name: file.get_tensor(name) for name in file.keys() if name != SEAL}
     steps = _STEPS.validate_json(metadata.get("steps", ""), strict=True)
     history = _HISTORY.validate_json(metadata.get("history", ""), strict=True)
     if set(steps) != set(values):

@@ -19,6 +19,7 @@ _INSTEAD = {
     "list_type": "write a list: [...]",
     "dict_type": "write a table: { ... }",
     "model_type": "write a table: { ... }",
+    "table_type": "write a table: { ... }",
     "finite_number": "write a finite number",
     "json_invalid": "mend it there",
 }

@@ -21,7 +21,7 @@ from pathreplay.inverse.config import Config
 from pathreplay.inverse.evaluate import Evaluation, Shard
 from pathreplay.inverse.problem import Problem
 from pathreplay.inverse.ray_actor import Answer, Hello, Parcel, RayActor, versions
-from pathreplay.inverse.ray_cluster import connected, load_ray
+from pathreplay.inverse.ray_cluster import Cluster, connected, load_ray
 from pathreplay.inverse.sharing import Sharing, Step
 from pathreplay.inverse.targets import Targets
 from pathreplay.inverse.values import Arrays
@@ -35,6 +35,9 @@ SMALL = 2**16
 
 SOON_S = 60.0
 """Seconds after which it is told that no actor is there yet: loading Mitsuba and a scene takes some."""
+
+LOOK_S = 1.0
+"""Seconds without an answer after which it is looked whether the cluster is still there."""
 
 Tell = Callable[[str], None]
 
@@ -71,7 +74,7 @@ class _Call:
 class Crew:
     """The actors of a run, and what they are asked; the executors of a job and of its rival share them."""
 
-    ray: Any
+    cluster: Cluster
     actors: dict[int, Any]
     parcel: Any
     """Ray's reference to what they need to know."""
@@ -86,6 +89,10 @@ class Crew:
     """By Ray's reference to the answer."""
     ready: dict[int, Hello] = field(default_factory=dict)
     said: set[str] = field(default_factory=set)
+
+    @property
+    def ray(self) -> Any:
+        return self.cluster.ray
 
     def __post_init__(self) -> None:
         for number in self.actors:
@@ -105,9 +112,19 @@ class Crew:
         return arrays if _bytes_of(arrays) < SMALL else self.ray.put(arrays)
 
     def answered(self, patience: float) -> list[tuple[_Call, Any]]:
-        """Calls that have been answered, and the references to fetch the answers by; waits at most so many seconds."""
-        # Where the answer is does not matter yet: whoever gave it can go on while it is on its way.
-        ready, _ = self.ray.wait(list(self.calls), num_returns=1, timeout=patience, fetch_local=False)
+        """Calls that have been answered, and the references to fetch the answers by; waits at most so many seconds.
+
+        Raises PathreplayError where the cluster is lost.
+        """
+        end, ready = time.monotonic() + patience, []
+        while not ready:
+            # Where the answer is does not matter yet: whoever gave it can go on while it is on its way.
+            some = min(LOOK_S, max(0.0, end - time.monotonic()))
+            ready, _ = self.ray.wait(list(self.calls), num_returns=1, timeout=some, fetch_local=False)
+            if time.monotonic() >= end:
+                break
+            if not ready:
+                self.cluster.require()
         return [(self.calls.pop(reference), reference) for reference in ready]
 
     def fetch(self, call: _Call, reference: Any) -> list[Answer] | None:
@@ -116,10 +133,11 @@ class Crew:
         Raises PathreplayError where no actor is left; what an evaluation raised.
         """
         try:
-            answer = self.ray.get(reference)
+            answer = self.ray.get(reference)  # which is there, or its actor is lost
         except self.ray.exceptions.RayTaskError as error:
             raise _cause(error) from None
         except self.ray.exceptions.RayError as error:
+            self.cluster.require()
             self._lost(call, error)
             return None
         if isinstance(answer, Hello):
@@ -289,21 +307,23 @@ def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Te
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = config.ray.threads or (1 if config.deterministic else max(1, min(THREADS, cores // 2)))
     wanted = max(cores, threads * (config.ray.actors or 1))
-    with connected(config.ray, wanted) as (ray, own):
+    with connected(config.ray, wanted) as cluster:
+        ray = cluster.ray
         count = _count(ray, config, threads, problem)
         targets = Targets.of(problem.views)
         parcel = ray.put(Parcel(config, base.resolve(), targets, mi.variant(), threads))
         kind = ray.remote(**_needs(threads), max_restarts=config.ray.max_restarts, max_task_retries=-1)(RayActor)
         actors = {number: kind.remote() for number in range(count)}
-        where = "this machine" if own else f"a cluster of {len(ray.nodes())} nodes"
+        where = "this machine" if cluster.own else f"a cluster of {len(ray.nodes())} nodes"
         tell(f"ray: {count} actors with {threads} {'thread' if threads == 1 else 'threads'} each on {where}")
-        crew = Crew(ray, actors, parcel, config.ray.max_task_retries, tell, status)
+        crew = Crew(cluster, actors, parcel, config.ray.max_task_retries, tell, status)
         try:
             yield crew
             tell(f"ray: {crew.counts.line()}")
         finally:
-            for actor in crew.actors.values():
-                ray.kill(actor)  # a cluster that others use goes on without them
+            if cluster.has_others():  # it goes on without these actors; our own ends with all that is in it
+                for actor in crew.actors.values():
+                    ray.kill(actor)
 
 
 def _needs(threads: int) -> dict[str, float]:

@@ -88,7 +88,7 @@ def _started(
                 "--resume takes config and output from the run folder; leave CONFIG, --output and -D out"
             )
         job, folder = open_run_folder(Path(resume))
-        return job, folder.path, folder
+        return job, folder.given, folder
     if config is None:
         raise PathreplayError("Nothing to do: give a config file, or --resume RUN_FOLDER")
     if not isinstance(config, (str, Path, Config)):
@@ -100,5 +100,5 @@ def _started(
             raise PathreplayError("define changes what a file says; give make_config the values that you want")
         job = Job(config, None, Path.cwd())
     else:
-        job = Job(load_config(Path(config), changes), Path(config), Path(config).parent, changes)
+        job = Job(load_config(Path(config), changes), Path(config), Path(config).parent.absolute(), changes)
     return job, new_output(job.config.output if output is None else output, job.source), None

@@ -48,7 +48,7 @@ class NotebookPanel:
 
     def follow(self, previews: Previews) -> None:
         """Show the pictures and losses of a run from now on."""
-        self._previews, self._title = previews, str(previews.folder.path)
+        self._previews, self._title = previews, str(previews.folder.name)
 
     def say(self, text: str) -> None:
         """Name what is going on now."""

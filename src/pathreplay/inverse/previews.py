@@ -263,7 +263,7 @@ class Previews:
             plots=plots(history),
             plots_note=plots_note(history),
             parameters=self._parameters(shown),
-            command=resume_command(self.folder.path),
+            command=resume_command(self.folder.name),
             how=(integrator_row(config), target_row(config)),
             log=tuple(self._log),
             titles={"plots": "Curves", "parameters": "Parameters", "how": "How it goes on if it is stopped"},

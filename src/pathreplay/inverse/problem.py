@@ -51,6 +51,7 @@ from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.scenes.loading import load_scene_for
 from pathreplay.threads import one_thread
+from pathreplay.traversal import traversed
 
 
 class Held:
@@ -176,7 +177,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
     scene, config, notes = _loaded(config, base, shots)
-    params = mi.traverse(scene)
+    params = traversed(scene)
     parameters.require_finite(params)
     integrator = _gradient_integrator(config.integrator)
     named, made = keys_of(params, config, integrator)
@@ -235,7 +236,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in moved)
     derived = tuple(replace(each, truth=truth.get(each.key)) for each in derived)
     # Traversed anew: an object from which values were read expects all its keys at the next update().
-    params = mi.traverse(scene)
+    params = traversed(scene)
     parameters.keep_only(params, keys)
     known = fingerprint(taken.values()) if taken else None
     return Problem(

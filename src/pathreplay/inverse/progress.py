@@ -20,7 +20,8 @@ _SECONDS = 10.0
 class _Forgiving:
     """Stderr, or silence once it is gone: a terminal that closes may not end the writing of what was found.
 
-    Silence, too, where a signal comes while something is printed, and its handler prints: Python raises RuntimeError.
+    Silence, too, where there is none (a program without a console has None in its place), and where a signal comes
+    while something is printed, and its handler prints: Python raises RuntimeError.
     """
 
     def __init__(self) -> None:
@@ -28,12 +29,13 @@ class _Forgiving:
 
     def write(self, text: str) -> int:
         with contextlib.suppress(OSError, RuntimeError):
-            return self._stream.write(text)
+            return len(text) if self._stream is None else self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
         with contextlib.suppress(OSError, RuntimeError):
-            self._stream.flush()
+            if self._stream is not None:
+                self._stream.flush()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)

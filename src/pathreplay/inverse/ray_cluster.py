@@ -10,12 +10,13 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-import shutil
+import socket
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ import psutil
 from pathreplay.errors import PathreplayError, plain_line
 from pathreplay.interrupts import undisturbed
 from pathreplay.inverse.executor_options import RayOptions
+from pathreplay.inverse.ray_guard import Guard
 
 OLDEST = (2, 60)
 """Its token authentication is on for clusters that a program starts."""
@@ -34,6 +36,51 @@ _MODE, _TOKEN, _ADDRESS = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"
 _LONGEST_FOLDER = 20
 _SECRET = secrets.token_hex(32)
 """Of all clusters of this process's own: Ray reads it once."""
+
+_KNOCK_S = 5.0
+"""Seconds that the head of a cluster has to take a connection."""
+
+_VITAL = ("gcs_server", "raylet")
+
+
+@dataclass
+class Cluster:
+    """The cluster that a run is connected to."""
+
+    ray: Any
+    own: bool
+    """It is of this run alone."""
+    processes: list[psutil.Process] = field(default_factory=list)
+    """Of our own: those without which nothing is answered any more."""
+
+    def has_others(self) -> bool:
+        """Whether it is there for others, too, and answers."""
+        return not self.own and self._answers()
+
+    def require(self) -> None:
+        """Raise PathreplayError if its head, or of our own what starts actors, is no longer there."""
+        gone = [name for process, name in zip(self.processes, _VITAL, strict=False) if not _runs(process)]
+        if gone or not self._answers():
+            where = "" if self.own else f" ({self.ray.get_runtime_context().gcs_address})"
+            raise PathreplayError(
+                f"ray: the cluster is lost: its {gone[0] if gone else 'head'}{where} does not run any more; look into "
+                "Ray's logs and start it again, or use executor = 'local'"
+            )
+
+    def _answers(self) -> bool:
+        host, _, port = self.ray.get_runtime_context().gcs_address.rpartition(":")
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), _KNOCK_S).close()
+        except OSError:
+            return False
+        return True
+
+
+def _runs(process: psutil.Process) -> bool:
+    try:
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.Error:
+        return False
 
 
 def load_ray() -> Any:
@@ -53,8 +100,8 @@ def load_ray() -> Any:
 
 
 @contextmanager
-def connected(options: RayOptions, cores: int) -> Iterator[tuple[Any, bool]]:
-    """Ray, connected within this block to the cluster of the options, and whether that is the run's own.
+def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
+    """Ray, connected within this block to the cluster of the options.
 
     One of its own gets so many ``cores``. What was connected before, by whoever calls us, is used and left as it is.
     Raises PathreplayError.
@@ -62,26 +109,28 @@ def connected(options: RayOptions, cores: int) -> Iterator[tuple[Any, bool]]:
     ray = load_ray()
     if ray.is_initialized():
         _require_authentication(ray, "that this process is connected to")
-        yield ray, False
+        yield Cluster(ray, own=False)
         return
     address = options.address or os.environ.get(_ADDRESS)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_silent(ray))
         with undisturbed():  # Ray has handlers of its own for signals
             if address is None:
-                _start(ray, stack, cores)
+                cluster = _start(ray, stack, cores)
             else:
                 _connect(ray, address)
+                cluster = Cluster(ray, own=False)
                 stack.callback(ray.shutdown)
-        yield ray, address is None
+        yield cluster
 
 
-def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> None:
+def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> Cluster:
     """A cluster of our own."""
     usual = tempfile.gettempdir()
     # Which only this user may enter; Ray's is open to all. Names of sockets may have 107 characters.
     folder = tempfile.mkdtemp(prefix="pathreplay-", dir=usual if len(usual) <= _LONGEST_FOLDER else "/tmp")
-    stack.callback(shutil.rmtree, folder, ignore_errors=True)
+    guard = Guard(Path(folder))
+    stack.callback(guard.close)
     with _private_environment(ray), _apart(ray):
         try:
             ray.init(
@@ -93,10 +142,14 @@ def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> None:
                 _node_ip_address="127.0.0.1",
                 _temp_dir=str(Path(folder) / "ray"),
             )
-        except (RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
+        except Exception as error:  # Ray's own are of that kind
+            guard.watch(_sessions())
             with contextlib.suppress(Exception):
                 ray.shutdown()
             raise PathreplayError(f"executor = 'ray': Ray cannot start here ({_first_line(error)})") from None
+    guard.watch(_sessions())
+    known = {process.name(): process for process in psutil.Process().children()}
+    cluster = Cluster(ray, True, [known[name] for name in _VITAL if name in known])
     stack.callback(ray.shutdown)
     _require_authentication(ray, "of this run")
     if open_to_others := _beyond_loopback():
@@ -104,6 +157,16 @@ def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> None:
             f"executor = 'ray': Ray {ray.__version__} listens at {open_to_others[0]}, where others reach it; install "
             "another version, or use executor = 'local'"
         )
+    return cluster
+
+
+def _sessions() -> list[int]:
+    """Those that Ray's processes are in: see `_apart`."""
+    ours, found = os.getsid(0), set()
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(OSError):
+            found.add(os.getsid(process.pid))
+    return sorted(found - {ours})
 
 
 def _connect(ray: Any, address: str) -> None:
@@ -159,6 +222,8 @@ def _require_closed(ray: Any, address: str) -> None:
 def _private_environment(ray: Any) -> Iterator[None]:
     """Within this block Ray starts a cluster that uses loopback and our token, and tells nobody of it."""
     ours = {_MANY_MACHINES: "0", _MODE: "token", _TOKEN: _SECRET, "RAY_USAGE_STATS_ENABLED": "0"}
+    # Ray would end this process when its head has been silent for so many seconds: see `Cluster.require`.
+    ours["RAY_gcs_rpc_server_reconnect_timeout_s"] = str(10**6)
     ours["RAY_worker_niceness"] = "0"  # actors are the run, and no less urgent than it would be by itself
     before = {name: os.environ.get(name) for name in ours}
     constants = ray._private.ray_constants

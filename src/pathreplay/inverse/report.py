@@ -13,9 +13,9 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import PIL.Image
-from matplotlib.figure import Figure
 
 from pathreplay.inverse.checkpoint import Entry
+from pathreplay.inverse.drawing import Figure, own_settings
 from pathreplay.inverse.grids import shown
 from pathreplay.inverse.images import Image, displayed, png_bytes, resized
 from pathreplay.inverse.outcome import Contestant, Outcome, Recovered, ViewPictures, number_of
@@ -55,14 +55,16 @@ PANELS = 2
 
 def report_files(outcome: Outcome, films: Mapping[str, Film] | None = None) -> dict[str, bytes]:
     """report.html, the curves (SVG, PNG) and summary.png, as file name -> content; ``films`` are by view and key."""
-    curves = {"loss": loss_figure(outcome.run.history)}
     contestants = outcome.comparison()
-    if contestants:
-        curves["comparison"] = comparison_figure(contestants)
-    drawings = {f"{name}.{kind}": drawn(curve, kind) for name, curve in curves.items() for kind in ("svg", "png")}
+    with own_settings():
+        curves = {"loss": loss_figure(outcome.run.history)}
+        if contestants:
+            curves["comparison"] = comparison_figure(contestants)
+        drawings = {f"{name}.{kind}": drawn(curve, kind) for name, curve in curves.items() for kind in ("svg", "png")}
+        sheet = summary(outcome)
     sources = {name: uri("image/svg+xml", drawings[f"{name}.svg"]) for name in curves}
     page = report_page(outcome, contestants, sources, films or {})
-    return {"report.html": document(page), **drawings, "summary.png": summary(outcome)}
+    return {"report.html": document(page), **drawings, "summary.png": sheet}
 
 
 def report_page(

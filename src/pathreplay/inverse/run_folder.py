@@ -24,6 +24,7 @@ from pathreplay.whole_files import Content, chunks
 
 PART = ".part"
 _CONFIGS = "config.toml", "config.yaml", "config.json"
+_FOLDERS = "images", "volumes", "rival", "previews"
 CHECKPOINT = "checkpoint.safetensors"
 RIVAL_CHECKPOINT = "rival/checkpoint.safetensors"
 
@@ -42,14 +43,26 @@ class Job:
 
 
 class RunFolder:
-    """A folder that belongs to one run, until its ``lock`` is closed."""
+    """A folder that belongs to one run, until its ``lock`` is closed.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.lock = FolderLock(path)
-        self.identity = _identity(path)
+    ``given`` is its path from the folder ``home`` (default: the current one), and stays it wherever the user goes.
+    """
+
+    def __init__(self, given: Path, home: Path | None = None) -> None:
+        self.given, self.home = given, Path.cwd() if home is None else home
+        self.path = self.home / given
+        self.lock = FolderLock(self.path)
+        self.identity = _identity(self.path)
         self.made_for_it: list[Path] = []
         """Folders that it was put into and that were not there before, the innermost first."""
+
+    @property
+    def name(self) -> Path:
+        """The path to be told to somebody who is in the current folder."""
+        with contextlib.suppress(OSError):  # that folder may be gone
+            if Path.cwd() == self.home:
+                return self.given
+        return self.path
 
     def remove(self) -> None:
         """Remove it with all that is in it, where it still is the folder that was made, and what was made for it."""
@@ -61,7 +74,7 @@ class RunFolder:
         """Raise PathreplayError if the folder is no longer where it was; ``lost`` names what was not saved."""
         if _identity(self.path) != self.identity:
             raise PathreplayError(
-                f"Run folder {self.path} was removed or renamed during the run, which ends here: {lost} lost; if it "
+                f"Run folder {self.name} was removed or renamed during the run, which ends here: {lost} lost; if it "
                 "was renamed, go on with: pathreplay optimize --resume NEW_NAME, else start the job again"
             )
 
@@ -112,23 +125,25 @@ class RunFolder:
 
     def _failure(self, error: OSError) -> str:
         if (self.path / CHECKPOINT).exists():
-            rescue = f"then go on with: pathreplay optimize --resume {self.path}"
+            rescue = f"then go on with: pathreplay optimize --resume {self.name}"
         else:
             rescue = "or give --output elsewhere, then start again (this folder was removed)"
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return f"No space left on the disk for run folder {self.path}: free some space, {rescue}"
-        return f"Run folder {self.path} cannot be written ({error.strerror}): mend that, {rescue}"
+            return f"No space left on the disk for run folder {self.name}: free some space, {rescue}"
+        return f"Run folder {self.name} cannot be written ({error.strerror}): mend that, {rescue}"
 
 
-def create_run_folder(output: Path, job: Job, files: Mapping[str, Content]) -> RunFolder:
+def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home: Path | None = None) -> RunFolder:
     """Make ``output``, or ``output-2``, ``-3``, … where that exists, and put the job and its first files into it.
+
+    A relative ``output`` starts at ``home`` (default: the current folder).
 
     The config is copied as it was written (``config.toml`` or ``.yaml``), or as JSON where it came from Python or was
     changed. What fails leaves no folder behind. Raises PathreplayError where the folder cannot be made or written.
     """
     if job.source is not None and job.source.suffix != ".json" and not job.changes:
         name = "config.yaml" if job.source.suffix.lower() in YAML else "config.toml"
-        copy: dict[str, Content] = {name: job.source.read_bytes()}
+        copy: dict[str, Content] = {name: (job.base / job.source.name).read_bytes()}
     else:
         copy = {"config.json": job.config.model_dump_json(indent=2, exclude_unset=True).encode()}
     origin: dict[str, Any] = {
@@ -137,12 +152,13 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content]) -> R
     }
     if job.changes:
         origin["changes"] = list(job.changes)
-    missing = [folder for folder in output.parents if not folder.exists()]
+    home = Path.cwd() if home is None else home
+    missing = [folder for folder in (home / output).parents if not folder.exists()]
     with undisturbed(), contextlib.ExitStack() as undo:
         undo.callback(_remove_empty, missing)
-        path = _make_new(output)
+        path = _make_new(output, home)
         undo.callback(shutil.rmtree, path, ignore_errors=True)
-        run = RunFolder(path)
+        run = RunFolder(output.with_name(path.name), home)
         run.made_for_it = missing
         undo.callback(run.lock.close)
         run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
@@ -163,13 +179,27 @@ class _Origin(BaseModel):
 def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
     """The job of an existing run folder, and that folder, locked.
 
+    What a killed run has left half written in it is removed.
+
     Raises PathreplayError if it is no run folder, holds no checkpoint to go on from, is damaged, or is in use.
     """
     require_writable_name(path, "--resume")
     copy = _config_in(path)
     if not (path / CHECKPOINT).is_file():
         raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start the job from its config")
-    return _job(path, copy), RunFolder(path)
+    job, run = _job(path, copy), RunFolder(path)
+    _remove_parts(path)
+    return job, run
+
+
+def _remove_parts(path: Path) -> None:
+    """Remove what a killed run has half written, in the folder and in those that a run makes in it. Raises nothing."""
+    for folder in (path, *(path / name for name in _FOLDERS)):
+        if folder.is_symlink():
+            continue
+        for part in folder.glob(f"*{PART}"):
+            with contextlib.suppress(OSError):
+                part.unlink()
 
 
 def read_job(path: Path) -> Job:
@@ -234,16 +264,17 @@ def _remove_empty(folders: Iterable[Path]) -> None:
             folder.rmdir()
 
 
-def _make_new(output: Path) -> Path:
+def _make_new(output: Path, home: Path) -> Path:
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        number, folder = 1, output
+        wanted = home / output
+        wanted.parent.mkdir(parents=True, exist_ok=True)
+        number, folder = 1, wanted
         while True:
             with contextlib.suppress(FileExistsError):
                 folder.mkdir()  # fails where it exists: two runs at once cannot get the same one
                 return folder
             number += 1
-            folder = output.with_name(f"{output.name}-{number}")
+            folder = wanted.with_name(f"{wanted.name}-{number}")
     except OSError as error:
         raise PathreplayError(
             f"Run folder {output} cannot be made ({error.strerror}); give another with --output"

@@ -10,6 +10,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.files import file_problem
 from pathreplay.inverse import checkpoint
 from pathreplay.inverse.checkpoint import Run
+from pathreplay.inverse.checksums import Sums, with_sums
 from pathreplay.inverse.events import Event, Started, Stepped, Stopped
 from pathreplay.inverse.images import Image, exr_bytes, read_image
 from pathreplay.inverse.problem import Problem
@@ -64,20 +65,21 @@ class Saving:
 
 
 def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict[str, Content]:
-    """What a run goes on from, by name: targets, pictures of its start (by view), checkpoints."""
+    """What a run goes on from, by name: targets, pictures of its start (by view), their checksums, checkpoints."""
     pictures = {_picture("target", view.name): view.target for view in problem.views}
     pictures |= {_picture("weight", view.name): view.weight for view in problem.views if view.weight is not None}
     pictures |= {_picture("start", name): image for name, image in before.items()}
-    files: dict[str, Content] = {name: made(exr_bytes, image) for name, image in pictures.items()}
+    files = with_sums({name: made(exr_bytes, image) for name, image in pictures.items()})
     if problem.capture is not None:
         files[CAPTURE] = problem.capture.encode() + b"\n"
     return files | _checkpoints(run)
 
 
 def saved_targets(folder: Path) -> Targets:
-    """The targets in a run folder."""
+    """The targets in a run folder. Raises PathreplayError where one is not what was written."""
+    sums = Sums(folder)
     images, weights = (
-        {path.stem.removeprefix(f"{kind}-"): _read(path) for path in sorted(folder.glob(_picture(kind, "*")))}
+        {path.stem.removeprefix(f"{kind}-"): _read(path, sums) for path in sorted(folder.glob(_picture(kind, "*")))}
         for kind in ("target", "weight")
     )
     return Targets(images, weights)
@@ -91,8 +93,8 @@ def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) 
     Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
     """
     _require_capture(folder / CAPTURE, problem)
-    keep = problem.album.keep
-    before = {view.name: keep(_read(folder / _picture("start", view.name))) for view in problem.views}
+    keep, sums = problem.album.keep, Sums(folder)
+    before = {view.name: keep(_read(folder / _picture("start", view.name), sums)) for view in problem.views}
     for view in problem.views:
         wanted = picture_shape(problem.scene.sensors()[view.sensor])
         for kind, found in (("target", view.target), ("start", before[view.name])):
@@ -133,7 +135,6 @@ def _picture(kind: str, view: str) -> str:
     return f"images/{kind}-{view}.exr"
 
 
-def _read(path: Path) -> Image:
-    if problem := file_problem(path):
-        raise PathreplayError(f"Image {path} {problem}; start the job from its config")
+def _read(path: Path, sums: Sums) -> Image:
+    sums.require(path)
     return read_image(path)

@@ -92,7 +92,7 @@ class Session:
 
     def __init__(self, job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> None:
         self._stop = Stop()
-        self._states = _states(job, output, resumed, progress, self._stop)
+        self._states = _states(job, output, Path.cwd(), resumed, progress, self._stop)
         self._resumed = resumed
         self.result: RunResult | None = None
 
@@ -133,9 +133,9 @@ class Session:
 
 
 def _states(
-    job: Job, output: Path, resumed: RunFolder | None, progress: bool, stop: Stop
+    job: Job, output: Path, home: Path, resumed: RunFolder | None, progress: bool, stop: Stop
 ) -> Generator[State, None, RunResult]:
-    """The states of a run; returns what it came to."""
+    """The states of a run; returns what it came to. A relative ``output`` starts at ``home``."""
     config = job.config
     with ExitStack() as stack:
         if resumed is not None:
@@ -160,11 +160,11 @@ def _states(
         if problem.rival is not None and config.rival is not None:
             run.rival = _run(problem, config, problem.rival, config.rival, crew, rival=True)
         if resumed is None:
-            folder, before = _begun(output, job, problem, run)
+            folder, before = _begun(output, home, job, problem, run)
             stack.callback(folder.lock.close)
         else:
             folder, before = resumed, _went_on(resumed, config, problem, run)
-        way_out = f"aborted; go on from the last checkpoint with: {resume_command(folder.path)}"
+        way_out = f"aborted; go on from the last checkpoint with: {resume_command(folder.name)}"
         stack.enter_context(stopping(bar.say, way_out, stop))
         saving = Saving(folder, run, config.checkpoint_every)
         previews = Previews(folder, config, problem, run, before, stop)
@@ -189,7 +189,7 @@ def _states(
             if resumed is None and not run.history and not stop.aborted:
                 folder.remove()
             elif saving.rescued() and not stop.aborted:
-                way_out = f"what was done is saved, go on with: {resume_command(folder.path)}"
+                way_out = f"what was done is saved, go on with: {resume_command(folder.name)}"
                 raise PathreplayError(f"{error}; {way_out}") from error
             raise
         bar.say("writing")
@@ -200,7 +200,7 @@ def _states(
             verdict = verdict_of(problem, run, stop.by is not None)
             after = render_views(problem, config, run.values)
             theirs = render_views(problem, config, run.rival.values) if run.rival else {}
-        outcome = outcome_of(job, folder.path, problem, run, before, after, theirs, verdict)
+        outcome = outcome_of(job, folder.name, problem, run, before, after, theirs, verdict)
         files = result_files(outcome, previews.finished(after))
         problem.album.rest()
         folder.write(files)
@@ -261,13 +261,13 @@ def _set_variant(config: Config) -> None:
         )
 
 
-def _begun(output: Path, job: Job, problem: Problem, run: Run) -> tuple[RunFolder, dict[str, Image]]:
+def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tuple[RunFolder, dict[str, Image]]:
     """A new folder for a run, and the pictures of its start."""
     with computing(job.config):
         before = render_views(problem, job.config, run.values)
     for view in problem.views:
         require_finite_loss(problem.loss, view.name, view.target, view.weight, before[view.name])
-    return create_run_folder(output, job, first_files(problem, before, run)), before
+    return create_run_folder(output, job, first_files(problem, before, run), home), before
 
 
 def _went_on(folder: RunFolder, config: Config, problem: Problem, run: Run) -> dict[str, Image]:
@@ -278,10 +278,10 @@ def _went_on(folder: RunFolder, config: Config, problem: Problem, run: Run) -> d
         return before
     if run.optimiser.finished:
         raise PathreplayError(
-            f"Run {folder.path} has ended by itself ({run.optimiser.finished}); lower 'tolerance' in its config"
+            f"Run {folder.name} has ended by itself ({run.optimiser.finished}); lower 'tolerance' in its config"
         )
     if len(run.history) >= config.iterations:
         raise PathreplayError(
-            f"Run {folder.path} has all its {len(run.history)} iterations; raise 'iterations' in its config"
+            f"Run {folder.name} has all its {len(run.history)} iterations; raise 'iterations' in its config"
         )
     return before

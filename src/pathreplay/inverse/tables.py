@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from numbers import Integral, Real
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from pathreplay.errors import shown
 
@@ -43,3 +45,11 @@ class Table(BaseModel):
     """A table of a job; it never changes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_a_table(cls, value: Any) -> Any:
+        """Of mappings only dictionaries: an optimiser of Dr.Jit's is one, and says nothing of what it is."""
+        if isinstance(value, Mapping) and not isinstance(value, dict):
+            raise PydanticCustomError("table_type", "input should be a dictionary")
+        return value

@@ -36,9 +36,10 @@ from pathreplay.inverse.views import View
 from pathreplay.render.film import picture_shape
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator, told
-from pathreplay.scenes.loading import load_scene
+from pathreplay.scenes.loading import load_scene_with_floats
 from pathreplay.scenes.picture_files import MOST_PIXELS
 from pathreplay.scenes.stored import form_of
+from pathreplay.traversal import traversed
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,9 @@ def target_scene(config: Config, base: Path) -> mi.Scene:
     target = config.target
     spec = config.scene if target.scene is None else target.scene
     arguments = config.scene_parameters if target.scene_parameters is None else target.scene_parameters
-    scene = load_scene(spec, base, **arguments)
-    params = mi.traverse(scene)
+    wanted = [*target.values, *(entry.key for entry in (*config.parameters, *config.derived))]
+    scene = load_scene_with_floats(spec, wanted, base, **arguments)
+    params = traversed(scene)
     parameters.require_finite(params)
     values = {}
     for pattern, value in target.values.items():
@@ -79,7 +81,7 @@ def target_scene(config: Config, base: Path) -> mi.Scene:
 
 def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> dict[str, Array]:
     """Values of the wanted parameters in the target scene, where it has them in the same shape or as such a grid."""
-    params = mi.traverse(scene)
+    params = traversed(scene)
     found = {key: parameters.get_array(seen(params, key)) for key in keys if key in params}
     return {k: value for k, value in found.items() if comparable(value.shape, parameters.get_array(seen(own, k)).shape)}
 

@@ -17,8 +17,12 @@ _KINDS = {"float32": "F32", "float64": "F64", "uint32": "U32", "int64": "I64", "
 _KINDS |= {"float16": "F16", "int32": "I32", "uint64": "U64"}
 
 
-def safetensors_chunks(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Iterator[Chunk]:
+def safetensors_chunks(
+    arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str], room: Mapping[str, int] | None = None
+) -> Iterator[Chunk]:
     """The bytes of a file of these arrays (by name), a chunk at a time. Each is asked for twice: see `WhenAsked`.
+
+    ``room`` names tensors of so many bytes at the end of the file, which the caller writes.
 
     Raises PathreplayError for numbers of a kind that such files do not have.
     """
@@ -34,6 +38,9 @@ def safetensors_chunks(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, 
         begin, end = end, end + array.nbytes
         header[name] = {"dtype": _KINDS[array.dtype.name], "shape": list(array.shape), "data_offsets": [begin, end]}
         del array
+    for name, size in (room or {}).items():
+        begin, end = end, end + size
+        header[name] = {"dtype": "U8", "shape": [size], "data_offsets": [begin, end]}
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)  # so that tensors begin where eight bytes do
     yield len(text).to_bytes(8, "little") + text

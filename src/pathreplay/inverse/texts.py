@@ -91,14 +91,15 @@ class _Plain(yaml.SafeLoader):
 
 for _tag, _pattern, _first in (
     ("bool", r"(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
-    ("int", r"[-+]?[0-9]+$", "-+0123456789"),
+    ("int", r"(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$", "-+0123456789"),
     ("float", r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$", "-+.0123456789"),
     ("float", r"(?:[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$", "-+."),
     ("null", r"(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
 ):
     _Plain.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first))
-# PyYAML takes 010 for eight; to YAML 1.2 and to people it is ten.
-_Plain.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value))
+# PyYAML takes 010 for eight; to YAML 1.2 and to people it is ten, and 0o10 is eight.
+_BASES = {"0o": 8, "0x": 16}
+_Plain.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value, _BASES.get(node.value[:2], 10)))
 
 
 def _of_yaml(error: yaml.YAMLError) -> str:

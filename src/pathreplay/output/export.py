@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import json
 import math
+import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +28,10 @@ from pathreplay.inverse.run_folder import Job, read_job, require_writable_name
 from pathreplay.inverse.values import Arrays
 from pathreplay.output.scene_folder import SCENE, Exported, Source, exported, require_same
 from pathreplay.scenes.builtin_scenes import BUILTINS
-from pathreplay.scenes.loading import as_xml_has_them, builtin_dict
+from pathreplay.scenes.descriptions import told
+from pathreplay.scenes.loading import as_xml_has_them, builtin_dict, coarse_pictures
 from pathreplay.scenes.parameters import get_array
+from pathreplay.traversal import traversed
 from pathreplay.whole_files import whole_folder
 
 _OPTION = "-o"
@@ -59,7 +64,9 @@ def export_run(run: Path, output: Path | None = None) -> str:
             (part / name).write_bytes(data)
         require_same(found.scene, part)
     files = sorted([*found.files, *found.copies])
-    lines = [f"{folder / SCENE}: render it with `mitsuba -m {mi.variant()} {folder / SCENE}`"]
+    # Not by Mitsuba's own command, which takes the system's newest LLVM, and is ended by some of them.
+    render = f"pathreplay render {shlex.quote(str(folder / SCENE))} -o scene.exr --variant {mi.variant()}"
+    lines = [f"{folder / SCENE}: render it with `{render}`"]
     lines += [f"{folder / name}" for name in files if name != SCENE and not name.startswith("files/")]
     return "\n".join([*lines, *(f"pathreplay: {note}" for note in found.notes)])
 
@@ -104,7 +111,19 @@ def _source(job: Job, values: Arrays) -> Source:
     path = job.base / config.scene
     if not path.is_file():
         raise PathreplayError(f"Scene {path} of the run is no longer there; put it back")
-    return Source(path, as_xml_has_them(config.scene_parameters), plugins, cameras)
+    source = Source(path, as_xml_has_them(config.scene_parameters), plugins, cameras)
+    return replace(source, floats=_floats(source, values))
+
+
+def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
+    """The pictures whose texels the run has stored as floating-point numbers."""
+    keys = [key for key in values if key.endswith(".data")]
+    if not keys:
+        return ()
+    with told("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
+        found = coarse_pictures(traversed(source.load()), keys)
+    gc.collect()  # Dr.Jit traces calls through every instance alive
+    return found
 
 
 def _beside(found: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:

@@ -6,7 +6,7 @@ name of its own, the scene is made once, and each parameter's owner tells by tha
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,9 @@ import mitsuba as mi
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.descriptions import require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
+from pathreplay.scenes.substitute import exchange
 from pathreplay.threads import spare_thread
+from pathreplay.traversal import traversed
 
 Node = Any
 """`mi.parser.SceneNode`."""
@@ -78,11 +80,13 @@ def describe(
     arguments: Mapping[str, str],
     plugins: Mapping[str, str],
     cameras: Mapping[str, Mapping[str, Any]],
+    floats: Collection[str] = (),
 ) -> tuple[Described, list[Owner]]:
     """The objects of a scene (an XML file or a dictionary), and the owners of its parameters in their order.
 
-    ``arguments`` replace ``$name`` in the file; plugins are exchanged (old type -> new type), and cameras join, as in
-    `load_file_with`. Raises RuntimeError (Mitsuba's) where it cannot be read, and PathreplayError as that does.
+    ``arguments`` replace ``$name`` in the file; plugins are exchanged (old type -> new type), cameras join and pictures
+    become ``floats`` as in `load_file_with`. Raises RuntimeError (Mitsuba's) where it cannot be read, and
+    PathreplayError as that does.
     """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
@@ -97,8 +101,7 @@ def describe(
         for name, camera in cameras.items():
             _join(state, name, mi.parser.parse_dict(config, dict(camera)))
         for node in state.nodes:
-            if (new := plugins.get(node.props.plugin_name())) is not None:
-                node.props.set_plugin_name(new)
+            exchange(node.props, plugins, floats)
         require_sound_files(state)
         mi.parser.transform_all(config, state)
         described = Described(state, folder)
@@ -126,7 +129,7 @@ def _owners(config: Any, state: Any, nodes: list[Node]) -> list[Owner]:
         copy.nodes[i].props.set_id(name)
     with spare_thread():
         scene = mi.parser.instantiate(config, copy)
-    params = mi.traverse(scene)
+    params = traversed(scene)
     owners = []
     for key in params.keys():
         node, depth = params.properties[key][2], 1

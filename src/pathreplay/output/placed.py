@@ -14,6 +14,7 @@ from pathreplay.media.volume_files import UNIT_CUBE, Bounds, vol_bytes
 from pathreplay.output.nodes import Described, Node, Owner
 from pathreplay.scenes.parameters import get_array
 from pathreplay.scenes.stored import form_of
+from pathreplay.traversal import traversed
 
 _PICTURES = ("bitmap", "envmap")
 _OF_A_MESH = ("vertex_", "faces", "face_")
@@ -40,7 +41,7 @@ class Placing:
 
     def __init__(self, described: Described, scene: mi.Scene, names: dict[str, str]) -> None:
         self.described, self.scene, self.names = described, scene, names
-        self.params = mi.traverse(scene)
+        self.params = traversed(scene)
         self.files: dict[str, bytes] = {}
         self._meshes: dict[str, str] = {}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import re
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from pathreplay.scenes.parameters import get_array, is_empty, to_value
 from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
 from pathreplay.threads import spare_thread
+from pathreplay.traversal import traversed
 
 SCENE = "scene.xml"
 
@@ -54,12 +55,14 @@ class Source:
     """Plugins that were exchanged, old type -> new type."""
     cameras: Mapping[str, Mapping[str, Any]]
     """Sensors that join the scene, by id."""
+    floats: Collection[str] = ()
+    """Files of textures that are floating-point numbers here: see `load_file_with`."""
 
     def load(self) -> mi.Scene:
         """The scene. Raises what Mitsuba and `load_file_with` raise."""
         if isinstance(self.scene, Mapping):
-            return load_dict_with(self.scene, self.plugins, self.cameras)[0]
-        return load_file_with(self.scene, self.plugins, self.arguments, self.cameras)[0]
+            return load_dict_with(self.scene, self.plugins, self.cameras, self.floats)[0]
+        return load_file_with(self.scene, self.plugins, self.arguments, self.cameras, self.floats)[0]
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, Any] | Non
     with told("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene = source.load()
         params = _set(scene, values)
-        described, owners = describe(source.scene, source.arguments, source.plugins, source.cameras)
+        described, owners = describe(source.scene, source.arguments, source.plugins, source.cameras, source.floats)
     keys = list(params.keys())
     if len(keys) != len(owners):
         raise PathreplayError("The scene is another one at every loading, and cannot be exported")
@@ -108,7 +111,7 @@ def require_same(original: mi.Scene, folder: Path) -> None:
     gc.collect()
     with told(f"The exported scene {folder / SCENE} cannot be loaded"), spare_thread():
         copy = mi.load_file(str(folder / SCENE), optimize=False)
-    ours, theirs = mi.traverse(original), mi.traverse(copy)
+    ours, theirs = traversed(original), traversed(copy)
     # Those without a name come in the same order.
     waiting: defaultdict[str, list[str]] = defaultdict(list)
     for key in theirs.keys():
@@ -145,7 +148,7 @@ def _numbers(value: Any) -> np.ndarray:
 
 
 def _set(scene: mi.Scene, values: Arrays) -> mi.SceneParameters:
-    params = mi.traverse(scene)
+    params = traversed(scene)
     for key, value in values.items():
         if key not in params:
             raise PathreplayError(f"The scene has no parameter '{key}' any more; export with the scene of the run")
@@ -154,7 +157,7 @@ def _set(scene: mi.Scene, values: Arrays) -> mi.SceneParameters:
         array = np.ascontiguousarray(value, np.float32)
         params[key] = form.store(type(seen)(array) if dr.is_tensor_v(seen) else to_value(seen, array))
     params.update()
-    return mi.traverse(scene)
+    return traversed(scene)
 
 
 def _file_names(keys: list[str], scene: mi.Scene) -> dict[str, str]:

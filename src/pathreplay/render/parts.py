@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from ..errors import PathreplayError
 from ..scenes.parameters import is_transform
+from ..traversal import known_values
 from .camera_pass import Pass, Seed
 from .film import MOST_SAMPLES, film_size
 
@@ -69,7 +70,9 @@ class Sums:
     def __init__(self, scene: mi.Scene) -> None:
         params = mi.traverse(scene)
         with dr.resume_grad():
-            self._values = [part for key in params.keys() for part in _arrays(params[key]) if dr.grad_enabled(part)]
+            self._values = [
+                part for _, value in known_values(params) for part in _arrays(value) if dr.grad_enabled(part)
+            ]
         self._sums: list[Any] = [None] * len(self._values)
         self.take()
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import difflib
 import gc
 import inspect
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,10 @@ from pathreplay.scenes import parameters as scene_parameters
 from pathreplay.scenes.builtin_scenes import BUILTINS, COSTS, SceneDict
 from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.substitute import Cameras, load_dict_with, load_file_with
+from pathreplay.traversal import traversed
+
+# What Mitsuba calls the class of a `bitmap` in 8 bits.
+_COARSE = "BitmapTextureImpl[uint8]"
 
 
 def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any) -> mi.Scene:
@@ -38,18 +43,19 @@ def load_scene_with(
     plugins: Mapping[str, str],
     base: Path | None = None,
     cameras: Cameras | None = None,
+    floats: Collection[str] = (),
     /,
     **parameters: Any,
 ) -> tuple[mi.Scene, list[str]]:
     """`load_scene` with plugins exchanged (old type -> new type), and one line for each that was: id and place.
 
-    ``cameras`` are added to those of the scene.
+    ``cameras`` are added to those of the scene. For ``floats`` see `load_file_with`.
     """
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
     if str(spec) in BUILTINS:
         with told(f"Built-in scene '{spec}' cannot be made of {parameters}"):
-            return load_dict_with(builtin_dict(str(spec), parameters), plugins, cameras)
+            return load_dict_with(builtin_dict(str(spec), parameters), plugins, cameras, floats)
     path = Path(spec) if base is None else Path(base) / spec
     if (problem := file_problem(path)) == MISSING:
         raise PathreplayError(_unknown(str(spec), path))
@@ -57,7 +63,7 @@ def load_scene_with(
         raise PathreplayError(f"Scene {path} {problem}; give the path of a Mitsuba XML file")
     arguments = as_xml_has_them(parameters)
     with told(f"Scene {path} cannot be loaded", (RuntimeError, ValueError, TypeError)):
-        scene, exchanged = load_file_with(path, plugins, arguments, cameras)
+        scene, exchanged = load_file_with(path, plugins, arguments, cameras, floats)
     if not isinstance(scene, mi.Scene):
         raise PathreplayError(f"{path} describes no <scene> but a {type(scene).__name__}; wrap it in <scene>")
     return scene, exchanged
@@ -79,24 +85,56 @@ def load_scene_for(
     """Load a scene in which the ``wanted`` keys and globs carry derivatives, as far as exchanging plugins brings it.
 
     Where a pattern that ends in ``eta`` matches the index of a ``dielectric``, the scene is loaded once more with
-    `smoothdielectric` in the place of every ``dielectric``. ``cameras`` are added to those of the scene. Returns the
-    scene and what is to be said about it, one line each. Patterns that match nothing are left for others to complain
-    about. Raises what `load_scene` does.
+    `smoothdielectric` in the place of every ``dielectric``; where one that ends in ``data`` matches a texture of 8
+    bits, with its texels as floating-point numbers. ``cameras`` are added to those of the scene. Returns the scene and
+    what is to be said about it, one line each. Patterns that match nothing are left for others to complain about.
+    Raises what `load_scene` does.
     """
     scene, _ = load_scene_with(spec, {}, base, cameras, **parameters)
-    params = mi.traverse(scene)
-    patterns = [pattern for pattern in wanted if pattern.rsplit(".", 1)[-1] == "eta"]
-    keys: list[str] = []
-    with suppress(PathreplayError):
-        keys = scene_parameters.resolve_keys(params, patterns)
-    if not any(scene_parameters.owner_class(params, key) == "SmoothDielectric" for key in keys):
+    params = traversed(scene)
+    eta = _matching(params, wanted, "eta")
+    smooth = any(scene_parameters.owner_class(params, key) == "SmoothDielectric" for key in eta)
+    plugins, floats = {"dielectric": "smoothdielectric"} if smooth else {}, coarse_pictures(params, wanted)
+    if not plugins and not floats:
         return scene, ()
     # Dr.Jit traces calls through every instance alive, so the first scene has to go before the second one comes.
     del scene, params
     gc.collect()
-    scene, exchanged = load_scene_with(spec, {"dielectric": "smoothdielectric"}, base, cameras, **parameters)
-    count = "one" if len(exchanged) == 1 else f"all {len(exchanged)}"
-    return scene, (f"replaced 'dielectric' by 'smoothdielectric' ({count} of them): its eta carries a derivative",)
+    scene, exchanged = load_scene_with(spec, plugins, base, cameras, floats, **parameters)
+    notes = [f"stored the texels of '{name}' as floating-point numbers: they carry derivatives" for name in floats]
+    if exchanged:
+        count = "one" if len(exchanged) == 1 else f"all {len(exchanged)}"
+        notes.append(f"replaced 'dielectric' by 'smoothdielectric' ({count} of them): its eta carries a derivative")
+    return scene, tuple(notes)
+
+
+def load_scene_with_floats(
+    spec: str | Path, wanted: Iterable[str], base: Path | None = None, /, **parameters: Any
+) -> mi.Scene:
+    """`load_scene` with textures of 8 bits as floating-point numbers where ``wanted`` keys and globs name them."""
+    scene = load_scene(spec, base, **parameters)
+    if not (floats := coarse_pictures(traversed(scene), wanted)):
+        return scene
+    del scene
+    gc.collect()
+    return load_scene_with(spec, {}, base, None, floats, **parameters)[0]
+
+
+def coarse_pictures(params: Any, wanted: Iterable[str]) -> tuple[str, ...]:
+    """The files of the textures that keys and globs ending in ``data`` name and Mitsuba holds as 8-bit integers."""
+    owners = [params.properties[key][2] for key in _matching(params, wanted, "data")]
+    found = [re.search(r'name = "(.*)"', str(owner)) for owner in owners if owner.class_name() == _COARSE]
+    return tuple(dict.fromkeys(match[1] for match in found if match))
+
+
+def _matching(params: Any, wanted: Iterable[str], name: str) -> list[str]:
+    """The keys that patterns with this last part name."""
+    keys: list[str] = []
+    for pattern in wanted:
+        if pattern.rsplit(".", 1)[-1] == name:
+            with suppress(PathreplayError):
+                keys += scene_parameters.resolve_keys(params, pattern)
+    return keys
 
 
 def builtin_dict(name: str, parameters: Mapping[str, Any]) -> SceneDict:

@@ -163,9 +163,8 @@ _LIGHT = {"to_world", "position"}
 def needs_ray_adjoint(params: Any, key: str) -> bool:
     """Whether a parameter is one of a camera, or moves a light that is no shape: Mitsuba's integrators drop these."""
     node, name = params.properties[key][2], key.rsplit(".", 1)[-1]
-    return _is_float(params[key]) and (
-        (isinstance(node, mi.Sensor) and name in _CAMERA) or (isinstance(node, mi.Emitter) and name in _LIGHT)
-    )
+    placed = (isinstance(node, mi.Sensor) and name in _CAMERA) or (isinstance(node, mi.Emitter) and name in _LIGHT)
+    return placed and _is_float(params[key])
 
 
 def is_transform(value: Any) -> bool:

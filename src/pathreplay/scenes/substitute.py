@@ -1,8 +1,11 @@
-"""Loads a scene with some of its plugins exchanged for others that read the same parameters."""
+"""Loads a scene with some of its plugins exchanged for others that read the same parameters.
+
+Where textures of 8 bits are to be floating-point numbers, the plugin `bitmap` gets another option.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -23,12 +26,14 @@ def load_file_with(
     plugins: Mapping[str, str],
     parameters: Mapping[str, str] | None = None,
     cameras: Cameras | None = None,
+    floats: Collection[str] = (),
 ) -> tuple[Any, list[str]]:
     """`mi.load_file(path, optimize=False, **parameters)` with plugins exchanged, included files' plugins too.
 
     `plugins` maps the type named in the scene to the type to load in its place, {"dielectric": "smoothdielectric"} for
     one. The new plugin has to be registered and is given the properties and the id of the old one, so that parameter
-    keys stay what they were. ``cameras`` are added to what the scene has.
+    keys stay what they were. ``cameras`` are added to what the scene has. ``floats`` are names of picture files
+    (without their folders) whose `bitmap` textures are stored as floating-point numbers, whatever the files have.
 
     Returns the scene (or object) and one line per exchanged plugin, its id and where it stands in the file.
     Raises RuntimeError (Mitsuba's) for a file that cannot be read or holds a property unknown to the new plugin, and
@@ -42,11 +47,14 @@ def load_file_with(
     with _parsing() as config:
         mi.file_resolver().prepend(mi.filesystem.path(str(path.parent)))
         state = mi.parser.parse_file(config, str(path), **parameters)
-        return _instantiate(config, state, plugins, cameras)
+        return _instantiate(config, state, plugins, cameras, floats)
 
 
 def load_dict_with(
-    scene: Mapping[str, Any], plugins: Mapping[str, str], cameras: Cameras | None = None
+    scene: Mapping[str, Any],
+    plugins: Mapping[str, str],
+    cameras: Cameras | None = None,
+    floats: Collection[str] = (),
 ) -> tuple[Any, list[str]]:
     """`mi.load_dict(scene, optimize=False)` with plugins exchanged; otherwise as `load_file_with`.
 
@@ -54,7 +62,17 @@ def load_dict_with(
     """
     require_values(scene)
     with _parsing() as config:
-        return _instantiate(config, mi.parser.parse_dict(config, dict(scene)), plugins, cameras)
+        return _instantiate(config, mi.parser.parse_dict(config, dict(scene)), plugins, cameras, floats)
+
+
+def exchange(props: Any, plugins: Mapping[str, str], floats: Collection[str]) -> bool:
+    """Exchange the plugin of an object, by its properties, or its option; whether it has another plugin now."""
+    if (new := plugins.get(props.plugin_name())) is not None:
+        props.set_plugin_name(new)
+        return True
+    if floats and props.plugin_name() == "bitmap" and Path(str(props.get("filename", ""))).name in floats:
+        props["format"] = "variant"
+    return False
 
 
 @contextmanager
@@ -71,7 +89,9 @@ def _parsing() -> Iterator[mi.parser.ParserConfig]:
         mi.set_file_resolver(outer)
 
 
-def _instantiate(config: Any, state: Any, plugins: Mapping[str, str], cameras: Cameras | None) -> tuple[Any, list[str]]:
+def _instantiate(
+    config: Any, state: Any, plugins: Mapping[str, str], cameras: Cameras | None, floats: Collection[str]
+) -> tuple[Any, list[str]]:
     exchanged = []
     taken = {node.props.id() for node in state.nodes}
     for name, camera in (cameras or {}).items():
@@ -79,9 +99,8 @@ def _instantiate(config: Any, state: Any, plugins: Mapping[str, str], cameras: C
             raise PathreplayError(f"The scene has an object '{name}', as a camera is called that joins it; rename one")
         state.root.props[name] = mi.load_dict(dict(camera))
     for node in state.nodes:
-        if (new := plugins.get(node.props.plugin_name())) is not None:
+        if exchange(node.props, plugins, floats):
             exchanged.append(f"{node.props.id() or 'unnamed'} ({mi.parser.file_location(state, node)})")
-            node.props.set_plugin_name(new)
     require_sound_files(state)
     mi.parser.transform_all(config, state)
     with spare_thread():

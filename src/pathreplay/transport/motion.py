@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..traversal import known_values
 from . import scatter
 from .arrive import Vertex
 from .nodes import nodes_of
@@ -20,7 +21,7 @@ def moving_shapes(scene: mi.Scene) -> tuple[mi.Shape, ...] | None:
     """Those that have gradients, in whatever belongs to them; None where other things have gradients, or too many."""
     params = mi.traverse(scene)
     with dr.resume_grad():
-        attached = {params.properties[key][2] for key in params.keys() if dr.grad_enabled(params[key])}
+        attached = {params.properties[key][2] for key, value in known_values(params) if dr.grad_enabled(value)}
     shapes = {shape: nodes_of(shape) | {shape} for shape in scene.shapes()}
     moving = tuple(shape for shape, nodes in shapes.items() if not attached.isdisjoint(nodes))
     rest = attached.difference(*(shapes[shape] for shape in moving))

@@ -25,7 +25,7 @@ def _collector() -> Any:
         def put(self: Any, name: str, value: object, flags: int, cpptype: type | None = None) -> None:
             if isinstance(value, mi.Object):
                 self.children.append((name, value))
-            elif value is not None:
+            else:
                 self.values.append((name, value, cpptype))
 
         _COLLECTORS[base] = type("Collector", (base,), {"put": put, "__module__": __name__})
@@ -64,7 +64,9 @@ def with_gradients(root: mi.Object, *names: str) -> list[Any]:
         children, values = _contents(node)
         for name, value, cpptype in values:
             if not names or any(f"{prefix}{name}.".startswith(f"{n}.") for n in names):
-                found.append(value if cpptype is None else mi.get_property(value, cpptype, node))
+                value = value if cpptype is None else mi.get_property(value, cpptype, node)
+                if value is not None:  # as ``sigma_a`` of hair with ``eumelanin``
+                    found.append(value)
         for name, child in children:
             if child not in seen:
                 seen.add(child)

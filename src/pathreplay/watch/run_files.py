@@ -95,8 +95,10 @@ def holder(run: Path) -> str | None:
 
 def ask_to_stop(run: Path) -> None:
     """Leave the wish to stop where the loop looks for it. Raises PathreplayError where that cannot be written."""
-    flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+    # A pipe that nobody reads, say, must not keep us waiting.
+    flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
         os.close(os.open(run / STOP, flags, 0o644))
     except OSError as error:
-        raise PathreplayError(f"{run / STOP} cannot be written ({error.strerror}); stop the run with SIGTERM") from None
+        why = file_problem(run / STOP) or f"cannot be written ({error.strerror})"
+        raise PathreplayError(f"{run / STOP} {why}; remove it, or stop the run with SIGTERM") from None

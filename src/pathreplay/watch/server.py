@@ -7,10 +7,13 @@ lead here (DNS rebinding) is refused by the name that it asks for.
 from __future__ import annotations
 
 import contextlib
+import io
 import ipaddress
 import secrets
 import socket
 import sys
+import threading
+import time
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -22,18 +25,22 @@ from pathreplay.inverse.previews import FOLDER
 from pathreplay.pages.document import document, policy
 from pathreplay.watch import run_files
 
-# Seconds after which a client that says nothing is left.
+# Seconds after which a client is left that has not said what it wants, or not taken what it is sent.
 PATIENCE = 30
+# Connections at once: several browsers. More get no answer.
+MOST = 32
 
 
 class RunServer(ThreadingHTTPServer):
     """Serves ``run`` at ``address``, a URL with a token in it, until `shutdown`."""
 
     daemon_threads = True
+    request_queue_size = MOST
 
     def __init__(self, run: Path, host: str, port: int, token: str | None = None) -> None:
         """Raises PathreplayError where the address cannot be listened at."""
         self.run = run
+        self.room = threading.BoundedSemaphore(MOST)
         self.token = token or secrets.token_urlsafe(18)
         try:
             found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
@@ -48,6 +55,20 @@ class RunServer(ThreadingHTTPServer):
         everywhere = host in ("", "0.0.0.0", "::")
         shown = socket.gethostname() if everywhere else f"[{host}]" if ":" in host else host
         self.address = f"http://{shown}:{self.server_address[1]}/{self.token}/"
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """In a thread of its own, where there is room for one more."""
+        if not self.room.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer, and make room again."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self.room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client that goes away is no error of ours."""
@@ -66,13 +87,39 @@ class RunServer(ThreadingHTTPServer):
         return name in self.names
 
 
+class _Within(io.RawIOBase):
+    """What a client sends until a moment; then reading raises TimeoutError, however many bytes still drip."""
+
+    def __init__(self, connection: socket.socket, seconds: float) -> None:
+        self.connection, self.end = connection, time.monotonic() + seconds
+
+    def readable(self) -> bool:
+        """It is."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Wait for bytes as long as there is time."""
+        if (left := self.end - time.monotonic()) <= 0:
+            raise TimeoutError
+        self.connection.settimeout(left)
+        try:
+            return self.connection.recv_into(buffer)
+        finally:
+            self.connection.settimeout(PATIENCE)
+
+
 class Handler(BaseHTTPRequestHandler):
-    """Answers one request."""
+    """Answers one request, the only one of its connection: what is sent behind it is never read."""
 
     server: RunServer
     timeout = PATIENCE
-    protocol_version = "HTTP/1.1"
+    protocol_version = "HTTP/1.0"
     server_version, sys_version = "pathreplay", ""
+
+    def setup(self) -> None:
+        """Give the client a time in which to say what it wants."""
+        super().setup()
+        self.rfile = io.BufferedReader(_Within(self.connection, PATIENCE))
 
     def do_GET(self) -> None:
         """The page, or one of its pictures."""
@@ -88,12 +135,10 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """A wish to stop the run."""
-        self.close_connection = True  # what is sent with it is not read
         place = self._place()
         if place is None:
             return
-        origin = self.headers.get("Origin")
-        if place != "stop" or (origin is not None and urlsplit(origin).netloc != self.headers.get("Host")):
+        if place != "stop" or not self._from_our_page():
             self._answer(404 if place != "stop" else 403, "text/plain", b"not here\n")
             return
         try:
@@ -103,12 +148,24 @@ class Handler(BaseHTTPRequestHandler):
         else:
             self._answer(200, "text/plain", b"stopping\n")
 
+    def _from_our_page(self) -> bool:
+        """Whether no page of another origin asks."""
+        origin = self.headers.get("Origin")
+        with contextlib.suppress(ValueError):  # what is no URL
+            return origin is None or urlsplit(origin).netloc == self.headers.get("Host")
+        return False
+
     def _place(self) -> str | None:
         """What is asked for behind the token; None where the request was refused."""
         if not self.server.knows(self.headers.get("Host", "")):
             self._answer(403, "text/plain", b"this server is not called that\n")
             return None
-        token, slash, place = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
+        try:
+            path = urlsplit(self.path).path
+        except ValueError:
+            self._answer(404, "text/plain", b"this is no address\n")
+            return None
+        token, slash, place = unquote(path).lstrip("/").partition("/")
         if not secrets.compare_digest(token.encode("utf-8", "replace"), self.server.token.encode()):
             self._answer(403, "text/plain", b"give the whole address that pathreplay watch printed\n")
             return None

@@ -1,0 +1,46 @@
+"""Hair by its pigments: Mitsuba holds None as its absorption then, which nobody may read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pathreplay.check.command import check_all
+from pathreplay.inverse import make_config, optimize
+from pathreplay.output.export import export_run
+from pathreplay.scenes.loading import load_scene
+
+SCENE = """<scene version="3.0.0">
+  <sensor type="perspective" id="eye">
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="6"/>
+      <string name="pixel_format" value="rgb"/><rfilter type="box"/></film></sensor>
+  <shape type="sphere" id="ball"><bsdf type="hair"><float name="eumelanin" value="0.3"/></bsdf></shape>
+  <emitter type="constant" id="sky"/>
+</scene>"""
+KEY = "ball.bsdf.eumelanin"
+
+
+@pytest.fixture(autouse=True)
+def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("hair.xml").write_text(SCENE)
+
+
+def test_its_pigments_can_be_checked() -> None:
+    (result,) = check_all(load_scene("hair.xml"), [KEY], seeds=2, spp=4, max_depth=2)
+    assert result.key == KEY and result.gradient < 0
+
+
+@pytest.mark.parametrize("edges", ["none", pytest.param("all", marks=pytest.mark.slow)])
+def test_its_pigments_can_be_optimised_and_exported(edges: str) -> None:
+    pose = {"key": "ball.to_world", "pose": "translation", "start": {"translation": [0.1, 0, 0]}}
+    parameters = [{"key": KEY, "initial": 0.5}, *([pose] if edges == "all" else [])]
+    job = {
+        "scene": "hair.xml", "parameters": parameters, "iterations": 2, "spp": 2, "picture_spp": 2, "output": "run",
+        "integrator": {"type": "pathreplay", "max_depth": 2, "edges": edges},
+        "target": {"values": {KEY: 0.3}, "spp": 4},
+    }  # fmt: skip
+    optimize(make_config(job), progress=False)
+    assert export_run(Path("run")).startswith("run/export/scene.xml")
