@@ -29,7 +29,7 @@ from ..transport.start import CameraStart
 from ..transport.velocity import held_direction, jumps_at_facets, moved_direction
 from ..transport.vertex import Arrival, Flight, Walk, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
-from .arcs import Arc, arc, density_of_centres
+from .arcs import Arc, arc, density_of_samples
 from .bends import Bend
 from .centres import LOOKS, Centres
 from .counted import Counted, key_of, quasi_random
@@ -265,7 +265,7 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
     steep = dr.select(bent, dr.dot(slope, n), 1)
     f, pdf = seer.towards(ray_far.d, active)
-    common = x.β * f * (0.5 * dr.pi * found.weight * line.weight(density_of_centres(pdf)))
+    common = x.β * f * (0.5 * dr.pi * found.weight * line.weight(seer, density_of_samples(pdf), active))
     active &= dr.any(common != 0)
     arrivals, depth = [seer.arrival(ray_near, near, pdf), seer.arrival(ray_far, far, pdf)], x.depth + 1
     T, arrivals = seer.onward(arrivals, SHORT_OF * edge.t, key, active & through)

@@ -40,11 +40,11 @@ def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:
 
 
 def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
-    """Whether a ray along ``d`` meets a surface whose shading normal points along it, and so the dark side.
+    """Whether a ray along ``d`` meets a mesh where its shading normal points along it, so that it is dark there.
 
-    A sphere's normal does so on its limb alone, by rounding: what lies there is an outline, and nothing else.
+    Other shapes turn away on their limb only, and there by rounding: what lies there is an outline, and nothing else.
     """
-    return (dr.dot(si.sh_frame.n, d) > 0) & (si.shape.shape_type() != int(mi.ShapeType.Sphere))
+    return si.shape.is_mesh() & (dr.dot(si.sh_frame.n, d) > 0)
 
 
 def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
