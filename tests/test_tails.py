@@ -14,21 +14,48 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import edge_media_scenes
+import edge_media_scenes as media
 import edge_ordinary
-import edge_scenes
+import edge_scenes as scenes
 from edge_truth import ours
 from pathreplay.check.objective import Objective
 from pathreplay.gradient.arcs import arc, density_of_samples
 from pathreplay.transport.signature import turned_away
-from truth import Bench, Case
+from truth import Bench, Case, add, translate
 
 PASSES, SPP = 256, 16
 SHARE = 0.1
 """Largest share of one pass in the variance of all; of normal deviates it is more once in 10^6 tests."""
 HALVES = 1.5
 """Largest ratio of the standard errors of two halves."""
-CASES = {each.name: each for each in (*edge_scenes.BY_NAME.values(), *edge_media_scenes.CELLS)}
+
+
+def ball(bsdf: dict) -> dict:
+    return scenes.shape(scenes.T().translate([0.1, 0.1, -0.3]).scale(0.5), bsdf, "sphere")
+
+
+def with_a_ball(bsdf: dict) -> dict:
+    return {
+        "wall": scenes.shape(scenes.BACK, scenes.patterned()),
+        "lamp": scenes.lamp(scenes.OVERHEAD),
+        "object": ball(bsdf),
+    }
+
+
+def of_glass() -> dict:
+    return scenes.scene(30, **with_a_ball(scenes.GLASS))
+
+
+ASIDE = translate(*scenes.ASIDE)
+BALLS = [
+    scenes.cell(
+        "ball_in_fog", lambda: media.in_fog(media.thin(), **with_a_ball(scenes.paint(0.5))), scenes.OBJECT, ASIDE, 3
+    ),
+    scenes.cell("glass_ball_moves", of_glass, scenes.OBJECT, ASIDE, 5),
+    scenes.cell("glass_ball_index", of_glass, "object.bsdf.eta", add(1.0), 5),
+]
+"""Balls whose limbs are seen from fog, and from a wall that is seen through them."""
+CASES = {each.name: each for each in (*BALLS, *scenes.BY_NAME.values(), *media.CELLS)}
 
 
 def passes(objective: Objective, integrator: mi.Integrator) -> np.ndarray:
@@ -46,7 +73,7 @@ def hold_tail(g: np.ndarray) -> None:
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_no_pass_says_it_all(case: Case) -> None:
     bench = Bench(case)
-    bench.weigh(edge_scenes.weights())
+    bench.weigh(scenes.weights())
     try:
         hold_tail(passes(bench, ours(bench)))
     finally:
