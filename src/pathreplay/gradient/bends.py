@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.signature import place_met
+from ..transport.signature import place_met, turned_away
 from ..transport.vertex import Walk
 from .crofton import at_an_angle, hides_itself
 
@@ -40,7 +40,7 @@ class Bend:
         si_a, si_b = (x.compute_surface_interaction(ray, flags, both) for x, ray in sides)
         meets = both & at_an_angle(si_a.n, si_b.n) & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
         same = both & (place_met(walk, a, both) == place_met(walk, b, both))
-        dark = [dr.dot(si.sh_frame.n, ray.d) > 0 for si, (_, ray) in zip((si_a, si_b), sides, strict=True)]
+        dark = [turned_away(si, ray.d) for si, (_, ray) in zip((si_a, si_b), sides, strict=True)]
         turns = same & (dark[0] != dark[1]) & ~hides_itself(si_a.p, si_a.n, si_b.p, si_b.n)
         return Bend(a, b, meets, turns)
 

@@ -31,7 +31,7 @@ from ..transport.emitters import draw_emitter
 from ..transport.motion import may_move
 from ..transport.passage import SHORT_OF, beyond_null
 from ..transport.path import PathState
-from ..transport.signature import edge_normal, mixed, outline_gap, place_met
+from ..transport.signature import edge_normal, mixed, outline_gap, place_met, turned_away
 from ..transport.start import CameraStart
 from ..transport.surface import steady
 from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
@@ -175,7 +175,7 @@ def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sigh
     at = path.at
     flags = mi.RayFlags.All if walk.traits.coarse_meshes else mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
     si = at.hit.compute_surface_interaction(at.ray, flags, active)
-    kind = dr.select(dr.dot(si.sh_frame.n, at.ray.d) > 0, mi.UInt32(1), 0)
+    kind = dr.select(turned_away(si, at.ray.d), mi.UInt32(1), 0)
     sight = Sight(mixed(place_met(walk, at.hit, active), kind), si.p, si.n)
     if not walk.traits.coarse_meshes:
         return sight

@@ -24,11 +24,12 @@ import mitsuba as mi
 from ..transport.motion import may_move
 from ..transport.passage import SHORT_OF
 from ..transport.path import PathState
-from ..transport.signature import edge_normal, mixed, outline_gap, place_met
+from ..transport.signature import edge_normal, mixed, outline_gap, place_met, turned_away
 from ..transport.start import CameraStart
 from ..transport.velocity import held_direction, jumps_at_facets, moved_direction
 from ..transport.vertex import Arrival, Flight, Walk, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
+from .arcs import Arc, arc, density_of_samples
 from .bends import Bend
 from .centres import LOOKS, Centres
 from .counted import Counted, key_of, quasi_random
@@ -43,10 +44,6 @@ BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
 JUMP = 4.0
 """So many times as far from an edge as its slope says is the other end of a line where a sample of an emitter jumps."""
-EVENLY = 0.25
-"""Share of the arcs that are thrown evenly: those that begin below the horizon, or where lobes are weak, count, too."""
-
-
 WIDELY = 0.5
 """Share of the lines that are thrown evenly over the film: where things touch, few lines find what counts much."""
 
@@ -71,20 +68,6 @@ class SquareLine(PlaneLine):
 
     lamp: Lamp
     share: mi.Float  # 1 / probability of the emitter
-
-
-@dataclass
-class Arc:
-    """A piece of a great circle of directions."""
-
-    c: mi.Vector3f
-    w: mi.Vector3f  # the direction in which it leaves its centre
-    pdf: mi.Float  # density of the centre
-    begin: mi.Float
-    end: mi.Float
-
-    def at(self, t: mi.Float) -> mi.Vector3f:
-        return self.c * dr.cos(t) + self.w * dr.sin(t)
 
 
 @dr.syntax
@@ -237,33 +220,19 @@ class Hiding:
     active: mi.Bool
 
 
-def arc(seer: Seer, l: float, key: mi.UInt32, active: mi.Bool) -> tuple[Arc, mi.Bool]:
-    """An arc around a direction in which a vertex scatters, and whether there is one."""
-    numbers = Counted(key, mi.UInt32(0x100))
-    d, smooth = seer.sample(numbers.next_1d(), numbers.next_2d())
-    evenly = numbers.next_1d() < EVENLY
-    d = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), d)
-    ok = active & (evenly | smooth)
-    pdf = dr.lerp(seer.towards(d, ok)[1], dr.inv_four_pi, EVENLY)
-    c = dr.select(ok, d, mi.Vector3f(0, 0, 1))
-    turn = dr.two_pi * numbers.next_1d()
-    w = mi.Frame3f(c).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
-    return Arc(c, w, dr.select(ok, pdf, 1), mi.Float(-0.5 * l), mi.Float(0.5 * l)), ok
-
-
 def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
     """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides: see `Search`.
 
     Detached.
     """
-    line, ok = arc(seer, l, key, x.active)
+    line, ok = arc(seer, l, walk.traits.narrow or walk.media is not None, key, x.active)
 
     def look(line: Arc, t: mi.Float, active: mi.Bool) -> Sight:
         ray = seer.origin.spawn_ray(line.at(t))
         first = seer.hit(ray, active & seer.may_scatter(ray.d))
         seen = seer.behind(ray, first, active)
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
-        turned = dr.select(dr.dot(at.sh_frame.n, ray.d) > 0, mi.UInt32(1), 0)
+        turned = dr.select(turned_away(at, ray.d), mi.UInt32(1), 0)
         place = dr.select(seer.keeps, place_met(walk, seen, active), place_met(walk, seen, active, facets=False))
         facets = ~seer.keeps & jumps_at_facets(walk.traits.tables.blend_lengths, seer.origin, seen, at.p, at.n)
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
@@ -275,7 +244,7 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
         return dr.select(_counts(walk, x, seen), sight, dark)
 
     if search.chosen is None:
-        return glance(look, line, ok)
+        return glance(look, line, ok) * line.importance()
     found = search.closer(look, line, ok)
     active = found.weight > 0
     rays = [seer.origin.spawn_ray(line.at(t)) for t in (found.a, found.b)]
@@ -296,7 +265,7 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
     steep = dr.select(bent, dr.dot(slope, n), 1)
     f, pdf = seer.towards(ray_far.d, active)
-    common = x.β * f * (0.5 * dr.pi / l * found.weight / line.pdf)
+    common = x.β * f * (0.5 * dr.pi * found.weight * line.weight(seer, density_of_samples(pdf), active))
     active &= dr.any(common != 0)
     arrivals, depth = [seer.arrival(ray_near, near, pdf), seer.arrival(ray_far, far, pdf)], x.depth + 1
     T, arrivals = seer.onward(arrivals, SHORT_OF * edge.t, key, active & through)

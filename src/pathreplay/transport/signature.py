@@ -39,6 +39,14 @@ def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:
     return h ^ (h >> 15)
 
 
+def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
+    """Whether a ray along ``d`` meets a mesh where its shading normal points along it, so that it is dark there.
+
+    Other shapes turn away on their limb only, and there by rounding: what lies there is an outline, and nothing else.
+    """
+    return si.shape.is_mesh() & (dr.dot(si.sh_frame.n, d) > 0)
+
+
 def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
     """A unit vector normal to the ray and to the border of the shape that it just met, on which the hit all but lies.
 

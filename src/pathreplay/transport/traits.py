@@ -68,7 +68,8 @@ class Traits:
     painted_meshes: bool  # there are meshes that emit, with a texture
     two_sides: bool  # a surface may have another BSDF on its back
     masks_mirrors: bool  # a mask lies over delta lobes
-    glossy: bool  # a surface may have a narrow smooth lobe, and no texture has seams
+    narrow: bool  # a surface may have a narrow smooth lobe
+    glossy: bool  # a surface may have a narrow smooth lobe, and no texture has a seam that it would slide over
     outlines: bool  # a point of a surface may see where a shape, a lamp or a texture ends
     tables: Tables = None  # type: ignore[assignment]  # of single BSDFs and shapes; of now, as all that follows
     # What has gradients:
@@ -105,7 +106,8 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         painted_meshes=any(is_painted(lamp.emitter()) for lamp in _mesh_lamps(shapes)),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
-        glossy=_is_glossy(bsdfs, nodes),
+        narrow=_is_narrow(bsdfs),
+        glossy=_is_narrow(bsdfs) and not any(node.class_name() == CHECKERED for node in nodes),
         outlines=not _seamless(shapes, nodes),
     )
 
@@ -239,10 +241,9 @@ def is_painted(emitter: mi.Emitter | mi.EmitterPtr) -> bool | mi.Bool:
     return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 
-def _is_glossy(bsdfs: list[mi.BSDF], nodes: set[mi.Object]) -> bool:
-    """Whether a surface may have a narrow smooth lobe, and no texture has a seam that such lobes would slide over."""
-    narrow = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) and b.class_name() not in DULL for b in bsdfs)
-    return narrow and not any(node.class_name() == CHECKERED for node in nodes)
+def _is_narrow(bsdfs: list[mi.BSDF]) -> bool:
+    """Whether a surface may have a narrow smooth lobe."""
+    return any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) and b.class_name() not in DULL for b in bsdfs)
 
 
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
