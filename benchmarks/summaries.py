@@ -53,7 +53,7 @@ def _media(record: Record) -> str:
 
 def _edges(record: Record) -> str:
     """What edges cost, scene by scene."""
-    return edges.costs(edges.by_job([point for point in record.points if ", " not in point.method]))
+    return edges.costs(edges.by_job([point for point in edges.timed(record) if ", " not in point.method]))
 
 
 def _depth(record: Record) -> str:
@@ -111,4 +111,4 @@ SUMMARIES: dict[str, tuple[str, Callable[[Record], str]]] = {
         (truth.TITLE, _truth),
         (edges.TITLE, _edges),
     )
-} | {"wrong-summary": (truth.TITLE, _wrong)}
+} | {"wrong-summary": (truth.TITLE, _wrong), "worth-summary": (edges.TITLE, edges.worth)}

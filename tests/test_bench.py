@@ -20,9 +20,10 @@ from benchmarks import drafts, pages, plots, records, runner, summaries, tables 
 from benchmarks.__main__ import TASKS, main  # noqa: E402
 from benchmarks.compare import Row, compare  # noqa: E402
 from benchmarks.measures.job import Job, Machine, Point, Record  # noqa: E402
+from benchmarks.measures.methods import DIFFERENCE  # noqa: E402
 from benchmarks.measures.replay_error import SWEEP  # noqa: E402
 from benchmarks.measures.worker import MEASURES, told  # noqa: E402
-from benchmarks.tasks import depth, iteration, media, noise, scale, surface, truth  # noqa: E402
+from benchmarks.tasks import depth, edges, iteration, media, noise, scale, surface, truth  # noqa: E402
 
 MACHINE = Machine("a processor", 2, 2, "Linux", "3.11", "3.9.1", "1.5.0", "0.1.0", "23.1.4", "llvm_ad_rgb")
 ROUNDS = 12
@@ -234,6 +235,26 @@ def test_recorded_steps_with_edges_are_measured(tmp_path: Path) -> None:
     measured = runner.run_jobs("edges", [job], drafts.Draft(tmp_path / "draft.json"))
     assert [point.method for point in measured.points] == list(job.methods)
     assert [point.error for point in measured.points] == [None] * len(job.methods)
+
+
+@pytest.mark.slow
+def test_a_number_is_measured_beside_a_central_difference(tmp_path: Path) -> None:
+    job = next(job for job in TASKS["edges"].jobs(quick=True) if job.measure == "number")
+    measured = runner.run_jobs("edges", [replace(job, rounds=2, spp=4)], drafts.Draft(tmp_path / "draft.json"))
+    assert [point.error for point in measured.points] == [None, None]
+    assert all(len(point.squared_errors) == 2 for point in measured.points)
+
+
+def test_a_number_is_as_noisy_as_its_variance_over_that_of_a_difference() -> None:
+    def found(method: str, *errors: float) -> Point:
+        return replace(point(method), scene="head turns", measure="number", squared_errors=errors)
+
+    pair = (found(DIFFERENCE, 1, 2, 3), found(edges.OURS, 1, 1, 10))
+    row = edges.worth(record(*pair, task="edges")).splitlines()[-1]
+    assert row.startswith("| head turns | 2.00 [") and row.endswith("| 0.50 | 83% |")
+    failed = edges.worth(record(pair[0], replace(pair[1], squared_errors=(), error="died: SIGKILL"), task="edges"))
+    assert "died: SIGKILL" in failed
+    assert "head turns" not in edges.costs(edges.by_job(edges.timed(record(*pair, task="edges"))))
 
 
 def test_a_cause_of_death_fits_into_a_table() -> None:

@@ -1,4 +1,4 @@
-"""One derivative by what moves in a scene, in parts: what task `edges` measures.
+"""One derivative by what moves in a scene, in parts or beside a finite difference: what task `edges` measures.
 
 Seconds are those of kernels, as Dr.Jit keeps them, for a method by itself; of the clock, for one that is `recorded`.
 """
@@ -13,13 +13,15 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.check.objective import Objective, smooth_weights
+from pathreplay.check.stencil import CENTRAL
 from pathreplay.inverse.losses import l2
 from pathreplay.inverse.recorded import Recordings, differentiate
 from pathreplay.render.boundary import Boundary
 
 from ..scenes import SCENES
+from ..scenes.movers import MOVERS
 from .job import Job
-from .methods import METHODS, RECORDED, TRACED, parts
+from .methods import DIFFERENCE, METHODS, RECORDED, TRACED, parts
 from .scene import stopwatch
 from .spread import spreads
 
@@ -28,6 +30,8 @@ PARTS = {"film edges alone": {"inner": False}, "inner edges alone": {"film": Fal
 #: Around which axis vertices turn, by scene.
 AXES = {"shadow": (0, 0, 1)}
 UPRIGHT = (0, 1, 0)
+#: Of finite differences.
+PICTURES = {"type": "path"}
 
 
 class EdgePass:
@@ -89,6 +93,43 @@ class EdgePass:
             if name in PARTS:
                 self.integrators[name].interior = Boundary(**PARTS[name])
         return self.integrators[name]
+
+    def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
+        """What the derivatives of all seeds say: see `spread`."""
+        return spreads(kept, None, ())
+
+
+class NumberPass:
+    """Each call gives the derivative by one number, of the image weighted by a wave: see `job.Measure`.
+
+    A gradient pass has ``job.spp`` samples a pixel, and so has each of the two pictures of a central difference, whose
+    random numbers are the same. Both are as people have them: ours with its own numbers, pictures by Mitsuba's `path`.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self.job, self.mover = job, MOVERS[job.scene]
+        scene = mi.load_dict(self.mover.scene(job.resolution), optimize=False)
+        (key,) = job.parameters
+        self.objective = Objective(scene, mi.traverse(scene), key, self.mover.move)
+        self.objective.weigh(smooth_weights((job.resolution, job.resolution, 3), alpha=False))
+        self.forget()
+
+    def forget(self) -> None:
+        """Make all integrators anew."""
+        self.integrators: dict[str, Any] = {
+            name: mi.load_dict((PICTURES if name == DIFFERENCE else METHODS[name]) | self.job.limits)
+            for name in self.job.methods
+        }
+
+    def __call__(self, method: str, seed: int) -> tuple[float, np.ndarray]:
+        """Seconds by the clock, and the derivative."""
+        run = self._difference if method == DIFFERENCE else self.objective.backward
+        seconds, value = stopwatch(lambda: run(self.integrators[method], seed, self.job.spp))
+        return seconds, np.array([value])
+
+    def _difference(self, integrator: Any, seed: int, spp: int) -> float:
+        objective = self.objective
+        return objective.dot(objective.difference(integrator, CENTRAL, self.mover.step, seed, spp))
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
         """What the derivatives of all seeds say: see `spread`."""

@@ -17,6 +17,7 @@ Kind = Literal[
     "noise",  # the error of a replay
     "step",  # an optimisation step
     "edges",  # a derivative by what moves, in parts
+    "number",  # a derivative by one number that moves something
     "cold start",  # the start of a process, without cached kernels
     "warm start",  # and with them
     "flight",  # way to the first real collision in a grid

@@ -13,6 +13,7 @@ METHODS: dict[str, dict[str, object]] = {
     "rb linear": {"type": "pathreplay_rb", "linear": True},
     "sweep": {"type": "pathreplay", "driver": "sweep", "numbers": "scene", "edges": "none"},
     "replay": {"type": "pathreplay", "driver": "replay", "numbers": "scene", "edges": "none"},
+    "edges and interior": {"type": "pathreplay", "edges": "all"},
     "film edges": {"type": "pathreplay", "edges": "film", "numbers": "scene"},
     "all edges": {"type": "pathreplay", "edges": "all", "numbers": "scene"},
     "prb_projective": {"type": "prb_projective"},
@@ -39,8 +40,12 @@ STOCK = (
     "prbvolpath",
     "volpath",
     "finite differences",
+    "central difference",
     "half steps",
 )
+
+#: Two pictures with the same random numbers, as one does without gradients.
+DIFFERENCE = "central difference"
 
 #: Ways: the loop of an optimisation step, whether a step was recorded, and what a new process does first.
 USUAL, OWN = "usual loop", "own loop"

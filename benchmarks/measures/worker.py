@@ -32,6 +32,7 @@ MEASURES: dict[Kind, tuple[str, str]] = {
     "noise": ("replay_error", "ReplayError"),
     "step": ("step", "Step"),
     "edges": ("edges", "EdgePass"),
+    "number": ("edges", "NumberPass"),
     "cold start": ("start", "Start"),
     "warm start": ("start", "Start"),
     "flight": ("grids", "Flight"),

@@ -36,11 +36,11 @@ def _paint(*value: float) -> SceneDict:
 
 
 def _box(bsdf: SceneDict) -> mi.Mesh:
-    return _mesh(*_cube(), [0.1, 0.1, 0], 0.4, bsdf, flat=True)
+    return mesh_of(*_cube(), [0.1, 0.1, 0], 0.4, bsdf, flat=True)
 
 
 def _ears(bsdf: SceneDict) -> mi.Mesh:
-    return _mesh(*_ball_with_ears(LUMPS), [0.1, 0, 0], 0.4, bsdf, flat=False)
+    return mesh_of(*ball_with_bumps(LUMPS, *EARS), [0.1, 0, 0], 0.4, bsdf, flat=False)
 
 
 def _cube() -> tuple[np.ndarray, np.ndarray]:
@@ -50,8 +50,13 @@ def _cube() -> tuple[np.ndarray, np.ndarray]:
     return corners, np.array([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))])
 
 
-def _ball_with_ears(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points of a spiral on the sphere, their hull, and then bumps and two ears: closed, and it hides itself."""
+Bump = tuple[tuple[float, float, float], float, float]
+"""Where it is, how high, and how wide, squared."""
+EARS: tuple[Bump, ...] = tuple(((side, 0.8, 0.2), 0.9, 0.06) for side in (-0.5, 0.5))
+
+
+def ball_with_bumps(n: int, *bumps: Bump) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a spiral on the sphere, their hull, and then waves and bumps: closed, and it hides itself."""
     z = 1 - (2 * np.arange(n) + 1) / n
     turn = np.pi * (1 + np.sqrt(5)) * np.arange(n)
     points = np.stack([*(np.sqrt(1 - z * z) * f(turn) for f in (np.cos, np.sin)), z], -1)
@@ -60,13 +65,13 @@ def _ball_with_ears(n: int) -> tuple[np.ndarray, np.ndarray]:
     inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0
     faces[inward] = faces[inward][:, ::-1]
     radius = 1 + 0.1 * np.sin(5 * points[:, 0]) * np.cos(4 * points[:, 1])
-    for side in (-0.5, 0.5):
-        ear = np.array([side, 0.8, 0.2]) / np.linalg.norm([side, 0.8, 0.2])
-        radius += 0.9 * np.exp(-np.sum((points - ear) ** 2, -1) / 0.06)
+    for at, height, width in bumps:
+        middle = np.array(at) / np.linalg.norm(at)
+        radius += height * np.exp(-np.sum((points - middle) ** 2, -1) / width)
     return points * radius[:, None], faces
 
 
-def _mesh(
+def mesh_of(
     vertices: np.ndarray, faces: np.ndarray, at: list[float], size: float, bsdf: SceneDict, flat: bool
 ) -> mi.Mesh:
     props = mi.Properties()
@@ -83,7 +88,7 @@ def _mesh(
 
 
 EDGE_SCENES: dict[str, Callable[[int], SceneDict]] = {
-    "shadow": lambda n: _room(n, 30, object=_mesh(*_cube(), [1.3, 0.9, 1.2], 0.25, _paint(0, 0, 0), flat=True)),
+    "shadow": lambda n: _room(n, 30, object=mesh_of(*_cube(), [1.3, 0.9, 1.2], 0.25, _paint(0, 0, 0), flat=True)),
     "silhouette": lambda n: _room(n, 45, object=_box(_paint(0.5, 0.5, 0.2))),
     "ears": lambda n: _room(n, 45, object=_ears(_paint(0.5, 0.5, 0.2))),
     "black silhouette": lambda n: _room(n, 45, glows=True, object=_box(_paint(0, 0, 0))),

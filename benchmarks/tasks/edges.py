@@ -3,6 +3,9 @@
 Seconds are those of kernels. The parts of ours, and those of `prb_projective`, are gradients of one thing: of what the
 camera sees, or of what surfaces see. Lists of edges are right where a mesh that is black moves before a glow: elsewhere
 they leave creases out, and shade the wrong faces (see docs/edges_peers.md).
+
+And what a derivative by one number is worth, interior and edges, beside a central difference with common random
+numbers, which is what one would do without gradients.
 """
 
 from __future__ import annotations
@@ -10,8 +13,9 @@ from __future__ import annotations
 import statistics as st
 from dataclasses import replace
 
+from ..measures.estimates import mean_ratio
 from ..measures.job import Job, Point, Record
-from ..measures.methods import RECORDED, TRACED
+from ..measures.methods import DIFFERENCE, RECORDED, TRACED
 from ..tables import comparison, markdown, method_cell
 
 TITLE = "edges"
@@ -29,8 +33,25 @@ ROUNDS, CHEAP_ROUNDS = 60, 480
 STEPS = tuple(f"{name}, {way}" for name in ("prb", "all edges") for way in (TRACED, RECORDED))
 GUIDED = 120
 """Seconds after which `prb_projective` sits out, whose guiding takes most of them."""
-SMALL, LARGE = 32, 128
+TINY, SMALL, LARGE = 16, 32, 128
 """Pixels along a side. On few the several kernels of edges do not fill the cores, as the one of `prb` does."""
+
+OURS = "edges and interior"
+PLACE, LOOK_FROM = "object.to_world", "camera.to_world"
+MOVING = {
+    "head turns": (*KEY, 3),
+    "shadow of the head": (*KEY, 3),
+    "textured ball": (PLACE, 3),
+    "heights": (*KEY, 3),
+    "camera turns": (LOOK_FROM, 3),
+    "orthographic camera": (LOOK_FROM, 3),
+    "field of view": ("camera.x_fov", 3),
+    "behind rough glass": (*KEY, 5),
+    "between walls": (*KEY, 6),
+    "ball lifts off": (PLACE, 3),
+    "small in a room": (PLACE, 3),
+}
+"""Scenes of which one number is asked: what it moves, and the depth."""
 
 
 def jobs(quick: bool) -> list[Job]:
@@ -41,7 +62,8 @@ def jobs(quick: bool) -> list[Job]:
     wanted += [(scene, ("prb", "projective inner"), GUIDED, SMALL) for scene in INNER]
     wanted += [(scene, ("prb", "edges alone"), 0.0, LARGE) for scene in INNER]
     wanted += [("ears", STEPS, 0.0, SMALL)]
-    return [
+    numbers = [by_number(scene, key, depth, quick) for scene, (key, depth) in MOVING.items()]
+    return numbers + [
         Job(
             scene=scene,
             parameters=KEY,
@@ -59,13 +81,57 @@ def jobs(quick: bool) -> list[Job]:
     ]
 
 
+def by_number(scene: str, key: str, depth: int, quick: bool) -> Job:
+    """A derivative by one number, and a central difference by the same."""
+    return Job(
+        scene=scene,
+        parameters=(key,),
+        methods=(DIFFERENCE, OURS),
+        max_depth=depth,
+        rr_depth=100,
+        resolution=TINY,
+        spp=16 if quick else 64,
+        rounds=4 if quick else 32,
+        warm_up=0,
+        measure="number",
+    )
+
+
 def table(record: Record) -> str:
-    """What edges cost, scene by scene; then all methods next to `prb`, and recorded steps next to their kernels."""
-    found = by_job([point for point in record.points if ", " not in point.method])
+    """What edges cost, scene by scene; then all methods next to `prb`, and recorded steps next to their kernels.
+
+    Last, derivatives by one number next to central differences.
+    """
+    found = by_job([point for point in timed(record) if ", " not in point.method])
     rows = [[p.scene, method_cell(p), *_versus(p, job.get("prb"))[:2]] for job in found for p in job.values()]
     header = ["scene", "method", "seconds of kernels (median)", "time / prb"]
-    steps = {point.method: point for point in record.points if ", " in point.method}
-    return "\n\n".join((costs(found), markdown(header, rows), _steps(steps)))
+    steps = {point.method: point for point in timed(record) if ", " in point.method}
+    return "\n\n".join((costs(found), markdown(header, rows), _steps(steps), worth(record)))
+
+
+def timed(record: Record) -> list[Point]:
+    """What was measured for its time."""
+    return [point for point in record.points if point.measure == "edges"]
+
+
+def worth(record: Record) -> str:
+    """Variance of a derivative by one number over that of a central difference, and how much of it one pass has."""
+    found: dict[str, dict[str, Point]] = {}
+    for point in record.points:
+        if point.measure == "number":
+            found.setdefault(point.scene, {})[point.method] = point
+    rows = []
+    for scene, points in found.items():
+        ours, other = points.get(OURS), points.get(DIFFERENCE)
+        if ours is None or other is None or not ours.squared_errors or not other.squared_errors:
+            rows.append([scene, *(next((p.error for p in points.values() if p.error), "not finite"), "", "")])
+            continue
+        ratio = mean_ratio(ours.squared_errors, other.squared_errors)
+        typical = st.median(ours.squared_errors) / st.median(other.squared_errors)
+        share = max(ours.squared_errors) / sum(ours.squared_errors)
+        rows.append([scene, str(ratio), f"{typical:.2f}", f"{share:.0%}"])
+    header = ["one number", "variance / central difference", "median of squared errors / the same", "largest share"]
+    return markdown(header, rows)
 
 
 def by_job(points: list[Point]) -> list[dict[str, Point]]:
