@@ -36,7 +36,7 @@ from ..transport.start import CameraStart
 from ..transport.surface import steady
 from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
-from .bends import Bend
+from .bends import Bend, off_contact
 from .centres import LOOKS, Centres
 from .counted import Counted, key_of, quasi_random
 from .crofton import Crossed, Picked, PlaneLine, Sight, bisect, glance
@@ -259,7 +259,7 @@ def _weighed(walk: Walk, full: Walk, places: Places, found: Crossed, per_line: m
     (ray_a, weight), (ray_b, _) = (places.ray(s, line.key) for s in ends)
     fork = _fork(walk, (ray_a, ray_b), line.key, active)
     active &= fork.found
-    sides, onward = [fork.a, fork.b], steadied(walk)
+    sides, onward = off_contact(walk, fork.a, fork.b, active), steadied(walk)
     if full.media is not None:
         onward, t = steadied(full), SHORT_OF * dr.minimum(fork.a.hit.t, fork.b.hit.t)
         T, medium = left_of_light(full, ray_a, line.key, fork.k, t, active)

@@ -29,7 +29,7 @@ from ..transport.start import CameraStart
 from ..transport.velocity import held_direction, jumps_at_facets, moved_direction
 from ..transport.vertex import Arrival, Flight, Walk, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
-from .bends import Bend
+from .bends import Bend, off_contact
 from .centres import LOOKS, Centres
 from .counted import Counted, key_of, quasi_random
 from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
@@ -298,7 +298,8 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
     f, pdf = seer.towards(ray_far.d, active)
     common = x.β * f * (0.5 * dr.pi / l * found.weight / line.pdf)
     active &= dr.any(common != 0)
-    arrivals, depth = [seer.arrival(ray_near, near, pdf), seer.arrival(ray_far, far, pdf)], x.depth + 1
+    arrivals = off_contact(walk, seer.arrival(ray_near, near, pdf), seer.arrival(ray_far, far, pdf), active)
+    depth = x.depth + 1
     T, arrivals = seer.onward(arrivals, SHORT_OF * edge.t, key, active & through)
     K = []
     for arrival in arrivals:
