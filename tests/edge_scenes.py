@@ -221,6 +221,28 @@ def stands_in_the_wall() -> dict:
     return scene(wall=shape(BACK, plain()), lamp=lamp(OVERHEAD), object=cube24(IN_THE_BACK, paint(0.8, 0.8, 0.3)))
 
 
+def in_a_floor(thing: Callable[[], Any]) -> Callable[[], dict]:
+    """Something that stands in a floor, under a sky: from the line of contact it overhangs."""
+    floor = T().rotate([1, 0, 0], -90).scale([4, 4, 1])
+    return lambda: {
+        "type": "scene",
+        "camera": camera((0, 1.2, 4), 30, (0, 0.3, 0)),
+        "floor": shape(floor, paint(0.5, 0.6, 0.7)),
+        "object": thing(),
+        "sky": {"type": "constant", "radiance": rgb(0.8, 0.9, 1)},
+    }
+
+
+def wide_lamp() -> dict:
+    return lamp(OVERHEAD.scale([2, 2, 1]))
+
+
+def sheet() -> dict:
+    """That lets a part of the light through."""
+    half = {"type": "mask", "opacity": 0.6, "bsdf": paint(0.6, 0.4, 0.3)}
+    return shape(SHADE.scale([0.35, 0.3, 1]), half)
+
+
 # ------------------------------ Glass and mirrors ------------------------------
 
 
@@ -345,6 +367,17 @@ INDIRECT = [
          seeds=16),
 ]  # fmt: skip
 """One bounce more."""
+TOUCHING = [
+    cell("ball_in_floor", in_a_floor(lambda: shape(T().translate([0, 0.35, 0]).scale(0.5), paint(0.7, 0.5, 0.3),
+        "sphere")), OBJECT, translate(0, 1, 0), spp=2048, reference_spp=4096, step=0.02),
+    cell("cube_in_floor", in_a_floor(lambda: cube24(T().translate([0, 0.2, 0]).rotate([1, 0.3, 0.5], 40).scale(0.4),
+        paint(0.7, 0.5, 0.3))), VERTICES, translate_vertices(0, 1, 0), 3, spp=1024, reference_spp=4096, step=0.02),
+]  # fmt: skip
+"""Bodies that stand in another."""
+VEILED = [
+    cell("veil_moves", shadow(sheet, light=wide_lamp), OBJECT, translate(*ASIDE), 3),
+]
+"""Seen through what lets a part of the light straight through."""
 BENT = [
     cell("mirror_z", mirror, "mirror.to_world", UP, 3),
     cell("mirror_x", mirror, "mirror.to_world", translate(1, 0, 0), 3),
@@ -358,4 +391,4 @@ BENT = [
 """By mirrors and through glass."""
 ALL_MOVE = cell("all_move", everything, ("wall.to_world", "lamp.to_world", "bulb.to_world", "mirror.to_world",
     "ball.to_world"), translate(*ASIDE), 3)  # fmt: skip
-BY_NAME = {each.name: each for each in (*SEEN, *SHADOWS, *INDIRECT, *BENT)}
+BY_NAME = {each.name: each for each in (*SEEN, *TOUCHING, *SHADOWS, *INDIRECT, *VEILED, *BENT)}

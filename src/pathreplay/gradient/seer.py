@@ -99,7 +99,7 @@ class Seer:
 
     def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
         """Whether a direction follows what it hits: from particles only what scatters or emits, see `scatter`."""
-        active = active & ~self.keeps
+        active = active & ~self.keeps & ~scatter.is_seen_through(self.walk, hit)
         if self.walk.media is None:
             return active
         seen = is_smooth(hit.shape.bsdf()) | (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)

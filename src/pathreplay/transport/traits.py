@@ -61,6 +61,7 @@ class Traits:
     brushed_meshes: bool  # of these, some with BSDFs that tell one tangent from another
     painted_meshes: bool  # there are meshes that emit, with a texture
     two_sides: bool  # a surface may have another BSDF on its back
+    veils: bool  # a surface may scatter some light and let some straight through
     masks_mirrors: bool  # a mask lies over delta lobes
     glossy: bool  # a surface may have a narrow smooth lobe, and no texture has seams
     outlines: bool  # a point of a surface may see where a shape, a lamp or a texture ends
@@ -98,6 +99,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         brushed_meshes=any(is_brushed(shape.bsdf()) for shape in coarse),
         painted_meshes=any(is_painted(lamp.emitter()) for lamp in _mesh_lamps(shapes)),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
+        veils=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_null(bsdf) for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         glossy=_is_glossy(bsdfs, nodes),
         outlines=not _seamless(shapes, nodes),
