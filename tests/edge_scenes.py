@@ -92,6 +92,20 @@ def can(place: Place, bsdf: dict, n: int = 10) -> mi.Mesh:
     return mesh([*rims, *rims], [*sides, *below, *above], bsdf, smooth=True)
 
 
+def globe(place: Place, bsdf: dict, n: int = 8) -> mi.Mesh:
+    """A coarse ball with a seam from pole to pole, as programs export it: the last bits of its two sides differ."""
+    a, b = np.meshgrid(np.linspace(0, 2 * np.pi, n + 1), np.linspace(0, np.pi, n // 2 + 1), indexing="ij")
+    unit = np.stack([np.cos(a) * np.sin(b), np.cos(b), np.sin(a) * np.sin(b)], -1).astype(np.float32).reshape(-1, 3)
+    m = n // 2 + 1
+    p = np.add.outer(m * np.arange(n), np.arange(m - 1)).ravel()
+    faces = np.concatenate([np.stack([p, p + m + 1, p + m], 1), np.stack([p, p + 1, p + m + 1], 1)])
+    corners = unit[faces]
+    faces = faces[np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > 1e-3]
+    positions = np.array([place @ mi.ScalarPoint3f(*q) for q in unit], np.float32).reshape(-1, 3)
+    positions[-m:] = np.nextafter(positions[-m:], np.float32(1))
+    return mesh(positions, faces, bsdf, smooth=True)
+
+
 def cube24(place: Place, bsdf: dict) -> dict:
     """The same as Mitsuba has it: every face has vertices of its own."""
     return shape(place, bsdf, "cube", face_normals=True)
@@ -106,6 +120,7 @@ def sky() -> dict:
 
 CARD = T().translate([0.7, 0.5, 0.9]).rotate([0, 0, 1], 20).scale([0.35, 0.3, 1])
 BOX = T().translate([0.1, 0.1, 0]).rotate([1, 0.4, 0], 30).scale(0.4)
+TURNED = T().translate([0.1, 0.1, 0]).rotate([0, 1, 0], -70).scale(0.6)
 OVERHEAD = T().translate([1.6, 1.2, 2.5]).look_at([0, 0, 0], [-1.6, -1.2, -3.5], [0, 1, 0]).scale([0.5, 0.5, 1])
 
 
@@ -192,6 +207,24 @@ def copies_shade() -> dict:
     group = {"type": "shapegroup", "box": box}
     copy = {"type": "instance", "to_world": SHADE, "group": {"type": "ref", "id": "group"}}
     return scene(30, wall=shape(BACK, patterned()), lamp=lamp(OVERHEAD), group=group, copy=copy)
+
+
+def copied(thing: dict, place: Place) -> dict:
+    """The parts of a scene that has a copy of something; its name is 'group.thing'."""
+    copy = {"type": "instance", "to_world": place, "group": {"type": "ref", "id": "group"}}
+    return {"group": {"type": "shapegroup", "thing": thing}, "copy": copy}
+
+
+def copy_is_shaded() -> dict:
+    card = shape(SHADE.scale([0.35, 0.3, 1]), BLACK)
+    return scene(30, lamp=lamp(OVERHEAD), object=card, **copied(shape(T().scale([6, 6, 1]), patterned()),
+                 T().translate([0, 0, -1])))  # fmt: skip
+
+
+def copy_has_creases() -> dict:
+    """No side of the cube hides the lamp from the others."""
+    box = copied(cube24(T(), paint(0.5, 0.5, 0.2)), BOX)
+    return scene(lamp=lamp(T().translate([0.1, 0.2, 4.5]).rotate([0, 1, 0], 180).scale([0.5, 0.5, 1])), **box)
 
 
 def by_a_side_wall(wall: Callable[[], dict], side: Callable[[], dict]) -> Callable[[], dict]:
@@ -335,6 +368,9 @@ SEEN = [
          spp=1024, seeds=24),
     cell("brushed_can_seen", can_from_near(BRUSHED), VERTICES, translate_vertices(1, 0.3, 0.4), step=0.002, spp=1024,
          seeds=24),
+    cell("globe_moves", lit_box(lambda place, bsdf: globe(TURNED, bsdf)),
+         VERTICES, translate_vertices(*ASIDE), spp=512),
+    cell("copy_has_creases", copy_has_creases, "group.thing.vertex_positions", translate_vertices(1, 0.3, 0)),
     cell("camera_moves", before_a_glow(lambda: shape(CARD, BLACK)), "camera.to_world", translate(*ASIDE)),
     cell("lamp_seen", lamp_seen, "lamp.to_world", translate(*ASIDE)),
 ]  # fmt: skip
@@ -348,6 +384,7 @@ SHADOWS = [
     cell("shadow_cube8", shadow(lambda: cube8(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
     cell("shadow_cube24", shadow(lambda: cube24(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
     cell("shadow_copy", copies_shade, "group.box.vertex_positions", translate_vertices(*ASIDE)),
+    cell("copy_is_shaded", copy_is_shaded, OBJECT, translate(*ASIDE)),
     cell("sphere_lamp", shadow(light=ball_lamp), "lamp.to_world", translate(*ASIDE)),
     cell("shadow_env", shadow_of_sky, OBJECT, translate(*ASIDE)),
     cell("shadow_painted", shadow(light=painted_lamp), "lamp.vertex_positions", turn_vertices(0.3, 1, 0.2)),

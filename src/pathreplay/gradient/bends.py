@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.signature import place_met
+from ..transport.signature import place_met, shape_met
 from ..transport.vertex import Arrival, Walk
 from .crofton import at_an_angle, hides_itself
 
@@ -43,7 +43,7 @@ class Bend:
         flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
         si_a, si_b = (x.compute_surface_interaction(ray, flags, both) for x, ray in sides)
         meets = both & at_an_angle(si_a.n, si_b.n) & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
-        same = both & (place_met(walk, a, both) == place_met(walk, b, both))
+        same = both & (place_met(walk, a, both, si_a.shape) == place_met(walk, b, both, si_b.shape))
         dark = [dr.dot(si.sh_frame.n, ray.d) > 0 for si, (_, ray) in zip((si_a, si_b), sides, strict=True)]
         turns = same & (dark[0] != dark[1]) & ~hides_itself(si_a.p, si_a.n, si_b.p, si_b.n)
         return Bend(a, b, meets, turns)
@@ -87,5 +87,6 @@ def _towards(walk: Walk, at: Arrival, p: mi.Point3f, short: mi.Float, active: mi
     rest.o, rest.maxt = ray.o + gone * ray.d, dr.inf
     hit = walk.scene.ray_intersect_preliminary(rest, coherent=False, reorder=False, active=active)
     hit.t += gone
-    same = active & (place_met(walk, hit, active) == place_met(walk, at.hit, active))
+    places = [place_met(walk, h, active, shape_met(walk, h, r, active)) for h, r in ((hit, ray), (at.hit, at.ray))]
+    same = active & (places[0] == places[1])
     return dr.select(same, replace(at, ray=ray, hit=hit), at)

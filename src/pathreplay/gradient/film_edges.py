@@ -31,7 +31,7 @@ from ..transport.emitters import draw_emitter
 from ..transport.motion import may_move
 from ..transport.passage import SHORT_OF, beyond_null
 from ..transport.path import PathState
-from ..transport.signature import edge_normal, mixed, outline_gap, place_met
+from ..transport.signature import edge_normal, mixed, outline_gap, place_met, shape_met
 from ..transport.start import CameraStart
 from ..transport.surface import steady
 from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
@@ -72,12 +72,17 @@ class Fork:
 
 @dataclass
 class Shade:
-    """What is between a point and a light without extent."""
+    """What keeps a light without extent from a point: something between, or the border of a projector's picture."""
 
     u: mi.Point2f  # which light
     ray: mi.Ray3f  # towards it
     hit: mi.PreliminaryIntersection3f
-    hidden: mi.Bool
+    outside: mi.Bool  # of the picture
+    uv: mi.Point2f  # place in it
+
+    @property
+    def dark(self) -> mi.Bool:
+        return self.outside | self.hit.is_valid()
 
 
 @dataclass
@@ -90,7 +95,7 @@ class FilmCrossing:
     near: Arrival
     bend: Bend
     n: mi.Vector3f
-    shadow: mi.Bool  # it is the border of a hard shadow
+    shadow: mi.Bool  # it is the border of a hard shadow, or of a picture that is thrown
     shade: Shade | None
     jump: mi.Spectrum  # (f_a - f_b) · π/2 / (l p(c) N)
     active: mi.Bool
@@ -160,9 +165,9 @@ def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> 
         moves |= may_move(walk, path.at.hit)
         here = dr.select(moves, _sight(walk, path, key, path.active), Sight.nothing())
         if dr.hint(walk.traits.hard_lights, mode="scalar"):
-            hidden = _shade(walk, path.at, key, path.depth, path.active).hidden
-            here.signature = mixed(here.signature, dr.select(hidden, mi.UInt32(1), 0))
-        path.active &= _slides(path.at.hit)
+            dark = _shade(walk, path.at, key, path.depth, path.active).dark
+            here.signature = mixed(here.signature, dr.select(dark, mi.UInt32(1), 0))
+        path.active &= _slides(walk, path.at)
         u, step = path.choose(walk, numbers)
         step.active &= step.kept.delta
         lobe = dr.select(step.active, step.kept.lobe + 1, 0)
@@ -176,7 +181,7 @@ def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sigh
     flags = mi.RayFlags.All if walk.traits.coarse_meshes else mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
     si = at.hit.compute_surface_interaction(at.ray, flags, active)
     kind = dr.select(dr.dot(si.sh_frame.n, at.ray.d) > 0, mi.UInt32(1), 0)
-    sight = Sight(mixed(place_met(walk, at.hit, active), kind), si.p, si.n)
+    sight = Sight(mixed(place_met(walk, at.hit, active, si.shape), kind), si.p, si.n)
     if not walk.traits.coarse_meshes:
         return sight
     triangle = dr.select(si.is_valid() & si.shape.is_mesh(), at.hit.prim_index + 1, 0)
@@ -198,13 +203,14 @@ def _directions(
     return to_light, dr.select(dr.any(weight != 0), si.to_world(lobe.wo), 0)
 
 
-def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+def _slides(walk: Walk, at: Arrival) -> mi.Bool:
     """Whether paths may be reflected or refracted there without being scattered."""
-    return hit.is_valid() & mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Delta)
+    valid = at.hit.is_valid()
+    return valid & mi.has_flag(shape_met(walk, at.hit, at.ray, valid).bsdf().flags(), mi.BSDFFlags.Delta)
 
 
 def _shade(walk: Walk, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Bool) -> Shade:
-    """What is between the k-th vertex and the light that is sampled there, if that has no extent."""
+    """What keeps the light that is sampled at the k-th vertex from it, if that has no extent."""
     u = Numbers.draw(Counted.at_vertex(key, k)).light
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
     light, lit = _light(walk, si, u, k, active)
@@ -212,16 +218,24 @@ def _shade(walk: Walk, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Boo
     hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, active=lit & light.delta)
     if walk.clear:
         hit = beyond_null(walk.scene, ray, hit, lit)
-    return Shade(u, ray, hit, hit.is_valid())
+    outside = mi.Bool(False)
+    for projector in walk.traits.projectors:
+        outside |= (light.pdf == 0) & (light.emitter == mi.EmitterPtr(projector))
+    return Shade(u, ray, hit, outside & _scatters(walk, si, k, active), light.uv)
 
 
 def _light(
     walk: Walk, si: mi.SurfaceInteraction3f, u: mi.Point2f, k: mi.UInt32, active: mi.Bool
 ) -> tuple[mi.DirectionSample3f, mi.Bool]:
     """The emitter sample of the k-th vertex, and whether there is any."""
-    lit = active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < walk.max_depth)
+    lit = _scatters(walk, si, k, active)
     light, _ = draw_emitter(walk.scene, si, u, lit, visible=False)
     return light, lit & (light.pdf != 0)
+
+
+def _scatters(walk: Walk, si: mi.SurfaceInteraction3f, k: mi.UInt32, active: mi.Bool) -> mi.Bool:
+    """Whether the k-th vertex scatters light of emitters."""
+    return active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < walk.max_depth)
 
 
 @dr.syntax
@@ -233,7 +247,7 @@ def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: m
     found = active & _sight(walk, a, key, active).differs(_sight(walk, b, key, active))
     go_on = active & ~found
     while dr.hint(go_on, exclude=[walk], label="pathreplay: fork"):
-        go_on &= _slides(a.at.hit)
+        go_on &= _slides(walk, a.at)
         a.active, b.active = mi.Bool(go_on), mi.Bool(go_on)
         u_a, step_a = a.choose(walk, numbers_a)
         u_b, step_b = b.choose(walk, numbers_b)
@@ -248,7 +262,7 @@ def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: m
     fork = Fork(a.depth, a.at, b.at, a.β, found)
     if dr.hint(walk.traits.hard_lights, mode="scalar"):
         fork.shade_a, fork.shade_b = (_shade(walk, at, key, fork.k, active & ~found) for at in (a.at, b.at))
-        fork.found |= fork.shade_a.hidden != fork.shade_b.hidden
+        fork.found |= fork.shade_a.dark != fork.shade_b.dark
     return fork
 
 
@@ -273,15 +287,15 @@ def _weighed(walk: Walk, full: Walk, places: Places, found: Crossed, per_line: m
 
     near_a, shadow = fork.a.hit.t <= fork.b.hit.t, mi.Bool(False)
     if fork.shade_a is not None:
-        shadow = fork.shade_a.hidden != fork.shade_b.hidden
-        near_a = dr.select(shadow, fork.shade_a.hidden, near_a)
+        shadow = fork.shade_a.dark != fork.shade_b.dark
+        near_a = dr.select(shadow, fork.shade_a.dark, near_a)
     near = dr.select(near_a, fork.a, fork.b)
     shade = None if fork.shade_a is None else dr.select(near_a, fork.shade_a, fork.shade_b)
     active &= near.hit.is_valid()
     bend = Bend.of(walk, ((fork.a.hit, fork.a.ray), (fork.b.hit, fork.b.ray)), active & ~shadow)
     n = edge_normal(near.hit, near.ray, active)
     if shade is not None:
-        n = dr.select(shadow, edge_normal(shade.hit, shade.ray, active & shadow), n)
+        n = dr.select(shadow, edge_normal(shade.hit, shade.ray, active & shadow & ~shade.outside), n)
     s = dr.select(near_a, *ends)
     return FilmCrossing(line, s, fork.k, near, bend, n, shadow, shade, jump, active)
 
@@ -298,7 +312,13 @@ def _shadow_gap(walk: Walk, c: FilmCrossing, shade: Shade, ray: mi.Ray3f) -> mi.
     active = c.active & c.shadow
     si = c.near.hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
     light, _ = walk.scene.sample_emitter_direction(si, shade.u, False, active)
-    return outline_gap(c.n, si.p, light.d, shade.hit, shade.ray, active)
+    shadow = outline_gap(c.n, si.p, light.d, shade.hit, shade.ray, active & ~shade.outside)
+    if not walk.traits.projectors:
+        return shadow
+    beyond = (shade.uv.x < 0) | (shade.uv.x > 1)
+    place = dr.select(beyond, light.uv.x, light.uv.y)
+    border = dr.select(dr.select(beyond, shade.uv.x, shade.uv.y) > 0.5, mi.Float(1), 0)
+    return dr.select(active & shade.outside, place - border, shadow)
 
 
 @dr.syntax

@@ -24,7 +24,7 @@ import mitsuba as mi
 from ..transport.motion import may_move
 from ..transport.passage import SHORT_OF
 from ..transport.path import PathState
-from ..transport.signature import edge_normal, mixed, outline_gap, place_met
+from ..transport.signature import edge_normal, mixed, outline_gap, place_met, shape_met
 from ..transport.start import CameraStart
 from ..transport.velocity import held_direction, jumps_at_facets, moved_direction
 from ..transport.vertex import Arrival, Flight, Walk, mis_weight
@@ -264,12 +264,14 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
         seen = seer.behind(ray, first, active)
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
         turned = dr.select(dr.dot(at.sh_frame.n, ray.d) > 0, mi.UInt32(1), 0)
-        place = dr.select(seer.keeps, place_met(walk, seen, active), place_met(walk, seen, active, facets=False))
+        places = [place_met(walk, seen, active, at.shape, facets) for facets in (True, False)]
+        place = dr.select(seer.keeps, *places)
         facets = ~seer.keeps & jumps_at_facets(walk.traits.tables.blend_lengths, seer.origin, seen, at.p, at.n)
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
         moves = x.moves | may_move(walk, seen)
         if walk.media is not None:  # directions follow null boundaries, too
-            place, moves = mixed(place, place_met(walk, first, active, facets=False)), moves | may_move(walk, first)
+            boundary = place_met(walk, first, active, shape_met(walk, first, ray, active), facets=False)
+            place, moves = mixed(place, boundary), moves | may_move(walk, first)
         sight = Sight(mixed(place, turned), at.p, at.n, moves)
         dark = replace(Sight.nothing(), signature=mi.UInt32(1), moves=moves)  # as nothing, a sky would be
         return dr.select(_counts(walk, x, seen), sight, dark)

@@ -28,6 +28,8 @@ from .term import Found
 
 FILM_CLOSER, INNER_CLOSER = 5, 16
 """For so many lines one is looked at closer, of those with an edge."""
+GRID = "SDFGrid"
+"""By class: its surface is neither met nor held where its outline would have to be."""
 BATCH = "BatchSensor"
 """By class: Dr.Jit ends the process where its rays are differentiated by their place."""
 FILM_LENGTH = 0.5  # pixels
@@ -84,6 +86,12 @@ class Boundary:
                 f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
                 "put its sensors into the scene one by one, or use edges = 'none'"
             )
+        for shape in walk.scene.shapes():
+            if shape.class_name() == GRID:
+                raise PathreplayError(
+                    f"edges of shape '{shape.id()}' of type 'sdfgrid' cannot be differentiated: "
+                    "put a mesh in its place, or use edges = 'none'"
+                )
         if walk.media is None:  # there boundaries that move are no vertices, and paths pass them unseen
             walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
         lines = lines_of(view, places, self.spp)
