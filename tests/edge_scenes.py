@@ -227,7 +227,17 @@ def copy_has_creases() -> dict:
     return scene(lamp=lamp(T().translate([0.1, 0.2, 4.5]).rotate([0, 1, 0], 180).scale([0.5, 0.5, 1])), **box)
 
 
-def by_a_side_wall(wall: Callable[[], dict], side: Callable[[], dict]) -> Callable[[], dict]:
+def projected() -> dict:
+    """A picture that is thrown at a wall, and ends there."""
+    turned = T().look_at([1.2, 0.8, 2.5], [0, 0, -1], [0, 1, 0])
+    return scene(
+        wall=shape(BACK, plain()),
+        lamp={"type": "projector", "to_world": turned, "fov": 25, "irradiance": {**bitmap(noise(8, 3, 2, 9)),
+              "filter_type": "bilinear"}},
+    )  # fmt: skip
+
+
+def by_a_side_wall(wall: Callable[[], dict], side: Callable[[], dict], light: dict | None = None) -> Callable[[], dict]:
     """Light that reaches the wall by another, past something that hides a part of it."""
     aside = T().translate([2.2, 0, 0]).rotate([0, 1, 0], -90).scale([2, 2, 1])
     above = T().translate([0.6, 2.6, 0.5]).look_at([0, 0, 0], [1.6, -2.4, 0], [0, 0, 1]).scale([0.4, 0.4, 1])
@@ -236,7 +246,7 @@ def by_a_side_wall(wall: Callable[[], dict], side: Callable[[], dict]) -> Callab
         30,
         wall=shape(BACK, wall()),
         side=shape(aside, side()),
-        lamp=lamp(above, 20),
+        lamp=light or lamp(above, 20),
         object=shape(card, paint(0.3)),
     )
 
@@ -371,6 +381,7 @@ SEEN = [
     cell("globe_moves", lit_box(lambda place, bsdf: globe(TURNED, bsdf)),
          VERTICES, translate_vertices(*ASIDE), spp=512),
     cell("copy_has_creases", copy_has_creases, "group.thing.vertex_positions", translate_vertices(1, 0.3, 0)),
+    cell("projector_moves", projected, "lamp.to_world", translate(*ASIDE)),
     cell("camera_moves", before_a_glow(lambda: shape(CARD, BLACK)), "camera.to_world", translate(*ASIDE)),
     cell("lamp_seen", lamp_seen, "lamp.to_world", translate(*ASIDE)),
 ]  # fmt: skip
@@ -394,6 +405,8 @@ SHADOWS = [
 INDIRECT = [
     cell("indirect", by_a_side_wall(patterned, lambda: paint(0.8, 0.7, 0.3)), OBJECT, translate(1, 0.3, 0.4), 3,
          seeds=32),
+    cell("indirect_point", by_a_side_wall(plain, lambda: paint(0.8, 0.7, 0.3),
+        {"type": "point", "position": [0.6, 2.6, 0.5], "intensity": rgb(9, 8, 7)}), OBJECT, translate(1, 0.3, 0.4), 3),
     cell("indirect_rough", by_a_side_wall(
         lambda: {"type": "twosided", "inner": {"type": "roughconductor", "alpha": 0.3}}, patterned),
         OBJECT, translate(1, 0.3, 0.4), 3, seeds=24),

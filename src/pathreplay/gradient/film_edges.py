@@ -27,20 +27,20 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.emitters import draw_emitter
 from ..transport.motion import may_move
-from ..transport.passage import SHORT_OF, beyond_null
+from ..transport.passage import SHORT_OF
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met, shape_met
 from ..transport.start import CameraStart
 from ..transport.surface import steady
-from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
+from ..transport.vertex import Arrival, Numbers, Walk
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
 from .bends import Bend, off_contact
 from .centres import LOOKS, Centres
 from .counted import Counted, key_of, quasi_random
 from .crofton import Crossed, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places, ray_to_camera
+from .hard_shadows import Shade, light_of
 from .primal import walk_on
 from .record import Layout, record, record_type
 from .through_media import clear, going_on, left_of_light
@@ -68,21 +68,6 @@ class Fork:
     found: mi.Bool
     shade_a: Shade | None = None  # where there are lights that cast hard shadows
     shade_b: Shade | None = None
-
-
-@dataclass
-class Shade:
-    """What keeps a light without extent from a point: something between, or the border of a projector's picture."""
-
-    u: mi.Point2f  # which light
-    ray: mi.Ray3f  # towards it
-    hit: mi.PreliminaryIntersection3f
-    outside: mi.Bool  # of the picture
-    uv: mi.Point2f  # place in it
-
-    @property
-    def dark(self) -> mi.Bool:
-        return self.outside | self.hit.is_valid()
 
 
 @dataclass
@@ -196,7 +181,7 @@ def _directions(
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Those of light and lobe that are sampled there; zero where nothing is scattered."""
     u, ctx = Numbers.draw(Counted.at_vertex(key, path.depth)), mi.BSDFContext()
-    light, lit = _light(walk, si, u.light, path.depth, active)
+    light, lit = light_of(walk, si, u.light, path.depth, active)
     lobe, weight = si.bsdf().sample(ctx, si, u.lobe, u.direction, active & si.is_valid())
     f = si.bsdf().eval(ctx, si, si.to_local(light.d), lit)
     to_light = dr.select(lit & dr.any(f != 0), light.d, 0)
@@ -210,32 +195,7 @@ def _slides(walk: Walk, at: Arrival) -> mi.Bool:
 
 
 def _shade(walk: Walk, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Bool) -> Shade:
-    """What keeps the light that is sampled at the k-th vertex from it, if that has no extent."""
-    u = Numbers.draw(Counted.at_vertex(key, k)).light
-    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
-    light, lit = _light(walk, si, u, k, active)
-    ray = si.spawn_ray_to(light.p)
-    hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, active=lit & light.delta)
-    if walk.clear:
-        hit = beyond_null(walk.scene, ray, hit, lit)
-    outside = mi.Bool(False)
-    for projector in walk.traits.projectors:
-        outside |= (light.pdf == 0) & (light.emitter == mi.EmitterPtr(projector))
-    return Shade(u, ray, hit, outside & _scatters(walk, si, k, active), light.uv)
-
-
-def _light(
-    walk: Walk, si: mi.SurfaceInteraction3f, u: mi.Point2f, k: mi.UInt32, active: mi.Bool
-) -> tuple[mi.DirectionSample3f, mi.Bool]:
-    """The emitter sample of the k-th vertex, and whether there is any."""
-    lit = _scatters(walk, si, k, active)
-    light, _ = draw_emitter(walk.scene, si, u, lit, visible=False)
-    return light, lit & (light.pdf != 0)
-
-
-def _scatters(walk: Walk, si: mi.SurfaceInteraction3f, k: mi.UInt32, active: mi.Bool) -> mi.Bool:
-    """Whether the k-th vertex scatters light of emitters."""
-    return active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < walk.max_depth)
+    return Shade.of(walk, at, Numbers.draw(Counted.at_vertex(key, k)).light, k, active)
 
 
 @dr.syntax
@@ -295,7 +255,7 @@ def _weighed(walk: Walk, full: Walk, places: Places, found: Crossed, per_line: m
     bend = Bend.of(walk, ((fork.a.hit, fork.a.ray), (fork.b.hit, fork.b.ray)), active & ~shadow)
     n = edge_normal(near.hit, near.ray, active)
     if shade is not None:
-        n = dr.select(shadow, edge_normal(shade.hit, shade.ray, active & shadow & ~shade.outside), n)
+        n = dr.select(shadow, shade.normal(active & shadow), n)
     s = dr.select(near_a, *ends)
     return FilmCrossing(line, s, fork.k, near, bend, n, shadow, shade, jump, active)
 
@@ -304,21 +264,9 @@ def _gap(walk: Walk, c: FilmCrossing, ray: mi.Ray3f) -> mi.Float:
     """B: zero on the edge; differentiable in the ray that arrives, and in the shapes."""
     outline = outline_gap(c.n, ray.o, ray.d, c.near.hit, ray, c.active)
     B = dr.select(c.bend.meets | c.bend.turns, c.bend.gap(ray, c.active), outline)
-    return B if c.shade is None else dr.select(c.shadow, _shadow_gap(walk, c, c.shade, ray), B)
-
-
-def _shadow_gap(walk: Walk, c: FilmCrossing, shade: Shade, ray: mi.Ray3f) -> mi.Float:
-    """The same at the border of a hard shadow."""
-    active = c.active & c.shadow
-    si = c.near.hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
-    light, _ = walk.scene.sample_emitter_direction(si, shade.u, False, active)
-    shadow = outline_gap(c.n, si.p, light.d, shade.hit, shade.ray, active & ~shade.outside)
-    if not walk.traits.projectors:
-        return shadow
-    beyond = (shade.uv.x < 0) | (shade.uv.x > 1)
-    place = dr.select(beyond, light.uv.x, light.uv.y)
-    border = dr.select(dr.select(beyond, shade.uv.x, shade.uv.y) > 0.5, mi.Float(1), 0)
-    return dr.select(active & shade.outside, place - border, shadow)
+    return (
+        B if c.shade is None else dr.select(c.shadow, c.shade.gap(walk, c.n, c.near.hit, ray, c.active & c.shadow), B)
+    )
 
 
 @dr.syntax
