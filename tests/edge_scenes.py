@@ -92,6 +92,20 @@ def can(place: Place, bsdf: dict, n: int = 10) -> mi.Mesh:
     return mesh([*rims, *rims], [*sides, *below, *above], bsdf, smooth=True)
 
 
+def globe(place: Place, bsdf: dict, n: int = 8) -> mi.Mesh:
+    """A coarse ball with a seam from pole to pole, as programs export it: the last bits of its two sides differ."""
+    a, b = np.meshgrid(np.linspace(0, 2 * np.pi, n + 1), np.linspace(0, np.pi, n // 2 + 1), indexing="ij")
+    unit = np.stack([np.cos(a) * np.sin(b), np.cos(b), np.sin(a) * np.sin(b)], -1).astype(np.float32).reshape(-1, 3)
+    m = n // 2 + 1
+    p = np.add.outer(m * np.arange(n), np.arange(m - 1)).ravel()
+    faces = np.concatenate([np.stack([p, p + m + 1, p + m], 1), np.stack([p, p + 1, p + m + 1], 1)])
+    corners = unit[faces]
+    faces = faces[np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > 1e-3]
+    positions = np.array([place @ mi.ScalarPoint3f(*q) for q in unit], np.float32).reshape(-1, 3)
+    positions[-m:] = np.nextafter(positions[-m:], np.float32(1))
+    return mesh(positions, faces, bsdf, smooth=True)
+
+
 def cube24(place: Place, bsdf: dict) -> dict:
     """The same as Mitsuba has it: every face has vertices of its own."""
     return shape(place, bsdf, "cube", face_normals=True)
@@ -106,6 +120,7 @@ def sky() -> dict:
 
 CARD = T().translate([0.7, 0.5, 0.9]).rotate([0, 0, 1], 20).scale([0.35, 0.3, 1])
 BOX = T().translate([0.1, 0.1, 0]).rotate([1, 0.4, 0], 30).scale(0.4)
+TURNED = T().translate([0.1, 0.1, 0]).rotate([0, 1, 0], -70).scale(0.6)
 OVERHEAD = T().translate([1.6, 1.2, 2.5]).look_at([0, 0, 0], [-1.6, -1.2, -3.5], [0, 1, 0]).scale([0.5, 0.5, 1])
 
 
@@ -194,7 +209,35 @@ def copies_shade() -> dict:
     return scene(30, wall=shape(BACK, patterned()), lamp=lamp(OVERHEAD), group=group, copy=copy)
 
 
-def by_a_side_wall(wall: Callable[[], dict], side: Callable[[], dict]) -> Callable[[], dict]:
+def copied(thing: dict, place: Place) -> dict:
+    """The parts of a scene that has a copy of something; its name is 'group.thing'."""
+    copy = {"type": "instance", "to_world": place, "group": {"type": "ref", "id": "group"}}
+    return {"group": {"type": "shapegroup", "thing": thing}, "copy": copy}
+
+
+def copy_is_shaded() -> dict:
+    card = shape(SHADE.scale([0.35, 0.3, 1]), BLACK)
+    return scene(30, lamp=lamp(OVERHEAD), object=card, **copied(shape(T().scale([6, 6, 1]), patterned()),
+                 T().translate([0, 0, -1])))  # fmt: skip
+
+
+def copy_has_creases() -> dict:
+    """No side of the cube hides the lamp from the others."""
+    box = copied(cube24(T(), paint(0.5, 0.5, 0.2)), BOX)
+    return scene(lamp=lamp(T().translate([0.1, 0.2, 4.5]).rotate([0, 1, 0], 180).scale([0.5, 0.5, 1])), **box)
+
+
+def projected() -> dict:
+    """A picture that is thrown at a wall, and ends there."""
+    turned = T().look_at([1.2, 0.8, 2.5], [0, 0, -1], [0, 1, 0])
+    return scene(
+        wall=shape(BACK, plain()),
+        lamp={"type": "projector", "to_world": turned, "fov": 25, "irradiance": {**bitmap(noise(8, 3, 2, 9)),
+              "filter_type": "bilinear"}},
+    )  # fmt: skip
+
+
+def by_a_side_wall(wall: Callable[[], dict], side: Callable[[], dict], light: dict | None = None) -> Callable[[], dict]:
     """Light that reaches the wall by another, past something that hides a part of it."""
     aside = T().translate([2.2, 0, 0]).rotate([0, 1, 0], -90).scale([2, 2, 1])
     above = T().translate([0.6, 2.6, 0.5]).look_at([0, 0, 0], [1.6, -2.4, 0], [0, 0, 1]).scale([0.4, 0.4, 1])
@@ -203,7 +246,7 @@ def by_a_side_wall(wall: Callable[[], dict], side: Callable[[], dict]) -> Callab
         30,
         wall=shape(BACK, wall()),
         side=shape(aside, side()),
-        lamp=lamp(above, 20),
+        lamp=light or lamp(above, 20),
         object=shape(card, paint(0.3)),
     )
 
@@ -219,6 +262,28 @@ def on_a_side_wall(thing: Callable[[], Any]) -> Callable[[], dict]:
 
 def stands_in_the_wall() -> dict:
     return scene(wall=shape(BACK, plain()), lamp=lamp(OVERHEAD), object=cube24(IN_THE_BACK, paint(0.8, 0.8, 0.3)))
+
+
+def in_a_floor(thing: Callable[[], Any]) -> Callable[[], dict]:
+    """Something that stands in a floor, under a sky: from the line of contact it overhangs."""
+    floor = T().rotate([1, 0, 0], -90).scale([4, 4, 1])
+    return lambda: {
+        "type": "scene",
+        "camera": camera((0, 1.2, 4), 30, (0, 0.3, 0)),
+        "floor": shape(floor, paint(0.5, 0.6, 0.7)),
+        "object": thing(),
+        "sky": {"type": "constant", "radiance": rgb(0.8, 0.9, 1)},
+    }
+
+
+def wide_lamp() -> dict:
+    return lamp(OVERHEAD.scale([2, 2, 1]))
+
+
+def sheet() -> dict:
+    """That lets a part of the light through."""
+    half = {"type": "mask", "opacity": 0.6, "bsdf": paint(0.6, 0.4, 0.3)}
+    return shape(SHADE.scale([0.35, 0.3, 1]), half)
 
 
 # ------------------------------ Glass and mirrors ------------------------------
@@ -313,6 +378,10 @@ SEEN = [
          spp=1024, seeds=24),
     cell("brushed_can_seen", can_from_near(BRUSHED), VERTICES, translate_vertices(1, 0.3, 0.4), step=0.002, spp=1024,
          seeds=24),
+    cell("globe_moves", lit_box(lambda place, bsdf: globe(TURNED, bsdf)),
+         VERTICES, translate_vertices(*ASIDE), spp=512),
+    cell("copy_has_creases", copy_has_creases, "group.thing.vertex_positions", translate_vertices(1, 0.3, 0)),
+    cell("projector_moves", projected, "lamp.to_world", translate(*ASIDE)),
     cell("camera_moves", before_a_glow(lambda: shape(CARD, BLACK)), "camera.to_world", translate(*ASIDE)),
     cell("lamp_seen", lamp_seen, "lamp.to_world", translate(*ASIDE)),
 ]  # fmt: skip
@@ -326,6 +395,7 @@ SHADOWS = [
     cell("shadow_cube8", shadow(lambda: cube8(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
     cell("shadow_cube24", shadow(lambda: cube24(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
     cell("shadow_copy", copies_shade, "group.box.vertex_positions", translate_vertices(*ASIDE)),
+    cell("copy_is_shaded", copy_is_shaded, OBJECT, translate(*ASIDE)),
     cell("sphere_lamp", shadow(light=ball_lamp), "lamp.to_world", translate(*ASIDE)),
     cell("shadow_env", shadow_of_sky, OBJECT, translate(*ASIDE)),
     cell("shadow_painted", shadow(light=painted_lamp), "lamp.vertex_positions", turn_vertices(0.3, 1, 0.2)),
@@ -335,6 +405,8 @@ SHADOWS = [
 INDIRECT = [
     cell("indirect", by_a_side_wall(patterned, lambda: paint(0.8, 0.7, 0.3)), OBJECT, translate(1, 0.3, 0.4), 3,
          seeds=32),
+    cell("indirect_point", by_a_side_wall(plain, lambda: paint(0.8, 0.7, 0.3),
+        {"type": "point", "position": [0.6, 2.6, 0.5], "intensity": rgb(9, 8, 7)}), OBJECT, translate(1, 0.3, 0.4), 3),
     cell("indirect_rough", by_a_side_wall(
         lambda: {"type": "twosided", "inner": {"type": "roughconductor", "alpha": 0.3}}, patterned),
         OBJECT, translate(1, 0.3, 0.4), 3, seeds=24),
@@ -345,6 +417,17 @@ INDIRECT = [
          seeds=16),
 ]  # fmt: skip
 """One bounce more."""
+TOUCHING = [
+    cell("ball_in_floor", in_a_floor(lambda: shape(T().translate([0, 0.35, 0]).scale(0.5), paint(0.7, 0.5, 0.3),
+        "sphere")), OBJECT, translate(0, 1, 0), spp=2048, reference_spp=4096, step=0.02),
+    cell("cube_in_floor", in_a_floor(lambda: cube24(T().translate([0, 0.2, 0]).rotate([1, 0.3, 0.5], 40).scale(0.4),
+        paint(0.7, 0.5, 0.3))), VERTICES, translate_vertices(0, 1, 0), 3, spp=1024, reference_spp=4096, step=0.02),
+]  # fmt: skip
+"""Bodies that stand in another."""
+VEILED = [
+    cell("veil_moves", shadow(sheet, light=wide_lamp), OBJECT, translate(*ASIDE), 3),
+]
+"""Seen through what lets a part of the light straight through."""
 BENT = [
     cell("mirror_z", mirror, "mirror.to_world", UP, 3),
     cell("mirror_x", mirror, "mirror.to_world", translate(1, 0, 0), 3),
@@ -358,4 +441,4 @@ BENT = [
 """By mirrors and through glass."""
 ALL_MOVE = cell("all_move", everything, ("wall.to_world", "lamp.to_world", "bulb.to_world", "mirror.to_world",
     "ball.to_world"), translate(*ASIDE), 3)  # fmt: skip
-BY_NAME = {each.name: each for each in (*SEEN, *SHADOWS, *INDIRECT, *BENT)}
+BY_NAME = {each.name: each for each in (*SEEN, *TOUCHING, *SHADOWS, *INDIRECT, *VEILED, *BENT)}

@@ -135,6 +135,20 @@ def test_a_mesh_falls_into_pieces_where_vertices_are_written_twice() -> None:
     assert list(np.flatnonzero(apart)) == [n - 1, n]  # the triangles at the tear
 
 
+@pytest.mark.parametrize("centre", [0.0, 50.0])
+def test_vertices_that_differ_in_their_last_bits_are_in_one_place(centre: float) -> None:
+    n = 8
+    a = np.linspace(0, 2 * np.pi, n + 1)
+    rims = [np.stack([np.cos(a), np.sin(a), 0 * a + z], 1).astype(np.float32) for z in (0, 1)]
+    positions = np.concatenate(rims) + np.float32(centre)
+    assert (positions[0] != positions[n]).any() or centre
+    positions[n] = np.nextafter(positions[n], np.float32(np.inf))
+    i = np.arange(n)
+    faces = np.concatenate([np.stack([i, i + 1, i + n + 2], 1), np.stack([i, i + n + 2, i + n + 1], 1)])
+    pieces = smooth_pieces(faces, positions)
+    assert list(np.flatnonzero(np.bincount(pieces)[pieces] == 1)) == [n - 1, n]
+
+
 def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
     """Crofton: four sides and four corners, at which two crossings of one line go unseen by its ends."""
 

@@ -39,6 +39,20 @@ def test_batch_sensors_are_refused() -> None:
         integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (1, 2, 3)), spp=1)
 
 
+@pytest.mark.slow
+def test_grids_of_distances_are_refused() -> None:
+    z, y, x = np.meshgrid(*3 * [np.linspace(-0.5, 0.5, 8)], indexing="ij")
+    grid = {"type": "sdfgrid", "grid": mi.TensorXf((np.sqrt(x * x + y * y + z * z) - 0.3)[..., None])}
+    pinhole = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])}
+    scene = mi.load_dict({**one_film(pinhole), "body": grid})
+    params = mi.traverse(scene)
+    dr.enable_grad(params["square.to_world"])
+    params.update()
+    integrator = mi.load_dict({"type": "pathreplay", "edges": "film", "max_depth": 2})
+    with pytest.raises(PathreplayError, match="shape 'body' of type 'sdfgrid'"):
+        integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (1, 2, 3)), spp=1)
+
+
 def hold(name: str, found: Measured) -> None:
     g = found.gradients
     hold_agreement(name, g, found.differences, found.transpose)

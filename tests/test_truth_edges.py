@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from edge_scenes import ALL_MOVE, BENT, SEEN
+from edge_scenes import ALL_MOVE, BENT, SEEN, TOUCHING
 from edge_truth import hold_forward, hold_gradients, hold_need, loaded, ours, some
 from truth import TRANSPOSE_MAX
 
-NAMES = pytest.mark.parametrize("name", some([*SEEN, *BENT]))
+NAMES = pytest.mark.parametrize("name", some([*SEEN, *TOUCHING, *BENT]))
 
 
 @NAMES

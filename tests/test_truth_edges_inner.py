@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from edge_scenes import BY_NAME, INDIRECT, SHADOWS
+from edge_scenes import BY_NAME, INDIRECT, SHADOWS, VEILED
 from edge_truth import backwards, hold_forward, hold_gradients, hold_need, loaded, reference, some
 from pathreplay.check.statistics import gap
 from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
@@ -17,7 +17,7 @@ from pathreplay.gradient import inner_edges, seer
 from pathreplay.render import boundary
 from pathreplay.transport import velocity
 
-NAMES = pytest.mark.parametrize("name", some([*SHADOWS, *INDIRECT]))
+NAMES = pytest.mark.parametrize("name", some([*SHADOWS, *INDIRECT, *VEILED]))
 MANY = 32
 """Passes where a small difference is to be seen, or where small lamps are looked for by chance."""
 COUNTED_TWICE = {

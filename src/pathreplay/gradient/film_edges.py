@@ -27,20 +27,20 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.emitters import draw_emitter
 from ..transport.motion import may_move
-from ..transport.passage import SHORT_OF, beyond_null
+from ..transport.passage import SHORT_OF
 from ..transport.path import PathState
-from ..transport.signature import edge_normal, mixed, outline_gap, place_met, turned_away
+from ..transport.signature import edge_normal, mixed, outline_gap, place_met, shape_met, turned_away
 from ..transport.start import CameraStart
 from ..transport.surface import steady
-from ..transport.vertex import Arrival, Numbers, Walk, is_smooth
+from ..transport.vertex import Arrival, Numbers, Walk
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
-from .bends import Bend
+from .bends import Bend, off_contact
 from .centres import LOOKS, Centres
 from .counted import Counted, key_of, quasi_random
 from .crofton import Crossed, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places, ray_to_camera
+from .hard_shadows import Shade, light_of
 from .primal import walk_on
 from .record import Layout, record, record_type
 from .through_media import clear, going_on, left_of_light
@@ -71,16 +71,6 @@ class Fork:
 
 
 @dataclass
-class Shade:
-    """What is between a point and a light without extent."""
-
-    u: mi.Point2f  # which light
-    ray: mi.Ray3f  # towards it
-    hit: mi.PreliminaryIntersection3f
-    hidden: mi.Bool
-
-
-@dataclass
 class FilmCrossing:
     """An edge on the film, and what the jump there weighs."""
 
@@ -90,7 +80,7 @@ class FilmCrossing:
     near: Arrival
     bend: Bend
     n: mi.Vector3f
-    shadow: mi.Bool  # it is the border of a hard shadow
+    shadow: mi.Bool  # it is the border of a hard shadow, or of a picture that is thrown
     shade: Shade | None
     jump: mi.Spectrum  # (f_a - f_b) · π/2 / (l p(c) N)
     active: mi.Bool
@@ -160,9 +150,9 @@ def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> 
         moves |= may_move(walk, path.at.hit)
         here = dr.select(moves, _sight(walk, path, key, path.active), Sight.nothing())
         if dr.hint(walk.traits.hard_lights, mode="scalar"):
-            hidden = _shade(walk, path.at, key, path.depth, path.active).hidden
-            here.signature = mixed(here.signature, dr.select(hidden, mi.UInt32(1), 0))
-        path.active &= _slides(path.at.hit)
+            dark = _shade(walk, path.at, key, path.depth, path.active).dark
+            here.signature = mixed(here.signature, dr.select(dark, mi.UInt32(1), 0))
+        path.active &= _slides(walk, path.at)
         u, step = path.choose(walk, numbers)
         step.active &= step.kept.delta
         lobe = dr.select(step.active, step.kept.lobe + 1, 0)
@@ -176,7 +166,7 @@ def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sigh
     flags = mi.RayFlags.All if walk.traits.coarse_meshes else mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
     si = at.hit.compute_surface_interaction(at.ray, flags, active)
     kind = dr.select(turned_away(si, at.ray.d), mi.UInt32(1), 0)
-    sight = Sight(mixed(place_met(walk, at.hit, active), kind), si.p, si.n)
+    sight = Sight(mixed(place_met(walk, at.hit, active, si.shape), kind), si.p, si.n)
     if not walk.traits.coarse_meshes:
         return sight
     triangle = dr.select(si.is_valid() & si.shape.is_mesh(), at.hit.prim_index + 1, 0)
@@ -191,37 +181,21 @@ def _directions(
 ) -> tuple[mi.Vector3f, mi.Vector3f]:
     """Those of light and lobe that are sampled there; zero where nothing is scattered."""
     u, ctx = Numbers.draw(Counted.at_vertex(key, path.depth)), mi.BSDFContext()
-    light, lit = _light(walk, si, u.light, path.depth, active)
+    light, lit = light_of(walk, si, u.light, path.depth, active)
     lobe, weight = si.bsdf().sample(ctx, si, u.lobe, u.direction, active & si.is_valid())
     f = si.bsdf().eval(ctx, si, si.to_local(light.d), lit)
     to_light = dr.select(lit & dr.any(f != 0), light.d, 0)
     return to_light, dr.select(dr.any(weight != 0), si.to_world(lobe.wo), 0)
 
 
-def _slides(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+def _slides(walk: Walk, at: Arrival) -> mi.Bool:
     """Whether paths may be reflected or refracted there without being scattered."""
-    return hit.is_valid() & mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Delta)
+    valid = at.hit.is_valid()
+    return valid & mi.has_flag(shape_met(walk, at.hit, at.ray, valid).bsdf().flags(), mi.BSDFFlags.Delta)
 
 
 def _shade(walk: Walk, at: Arrival, key: mi.UInt32, k: mi.UInt32, active: mi.Bool) -> Shade:
-    """What is between the k-th vertex and the light that is sampled there, if that has no extent."""
-    u = Numbers.draw(Counted.at_vertex(key, k)).light
-    si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
-    light, lit = _light(walk, si, u, k, active)
-    ray = si.spawn_ray_to(light.p)
-    hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, active=lit & light.delta)
-    if walk.clear:
-        hit = beyond_null(walk.scene, ray, hit, lit)
-    return Shade(u, ray, hit, hit.is_valid())
-
-
-def _light(
-    walk: Walk, si: mi.SurfaceInteraction3f, u: mi.Point2f, k: mi.UInt32, active: mi.Bool
-) -> tuple[mi.DirectionSample3f, mi.Bool]:
-    """The emitter sample of the k-th vertex, and whether there is any."""
-    lit = active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < walk.max_depth)
-    light, _ = draw_emitter(walk.scene, si, u, lit, visible=False)
-    return light, lit & (light.pdf != 0)
+    return Shade.of(walk, at, Numbers.draw(Counted.at_vertex(key, k)).light, k, active)
 
 
 @dr.syntax
@@ -233,7 +207,7 @@ def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: m
     found = active & _sight(walk, a, key, active).differs(_sight(walk, b, key, active))
     go_on = active & ~found
     while dr.hint(go_on, exclude=[walk], label="pathreplay: fork"):
-        go_on &= _slides(a.at.hit)
+        go_on &= _slides(walk, a.at)
         a.active, b.active = mi.Bool(go_on), mi.Bool(go_on)
         u_a, step_a = a.choose(walk, numbers_a)
         u_b, step_b = b.choose(walk, numbers_b)
@@ -248,7 +222,7 @@ def _fork(walk: Walk, rays: tuple[mi.Ray3f, mi.Ray3f], key: mi.UInt32, active: m
     fork = Fork(a.depth, a.at, b.at, a.β, found)
     if dr.hint(walk.traits.hard_lights, mode="scalar"):
         fork.shade_a, fork.shade_b = (_shade(walk, at, key, fork.k, active & ~found) for at in (a.at, b.at))
-        fork.found |= fork.shade_a.hidden != fork.shade_b.hidden
+        fork.found |= fork.shade_a.dark != fork.shade_b.dark
     return fork
 
 
@@ -259,7 +233,7 @@ def _weighed(walk: Walk, full: Walk, places: Places, found: Crossed, per_line: m
     (ray_a, weight), (ray_b, _) = (places.ray(s, line.key) for s in ends)
     fork = _fork(walk, (ray_a, ray_b), line.key, active)
     active &= fork.found
-    sides, onward = [fork.a, fork.b], steadied(walk)
+    sides, onward = off_contact(walk, fork.a, fork.b, active), steadied(walk)
     if full.media is not None:
         onward, t = steadied(full), SHORT_OF * dr.minimum(fork.a.hit.t, fork.b.hit.t)
         T, medium = left_of_light(full, ray_a, line.key, fork.k, t, active)
@@ -273,15 +247,15 @@ def _weighed(walk: Walk, full: Walk, places: Places, found: Crossed, per_line: m
 
     near_a, shadow = fork.a.hit.t <= fork.b.hit.t, mi.Bool(False)
     if fork.shade_a is not None:
-        shadow = fork.shade_a.hidden != fork.shade_b.hidden
-        near_a = dr.select(shadow, fork.shade_a.hidden, near_a)
+        shadow = fork.shade_a.dark != fork.shade_b.dark
+        near_a = dr.select(shadow, fork.shade_a.dark, near_a)
     near = dr.select(near_a, fork.a, fork.b)
     shade = None if fork.shade_a is None else dr.select(near_a, fork.shade_a, fork.shade_b)
     active &= near.hit.is_valid()
     bend = Bend.of(walk, ((fork.a.hit, fork.a.ray), (fork.b.hit, fork.b.ray)), active & ~shadow)
     n = edge_normal(near.hit, near.ray, active)
     if shade is not None:
-        n = dr.select(shadow, edge_normal(shade.hit, shade.ray, active & shadow), n)
+        n = dr.select(shadow, shade.normal(active & shadow), n)
     s = dr.select(near_a, *ends)
     return FilmCrossing(line, s, fork.k, near, bend, n, shadow, shade, jump, active)
 
@@ -290,15 +264,9 @@ def _gap(walk: Walk, c: FilmCrossing, ray: mi.Ray3f) -> mi.Float:
     """B: zero on the edge; differentiable in the ray that arrives, and in the shapes."""
     outline = outline_gap(c.n, ray.o, ray.d, c.near.hit, ray, c.active)
     B = dr.select(c.bend.meets | c.bend.turns, c.bend.gap(ray, c.active), outline)
-    return B if c.shade is None else dr.select(c.shadow, _shadow_gap(walk, c, c.shade, ray), B)
-
-
-def _shadow_gap(walk: Walk, c: FilmCrossing, shade: Shade, ray: mi.Ray3f) -> mi.Float:
-    """The same at the border of a hard shadow."""
-    active = c.active & c.shadow
-    si = c.near.hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
-    light, _ = walk.scene.sample_emitter_direction(si, shade.u, False, active)
-    return outline_gap(c.n, si.p, light.d, shade.hit, shade.ray, active)
+    return (
+        B if c.shade is None else dr.select(c.shadow, c.shade.gap(walk, c.n, c.near.hit, ray, c.active & c.shadow), B)
+    )
 
 
 @dr.syntax

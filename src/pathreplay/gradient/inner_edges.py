@@ -24,17 +24,18 @@ import mitsuba as mi
 from ..transport.motion import may_move
 from ..transport.passage import SHORT_OF
 from ..transport.path import PathState
-from ..transport.signature import edge_normal, mixed, outline_gap, place_met, turned_away
+from ..transport.signature import edge_normal, mixed, outline_gap, place_met, shape_met, turned_away
 from ..transport.start import CameraStart
 from ..transport.velocity import held_direction, jumps_at_facets, moved_direction
-from ..transport.vertex import Arrival, Flight, Walk, mis_weight
+from ..transport.vertex import Arrival, Flight, Numbers, Walk, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
 from .arcs import Arc, arc, density_of_samples
-from .bends import Bend
+from .bends import Bend, off_contact
 from .centres import LOOKS, Centres
 from .counted import Counted, key_of, quasi_random
 from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
 from .edges import Edges, Places
+from .hard_shadows import Shade
 from .lamps import Glimpse, Lamp, followed, glimpse
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
@@ -44,6 +45,10 @@ BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
 JUMP = 4.0
 """So many times as far from an edge as its slope says is the other end of a line where a sample of an emitter jumps."""
+BEYOND = 0x20000
+"""The first of the random numbers of what comes from beyond an edge."""
+
+
 WIDELY = 0.5
 """Share of the lines that are thrown evenly over the film: where things touch, few lines find what counts much."""
 
@@ -203,8 +208,23 @@ def shadow_weight(seer: Seer, c: Shaded) -> mi.Spectrum:
 
 
 @dataclass
+class HardShadow:
+    """Of a light without extent, on the surface that is seen at both sides: its border is crossed there."""
+
+    there: mi.Bool
+    shade: Shade  # at the side in the shadow, which is the near one
+    n: mi.Vector3f
+
+    def gap(self, walk: Walk, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+        return self.shade.gap(walk, self.n, hit, ray, active & self.there)
+
+    def slope(self, walk: Walk, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
+        return derivative_by_ray(ray, lambda ray: self.gap(walk, hit, ray, active)).d
+
+
+@dataclass
 class Hiding:
-    """A crossing on an arc: one surface hides another, or bends."""
+    """A crossing on an arc: one surface hides another, or bends, or a hard shadow ends on it."""
 
     edge: mi.PreliminaryIntersection3f  # of the one that hides
     near: mi.PreliminaryIntersection3f  # what the direction at its side hits: it, or a null boundary before it
@@ -213,6 +233,7 @@ class Hiding:
     d_far: mi.Vector3f
     n: mi.Vector3f  # from near to far
     bend: Bend
+    hard: HardShadow | None
     own: mi.Bool  # it is the plane of the seer's own triangle
     slope: mi.Float  # of its B, along n
     K_near: mi.Spectrum
@@ -227,18 +248,29 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
     """
     line, ok = arc(seer, l, walk.traits.narrow or walk.media is not None, key, x.active)
 
-    def look(line: Arc, t: mi.Float, active: mi.Bool) -> Sight:
+    hard = walk.traits.hard_lights and walk.media is None
+
+    def shade(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> Shade:
+        u = Numbers.draw(Counted(key, mi.UInt32(BEYOND))).light  # as `walk_on` draws it
+        return Shade.of(walk, seer.arrival(ray, hit, mi.Float(1)), u, x.depth + 1, active)
+
+    def look(line: Arc, t: mi.Float, active: mi.Bool, shaded: bool = hard) -> Sight:
         ray = seer.origin.spawn_ray(line.at(t))
         first = seer.hit(ray, active & seer.may_scatter(ray.d))
         seen = seer.behind(ray, first, active)
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
         turned = dr.select(turned_away(at, ray.d), mi.UInt32(1), 0)
-        place = dr.select(seer.keeps, place_met(walk, seen, active), place_met(walk, seen, active, facets=False))
+        places = [place_met(walk, seen, active, at.shape, facets) for facets in (True, False)]
+        place = dr.select(seer.keeps, *places)
         facets = ~seer.keeps & jumps_at_facets(walk.traits.tables.blend_lengths, seer.origin, seen, at.p, at.n)
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
         moves = x.moves | may_move(walk, seen)
         if walk.media is not None:  # directions follow null boundaries, too
-            place, moves = mixed(place, place_met(walk, first, active, facets=False)), moves | may_move(walk, first)
+            boundary = place_met(walk, first, active, shape_met(walk, first, ray, active), facets=False)
+            place, moves = mixed(place, boundary), moves | may_move(walk, first)
+        if shaded:
+            dimmed = shade(ray, seen, active)
+            place, moves = mixed(place, dr.select(dimmed.dark, mi.UInt32(1), 0)), moves | may_move(walk, dimmed.hit)
         sight = Sight(mixed(place, turned), at.p, at.n, moves)
         dark = replace(Sight.nothing(), signature=mi.UInt32(1), moves=moves)  # as nothing, a sky would be
         return dr.select(_counts(walk, x, seen), sight, dark)
@@ -250,31 +282,43 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
     rays = [seer.origin.spawn_ray(line.at(t)) for t in (found.a, found.b)]
     firsts = [seer.hit(ray, active) for ray in rays]
     edges, through = seer.edges(rays, firsts, active)
-    near_a = edges[0].t <= edges[1].t
+    near_a, shadow, shades = edges[0].t <= edges[1].t, mi.Bool(False), None
+    if hard:
+        shades = [shade(ray, first, active) for ray, first in zip(rays, firsts, strict=True)]
+        a, b = (look(line, t, active, shaded=False) for t in (found.a, found.b))
+        shadow = active & ~a.differs(b) & (shades[0].dark != shades[1].dark)
+        near_a = dr.select(shadow, shades[0].dark, near_a)
     edge, near, far = dr.select(near_a, *edges), dr.select(near_a, *firsts), dr.select(near_a, *firsts[::-1])
     ray_near, ray_far = dr.select(near_a, *rays), dr.select(near_a, *rays[::-1])
     active &= edge.is_valid() & seer.is_off(edge.t)
 
-    bend = Bend.of(walk, ((edge, ray_near), (dr.select(near_a, *edges[::-1]), ray_far)), active)
+    bend = Bend.of(walk, ((edge, ray_near), (dr.select(near_a, *edges[::-1]), ray_far)), active & ~shadow)
     slope = derivative_by_ray(ray_near, lambda ray: bend.gap(ray, active)).d
-    own = active & seer.parts(ray_near.d, ray_far.d)
+    own = active & ~shadow & seer.parts(ray_near.d, ray_far.d)
+    border = None
+    if shades is not None:
+        dark = dr.select(near_a, *shades)
+        border = HardShadow(shadow, dark, dark.normal(shadow))
+        slope = dr.select(shadow, border.slope(walk, edge, ray_near, active), slope)
     slope = dr.select(own, seer.si.n, slope)
     slope -= dr.dot(slope, ray_near.d) * ray_near.d
-    bent = (own | bend.meets | bend.turns) & (dr.squared_norm(slope) > 0)
+    bent = (own | bend.meets | bend.turns | shadow) & (dr.squared_norm(slope) > 0)
+    active &= bent | ~shadow
     n = dr.select(bent, dr.normalize(slope), edge_normal(edge, ray_near, active))
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
     steep = dr.select(bent, dr.dot(slope, n), 1)
     f, pdf = seer.towards(ray_far.d, active)
     common = x.β * f * (0.5 * dr.pi * found.weight * line.weight(seer, density_of_samples(pdf), active))
     active &= dr.any(common != 0)
-    arrivals, depth = [seer.arrival(ray_near, near, pdf), seer.arrival(ray_far, far, pdf)], x.depth + 1
+    arrivals = off_contact(walk, seer.arrival(ray_near, near, pdf), seer.arrival(ray_far, far, pdf), active)
+    depth = x.depth + 1
     T, arrivals = seer.onward(arrivals, SHORT_OF * edge.t, key, active & through)
     K = []
     for arrival in arrivals:
         path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < walk.max_depth))
-        L, _ = walk_on(walk, Counted(key, mi.UInt32(0x20000)), path)
+        L, _ = walk_on(walk, Counted(key, mi.UInt32(BEYOND)), path)
         K.append(dr.select(active, common * T * L, 0))
-    return Hiding(edge, near, far, ray_near.d, ray_far.d, n, bend, own, steep, K[0], K[1], active)
+    return Hiding(edge, near, far, ray_near.d, ray_far.d, n, bend, border, own, steep, K[0], K[1], active)
 
 
 def _counts(walk: Walk, x: Chosen, seen: mi.PreliminaryIntersection3f) -> mi.Bool:
@@ -292,12 +336,15 @@ def hiding_motion(walk: Walk, seer: Seer, c: Hiding, at: mi.Ray3f) -> mi.Spectru
     edge = held_direction(origin, c.d_near, c.edge, c.active)
     d_near, _ = moved_direction(lengths, origin, c.d_near, c.near, seer.holds(c.near, c.active))
     d_far, _ = moved_direction(lengths, origin, c.d_far, c.far, seer.holds(c.far, c.active))
-    bends = c.own | c.bend.meets | c.bend.turns
+    shadow = mi.Bool(False) if c.hard is None else c.hard.there
+    bends = c.own | c.bend.meets | c.bend.turns | shadow
 
     def gap(d: mi.Vector3f) -> mi.Float:
         """How far a direction is from the edge, along n."""
         ray = mi.Ray3f(origin.spawn_ray(dr.detach(d)).o, d)
         B = dr.select(c.own, dr.dot(origin.n, d), c.bend.gap(ray, c.active & ~c.own))
+        if c.hard is not None:
+            B = dr.select(shadow, c.hard.gap(walk, c.edge, ray, c.active), B)
         return dr.select(bends, -B / c.slope, dr.dot(c.n, edge - d))
 
     swept = c.K_near * gap(d_near) - c.K_far * gap(d_far)

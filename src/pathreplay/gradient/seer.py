@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..transport import arrive, scatter
 from ..transport.media import carried, span
 from ..transport.passage import beyond_null, passage, past
-from ..transport.signature import place_met
+from ..transport.signature import place_met, shape_met
 from ..transport.surface import met
 from ..transport.traits import is_null
 from ..transport.vertex import Arrival, Chosen, Flight, Walk, is_smooth
@@ -23,7 +23,8 @@ NEAR = 10.0
 
 def may_see(walk: Walk, at: Arrival, step: Chosen) -> tuple[mi.Bool, mi.Spectrum]:
     """Whether the vertex that a path arrived at scatters smoothly, and the weight of the flight before it."""
-    surface = at.hit.is_valid() & is_smooth(at.hit.shape.bsdf())
+    valid = at.hit.is_valid()
+    surface = valid & is_smooth(shape_met(walk, at.hit, at.ray, valid).bsdf())
     if walk.media is None:
         return surface, mi.Spectrum(1)
     flight = step.kept.media.flight
@@ -99,7 +100,7 @@ class Seer:
 
     def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
         """Whether a direction follows what it hits: from particles only what scatters or emits, see `scatter`."""
-        active = active & ~self.keeps
+        active = active & ~self.keeps & ~scatter.is_seen_through(self.walk, hit)
         if self.walk.media is None:
             return active
         seen = is_smooth(hit.shape.bsdf()) | (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
@@ -122,8 +123,11 @@ class Seer:
         """
         if self.walk.media is None:
             return firsts, mi.Bool(False)
-        places = [place_met(self.walk, first, active, facets=False) for first in firsts]
-        through = (places[0] == places[1]) & firsts[0].is_valid() & is_null(firsts[0].shape.bsdf())
+        shapes = [shape_met(self.walk, first, ray, active) for ray, first in zip(rays, firsts, strict=True)]
+        places = [
+            place_met(self.walk, *met, facets=False) for met in zip(firsts, (active, active), shapes, strict=True)
+        ]
+        through = (places[0] == places[1]) & firsts[0].is_valid() & is_null(shapes[0].bsdf())
         pairs = zip(rays, firsts, strict=True)
         return [dr.select(through, self.behind(ray, first, active), first) for ray, first in pairs], through
 

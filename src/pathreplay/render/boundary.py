@@ -28,6 +28,8 @@ from .term import Found
 
 FILM_CLOSER, INNER_CLOSER = 5, 16
 """For so many lines one is looked at closer, of those with an edge."""
+GRID = "SDFGrid"
+"""By class: its surface is neither met nor held where its outline would have to be."""
 BATCH = "BatchSensor"
 """By class: Dr.Jit ends the process where its rays are differentiated by their place."""
 FILM_LENGTH = 0.5  # pixels
@@ -90,6 +92,11 @@ class Boundary:
                 f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
                 "put its sensors into the scene one by one"
             )
+        for shape in view.scene.shapes():
+            if shape.class_name() == GRID:
+                return (
+                    f"edges of shape '{shape.id()}' of type 'sdfgrid' cannot be differentiated: put a mesh in its place"
+                )
         return ""
 
     def _searches(self, view: Pass, walk: Walk, places: FilmPlaces) -> Iterator[Edges]:

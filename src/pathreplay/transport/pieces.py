@@ -10,6 +10,10 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+WELD, ULPS = 1e-5, 4
+"""Vertices are in one place up to this share of the mesh's diagonal, and up to so many units in the last place."""
 
 
 def mesh_pieces(mesh: mi.Mesh) -> np.ndarray:
@@ -33,10 +37,25 @@ def smooth_pieces(faces: np.ndarray, positions: np.ndarray) -> np.ndarray:
     sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2).astype(np.int64), axis=1)
     _, side, shared = np.unique(sides[:, 0] * count + sides[:, 1], return_inverse=True, return_counts=True)
     alone = np.flatnonzero(shared[side] == 1)
-    _, places = np.unique(positions[sides[alone]].reshape(-1, 3), axis=0, return_inverse=True)
+    places = _places(positions, sides[alone].ravel())
     of = alone // 3  # triangles
     meeting = np.column_stack([np.sort(places.reshape(-1, 2), axis=1), pieces[of]])
     _, where, together = np.unique(meeting, axis=0, return_inverse=True, return_counts=True)
     torn = of[together[where.ravel()] > 1]
     pieces[torn] = count + torn
     return np.unique(pieces, return_inverse=True)[1].reshape(-1)
+
+
+def _places(positions: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """A number for each of some vertices, the same where they are in one place but for rounding.
+
+    Programs compute both ends of a seam, say by sines of 0 and of 2π, which differ in the last bits.
+    """
+    ends, at = np.unique(vertices, return_inverse=True)
+    if not len(ends):
+        return at
+    diagonal = np.linalg.norm(np.ptp(positions, axis=0))
+    near = WELD * diagonal + ULPS * np.finfo(np.float32).eps * np.abs(positions).max()
+    pairs = cKDTree(positions[ends]).query_pairs(near, output_type="ndarray")
+    same = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), (len(ends), len(ends)))
+    return connected_components(same, directed=False)[1][at]

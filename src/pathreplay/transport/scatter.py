@@ -113,7 +113,7 @@ def _at_surface(
     smooth = active & ~kept.delta
     d, J = kept.d, mi.Float(1)
     if attached:
-        holds = smooth & ~keeps_direction(walk, si, smooth)
+        holds = smooth & ~keeps_direction(walk, si, smooth) & ~is_seen_through(walk, again.hit_next)
         d, J = moved_direction(walk.traits.tables.blend_lengths, si, kept.d, again.hit_next, holds)
 
     if walk.resamples:
@@ -153,6 +153,17 @@ def keeps_direction(walk: Walk, si: mi.SurfaceInteraction3f, active: mi.Bool) ->
         return mi.Bool(False)
     centre, _ = si.bsdf().sample(mi.BSDFContext(), dr.detach(si), 0.5, mi.Point2f(0.5), active)
     return active & ~mi.has_flag(centre.sampled_type, mi.BSDFFlags.Delta) & (dr.detach(centre.pdf) > NARROW)
+
+
+def is_seen_through(walk: Walk, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+    """Where a hit lets a part of the light straight through. A continuation keeps its direction there.
+
+    If it held the point of a sheet that moves, it would slide over what is behind, and over the borders of that. Only
+    where edges are looked for, which see the outline of the sheet.
+    """
+    if not (walk.edges and walk.traits.veils):
+        return mi.Bool(False)
+    return mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Null)
 
 
 def _followed(walk: Walk, v: Vertex, u: Numbers, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:
@@ -205,7 +216,7 @@ def _at_particle(
     if attached:
         shape = hit_next.shape
         seen = is_smooth(shape.bsdf()) | (shape.emitter() != None)  # noqa: E711 (an array of pointers)
-        found = active & hit_next.is_valid() & seen
+        found = active & hit_next.is_valid() & seen & ~is_seen_through(walk, hit_next)
         d, J = moved_direction(walk.traits.tables.blend_lengths, v.origin, kept.d, hit_next, found)
     f, pdf = v.inside.phase.eval_pdf(mi.PhaseFunctionContext(None), v.inside.mei, d, active)
     pdf = dr.replace_grad(kept.pdf, dr.select(active, pdf, 0)) if attached else kept.pdf

@@ -13,13 +13,16 @@ from .vertex import Walk
 GRAZING = 0.05
 
 
-def place_met(walk: Walk, hit: mi.PreliminaryIntersection3f, active: mi.Bool, facets: bool = True) -> mi.UInt32:
+def place_met(
+    walk: Walk, hit: mi.PreliminaryIntersection3f, active: mi.Bool, shape: mi.ShapePtr, facets: bool = True
+) -> mi.UInt32:
     """What a ray met, as a number: 0 for nothing, else one for each shape, copy of a shape, and piece of a mesh.
 
-    Pieces are shaded as if they were smooth; of a flat mesh they are its triangles. Only if ``facets``.
+    ``shape`` is what `shape_met` says. Pieces are shaded as if they were smooth; of a flat mesh they are its triangles.
+    Only if ``facets``.
     """
     met = active & hit.is_valid()
-    shape = dr.reinterpret_array(mi.UInt32, hit.shape)
+    shape = dr.reinterpret_array(mi.UInt32, shape)
     place = mixed(shape, dr.reinterpret_array(mi.UInt32, hit.instance))
     if facets:
         place = mixed(place, _piece(walk.traits.tables, shape, hit.prim_index, met))
@@ -31,6 +34,13 @@ def _piece(tables: Tables, shape: mi.UInt32, triangle: mi.UInt32, met: mi.Bool) 
     flat = begin == FACETS
     piece = dr.gather(mi.UInt32, tables.pieces, begin + triangle, met & ~flat & (begin != WHOLE))
     return dr.select(flat, triangle + 1, piece)
+
+
+def shape_met(walk: Walk, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.ShapePtr:
+    """The shape that a ray met; of a copy that which is copied, which a hit does not tell by itself."""
+    if not walk.traits.copies:
+        return hit.shape
+    return hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active & hit.is_valid()).shape
 
 
 def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:

@@ -24,7 +24,7 @@ RELIEFS = frozenset({"NormalMap", "BumpMap"})
 FRAMES = RELIEFS | {TWO_SIDED}
 # Those without a narrow lobe of their own, and a texture that jumps within itself.
 DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
-INSTANCE = "Instance"
+INSTANCE, PROJECTOR = "Instance", "Projector"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
 COARSE = 1.0
@@ -61,12 +61,15 @@ class Traits:
     detached_names: tuple[str, ...]  # classes of the others with smooth lobes
     area_lights: bool  # there are emitters with an edge
     hard_lights: bool  # there are emitters whose shadows are hard
+    projectors: tuple[mi.Emitter, ...]  # of these also the border of what they light is hard
     mesh_lights: bool  # there are meshes that emit
     ball_lights: bool  # there are spheres that emit
     coarse_meshes: bool  # there are meshes that are shaded as if they were smooth, and are not: see `is_coarse`
     brushed_meshes: bool  # of these, some with BSDFs that tell one tangent from another
     painted_meshes: bool  # there are meshes that emit, with a texture
     two_sides: bool  # a surface may have another BSDF on its back
+    copies: bool  # there are instances
+    veils: bool  # a surface may scatter some light and let some straight through
     masks_mirrors: bool  # a mask lies over delta lobes
     narrow: bool  # a surface may have a narrow smooth lobe
     glossy: bool  # a surface may have a narrow smooth lobe, and no texture has a seam that it would slide over
@@ -99,12 +102,15 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         detached_names=tuple(sorted({bsdf.class_name() for bsdf in others})),
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
+        projectors=tuple(light for light in scene.emitters() if light.class_name() == PROJECTOR),
         mesh_lights=any(_ball(lamp)[3] > 0 for lamp in _mesh_lamps(shapes)),
         ball_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
         coarse_meshes=bool(coarse),
         brushed_meshes=any(is_brushed(shape.bsdf()) for shape in coarse),
         painted_meshes=any(is_painted(lamp.emitter()) for lamp in _mesh_lamps(shapes)),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
+        copies=any(shape.class_name() == INSTANCE for shape in shapes),
+        veils=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_null(bsdf) for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         narrow=_is_narrow(bsdfs),
         glossy=_is_narrow(bsdfs) and not any(node.class_name() == CHECKERED for node in nodes),

@@ -1,0 +1,79 @@
+"""Hard shadows: what keeps a light without extent from a point, and how far a point is from where that ends.
+
+The border of such a shadow is an edge for whoever sees the surface it falls on: the camera, or a point that scatters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.emitters import draw_emitter
+from ..transport.passage import beyond_null
+from ..transport.signature import edge_normal, outline_gap
+from ..transport.vertex import Arrival, Walk, is_smooth
+
+
+@dataclass
+class Shade:
+    """What keeps a light from a point: something between, or the border of a projector's picture."""
+
+    u: mi.Point2f  # which light
+    ray: mi.Ray3f  # towards it
+    hit: mi.PreliminaryIntersection3f
+    outside: mi.Bool  # of the picture
+    uv: mi.Point2f  # place in it
+
+    @staticmethod
+    def of(walk: Walk, at: Arrival, u: mi.Point2f, k: mi.UInt32, active: mi.Bool) -> Shade:
+        """That of the light which ``u`` samples where a path arrives as its k-th vertex, if that has no extent."""
+        si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+        light, lit = light_of(walk, si, u, k, active)
+        ray = si.spawn_ray_to(light.p)
+        hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, active=lit & light.delta)
+        if walk.clear:
+            hit = beyond_null(walk.scene, ray, hit, lit)
+        outside = mi.Bool(False)
+        for projector in walk.traits.projectors:
+            outside |= (light.pdf == 0) & (light.emitter == mi.EmitterPtr(projector))
+        return Shade(u, ray, hit, outside & _scatters(walk, si, k, active), light.uv)
+
+    @property
+    def dark(self) -> mi.Bool:
+        return self.outside | self.hit.is_valid()
+
+    def normal(self, active: mi.Bool) -> mi.Vector3f:
+        """That of the edge of what is between: see `edge_normal`."""
+        return edge_normal(self.hit, self.ray, active & ~self.outside)
+
+    def gap(
+        self, walk: Walk, n: mi.Vector3f, met: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
+    ) -> mi.Float:
+        """B: zero where the shadow on the surface that was ``met`` ends; ``n`` is the `normal`.
+
+        Differentiable in the ray, which slides over that surface, in the surfaces and in the light.
+        """
+        si = met.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        light, _ = walk.scene.sample_emitter_direction(si, self.u, False, active)
+        shadow = outline_gap(n, si.p, light.d, self.hit, self.ray, active & ~self.outside)
+        if not walk.traits.projectors:
+            return shadow
+        beside = (self.uv.x < 0) | (self.uv.x > 1)
+        border = dr.select(dr.select(beside, self.uv.x, self.uv.y) > 0.5, mi.Float(1), 0)
+        return dr.select(active & self.outside, dr.select(beside, light.uv.x, light.uv.y) - border, shadow)
+
+
+def light_of(
+    walk: Walk, si: mi.SurfaceInteraction3f, u: mi.Point2f, k: mi.UInt32, active: mi.Bool
+) -> tuple[mi.DirectionSample3f, mi.Bool]:
+    """The emitter sample of the k-th vertex, and whether there is any."""
+    lit = _scatters(walk, si, k, active)
+    light, _ = draw_emitter(walk.scene, si, u, lit, visible=False)
+    return light, lit & (light.pdf != 0)
+
+
+def _scatters(walk: Walk, si: mi.SurfaceInteraction3f, k: mi.UInt32, active: mi.Bool) -> mi.Bool:
+    """Whether the k-th vertex scatters light of emitters."""
+    return active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < walk.max_depth)
