@@ -25,7 +25,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -72,13 +72,13 @@ class SceneMemory(Generic[T]):
         self._kept.clear()
 
 
-_MEMORIES: list[SceneMemory[Any]] = []
+_MEMORIES: list[SceneMemory] = []
 _ONE_THREAD = threading.RLock()
 _passes = 0  # under way, one within the other
 _put_aside = False  # objects are kept from the collector
 
 
-def scene_memory() -> SceneMemory[Any]:
+def scene_memory() -> SceneMemory:
     """A memory that is released as the rules above say."""
     _MEMORIES.append(SceneMemory())
     return _MEMORIES[-1]

@@ -32,7 +32,7 @@ def _collector() -> Any:
     return _COLLECTORS[base]()
 
 
-def _contents(node: mi.Object) -> tuple[list[tuple[str, mi.Object]], list[tuple[str, Any, type | None]]]:
+def _contents(node: mi.Object) -> tuple[list[tuple[str, mi.Object]], list[tuple[str, object, type | None]]]:
     """What a node names: objects, and values with their C++ types."""
     callback = _collector()
     callback.children, callback.values = [], []
@@ -52,12 +52,12 @@ def nodes_of(root: mi.Object) -> set[mi.Object]:
     return seen
 
 
-def with_gradients(root: mi.Object, *names: str) -> list[Any]:
+def with_gradients(root: mi.Object, *names: str) -> list[dr.ArrayBase]:
     """The parameters of an object, and of those below it, that have gradients; with names, those under one of them.
 
     A parameter ``a.b`` is under ``a.b`` and under ``a``.
     """
-    found: list[Any] = []
+    found: list[dr.ArrayBase] = []
     seen, waiting = {root}, [("", root)]
     while waiting:
         prefix, node = waiting.pop()
