@@ -64,7 +64,7 @@ def swept(bench: Bench, integrator: mi.Integrator, seed: int, count: int, offset
 @pytest.mark.parametrize("film", [pytest.param(n, marks=() if n in QUICK else SLOW) for n in FILMS])
 def test_some_pixels_stand_for_all(film: str, opened) -> None:
     """Image and gradient of a quadratic loss, against Mitsuba's images with the same filter, and their differences."""
-    bench = opened(Case(film, lambda: room(**FILMS[film]), FLOOR, random(1.0), spp=4, seeds=160))
+    bench = opened(Case(film, lambda: room(**FILMS[film]), FLOOR, random(1.0), spp=4, seeds=64))
     plain = bench.integrator("path", rr_depth=bench.case.rr_depth)
     expected = np.mean([bench.image(plain, 5000 + seed, 1024) for seed in range(4)], axis=0)
     slope = 2 * bench.weights
