@@ -10,6 +10,7 @@ from . import (
     of_picture,
     of_process,
     of_python,
+    of_ray,
     of_run,
     of_scene,
     of_stages,
@@ -33,6 +34,7 @@ KINDS = tuple(
         of_python,
         of_process,
         of_watch,
+        of_ray,
     )
 )
 
