@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import os
+import secrets
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -150,11 +151,15 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
     if job.changes:
         origin["changes"] = list(job.changes)
     with undisturbed(), contextlib.ExitStack() as undo:
-        path = _make_new(output, Path.cwd() if home is None else home)
-        undo.callback(shutil.rmtree, path, ignore_errors=True)
-        run = RunFolder(output.with_name(path.name), home)
+        home = Path.cwd() if home is None else home
+        part = _make_part(output, home)
+        undo.callback(shutil.rmtree, part, ignore_errors=True)
+        run = RunFolder(part)
+        run.given, run.home = _free(output, home), home
         undo.callback(run.lock.close)
         run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
+        run.given = _claim(part, output, home)
+        run.path = home / run.given
         undo.pop_all()
     return run
 
@@ -250,21 +255,41 @@ def require_writable_name(path: Path, option: str) -> None:
         raise PathreplayError(f"Run folder {name} cannot be used ({error}); give another {option}") from None
 
 
-def _make_new(output: Path, home: Path) -> Path:
+def _make_part(output: Path, home: Path) -> Path:
+    """A folder beside the one that is wanted, which takes its place when it is whole: a process may end at any time."""
+    wanted = home / output
+    part = wanted.with_name(f".{wanted.name[:100]}.{secrets.token_hex(4)}{PART}")
     try:
-        wanted = home / output
         wanted.parent.mkdir(parents=True, exist_ok=True)
-        number, folder = 1, wanted
-        while True:
-            with contextlib.suppress(FileExistsError):
-                folder.mkdir()  # fails where it exists: two runs at once cannot get the same one
-                return folder
-            number += 1
-            folder = wanted.with_name(f"{wanted.name}-{number}")
+        part.mkdir()
+        return part
     except OSError as error:
-        raise PathreplayError(
-            f"Run folder {output} cannot be made ({error.strerror}); give another with --output"
-        ) from error
+        raise PathreplayError(_not_made(output, error)) from error
+
+
+def _free(output: Path, home: Path) -> Path:
+    """``output``, or the first of ``output-2``, ``-3``, … that does not exist."""
+    number, found = 1, output
+    while os.path.lexists(home / found):
+        number += 1
+        found = output.with_name(f"{output.name}-{number}")
+    return found
+
+
+def _claim(part: Path, output: Path, home: Path) -> Path:
+    """Give the folder the first name that is free; two runs at once cannot get the same one, since none is empty."""
+    while True:
+        found = _free(output, home)
+        try:
+            os.rename(part, home / found)
+            return found
+        except OSError as error:
+            if error.errno not in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
+                raise PathreplayError(_not_made(output, error)) from error
+
+
+def _not_made(output: Path, error: OSError) -> str:
+    return f"Run folder {output} cannot be made ({error.strerror}); give another with --output"
 
 
 @contextlib.contextmanager
