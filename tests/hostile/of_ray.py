@@ -15,7 +15,8 @@ KIND = "ray"
 
 # Ends as the run does; with status 77 where something of Ray stays.
 KILL = """
-import subprocess, sys, time
+import os, subprocess, sys, time
+os.environ["RAY_DEFAULT_OBJECT_STORE_MAX_MEMORY_BYTES"] = str(2**28)  # a file, and those of a case are limited
 from pathlib import Path
 import psutil
 names, early = sys.argv[1].split(","), sys.argv[2] == "early"
@@ -27,6 +28,8 @@ ready = (lambda: tree("RayActor")) if early else Path("runs/job/checkpoint.safet
 while not ready() and process.poll() is None:
     time.sleep(0.05)
 time.sleep(0.2 if early else 2)
+if process.poll() is not None:
+    sys.exit(process.returncode)
 known = tree()
 for each in known if names == ["all"] else [me] if names == ["driver"] else tree(*names):
     each.kill()
@@ -41,7 +44,7 @@ def _killed(names: str, when: str) -> None:
         # The head may go while actors compute on: then the run comes to its end.
         room.change("iterations", 300 if names == "gcs_server" else 5000)
         room.write("kill.py", KILL)
-        return Action(shell=f"{shlex.quote(sys.executable)} kill.py {names} {when}", writes=("kill.py",))
+        return Action(shell=f"{shlex.quote(sys.executable)} kill.py {names} {when}", writes=("kill.py", "runs"))
 
     add(KIND, f"{names} killed, {when}", spoil)
 

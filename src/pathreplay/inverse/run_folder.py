@@ -65,8 +65,15 @@ class RunFolder:
 
     def remove(self) -> None:
         """Remove it with all that is in it, where it still is the folder that was made."""
-        if _identity(self.path) == self.identity:
-            shutil.rmtree(self.path, ignore_errors=True)
+        if _identity(self.path) != self.identity:
+            return
+        # Half a folder would look like a run; the process may end in the middle of this.
+        hidden = self.path.with_name(f".{self.path.name[:100]}.{secrets.token_hex(4)}{PART}")
+        with contextlib.suppress(OSError):
+            os.rename(self.path, hidden)
+        for path in (hidden, self.path):
+            if _identity(path) == self.identity:
+                shutil.rmtree(path, ignore_errors=True)
 
     def require_in_place(self, lost: str) -> None:
         """Raise PathreplayError if the folder is no longer where it was; ``lost`` names what was not saved."""
