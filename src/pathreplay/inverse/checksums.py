@@ -73,9 +73,9 @@ def with_sums(files: Mapping[str, Content]) -> dict[str, Content]:
             del chunk
         sums[name] = _Sum(size, digest.hexdigest())
 
-    return {name: partial(summed, name, content) for name, content in files.items()} | {
-        SUMS: lambda: (_TABLE.dump_json(sums, indent=2),)
-    }
+    whole: dict[str, Content] = {name: partial(summed, name, content) for name, content in files.items()}
+    whole[SUMS] = lambda: (_TABLE.dump_json(sums, indent=2),)
+    return whole
 
 
 class Sums:

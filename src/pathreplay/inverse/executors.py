@@ -116,7 +116,8 @@ class Crew:
 
         Raises PathreplayError where the cluster is lost.
         """
-        end, ready = time.monotonic() + patience, []
+        end = time.monotonic() + patience
+        ready: list[Any] = []
         self.cluster.require_processes()
         while not ready:
             # Where the answer is does not matter yet: whoever gave it can go on while it is on its way.
