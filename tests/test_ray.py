@@ -297,3 +297,53 @@ def test_a_run_goes_on_by_another_executor(tmp_path: Path) -> None:
     status, _, err = ended(start(tmp_path, "--resume", "run", "--quiet"))
     assert status == 0 or "all its 20 iterations" in err
     assert bits(tmp_path / "run") == whole
+
+
+def parts_of(process: subprocess.Popen[str], *names: str) -> list[psutil.Process]:
+    """What is below a run, by the names of the processes; all without names."""
+    found = psutil.Process(process.pid).children(recursive=True)
+    return [each for each in found if not names or any(name in each.name() for name in names)]
+
+
+def gone(processes: list[psutil.Process]) -> bool:
+    _, alive = psutil.wait_procs(processes, timeout=30)
+    return not alive
+
+
+@SLOW
+@with_ray
+@pytest.mark.parametrize("who", ["all", "raylet", "driver"])
+def test_what_is_left_of_a_cluster_ends_and_a_line_says_so(who: str, tmp_path: Path) -> None:
+    before = set(Path("/tmp").glob("pathreplay-*"))
+    write_job(tmp_path, **{**job_of("surfaces"), "iterations": 5000, "checkpoint_every": 1}, ray={"actors": 1})
+    process = start(tmp_path, "job.json", "--quiet", "--executor", "ray")
+    checkpoint = tmp_path / "run/checkpoint.safetensors"
+    wait_for(checkpoint, process)
+    wait_for(checkpoint, process, newer_than=checkpoint.stat().st_mtime)
+    tree = parts_of(process)
+    for each in {"all": tree, "raylet": parts_of(process, "raylet"), "driver": [psutil.Process(process.pid)]}[who]:
+        each.kill()
+    status, _, err = ended(process)
+    if who == "driver":
+        assert "the process has ended in the middle of its run" in err
+    else:
+        assert status == 2 and err.count(ERROR) == 1, err
+        assert f"{ERROR}ray: the cluster is lost" in err and "go on with: pathreplay optimize --resume run" in err
+    assert gone(tree) and set(Path("/tmp").glob("pathreplay-*")) <= before
+
+
+@SLOW
+@with_ray
+def test_a_cluster_that_is_killed_at_the_start_gets_a_line(tmp_path: Path) -> None:
+    write_job(tmp_path, **{**job_of("surfaces"), "iterations": 5000}, ray={"actors": 1})
+    process = start(tmp_path, "job.json", "--quiet", "--executor", "ray")
+    while not (victims := parts_of(process, "RayActor")) and process.poll() is None:
+        time.sleep(0.05)
+    tree = parts_of(process)
+    for each in [*victims, *parts_of(process, "DashboardAgent", "RuntimeEnvAgent")]:
+        each.kill()
+    status, _, err = ended(process)
+    assert status != 0 and sum(line.startswith("pathreplay: ") for line in err.splitlines()) == 1, err
+    folder = tmp_path / "run"
+    assert not folder.exists() or len(list((folder / "images").glob("target-*.exr"))) == 2
+    assert gone(tree)

@@ -12,6 +12,7 @@ from . import (
     of_picture,
     of_process,
     of_python,
+    of_ray,
     of_run,
     of_scene,
     of_stages,
@@ -37,6 +38,7 @@ KINDS = tuple(
         of_own,
         of_process,
         of_watch,
+        of_ray,
     )
 )
 

@@ -73,9 +73,9 @@ def with_sums(files: Mapping[str, Content]) -> dict[str, Content]:
             del chunk
         sums[name] = _Sum(size, digest.hexdigest())
 
-    checked: dict[str, Content] = {name: partial(summed, name, content) for name, content in files.items()}
-    checked[SUMS] = lambda: (_TABLE.dump_json(sums, indent=2),)
-    return checked
+    whole: dict[str, Content] = {name: partial(summed, name, content) for name, content in files.items()}
+    whole[SUMS] = lambda: (_TABLE.dump_json(sums, indent=2),)
+    return whole
 
 
 class Sums:

@@ -36,8 +36,8 @@ SMALL = 2**16
 SOON_S = 60.0
 """Seconds after which it is told that no actor is there yet: loading Mitsuba and a scene takes some."""
 
-LOOK_S = 1.0
-"""Seconds without an answer after which it is looked whether the cluster is still there."""
+LOOK_S, AGAIN_S = 0.1, 1.0
+"""Seconds without an answer after which it is looked for the processes of the cluster, and for its head."""
 
 Tell = Callable[[str], None]
 
@@ -118,6 +118,7 @@ class Crew:
         """
         end = time.monotonic() + patience
         ready: list[Any] = []
+        self.cluster.require_processes()
         while not ready:
             # Where the answer is does not matter yet: whoever gave it can go on while it is on its way.
             some = min(LOOK_S, max(0.0, end - time.monotonic()))
@@ -125,7 +126,7 @@ class Crew:
             if time.monotonic() >= end:
                 break
             if not ready:
-                self.cluster.require()
+                self.cluster.require(AGAIN_S)
         return [(self.calls.pop(reference), reference) for reference in ready]
 
     def fetch(self, call: _Call, reference: Any) -> list[Answer] | None:

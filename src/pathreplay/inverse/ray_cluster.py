@@ -14,6 +14,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -52,20 +53,25 @@ class Cluster:
     """It is of this run alone."""
     processes: list[psutil.Process] = field(default_factory=list)
     """Of our own: those without which nothing is answered any more."""
+    _asked: float = -1e9
 
     def has_others(self) -> bool:
         """Whether it is there for others, too, and answers."""
         return not self.own and self._answers()
 
-    def require(self) -> None:
-        """Raise PathreplayError if its head, or of our own what starts actors, is no longer there."""
-        gone = [name for process, name in zip(self.processes, _VITAL, strict=False) if not _runs(process)]
-        if gone or not self._answers():
-            where = "" if self.own else f" ({self.ray.get_runtime_context().gcs_address})"
-            raise PathreplayError(
-                f"ray: the cluster is lost: its {gone[0] if gone else 'head'}{where} does not run any more; look into "
-                "Ray's logs and start it again, or use executor = 'local'"
-            )
+    def require_processes(self) -> None:
+        """Raise PathreplayError if one of the `processes` does not run any more."""
+        for process, name in zip(self.processes, _VITAL, strict=False):
+            if not _runs(process):
+                raise _lost(f"{name} does not run any more")
+
+    def require(self, pause: float = 0.0) -> None:
+        """Raise PathreplayError as `require_processes`, or if the head does not answer; asked after a pause only."""
+        self.require_processes()
+        if time.monotonic() - self._asked >= pause:
+            self._asked = time.monotonic()
+            if not self._answers():
+                raise _lost(f"head at {self.ray.get_runtime_context().gcs_address} does not answer")
 
     def _answers(self) -> bool:
         host, _, port = self.ray.get_runtime_context().gcs_address.rpartition(":")
@@ -74,6 +80,12 @@ class Cluster:
         except OSError:
             return False
         return True
+
+
+def _lost(why: str) -> PathreplayError:
+    return PathreplayError(
+        f"ray: the cluster is lost: its {why}; look into Ray's logs and start it again, or use executor = 'local'"
+    )
 
 
 def _runs(process: psutil.Process) -> bool:

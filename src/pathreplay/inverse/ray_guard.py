@@ -1,7 +1,7 @@
 """Sees to it that nothing of a cluster of our own stays, however this process ends: a process that outlives it.
 
 Ray's processes are ended by the kernel with the one that started them, but not what those have started: agents of a
-raylet that was killed stay for ever.
+raylet that was killed stay for ever. And Ray ends a process without a word whose raylet is gone: the guard says it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,14 @@ _GUARD = """
 import os, shutil, signal, sys, time
 for name in ("SIGINT", "SIGTERM", "SIGHUP"):
     signal.signal(getattr(signal, name), signal.SIG_IGN)
-sessions = {int(number) for line in sys.stdin for number in line.split()} - {os.getsid(0)}
+said = {word for line in sys.stdin for word in line.split()}
+sessions = {int(word) for word in said - {"done"}} - {os.getsid(0)}
+if "done" not in said:
+    try:
+        print("pathreplay: the process has ended in the middle of its run: it was killed, or Ray has ended it, whose "
+              "processes are gone; go on with: pathreplay optimize --resume RUN_FOLDER", file=sys.stderr, flush=True)
+    except OSError:
+        pass
 def left():
     for name in os.listdir("/proc"):
         try:
@@ -50,7 +57,7 @@ class Guard:
         self._folder = folder
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", "-c", _GUARD, str(folder)],
-            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True,
             text=True,
         )  # fmt: skip
 
@@ -64,6 +71,7 @@ class Guard:
         """Let it do its work now, and wait for it."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
+            print("done", file=self._process.stdin)
             self._process.stdin.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_PATIENCE_S)

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import os
+import secrets
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -66,9 +67,16 @@ class RunFolder:
 
     def remove(self) -> None:
         """Remove it with all that is in it, where it still is the folder that was made, and what was made for it."""
-        if _identity(self.path) == self.identity:
-            shutil.rmtree(self.path, ignore_errors=True)
-            _remove_empty(self.made_for_it)
+        if _identity(self.path) != self.identity:
+            return
+        # Half a folder would look like a run; the process may end in the middle of this.
+        hidden = self.path.with_name(f".{self.path.name[:100]}.{secrets.token_hex(4)}{PART}")
+        with contextlib.suppress(OSError):
+            os.rename(self.path, hidden)
+        for path in (hidden, self.path):
+            if _identity(path) == self.identity:
+                shutil.rmtree(path, ignore_errors=True)
+        _remove_empty(self.made_for_it)
 
     def require_in_place(self, lost: str) -> None:
         """Raise PathreplayError if the folder is no longer where it was; ``lost`` names what was not saved."""
@@ -156,12 +164,14 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
     missing = [folder for folder in (home / output).parents if not folder.exists()]
     with undisturbed(), contextlib.ExitStack() as undo:
         undo.callback(_remove_empty, missing)
-        path = _make_new(output, home)
-        undo.callback(shutil.rmtree, path, ignore_errors=True)
-        run = RunFolder(output.with_name(path.name), home)
-        run.made_for_it = missing
+        part = _make_part(output, home)
+        undo.callback(shutil.rmtree, part, ignore_errors=True)
+        run = RunFolder(part)
+        run.given, run.home, run.made_for_it = _free(output, home), home, missing
         undo.callback(run.lock.close)
         run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
+        run.given = _claim(part, output, home)
+        run.path = home / run.given
         undo.pop_all()
     return run
 
@@ -264,21 +274,41 @@ def _remove_empty(folders: Iterable[Path]) -> None:
             folder.rmdir()
 
 
-def _make_new(output: Path, home: Path) -> Path:
+def _make_part(output: Path, home: Path) -> Path:
+    """A folder beside the one that is wanted, which takes its place when it is whole: a process may end at any time."""
+    wanted = home / output
+    part = wanted.with_name(f".{wanted.name[:100]}.{secrets.token_hex(4)}{PART}")
     try:
-        wanted = home / output
         wanted.parent.mkdir(parents=True, exist_ok=True)
-        number, folder = 1, wanted
-        while True:
-            with contextlib.suppress(FileExistsError):
-                folder.mkdir()  # fails where it exists: two runs at once cannot get the same one
-                return folder
-            number += 1
-            folder = wanted.with_name(f"{wanted.name}-{number}")
+        part.mkdir()
+        return part
     except OSError as error:
-        raise PathreplayError(
-            f"Run folder {output} cannot be made ({error.strerror}); give another with --output"
-        ) from error
+        raise PathreplayError(_not_made(output, error)) from error
+
+
+def _free(output: Path, home: Path) -> Path:
+    """``output``, or the first of ``output-2``, ``-3``, … that does not exist."""
+    number, found = 1, output
+    while os.path.lexists(home / found):
+        number += 1
+        found = output.with_name(f"{output.name}-{number}")
+    return found
+
+
+def _claim(part: Path, output: Path, home: Path) -> Path:
+    """Give the folder the first name that is free; two runs at once cannot get the same one, since none is empty."""
+    while True:
+        found = _free(output, home)
+        try:
+            os.rename(part, home / found)
+            return found
+        except OSError as error:
+            if error.errno not in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
+                raise PathreplayError(_not_made(output, error)) from error
+
+
+def _not_made(output: Path, error: OSError) -> str:
+    return f"Run folder {output} cannot be made ({error.strerror}); give another with --output"
 
 
 @contextlib.contextmanager

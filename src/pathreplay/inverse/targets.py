@@ -64,7 +64,7 @@ def target_scene(config: Config, base: Path) -> mi.Scene:
     target = config.target
     spec = config.scene if target.scene is None else target.scene
     arguments = config.scene_parameters if target.scene_parameters is None else target.scene_parameters
-    wanted = [*target.values, *(entry.key for entry in config.parameters), *(entry.key for entry in config.derived)]
+    wanted = [*target.values, *(entry.key for entry in config.parameters), *(made.key for made in config.derived)]
     scene = load_scene_with_floats(spec, wanted, base, **arguments)
     params = traversed(scene)
     parameters.require_finite(params)
