@@ -314,3 +314,9 @@ def test_samples_of_a_ball_are_asked_for_on_a_disk() -> None:
     there = [dr.sqrt(p.x) * mi.Point2f(dr.cos(dr.two_pi * p.y), dr.sin(dr.two_pi * p.y)) for p in close]
     assert dr.all(dr.norm(there[1] - there[0]) < 1e-2)
     assert dr.all(sample_at(walk, SimpleNamespace(around=mi.Bool(False)), close[0]).x == close[0].x)
+
+
+def test_a_single_line_has_a_place() -> None:
+    """As in the search of a film of few pixels, which looks closer at every sixteenth line."""
+    places = quasi_random(mi.UInt32(0), 1, mi.UInt32(7), 3)
+    assert all(0 <= x[0] < 1 for x in places)

@@ -66,6 +66,7 @@ TARGET = {"target.values": {TEXTURE: 0.7}, "target.spp": 4}
 
 # Parameters and stages stand in tables while keys are put together, and are made lists in the end.
 _POSE = {"parameters.pose.key": "ball.to_world", "parameters.pose.pose": "rigid"}
+_DELTA = {"integrator.attach": "delta"}
 _MESH = {"parameters.mesh.key": "tile.vertex_positions", "parameters.mesh.learning_rate": 0.001}
 _SHARE = {
     "parameters.share.key": "share",
@@ -92,7 +93,7 @@ KEYS: dict[str, list[Mapping[str, Any]]] = {
         for key, values in {
             "scene_parameters": [{"res": 8}],
             "sensors": [["left", "right"], [1, 0]],
-            "held_out": [["right"], [0]],
+            "held_out": [["right"]],
             "variant": ["llvm_ad_rgb"],
             "rival": [{"type": "pathreplay", "max_depth": 2}, {"type": "prb", "max_depth": 3}],
             "view_weights": [{"left": 2.0}],
@@ -167,7 +168,7 @@ KEYS: dict[str, list[Mapping[str, Any]]] = {
     **_of("parameters.pose", _POSE, pivot=[[0.0, 0, 0]], distance=[1.0], rotation_learning_rate=[1.0]),
     "parameters.key": [
         {"parameters.texture.key": TEXTURE},
-        {"parameters.camera.key": "right.x_fov", "parameters.camera.learning_rate": 0.1},
+        {"parameters.camera.key": "right.x_fov", "parameters.camera.learning_rate": 0.1, **_DELTA},
     ],
     "stages": [_STAGES],
     **_of("stages.second", _STAGES, iterations=[1], downscale=[2], spp=[2], max_depth=[2], sensors=[["left"]]),
@@ -176,11 +177,11 @@ KEYS: dict[str, list[Mapping[str, Any]]] = {
 }
 #: The same with the views of a capture, which take the place of the scene's.
 for _key, _path, _names in (
-    ("sensors", "sensors", ["shot_0", "shot_1"]),
-    ("held_out", "held_out", ["shot_1"]),
-    ("view_weights", "view_weights", {"shot_0": 2.0}),
-    ("exposure.reference", "exposure.reference", "shot_0"),
-    ("stages.second.sensors", "stages.second.sensors", ["shot_0"]),
+    ("sensors", "sensors", ["shot_0", "shot_1", "shot_2"]),
+    ("held_out", "held_out", ["shot_2"]),
+    ("view_weights", "view_weights", {"shot_1": 2.0}),
+    ("exposure.reference", "exposure.reference", "shot_1"),
+    ("stages.second.sensors", "stages.second.sensors", ["shot_1"]),
 ):
     KEYS[_key].append({**KEYS[_key][0], **_CAPTURE, _path: _names})
 
@@ -327,6 +328,7 @@ def _overrules(row: Row, setting: Mapping[str, Any]) -> bool:
     """Whether a setting takes back what another key of the row has set."""
     before = {path: value for each in row.values() for path, value in each.items()}
     return any(
-        (path in before and before[path] != value) or any(old.startswith(f"{path}.") for old in before)
+        (path in before and before[path] != value)
+        or any(old.startswith(f"{path}.") or path.startswith(f"{old}.") for old in before)
         for path, value in setting.items()
     )
