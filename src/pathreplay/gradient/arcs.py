@@ -42,7 +42,8 @@ class Arc:
     w: mi.Vector3f  # the direction in which it leaves its centre
     begin: mi.Float
     end: mi.Float
-    p: mi.Float  # density of the sample on it
+    t: mi.Float  # where the sample is on it
+    p: mi.Float  # its density
     j: mi.UInt32 | None  # of its length; None: there is one only, and the sample is the centre
 
     def at(self, t: mi.Float) -> mi.Vector3f:
@@ -86,12 +87,12 @@ def arc(seer: Seer, l: float, narrow: bool, key: mi.UInt32, active: mi.Bool) -> 
     turn = dr.two_pi * numbers.next_1d()
     w = mi.Frame3f(d).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
     if not narrow:
-        return Arc(d, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), p, None), ok
+        return Arc(d, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), mi.Float(0), p, None), ok
     j = length_drawn(p, numbers)
     full = l * _length(j)
     back = -full * _place(dr.minimum(mi.UInt32(PLACES * numbers.next_1d()), PLACES - 1))
     c, s = dr.cos(back), dr.sin(back)
-    return Arc(c * d + s * w, c * w - s * d, -0.5 * full, 0.5 * full, p, j), ok
+    return Arc(c * d + s * w, c * w - s * d, -0.5 * full, 0.5 * full, -back, p, j), ok
 
 
 def density_of_samples(pdf: mi.Float) -> mi.Float:

@@ -46,6 +46,9 @@ class Sight:
     p: mi.Point3f  # where the view ends; zero where it does not
     n: mi.Normal3f
     moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # between two that do not, an edge does nothing
+    # What whoever looks knows of how much an edge beside it counts:
+    near: mi.Float = field(default_factory=lambda: mi.Float(1))  # how close it is
+    bright: mi.Float = field(default_factory=lambda: mi.Float(1))  # how much light comes from it
     # Of a mesh that is shaded smoothly and is not smooth:
     triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 0: no matter
     light: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # directions that are scattered, or none:
@@ -132,14 +135,30 @@ Look = Callable[..., Sight]
 """(line, place on it, active) -> what is seen there."""
 
 
+@dataclass
+class Survey:
+    """What a glance at a line tells."""
+
+    found: mi.Float  # how much the line counts as one with an edge, 0 where it has none
+    near: mi.Float  # of what is seen along it, the most
+    bright: mi.Float
+
+
 def glance(look: Look, line: Any, active: mi.Bool) -> mi.Float:
     """How much a line counts, whose places are from ``line.begin`` to ``line.end``: 0 where it finds nothing."""
+    return survey(look, line, active).found
+
+
+def survey(look: Look, line: Any, active: mi.Bool) -> Survey:
+    """The same, with what is seen along the line."""
     at_a, at_b = (look(line, t, active) for t in (line.begin, line.end))
     at_c = look(line, 0.5 * (line.begin + line.end), active)
     ends, halves = at_a.hint(at_b), dr.maximum(at_c.hint(at_a), at_c.hint(at_b))
     # Of two crossings, which count twice, one is chosen in time, for both: see `bisect`.
     found = dr.select(ends > 0, dr.maximum(ends, halves), 4 * halves)
-    return dr.select(active, found, 0)
+    near = dr.maximum(dr.maximum(at_a.near, at_b.near), at_c.near)
+    bright = dr.maximum(dr.maximum(at_a.bright, at_b.bright), at_c.bright)
+    return Survey(dr.select(active, found, 0), near, bright)
 
 
 @dataclass

@@ -33,13 +33,14 @@ from .arcs import Arc, arc, density_of_samples
 from .bends import Bend, off_contact
 from .centres import LOOKS, Centres
 from .counted import Counted, key_of, quasi_random
-from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, glance
+from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, survey
 from .edges import Edges, Places
 from .hard_shadows import Shade
-from .lamps import Glimpse, Lamp, followed, glimpse
+from .lamps import Glimpse, Lamp, followed, glimpse, towards_place
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
 from .seer import Seer, may_see
+from .worth import DIM, MOST, STEEP, UNFORESEEN, Worth, closeness, own_plane, radiance_of, weighed
 
 BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
@@ -47,7 +48,6 @@ JUMP = 4.0
 """So many times as far from an edge as its slope says is the other end of a line where a sample of an emitter jumps."""
 BEYOND = 0x20000
 """The first of the random numbers of what comes from beyond an edge."""
-
 
 WIDELY = 0.5
 """Share of the lines that are thrown evenly over the film: where things touch, few lines find what counts much."""
@@ -160,10 +160,19 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
         seen = glimpse(walk, seer, line.lamp, line.at(t), active)
         moves = x.moves | _lamp_moves(walk, line.lamp.emitter) | may_move(walk, seen.hit)
-        return Sight(mi.UInt32(seen.hidden & moves), mi.Point3f(0), mi.Normal3f(0))
+        sight = Sight(mi.UInt32(seen.hidden & moves), mi.Point3f(0), mi.Normal3f(0))
+        if search.chosen is not None:
+            return sight
+        f, pdf = seer.towards(seen.light.d, active)
+        F = dr.mean(dr.abs(x.β * f * seen.Le)) * line.share
+        F *= dr.select(seen.light.delta, 1, mis_weight(seen.density / line.share, pdf))
+        return replace(sight, near=dr.select(seen.hidden, closeness(walk, seen.hit), 0), bright=F)
 
     if search.chosen is None:
-        return glance(look, line, inside)
+        a, b = (towards_place(walk, seer, line.lamp, line.at(t), inside) for t in (line.begin, line.end))
+        turn = dr.norm(a - b) / dr.maximum(line.end - line.begin, BORDER)
+        seen = survey(look, line, inside)
+        return Worth.of(seen, seen.bright, own_plane(seer, a, b) * dr.square(1 + l) / (l * (turn + STEEP)))
     found = search.closer(look, line, inside)
     active = found.weight > 0
     a, b = (glimpse(walk, seer, line.lamp, line.at(t), active) for t in (found.a, found.b))
@@ -271,12 +280,20 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
         if shaded:
             dimmed = shade(ray, seen, active)
             place, moves = mixed(place, dr.select(dimmed.dark, mi.UInt32(1), 0)), moves | may_move(walk, dimmed.hit)
-        sight = Sight(mixed(place, turned), at.p, at.n, moves)
-        dark = replace(Sight.nothing(), signature=mi.UInt32(1), moves=moves)  # as nothing, a sky would be
+        near = closeness(walk, seen)
+        if walk.media is not None:
+            near = dr.maximum(near, closeness(walk, first))
+        bright = dr.select(seen.is_valid(), DIM, mi.Float(walk.scene.environment() is not None))
+        sight = Sight(mixed(place, turned), at.p, at.n, moves, near, bright)
+        # As nothing, a sky would be.
+        dark = replace(Sight.nothing(), signature=mi.UInt32(1), moves=moves, near=near, bright=bright)
         return dr.select(_counts(walk, x, seen), sight, dark)
 
     if search.chosen is None:
-        return glance(look, line, ok) * line.importance()
+        f = dr.mean(dr.abs(x.β * seer.towards(line.at(line.t), ok)[0]))
+        light, own = dr.select(ok, f / line.p, 0), own_plane(seer, line.at(line.begin), line.at(line.end))
+        seen = survey(look, line, ok)
+        return Worth.of(replace(seen, found=seen.found * line.importance()), light, light * own / l)
     found = search.closer(look, line, ok)
     active = found.weight > 0
     rays = [seer.origin.spawn_ray(line.at(t)) for t in (found.a, found.b)]
@@ -376,19 +393,25 @@ def inner_edges(
         x.β *= weight / (density * dr.opaque(mi.Float, n))
         return s, density, key, records, x
 
-    def glances(centres: Centres, n: int, seed: mi.UInt32) -> tuple[mi.Point2f, mi.Float, mi.Float]:
+    def glances(centres: Centres, n: int, seed: mi.UInt32) -> tuple[mi.Point2f, list[Worth]]:
         s, density, key, _, x = path(centres, dr.arange(mi.UInt32, n), n, seed, None)
         seer = Seer(walk, x.at, x.flight, x.active)
-        in_squares = emitter_edges(walk, x, seer, square, key ^ 0x1B873593, Search()) / density
-        on_arcs = arc_edges(walk, x, seer, arc, key ^ 0x38B34AE5, Search()) / density
-        return s, in_squares + dr.zeros(mi.Float, n), on_arcs + dr.zeros(mi.Float, n)
+        in_squares = emitter_edges(walk, x, seer, square, key ^ 0x1B873593, Search())
+        on_arcs = arc_edges(walk, x, seer, arc, key ^ 0x38B34AE5, Search())
+        none = dr.zeros(mi.Float, n)
+        worths = [replace(w, found=w.found / density + none, edges=w.edges + none) for w in (in_squares, on_arcs)]
+        dr.eval(s, worths)
+        return s, worths
 
     centres = Centres(int(places.size.x), int(places.size.y), 0.0)
-    s, *found = glances(centres, max(lines // LOOKS, 1), seed ^ 0x7F4A7C15)
-    centres = centres.refined(s, found[0] + found[1], WIDELY)
-    _, *found = glances(centres, lines, seed)
-    dr.eval(found)
-    chosen = Picked.of(dr.concat(found), closer, seed)
+    s, first = glances(centres, max(lines // LOOKS, 1), seed ^ 0x7F4A7C15)
+    radiance = radiance_of(first)
+    worth = weighed(first, radiance)[1]
+    usual = dr.rcp(dr.maximum(dr.sum(dr.select(worth > 0, mi.Float(1), 0)), 1))
+    of_both = mi.Point2f(dr.concat([s.x, s.x]), dr.concat([s.y, s.y]))
+    centres = centres.refined(of_both, dr.square(dr.minimum(worth / (MOST * usual), 1)), WIDELY)
+    found, worth = weighed(glances(centres, lines, seed)[1], radiance)
+    chosen = Picked.of(worth + UNFORESEEN * found, closer, seed)
 
     on_arc = chosen.index >= lines
     i = dr.select(on_arc, chosen.index - lines, chosen.index)
