@@ -15,6 +15,7 @@ Where x does not move, all that does not move looks alike, so that no line is sp
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -250,14 +251,10 @@ class Hiding:
     active: mi.Bool
 
 
-def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
-    """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides: see `Search`.
-
-    Detached.
-    """
-    line, ok = arc(seer, l, walk.traits.narrow or walk.media is not None, key, x.active)
-
-    hard = walk.traits.hard_lights and walk.media is None
+def _views(
+    walk: Walk, x: Chosen, seer: Seer, key: mi.UInt32, hard: bool
+) -> tuple[Callable[..., Sight], Callable[..., Shade]]:
+    """What x sees along an arc, and what of it lies in the shadow of a light without extent, if any is ``hard``."""
 
     def shade(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> Shade:
         u = Numbers.draw(Counted(key, mi.UInt32(BEYOND))).light  # as `walk_on` draws it
@@ -289,6 +286,17 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
         dark = replace(Sight.nothing(), signature=mi.UInt32(1), moves=moves, near=near, bright=bright)
         return dr.select(_counts(walk, x, seen), sight, dark)
 
+    return look, shade
+
+
+def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
+    """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides: see `Search`.
+
+    Detached.
+    """
+    line, ok = arc(seer, l, walk.traits.narrow or walk.media is not None, key, x.active)
+    hard = walk.traits.hard_lights and walk.media is None
+    look, shade = _views(walk, x, seer, key, hard)
     if search.chosen is None:
         f = dr.mean(dr.abs(x.β * seer.towards(line.at(line.t), ok)[0]))
         light, own = dr.select(ok, f / line.p, 0), own_plane(seer, line.at(line.begin), line.at(line.end))
