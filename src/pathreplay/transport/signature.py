@@ -79,7 +79,9 @@ def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Boo
             on_mesh, _nearest_side(hit, ray, on_mesh), dr.select(square, side, dr.select(cylinder, si.dp_du, si.dp_dv))
         )
         straight = on_mesh | square | rim
-        return dr.normalize(dr.select(straight, dr.cross(side, ray.d), si.n - dr.dot(si.n, ray.d) * ray.d))
+        n = dr.normalize(dr.select(straight, dr.cross(side, ray.d), si.n - dr.dot(si.n, ray.d) * ray.d))
+        # Zero where there is none (a triangle without area, a ray along its normal): no edge, and no NaN behind a mask.
+        return dr.select(dr.all(dr.isfinite(n)), n, 0)
 
 
 def outline_gap(
