@@ -8,12 +8,13 @@ READY := $(VENV)/.ready
 PYTEST := -q --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint bench clean
+.PHONY: help demo test test-all test-hours lint bench clean
 
 help:
 	@echo "make demo      recover a texture, two wall colours and a light from rendered pictures, write a report"
 	@echo "make test      lint and the quick tests"
-	@echo "make test-all  lint and every test"
+	@echo "make test-all  lint and every test but those that take hours"
+	@echo "make test-hours  those: tails of all cells in 256 passes each, 300 random scenes in one process"
 	@echo "make lint      ruff and mypy"
 	@echo "make bench     time, memory and variance next to Mitsuba's own integrators"
 	@echo "make clean     remove .venv and caches, keep runs/"
@@ -46,10 +47,13 @@ lint: $(READY)
 	$(BIN)/mypy
 
 test: lint
-	$(BIN)/python -m pytest $(PYTEST) -m "not slow"
+	$(BIN)/python -m pytest $(PYTEST) -m "not slow and not hours"
 
 test-all: lint
-	$(BIN)/python -m pytest $(PYTEST)
+	$(BIN)/python -m pytest $(PYTEST) -m "not hours"
+
+test-hours: lint
+	$(BIN)/python -m pytest $(PYTEST) -m hours
 
 # TASKS='surface --quick' and the like: see benchmarks/__main__.py; without it all of them, in full.
 bench: $(READY)

@@ -252,7 +252,7 @@ def test_scenes_with_edges_one_after_the_other_in_one_process(run_python) -> Non
     assert done.returncode == 0 and done.stdout.split("\n")[-2] == "all of them", done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.hours
 @pytest.mark.parametrize("options", [(), ("--no-gc",)])
 def test_random_scenes_one_after_the_other_in_one_process(options: tuple[str, ...]) -> None:
     command = [sys.executable, str(HERE / "random_scenes.py"), "300", *options]

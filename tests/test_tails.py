@@ -83,7 +83,7 @@ def hold_tail(g: np.ndarray) -> None:
     assert halves[1] < HALVES * halves[0], halves
 
 
-@pytest.mark.slow
+@pytest.mark.hours
 @pytest.mark.parametrize("name", some(CASES))
 def test_no_pass_says_it_all(name: str) -> None:
     bench = Bench(CASES[name])
@@ -94,7 +94,7 @@ def test_no_pass_says_it_all(name: str) -> None:
         bench.release()
 
 
-@pytest.mark.slow
+@pytest.mark.hours
 @pytest.mark.parametrize("name", some(edge_ordinary.SCENES))
 def test_nor_does_one_in_ordinary_scenes(name: str, tmp_path: Path) -> None:
     moving = edge_ordinary.SCENES[name](tmp_path)
