@@ -141,7 +141,7 @@ BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
         ["named twice", "paint.*.data"],
     ),
     "missing target": (replace("target.exr", "targt.exr"), ["targt.exr", "does not exist"]),
-    "target is no image": (replace("target.exr", "ball.xml"), ["ball.xml cannot be read"]),
+    "target is no image": (replace("target.exr", "ball.xml"), ["ball.xml", "of no format that is read"]),
     "wrong-sized target": (small_target, ["target.exr", "5 x 3", "6 x 4"]),
     "too many targets": (replace('["target.exr"]', '["target.exr", "target.exr"]'), ["2 target images for 1 sensors"]),
     "NaN in the target": (spoil("target.exr", np.nan), ["target.exr", "NaN", "(1, 0, 2)"]),

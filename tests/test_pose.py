@@ -208,7 +208,7 @@ def html_text(result: Any) -> str:
 @pytest.mark.usefixtures("sheet")
 def test_the_target_scene_is_gone_when_iterations_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[weakref.ref[Any]] = []
-    load = targets.load_scene
+    load = targets.load_scene_with_floats
 
     def watched(*arguments: Any, **options: Any) -> Any:
         scene = load(*arguments, **options)
@@ -216,7 +216,7 @@ def test_the_target_scene_is_gone_when_iterations_begin(monkeypatch: pytest.Monk
         seen.append(weakref.ref(glass[0]))  # an object of Python, unlike the scene
         return scene
 
-    monkeypatch.setattr(targets, "load_scene", watched)
+    monkeypatch.setattr(targets, "load_scene_with_floats", watched)
     target = {**JOB["target"], "scene": "smoothdielectric.xml"}  # type: ignore[dict-item]
     problem.build_problem(make_config({**JOB, "target": target}), Path.cwd())
     assert len(seen) == 1 and seen[0]() is None

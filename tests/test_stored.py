@@ -39,6 +39,7 @@ JOB: dict[str, Any] = {
     "spp": 4,
     "picture_spp": 4,
     "learning_rate": 0.01,
+    "learning_rate_decay": 0.1,
     "target": {"values": {"env.data": "other.exr"}, "spp": 16, "integrator": {"type": "path", "max_depth": 3}},
 }
 

@@ -62,7 +62,7 @@ for variant in sys.argv[1:]:
         ("pathreplay", glassy_scene, eta), ("pathreplay", cloudy_scene, density), ("pathreplay", glassy_scene, paint),
         ("pathreplay_tape", glassy_scene, eta), ("pathreplay_rb", glassy_scene, paint), ("prb", glassy_scene, paint),
     ]:
-        options = {"numbers": "scene"} if plugin == "pathreplay" else {}  # those of the others
+        options = {"numbers": "scene", "edges": "none"} if plugin == "pathreplay" else {}  # as the others have it
         integrator = mi.load_dict({"type": plugin, "max_depth": 4, **options})
         assert isinstance(integrator, mi.Integrator), (variant, plugin)
         print()  # ends what Mitsuba's log may have begun

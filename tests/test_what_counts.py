@@ -239,7 +239,7 @@ def test_a_mask_that_is_lost_is_missed(room: Path) -> None:
     job = {**JOB, "iterations": 1, "target": {"images": ["target.exr"], "masks": ["mask.exr"]}}
     folder = optimize(make_config(job), progress=False).folder
     (folder / "images" / "weight-one.exr").write_bytes(exr_bytes(LEFT[:2]))
-    with pytest.raises(PathreplayError, match="The mask of sensor 'one' in the run folder"):
+    with pytest.raises(PathreplayError, match=r"weight-one\.exr .* has changed since it was written"):
         optimize(resume=folder, progress=False)
     (folder / "images" / "weight-one.exr").unlink()
     with pytest.raises(PathreplayError, match="The mask of sensor 'one' in the run folder"):

@@ -67,11 +67,12 @@ def _told(what: str) -> Iterator[Callable[[int, int], None]]:
     def say(line: str) -> None:
         console.print(Text(f"pathreplay: {line}"), soft_wrap=True)
 
-    say(f"checking {what}")
     last = [time.monotonic()]
 
     def tell(done: int, total: int) -> None:
-        if time.monotonic() - last[0] >= _PAUSE_S:
+        if done == 0:
+            say(f"checking {what}")
+        elif time.monotonic() - last[0] >= _PAUSE_S:
             last[0] = time.monotonic()
             say(f"{what}: {done} of {total} renderings")
 

@@ -107,7 +107,7 @@ def check_gradient(
             height x width x channels) to a scalar, which is linearised once at a rendered image: the check
             is one of the renderer, and a nonlinear loss of a noisy image would be biased.
         seed: chooses all random numbers, and the direction.
-        progress: called with (renderings done, renderings in all).
+        progress: called with (renderings done, renderings in all), first with 0 when all arguments are known to do.
 
     Returns:
         the estimates, their standard errors and the verdict (see :mod:`pathreplay.check.verdict`).
@@ -147,6 +147,7 @@ class _Plan:
         self, objective: Objective, line: Line, tested: mi.Integrator, plain: mi.Integrator, loss: Loss | None
     ) -> GradientCheck:
         n, stencil = self.seeds, line.stencil
+        self._tell()
         # Distinct 32-bit words: seeds of the gradient's primal image, of its derivative, of the reference, of the
         # weights.
         words = [int(word) for word in np.random.SeedSequence(self.seed).generate_state(3 * n + 1)]
@@ -178,9 +179,12 @@ class _Plan:
 
     def _tick(self, result: float = 0.0) -> float:
         self.done += 1
+        self._tell()
+        return result
+
+    def _tell(self) -> None:
         if self.progress is not None:
             self.progress(self.done, 1 + 5 * self.seeds)
-        return result
 
 
 def _line(

@@ -243,7 +243,8 @@ class PathIntegrator:
     def to_hand(self, scene: mi.Scene) -> Handed:
         """What passes over this scene are to be handed if they are recorded."""
         facts = facts_of(scene)
-        return Handed(facts.tables(), facts.branches(), facts.constants())
+        self.tables = facts.tables()  # now, since a recording wants all that integrators hold to stay as it is
+        return Handed(self.tables, facts.branches(), facts.constants())
 
     def _described(self, **more: Any) -> str:
         depth = -1 if self.max_depth == UNBOUNDED else self.max_depth
