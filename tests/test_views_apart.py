@@ -14,6 +14,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse import iterate, make_config, optimize
 from pathreplay.inverse.evaluate import Evaluator, Shard
 from pathreplay.inverse.problem import build_problem
+from pathreplay.render import parts
 from pathreplay.scenes.parameters import get_array
 from test_inverse_run import JOB, SCENE, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 
@@ -150,5 +151,25 @@ def test_a_script_gets_zero_in_the_view_of_another_camera() -> None:
         integrator = mi.load_dict({"type": "pathreplay", "edges": edges})
         dr.backward(dr.sum(mi.render(scene, params, sensor=1, integrator=integrator, spp=4), axis=None))
         assert dr.grad(x) == 0
+    params["left.x_fov"] = dr.detach(x)
+    params.update()
+
+
+def test_a_view_in_parts_keeps_what_another_view_gave(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pass of many samples adds up its parts apart, and gives back what was there, also where it adds nothing."""
+    for name, value in (("MOST_AT_ONCE", 20), ("A_PART", 16), ("LEAST_A_PIXEL", 1)):
+        monkeypatch.setattr(parts, name, value)
+    scene = mi.load_string(SCENE)
+    params = mi.traverse(scene)
+    x = mi.Float(params["left.x_fov"])
+    dr.enable_grad(x)
+    params["left.x_fov"] = x
+    params.update()
+    integrator = mi.load_dict({"type": "pathreplay", "edges": "none"})
+    found = []
+    for sensor in (0, 1):
+        dr.backward(dr.sum(mi.render(scene, params, sensor=sensor, integrator=integrator, spp=4), axis=None))
+        found.append(dr.grad(x)[0])
+    assert found[0] != 0 and found[1] == found[0]
     params["left.x_fov"] = dr.detach(x)
     params.update()

@@ -39,7 +39,7 @@ class Worth:
     def of(seen: Survey, light: mi.Float, scale: mi.Float) -> Worth:
         """Of a line with this survey; ``scale`` is the rest of its worth. What is not finite counts as zero."""
         edges = seen.found * seen.near * seen.bright * scale
-        return Worth(seen.found, _finite(edges), _finite(light))
+        return Worth(_finite(seen.found), _finite(edges), _finite(light))
 
 
 def _finite(x: mi.Float) -> mi.Float:

@@ -143,6 +143,7 @@ def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> Cluster:
     folder = tempfile.mkdtemp(prefix="pathreplay-", dir=usual if len(usual) <= _LONGEST_FOLDER else "/tmp")
     guard = Guard(Path(folder))
     stack.callback(guard.close)
+    before = set(_sessions())  # what the user has started himself is none of Ray's
     with _private_environment(ray), _apart(ray):
         try:
             ray.init(
@@ -155,11 +156,11 @@ def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> Cluster:
                 _temp_dir=str(Path(folder) / "ray"),
             )
         except Exception as error:  # Ray's own are of that kind
-            guard.watch(_sessions())
+            guard.watch(sorted(set(_sessions()) - before))
             with contextlib.suppress(Exception):
                 ray.shutdown()
             raise PathreplayError(f"executor = 'ray': Ray cannot start here ({_first_line(error)})") from None
-    guard.watch(_sessions())
+    guard.watch(sorted(set(_sessions()) - before))
     known = {process.name(): process for process in psutil.Process().children()}
     cluster = Cluster(ray, True, [known[name] for name in _VITAL if name in known])
     stack.callback(ray.shutdown)

@@ -29,7 +29,7 @@ if "done" not in said:
     except OSError:
         pass
 def left():
-    for name in os.listdir("/proc"):
+    for name in os.listdir("/proc") if os.path.isdir("/proc") else ():
         try:
             if name.isdigit() and os.getsid(int(name)) in sessions and os.stat("/proc/" + name).st_uid == os.getuid():
                 if open(f"/proc/{name}/stat").read().rpartition(")")[2].split()[0] != "Z":

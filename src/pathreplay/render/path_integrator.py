@@ -150,17 +150,19 @@ class PathIntegrator:
         # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
         of_parts = self._parts(scene, sensor, seed, spp)
         sums = Sums(scene) if len(of_parts) > 1 else None
-        for part in of_parts:
-            with self._passing(), dr.isolate_grad():
-                walk, terms = self._planned(part)
-                learned = self._learned(part, walk)
-                wanted = grad_in if part.share == 1 else grad_in * part.share
-                found = reduce(add, [term.backward(part, walk, wanted, learned) for term in terms])
-            self._told(part, walk, found)
-            if sums is not None:
-                sums.take()
-        if sums is not None:
-            sums.give()
+        try:
+            for part in of_parts:
+                with self._passing(), dr.isolate_grad():
+                    walk, terms = self._planned(part)
+                    learned = self._learned(part, walk)
+                    wanted = grad_in if part.share == 1 else grad_in * part.share
+                    found = reduce(add, [term.backward(part, walk, wanted, learned) for term in terms])
+                self._told(part, walk, found)
+                if sums is not None:
+                    sums.take()
+        finally:
+            if sums is not None:  # also of a view that no parameter reaches: what others gave stays
+                sums.give()
 
     def sample(
         self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool = True, **_: Any
