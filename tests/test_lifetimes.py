@@ -221,6 +221,26 @@ def test_a_pass_beside_one_of_another_thread_is_refused() -> None:
     assert len(told) == 1 and "pathreplay.exclusive()" in told[0]
 
 
+def test_a_thread_that_collects_garbage_disturbs_no_pass() -> None:
+    """It knows nothing of Mitsuba; Python collects in whatever thread makes objects."""
+    done = threading.Event()
+
+    def litter() -> None:
+        while not done.is_set():
+            kept: list[Any] = []
+            kept.extend([kept] for _ in range(2000))
+
+    thread = threading.Thread(target=litter)
+    thread.start()
+    try:
+        for _ in range(20000):
+            with careful():
+                pass
+    finally:
+        done.set()
+        thread.join()
+
+
 SEQUENCE = """
 import sys
 sys.path.insert(0, sys.argv[1])

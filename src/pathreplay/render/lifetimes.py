@@ -74,6 +74,8 @@ class SceneMemory(Generic[T]):
 
 _MEMORIES: list[SceneMemory] = []
 _ONE_THREAD = threading.RLock()
+_AT_COLLECTION = threading.Lock()
+"""Held by `_collected`, which has the other one for a moment, in whatever thread Python collects."""
 _passes = 0  # under way, one within the other
 _put_aside = False  # objects are kept from the collector
 
@@ -110,7 +112,7 @@ def careful() -> Iterator[None]:
     Raises PathreplayError if another thread has one, or is `exclusive`.
     """
     global _passes
-    if not _ONE_THREAD.acquire(blocking=False):
+    if not _entered():
         raise PathreplayError(
             "pathreplay: another Python thread is rendering, and Dr.Jit computes wrong numbers if two use it at once: "
             "put all that each thread does with Mitsuba into 'with pathreplay.exclusive():', or use processes"
@@ -132,6 +134,16 @@ def careful() -> Iterator[None]:
         if collecting:
             gc.enable()
         _ONE_THREAD.release()
+
+
+def _entered() -> bool:
+    """Take the lock, unless another thread has it that does more than collect garbage."""
+    while not _ONE_THREAD.acquire(blocking=False):
+        if not _AT_COLLECTION.locked():
+            return _ONE_THREAD.acquire(blocking=False)
+        with _AT_COLLECTION:  # until that is over
+            pass
+    return True
 
 
 @contextmanager
@@ -164,23 +176,29 @@ def _put_garbage_aside() -> None:
 def _collected(phase: str, info: dict[str, int]) -> None:
     """Called by the collector: before it runs, give back what was put aside; after it ran, release scenes."""
     global _put_aside
-    if is_recording() or not _ONE_THREAD.acquire(blocking=False):
+    if is_recording() or not _AT_COLLECTION.acquire(blocking=False):
         return
     try:
-        if _passes:
+        if not _ONE_THREAD.acquire(blocking=False):
             return
-        if phase == "start" and _put_aside:
-            gc.unfreeze()
-            _put_aside = False
-        elif phase == "stop":
-            _release()
+        try:
+            if _passes:
+                return
+            if phase == "start" and _put_aside:
+                gc.unfreeze()
+                _put_aside = False
+            elif phase == "stop":
+                _release()
+        finally:
+            _ONE_THREAD.release()
     finally:
-        _ONE_THREAD.release()
+        _AT_COLLECTION.release()
 
 
 def _end() -> None:
     """Free what is left while Dr.Jit is still there to be told."""
-    gc.callbacks.remove(_collected)
+    if _collected in gc.callbacks:
+        gc.callbacks.remove(_collected)
     for memory in _MEMORIES:
         memory.clear()
 
