@@ -37,6 +37,25 @@ STAYS = ["wall.bsdf.reflectance.value", "card.vertex_texcoords", "rough.bsdf.eta
          "lamp.intensity.value", "sky.data", "sky.scale"]  # fmt: skip
 
 
+#: Where nothing has an outline, and rough lobes follow their samples.
+BALL: dict[str, Any] = {
+    "type": "scene",
+    "cam": ROOM["cam"],
+    "ball": {"type": "sphere", "bsdf": {"type": "roughconductor", "alpha": 0.2}},
+    "sky": {"type": "constant"},
+}
+
+
+def test_roughness_moves_no_edge_where_lobes_follow_their_samples() -> None:
+    scene = mi.load_dict(BALL, optimize=False)
+    by = ours()
+    for key, moves in (("ball.bsdf.alpha.value", False), ("ball.to_world", True)):
+        with attached(scene, key):
+            view = Pass.of(scene, 0, 0, 1)
+            walk = by._walk(scene, view.sensor)
+            assert walk.follows and Boundary.move(view, walk) is moves, key
+
+
 @pytest.fixture(scope="module")
 def room() -> mi.Scene:
     return mi.load_dict(ROOM, optimize=False)

@@ -40,8 +40,8 @@ INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
 class Boundary:
     """A term: edges that the camera sees, directly or by mirrors and glass, and those that surfaces and particles see.
 
-    Not differentiated: hard shadows beyond the first vertex that scatters; edges of
-    textures and of masks; alpha.
+    Not differentiated: hard shadows beyond the first vertex that scatters, with media; edges of textures and of masks;
+    alpha.
     """
 
     film: bool = True  # edges that the camera sees

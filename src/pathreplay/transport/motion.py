@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..traversal import known_values
 from . import scatter
 from .arrive import Vertex
-from .nodes import nodes_of
+from .nodes import nodes_of, with_gradients
 from .start import CameraStart
 from .vertex import Arrival, Kept, Numbers, Replayed, Walk
 
@@ -53,9 +53,10 @@ def edges_move(walk: Walk, start: CameraStart, at: Arrival) -> bool:
     """Whether something that can hide light, or what is seen or lit from, depends on parameters with gradients.
 
     As `path_moves`, but for texture coordinates and the tangents that follow them: what is painted on a surface hides
-    nothing.
+    nothing. A projector that turns moves the border of what it lights, though its light comes from where it came.
     """
-    return _depends(walk, start, at, painted=False)
+    turns = walk.attach != "none" and any(with_gradients(light, "to_world") for light in walk.traits.projectors)
+    return turns or _depends(walk, start, at, painted=False)
 
 
 def _depends(walk: Walk, start: CameraStart, at: Arrival, painted: bool) -> bool:
@@ -67,7 +68,8 @@ def _depends(walk: Walk, start: CameraStart, at: Arrival, painted: bool) -> bool
         if painted:
             moving += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
-        for bsdf in walk.traits.mirrors + (walk.traits.attachables if walk.follows else ()):
+        # Rough lobes are followed where nothing has an outline, and so there are no edges to move.
+        for bsdf in walk.traits.mirrors + (walk.traits.attachables if walk.follows and painted else ()):
             sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))
             moving.append(sample.wo)
         light, _ = walk.scene.sample_emitter_direction(still, mi.Point2f(0.5), False)
