@@ -59,6 +59,14 @@ def test_a_job_without_integrator_has_the_depth_and_options_of_the_scenes() -> N
     assert read_limits(problem(integrator={"type": "pathreplay"}).integrator) == Limits(6, 5, False)
 
 
+def test_a_scene_without_a_bound_leaves_the_job_the_default_depth() -> None:
+    """`path` has none unless it is told, and paths without a bound are walked twice."""
+    Path("scene.xml").write_text(SCENE.format(integrator="path", options="").replace('"2"', '"-1"'))
+    found = build_problem(make_config(JOB), Path.cwd())
+    assert read_limits(found.integrator) == Limits(6, 5, True)
+    assert read_limits(mi.load_dict(found.config.target.integrator.model_dump())) == Limits(6, 5, True)
+
+
 @pytest.mark.parametrize("given", [None, {"type": "pathreplay", "max_depth": 3}])
 def test_targets_are_rendered_as_the_job_renders(given: dict[str, Any] | None) -> None:
     """Without any of their own: with the depth of the job, and emitters hidden or not. Nothing has to be told."""

@@ -84,7 +84,8 @@ class Sums:
     def __init__(self, folder: Path) -> None:
         self.folder, path = folder, folder / SUMS
         if problem := file_problem(path, _MOST_BYTES):
-            raise PathreplayError(f"File {path} {problem}; {_WAY_OUT}")
+            old = "" if path.exists() else " (runs of versions before checksums cannot be gone on with)"
+            raise PathreplayError(f"File {path} {problem}{old}; {_WAY_OUT}")
         try:
             self.table = _TABLE.validate_json(path.read_bytes(), strict=True)
         except (OSError, ValidationError):

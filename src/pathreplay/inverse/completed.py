@@ -40,7 +40,10 @@ def _options(own: Any) -> dict[str, Any]:
     limits = None if own is None else read_limits(own)
     if limits is None:
         return {}
-    return vars(limits) | (own.options() if hasattr(own, "options") else {})
+    if hasattr(own, "options"):
+        return vars(limits) | own.options()
+    # Without a bound paths are walked twice, which nobody asks for who leaves out a depth that Mitsuba has none for.
+    return {name: value for name, value in vars(limits).items() if name != "max_depth" or value >= 0}
 
 
 def _differences(ours: Limits | None, theirs: Limits | None, config: Config) -> tuple[str, ...]:

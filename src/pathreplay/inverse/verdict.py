@@ -67,11 +67,13 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
     taken = float(pixels) * views * sum(entry.spp for entry in run.history)
     try:
         columns, unseen = columns_of(problem, run.values, taken)
-    except PathreplayError:  # a function of the user's may not take what is beside the values: the run is done
+        pairs = trade_offs(columns)
+    except (PathreplayError, RuntimeError, ValueError, np.linalg.LinAlgError):
+        # A function of the user's, or Mitsuba, may not take what is beside the values: the run is done.
         return Verdict(moving, arrived)
     # An outline may stay where it is among few samples; edges pull all the same.
     pulled = {key for entry in run.history for key, slopes in entry.slopes.items() if any(slopes)}
-    return Verdict(moving, arrived, trade_offs(columns), tuple(key for key in unseen if key not in pulled))
+    return Verdict(moving, arrived, pairs, tuple(key for key in unseen if key not in pulled))
 
 
 def _begin(problem: Problem, key: str, run: Run) -> int:

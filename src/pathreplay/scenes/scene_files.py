@@ -85,7 +85,7 @@ def require_sound_files(state: Any) -> None:
         elif kind == "gridvolume":
             require_whole_vol(path)
         elif kind in ("bitmap", "envmap"):
-            require_readable_picture(path)
+            require_readable_picture(path, pixels=2**31)  # of its size only memory decides
         elif kind == "serialized":
             require_sound_serialized(path, node.props.get("shape_index", 0))
 
