@@ -22,9 +22,9 @@ MANY = 32
 """Passes where a small difference is to be seen, or where small lamps are looked for by chance."""
 COUNTED_TWICE = {
     "shadow_lamp": MANY,
-    "shadow_all": 2 * MANY,
+    "shadow_all": 6 * MANY,
     "lamp_lights": MANY,
-    "sphere_lamp": MANY,
+    "sphere_lamp": 3 * MANY,
     "cube8_lit": 4 * MANY,
 }
 """Cells in which something moves that the interior follows, and that edges could add again, and passes that show it."""

@@ -22,14 +22,16 @@ def mesh_pieces(mesh: mi.Mesh) -> np.ndarray:
     if "faces" not in params:
         return np.zeros(mesh.face_count(), int)
     faces, positions = (np.array(params[key]).reshape(-1, 3) for key in ("faces", "vertex_positions"))
-    return smooth_pieces(faces, positions)
+    # What a lamp emits has no seam: lines that find one would be lost for its outline.
+    return smooth_pieces(faces, positions, 0 if mesh.is_emitter() else WELD)
 
 
-def smooth_pieces(faces: np.ndarray, positions: np.ndarray) -> np.ndarray:
+def smooth_pieces(faces: np.ndarray, positions: np.ndarray, weld: float = WELD) -> np.ndarray:
     """A number for each triangle, other ones on both sides of an edge; all zero where there is none.
 
     What hangs together by vertices is one piece. Where a piece meets itself without sharing vertices, as where an edge
-    runs out, each triangle there is a piece of its own.
+    runs out, each triangle there is a piece of its own. Vertices meet up to the share ``weld`` of the mesh's diagonal,
+    and rounding; with 0 exactly.
     """
     count = len(positions)
     links = coo_matrix((np.ones(faces.size, bool), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), (count, count))
@@ -37,7 +39,7 @@ def smooth_pieces(faces: np.ndarray, positions: np.ndarray) -> np.ndarray:
     sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2).astype(np.int64), axis=1)
     _, side, shared = np.unique(sides[:, 0] * count + sides[:, 1], return_inverse=True, return_counts=True)
     alone = np.flatnonzero(shared[side] == 1)
-    places = _places(positions, sides[alone].ravel())
+    places = _places(positions, sides[alone].ravel(), weld)
     of = alone // 3  # triangles
     meeting = np.column_stack([np.sort(places.reshape(-1, 2), axis=1), pieces[of]])
     _, where, together = np.unique(meeting, axis=0, return_inverse=True, return_counts=True)
@@ -46,7 +48,7 @@ def smooth_pieces(faces: np.ndarray, positions: np.ndarray) -> np.ndarray:
     return np.unique(pieces, return_inverse=True)[1].reshape(-1)
 
 
-def _places(positions: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+def _places(positions: np.ndarray, vertices: np.ndarray, weld: float) -> np.ndarray:
     """A number for each of some vertices, the same where they are in one place but for rounding.
 
     Programs compute both ends of a seam, say by sines of 0 and of 2π, which differ in the last bits.
@@ -55,7 +57,7 @@ def _places(positions: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     if not len(ends):
         return at
     diagonal = np.linalg.norm(np.ptp(positions, axis=0))
-    near = WELD * diagonal + ULPS * np.finfo(np.float32).eps * np.abs(positions).max()
+    near = weld * diagonal + ULPS * np.finfo(np.float32).eps * np.abs(positions).max() if weld else 0.0
     pairs = cKDTree(positions[ends]).query_pairs(near, output_type="ndarray")
     same = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), (len(ends), len(ends)))
     return connected_components(same, directed=False)[1][at]
