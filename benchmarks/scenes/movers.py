@@ -16,7 +16,6 @@ import numpy as np
 from .edges import ball_with_bumps, mesh_of
 from .parts import SceneDict, sensor
 
-T = mi.ScalarTransform4f
 HEAD, FIELD = 2000, 24
 """Vertices of the head, and of a side of the field of heights."""
 Move = Callable[[Any, mi.Float], Any]
@@ -29,6 +28,11 @@ class Mover:
     scene: Callable[[int], SceneDict]
     move: Move
     step: float = 0.02  # of finite differences
+
+
+def T() -> Any:
+    """The identity, of the variant that is set when a scene is made."""
+    return mi.ScalarTransform4f()
 
 
 # ------------------------------ Moves ------------------------------
