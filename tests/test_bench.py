@@ -65,6 +65,11 @@ def test_a_run_that_is_as_fast_and_as_noisy_is_not_flagged() -> None:
     assert not comparison.worse and "2 of 2" in comparison.table()
 
 
+def test_benchmarks_can_be_imported_before_a_variant_is_set(run_python) -> None:
+    done = run_python("import benchmarks.__main__")
+    assert done.returncode == 0, done.stderr
+
+
 def test_what_is_no_file_is_no_record() -> None:
     with pytest.raises(PathreplayError, match="/dev/zero cannot be read: it is a device"):
         records.read(Path("/dev/zero"))

@@ -18,7 +18,8 @@ from .parts import SceneDict, sensor
 
 HEAD, FIELD = 2000, 24
 """Vertices of the head, and of a side of the field of heights."""
-Move = Callable[[Any, mi.Float], Any]
+Move = Callable[..., Any]
+"""(value, number) -> the value that is moved by it."""
 
 
 @dataclass(frozen=True)
