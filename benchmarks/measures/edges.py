@@ -89,7 +89,8 @@ class EdgePass:
     def _integrator(self, name: str) -> Any:
         if name not in self.integrators:
             plugin = METHODS["auto" if name in PARTS else name]
-            self.integrators[name] = mi.load_dict(plugin | self.job.limits)
+            alone = {"edges": "none"} if name in PARTS else {}  # the boundary takes the interior's place
+            self.integrators[name] = mi.load_dict(plugin | self.job.limits | alone)
             if name in PARTS:
                 self.integrators[name].interior = Boundary(**PARTS[name])
         return self.integrators[name]
