@@ -13,6 +13,7 @@ from ..gradient.pixel_numbers import Alone, EvenSets, PixelNumbers
 from ..plugins import mitsuba_integrator
 from ..transport.even import Even, in_order, key_of
 from ..transport.start import CameraStart
+from .lifetimes import is_recording
 
 Seed: TypeAlias = "int | mi.UInt32"
 Which: TypeAlias = "int | mi.Sensor"
@@ -119,7 +120,7 @@ class Pass:
 
         Nothing in a frozen function, which cannot read it.
         """
-        if dr.flag(dr.JitFlag.FreezingScope):
+        if is_recording():
             return ()
         seed = int(self.seed) if isinstance(self.seed, int) else int(self.seed[0])
         return ((seed, self.spp, self.sensor.ptr),)

@@ -15,13 +15,12 @@ from ..transport.traits import (
     Traits,
     blend_lengths,
     fixed_traits,
-    is_null,
     lamp_balls,
     pieces_of,
     tables_of,
 )
 from ..transport.traits import Tables as Tables
-from .lifetimes import scene_memory
+from .lifetimes import SCENES
 
 
 class SceneFacts:
@@ -39,9 +38,7 @@ class SceneFacts:
         self._emitters = [*scene.emitters(), *(shape for shape in self._shapes if shape.is_emitter())]
         self._lamps = [shape for shape in self._shapes if shape.is_mesh() and shape.is_emitter()]
         self._instances = [shape for shape in self._shapes if shape.class_name() == INSTANCE]
-        bsdfs = [node for node in nodes if isinstance(node, mi.BSDF)]
-        self._masks = [bsdf for bsdf in bsdfs if bsdf.class_name() == MASK]
-        self._passes = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_null(bsdf) for bsdf in bsdfs)
+        self._masks = [node for node in nodes if isinstance(node, mi.BSDF) and node.class_name() == MASK]
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
 
     def are_about(self, scene: mi.Scene) -> bool:
@@ -55,7 +52,7 @@ class SceneFacts:
 
     def media(self, sensor: mi.Sensor | None, branches: bool | None = None) -> Media | None:
         """What the walk wants to know of media now; ``sensor`` (or None) may be in one. For the rest: see there."""
-        return scene_media(self._media, self._passes, sensor, branches)
+        return scene_media(self._media, self._traits.veils, sensor, branches)
 
     def constants(self) -> tuple[object, ...]:
         """All of media that kernels take for constants, now: see `GridMedium`. Those of Mitsuba have none."""
@@ -94,9 +91,10 @@ class SceneFacts:
         return self._tables
 
     def recorded_tables(self, known: Tables | None, edges: bool) -> Tables:
-        """Those of a pass that `dr.freeze` records: the ``known`` ones, if they are of this scene, as they are.
+        """The tables of a pass that `dr.freeze` records.
 
-        Else the recording writes them, as they are now; with those of pieces only if it looks for ``edges``.
+        The ``known`` tables are taken as they are if they belong to this scene. Otherwise the recording writes the
+        tables of the scene as it is now, and those of pieces only if it looks for ``edges``.
         """
         if known is not None and known is self._tables:
             return known
@@ -113,9 +111,6 @@ def _parts(scene: mi.Scene) -> list[mi.Object]:
     return [*scene.sensors(), *scene.emitters(), *shapes, *(shape.bsdf() for shape in shapes)]
 
 
-_FACTS = scene_memory()
-
-
 def facts_of(scene: mi.Scene) -> SceneFacts:
     """The facts about a scene, found once; anew where the scene has become another."""
-    return _FACTS.about(scene, lambda facts: facts.are_about(scene), lambda: SceneFacts(scene))
+    return SCENES.about(scene, lambda facts: facts.are_about(scene), lambda: SceneFacts(scene))

@@ -140,9 +140,9 @@ class PathReplayIntegrator(PathIntegrator):
                 self._tell_once(COST_OF_EDGES)
             edges = not why
         if not edges:
-            return walk, tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
+            return walk, (self.interior,)
         if is_recording():
-            walk = replace(walk, traits=replace(walk.traits, tables=self._tables(view.scene, edges=True)))
+            walk = replace(walk, traits=replace(walk.traits, tables=self._tables(facts_of(view.scene), edges=True)))
         return replace(walk, edges=self.edges != "film" and walk.media is None), terms
 
     def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
@@ -200,7 +200,7 @@ class PathReplayIntegrator(PathIntegrator):
             self._tell_once(doubt)
         if walk.media is None:
             return None
-        if dr.flag(dr.JitFlag.FreezingScope):
+        if is_recording():
             return None if self.handed is None else self.handed.guess
         facts = facts_of(walk.scene)
         if self.baseline is None or self.baseline[0]() is not facts:
@@ -231,7 +231,7 @@ class PathReplayIntegrator(PathIntegrator):
         `take_untold`, which tells of the passes before, too."""
         if found.moves:
             self._tell_edges(walk, view.sensor)
-        frozen = dr.flag(dr.JitFlag.FreezingScope)
+        frozen = is_recording()
         self.untold = self.untold + replace(found, image=None) if frozen else Found()
         if not frozen:
             self._keep(found)

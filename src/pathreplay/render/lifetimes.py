@@ -72,18 +72,13 @@ class SceneMemory(Generic[T]):
         self._kept.clear()
 
 
-_MEMORIES: list[SceneMemory] = []
+SCENES: SceneMemory = SceneMemory()
+"""What is known of the scenes of this process, released as the rules above say."""
 _ONE_THREAD = threading.RLock()
 _AT_COLLECTION = threading.Lock()
 """Held by `_collected`, which has the other one for a moment, in whatever thread Python collects."""
 _passes = 0  # under way, one within the other
 _put_aside = False  # objects are kept from the collector
-
-
-def scene_memory() -> SceneMemory:
-    """A memory that is released as the rules above say."""
-    _MEMORIES.append(SceneMemory())
-    return _MEMORIES[-1]
 
 
 def is_recording() -> bool:
@@ -120,7 +115,7 @@ def careful() -> Iterator[None]:
     collecting = gc.isenabled()
     try:
         if _passes == 0 and not is_recording():
-            _release()
+            SCENES.release()
         gc.disable()
         _passes += 1
         try:
@@ -160,11 +155,6 @@ def plain_errors() -> Iterator[None]:
         raise cause from None
 
 
-def _release() -> None:
-    for memory in _MEMORIES:
-        memory.release()
-
-
 def _put_garbage_aside() -> None:
     """Keep all objects from the collector, unless somebody else does; takes no time. See `_collected`."""
     global _put_aside
@@ -188,7 +178,7 @@ def _collected(phase: str, info: dict[str, int]) -> None:
                 gc.unfreeze()
                 _put_aside = False
             elif phase == "stop":
-                _release()
+                SCENES.release()
         finally:
             _ONE_THREAD.release()
     finally:
@@ -199,8 +189,7 @@ def _end() -> None:
     """Free what is left while Dr.Jit is still there to be told."""
     if _collected in gc.callbacks:
         gc.callbacks.remove(_collected)
-    for memory in _MEMORIES:
-        memory.clear()
+    SCENES.clear()
 
 
 gc.callbacks.append(_collected)

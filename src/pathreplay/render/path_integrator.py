@@ -23,7 +23,7 @@ from ..transport.start import CameraStart
 from ..transport.traits import Tables
 from ..transport.vertex import Walk
 from .camera_pass import Pass, Seed, Which
-from .facts import facts_of
+from .facts import SceneFacts, facts_of
 from .interior import image
 from .lifetimes import careful, is_recording
 from .parts import Sums, parts
@@ -211,7 +211,7 @@ class PathIntegrator:
         branches = None if self.handed is None else self.handed.branches
         return Walk(
             scene=scene,
-            traits=facts.traits(self._tables(scene)),
+            traits=facts.traits(self._tables(facts)),
             media=facts.media(sensor, branches),  # type: ignore[arg-type]
             attach=self.attach,
             hide_emitters=self.hide_emitters,
@@ -220,13 +220,13 @@ class PathIntegrator:
             skip_area_emitters=self.skip_area_emitters,
         )
 
-    def _tables(self, scene: mi.Scene, edges: bool = False) -> Tables:
+    def _tables(self, facts: SceneFacts, edges: bool = False) -> Tables:
         """Those of a pass; while `dr.freeze` records, with all that is asked for ``edges``."""
         if self.handed is not None:
             return self.handed.tables
         if is_recording():
-            return facts_of(scene).recorded_tables(self.tables, edges)
-        self.tables = facts_of(scene).tables()
+            return facts.recorded_tables(self.tables, edges)
+        self.tables = facts.tables()
         return self.tables
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:

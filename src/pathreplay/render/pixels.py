@@ -14,6 +14,7 @@ from ..gradient.pixel_sweep import PixelLoss
 from ..gradient.record import LARGEST_RECORD, MAX_DEPTH
 from .camera_pass import Pass
 from .filter_samples import FilterSamples, is_drawable
+from .lifetimes import is_recording
 
 
 def _most(max_depth: int) -> int:
@@ -104,7 +105,7 @@ def pixel_loss(
     for tensor in (offset, slope):
         if tensor.shape != shape:
             raise PathreplayError(f"pathreplay: derivative of the loss has shape {tensor.shape}: use {shape}")
-    if pixels is not None and not dr.flag(dr.JitFlag.FreezingScope):
+    if pixels is not None and not is_recording():
         numbers = np.unique(np.array(pixels))
         if len(numbers) < dr.width(pixels) or numbers[-1] >= width * height:
             raise PathreplayError(
