@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 from pathreplay.inverse.config import Config, Plugin
-from pathreplay.render.facts import SceneFacts
+from pathreplay.render.facts import facts_of
 from pathreplay.render.path_limits import Limits, read_limits
 from pathreplay.scenes.descriptions import load_integrator
 
@@ -30,19 +30,19 @@ def completed(config: Config, scene: mi.Scene) -> tuple[Config, tuple[str, ...]]
     asked = config.target.integrator
     if asked is not None:
         return config, _differences(limits, read_limits(load_integrator(asked.model_dump())), config)
-    name = "volpath" if SceneFacts(scene).has_media else "path"
+    name = "volpath" if facts_of(scene).has_media else "path"
     plugin = Plugin(type=name, **({"max_depth": 6} if limits is None else vars(limits)))
     return config.model_copy(update={"target": config.target.model_copy(update={"integrator": plugin})}), ()
 
 
 def _options(own: Any) -> dict[str, Any]:
-    """What a scene's integrator says, as options of `pathreplay`; nothing where there is none, or it has no limits."""
+    """The options of `pathreplay` that a scene's integrator implies; empty without one, or if it has no limits."""
     limits = None if own is None else read_limits(own)
     if limits is None:
         return {}
     if hasattr(own, "options"):
         return vars(limits) | own.options()
-    # Without a bound paths are walked twice, which nobody asks for who leaves out a depth that Mitsuba has none for.
+    # Mitsuba's integrators are unbounded unless they are told, and unbounded paths would be walked twice.
     return {name: value for name, value in vars(limits).items() if name != "max_depth" or value >= 0}
 
 

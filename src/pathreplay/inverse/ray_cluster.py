@@ -143,7 +143,7 @@ def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> Cluster:
     folder = tempfile.mkdtemp(prefix="pathreplay-", dir=usual if len(usual) <= _LONGEST_FOLDER else "/tmp")
     guard = Guard(Path(folder))
     stack.callback(guard.close)
-    before = set(_sessions())  # what the user has started himself is none of Ray's
+    before = _sessions()  # what the user has started himself is none of Ray's
     with _private_environment(ray), _apart(ray):
         try:
             ray.init(
@@ -156,11 +156,11 @@ def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> Cluster:
                 _temp_dir=str(Path(folder) / "ray"),
             )
         except Exception as error:  # Ray's own are of that kind
-            guard.watch(sorted(set(_sessions()) - before))
+            guard.watch(_sessions() - before)
             with contextlib.suppress(Exception):
                 ray.shutdown()
             raise PathreplayError(f"executor = 'ray': Ray cannot start here ({_first_line(error)})") from None
-    guard.watch(sorted(set(_sessions()) - before))
+    guard.watch(_sessions() - before)
     known = {process.name(): process for process in psutil.Process().children()}
     cluster = Cluster(ray, True, [known[name] for name in _VITAL if name in known])
     stack.callback(ray.shutdown)
@@ -173,13 +173,13 @@ def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> Cluster:
     return cluster
 
 
-def _sessions() -> list[int]:
+def _sessions() -> set[int]:
     """Those that Ray's processes are in: see `_apart`."""
     ours, found = os.getsid(0), set()
     for process in psutil.Process().children(recursive=True):
         with contextlib.suppress(OSError):
             found.add(os.getsid(process.pid))
-    return sorted(found - {ours})
+    return found - {ours}
 
 
 def _connect(ray: Any, address: str) -> None:
@@ -235,7 +235,7 @@ def _require_closed(ray: Any, address: str) -> None:
 def _private_environment(ray: Any) -> Iterator[None]:
     """Within this block Ray starts a cluster that uses loopback and our token, and tells nobody of it."""
     ours = {_MANY_MACHINES: "0", _MODE: "token", _TOKEN: _SECRET, "RAY_USAGE_STATS_ENABLED": "0"}
-    # Ray would end this process when its head has been silent for so many seconds: see `Cluster.require`.
+    # Seconds of silence of its head after which Ray would end this process; `Cluster.require` notices earlier.
     ours["RAY_gcs_rpc_server_reconnect_timeout_s"] = str(10**6)
     ours["RAY_worker_niceness"] = "0"  # actors are the run, and no less urgent than it would be by itself
     before = {name: os.environ.get(name) for name in ours}

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.nodes import nodes_of
+from ..traversal import known_values
 
 
 def reached_sensors(
@@ -29,7 +30,7 @@ def reached_sensors(
 def attached_keys(params: mi.SceneParameters) -> list[str]:
     """The keys whose values have gradients."""
     with dr.resume_grad():
-        return [key for key in params.keys() if dr.grad_enabled(params[key])]
+        return [key for key, value in known_values(params) if dr.grad_enabled(value)]
 
 
 def unreached_note(scene: mi.Scene, sensor: mi.Sensor) -> str:
