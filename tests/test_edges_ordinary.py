@@ -27,30 +27,30 @@ def one_film(sensor: dict) -> dict:
     return {"type": "scene", "camera": {"film": film, **sensor}, "square": {"type": "rectangle"}, "sky": sky}
 
 
-@pytest.mark.slow
-def test_batch_sensors_are_refused() -> None:
-    pinhole = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])}
-    scene = mi.load_dict(one_film({"type": "batch", "one": pinhole, "two": pinhole}))
+PINHOLE = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])}
+
+
+def hold_refusal(description: dict, edges: str, message: str) -> None:
+    """To edges of this scene being refused where its square moves."""
+    scene = mi.load_dict(description)
     params = mi.traverse(scene)
     dr.enable_grad(params["square.to_world"])
     params.update()
-    integrator = mi.load_dict({"type": "pathreplay", "edges": "all", "max_depth": 2})
-    with pytest.raises(PathreplayError, match="of type 'batch'"):
+    integrator = mi.load_dict({"type": "pathreplay", "edges": edges, "max_depth": 2})
+    with pytest.raises(PathreplayError, match=message):
         integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (1, 2, 3)), spp=1)
+
+
+@pytest.mark.slow
+def test_batch_sensors_are_refused() -> None:
+    hold_refusal(one_film({"type": "batch", "one": PINHOLE, "two": PINHOLE}), "all", "of type 'batch'")
 
 
 @pytest.mark.slow
 def test_grids_of_distances_are_refused() -> None:
     z, y, x = np.meshgrid(*3 * [np.linspace(-0.5, 0.5, 8)], indexing="ij")
     grid = {"type": "sdfgrid", "grid": mi.TensorXf((np.sqrt(x * x + y * y + z * z) - 0.3)[..., None])}
-    pinhole = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])}
-    scene = mi.load_dict({**one_film(pinhole), "body": grid})
-    params = mi.traverse(scene)
-    dr.enable_grad(params["square.to_world"])
-    params.update()
-    integrator = mi.load_dict({"type": "pathreplay", "edges": "film", "max_depth": 2})
-    with pytest.raises(PathreplayError, match="shape 'body' of type 'sdfgrid'"):
-        integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (1, 2, 3)), spp=1)
+    hold_refusal({**one_film(PINHOLE), "body": grid}, "film", "shape 'body' of type 'sdfgrid'")
 
 
 def hold(name: str, found: Measured) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -140,36 +142,36 @@ def test_a_script_is_told_of_view_and_parameter_where_nothing_moves() -> None:
     params.update()
 
 
-def test_a_script_gets_zero_in_the_view_of_another_camera() -> None:
+@contextmanager
+def widening() -> Iterator[tuple[mi.Scene, Any, mi.Float]]:
+    """A scene, its parameters, and the field of view of its left camera, which has a gradient in this block."""
     scene = mi.load_string(SCENE)
     params = mi.traverse(scene)
     x = mi.Float(params["left.x_fov"])
     dr.enable_grad(x)
     params["left.x_fov"] = x
     params.update()
-    for edges in ("none", "all"):
-        integrator = mi.load_dict({"type": "pathreplay", "edges": edges})
-        dr.backward(dr.sum(mi.render(scene, params, sensor=1, integrator=integrator, spp=4), axis=None))
-        assert dr.grad(x) == 0
+    yield scene, params, x
     params["left.x_fov"] = dr.detach(x)
     params.update()
+
+
+def test_a_script_gets_zero_in_the_view_of_another_camera() -> None:
+    with widening() as (scene, params, x):
+        for edges in ("none", "all"):
+            integrator = mi.load_dict({"type": "pathreplay", "edges": edges})
+            dr.backward(dr.sum(mi.render(scene, params, sensor=1, integrator=integrator, spp=4), axis=None))
+            assert dr.grad(x) == 0
 
 
 def test_a_view_in_parts_keeps_what_another_view_gave(monkeypatch: pytest.MonkeyPatch) -> None:
     """A pass of many samples adds up its parts apart, and gives back what was there, also where it adds nothing."""
     for name, value in (("MOST_AT_ONCE", 20), ("A_PART", 16), ("LEAST_A_PIXEL", 1)):
         monkeypatch.setattr(parts, name, value)
-    scene = mi.load_string(SCENE)
-    params = mi.traverse(scene)
-    x = mi.Float(params["left.x_fov"])
-    dr.enable_grad(x)
-    params["left.x_fov"] = x
-    params.update()
     integrator = mi.load_dict({"type": "pathreplay", "edges": "none"})
     found = []
-    for sensor in (0, 1):
-        dr.backward(dr.sum(mi.render(scene, params, sensor=sensor, integrator=integrator, spp=4), axis=None))
-        found.append(dr.grad(x)[0])
+    with widening() as (scene, params, x):
+        for sensor in (0, 1):
+            dr.backward(dr.sum(mi.render(scene, params, sensor=sensor, integrator=integrator, spp=4), axis=None))
+            found.append(dr.grad(x)[0])
     assert found[0] != 0 and found[1] == found[0]
-    params["left.x_fov"] = dr.detach(x)
-    params.update()
