@@ -44,7 +44,7 @@ def problem(own: str = "prb", options: str = "", **changes: Any) -> Problem:
 
 
 def rendered(problem: Problem, **options: Any) -> np.ndarray:
-    """What `path` shows of the scene, with other random numbers than those of the target."""
+    """An image of the scene by `path`; its random numbers are not those of the target."""
     integrator = mi.load_dict({"type": "path", **options})
     return np.array(mi.render(problem.scene, integrator=integrator, spp=256, seed=mi.UInt32(77)))
 

@@ -1,4 +1,4 @@
-"""Parameters of a scene or an object, without those of which its plugins hold no value.
+"""The parameters of a scene or an object that have a value.
 
 Hair with ``eumelanin`` has such a ``sigma_a``: it is None, and Mitsuba raises a TypeError where it is read.
 """

@@ -17,7 +17,7 @@ from .crofton import at_an_angle, hides_itself
 MEETS = 1e-3
 """Relative difference of two distances up to which surfaces meet."""
 ASIDE = 2.0
-"""From a line of contact one looks at light so many times as far off as rays have to be, to begin between its sides."""
+"""Distance from a line of contact at which light is looked at, over the least at which rays begin between its sides."""
 STEEPEST = 8.0
 """Cotangent of half the angle of the sharpest corner for which that is far enough: it has 14 degrees."""
 

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 WELD, ULPS = 1e-5, 4
-"""Vertices are in one place up to this share of the mesh's diagonal, and up to so many units in the last place."""
+"""Largest distance of two vertices in one place: a share of the mesh's diagonal, and units in the last place."""
 
 
 def mesh_pieces(mesh: mi.Mesh) -> np.ndarray:
