@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import pytest
 
 from pathreplay.check.command import check_all
+from pathreplay.errors import PathreplayError
 from pathreplay.inverse import make_config, optimize
 from pathreplay.output.export import export_run
 from pathreplay.scenes.loading import load_scene
@@ -31,6 +34,13 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_its_pigments_can_be_checked() -> None:
     (result,) = check_all(load_scene("hair.xml"), [KEY], seeds=2, spp=4, max_depth=2)
     assert result.key == KEY and result.gradient < 0
+
+
+def test_a_pass_without_gradients_is_told_what_is_wrong() -> None:
+    scene = load_scene("hair.xml")
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    with pytest.raises(PathreplayError, match="sensor 'eye', and none has gradients"):
+        integrator.render_backward(scene, None, dr.ones(mi.TensorXf, (6, 6, 3)), spp=1)
 
 
 @pytest.mark.parametrize("edges", ["none", pytest.param("all", marks=pytest.mark.slow)])
