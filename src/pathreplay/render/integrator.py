@@ -140,7 +140,7 @@ class PathReplayIntegrator(PathIntegrator):
                 self._tell_once(COST_OF_EDGES)
             edges = not why
         if not edges:
-            return walk, (self.interior,)
+            return walk, tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
         if is_recording():
             walk = replace(walk, traits=replace(walk.traits, tables=self._tables(facts_of(view.scene), edges=True)))
         return replace(walk, edges=self.edges != "film" and walk.media is None), terms
