@@ -13,6 +13,7 @@ from ..gradient.pixel_numbers import Alone, EvenSets, PixelNumbers
 from ..plugins import mitsuba_integrator
 from ..transport.even import Even, in_order, key_of
 from ..transport.start import CameraStart
+from .film_flow import FilmFlow
 from .lifetimes import is_recording
 
 Seed: TypeAlias = "int | mi.UInt32"
@@ -54,6 +55,22 @@ class _ForCamera:
 
 
 @dataclass(frozen=True)
+class _Seen:
+    """The sensor of a pass, as Mitsuba's integrators want it to draw camera rays."""
+
+    view: Pass
+
+    def __getattr__(self, name: str) -> object:
+        """What a sensor has."""
+        return getattr(self.view.sensor, name)
+
+    def sample_ray_differential(
+        self, time: mi.Float, sample1: mi.Float, sample2: mi.Point2f, sample3: mi.Point2f
+    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+        return self.view.camera_ray(time, sample1, sample2, sample3)
+
+
+@dataclass(frozen=True)
 class Pass:
     """Everything that decides which paths are walked, but for the integrator's options. Gives the same rays each time.
 
@@ -67,6 +84,7 @@ class Pass:
     spp: int = 0
     share: float = 1.0  # of a larger pass, whose part this is: see `parts`
     even: bool = False
+    flow: FilmFlow | None = None  # of a camera whose rays move by the rest only
 
     @staticmethod
     def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int, even: bool = False) -> Pass:
@@ -92,8 +110,17 @@ class Pass:
             i = dr.arange(mi.UInt32, width * height * spp)
             sampler = self.numbers(i // spp, width, i % spp, spp)
         camera = _ForCamera(sampler, spp) if self.even else sampler
-        ray, weight, position = mitsuba.sample_rays(None, self.scene, self.sensor, camera)
+        ray, weight, position = mitsuba.sample_rays(None, self.scene, _Seen(self), camera)
         return Rays(sampler, ray, weight, position, spp)
+
+    def camera_ray(
+        self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f
+    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+        """The sensor's ray and its weight (see Mitsuba's Sensor), attached to the camera as the pass has it."""
+        if self.flow is not None:
+            return self.flow.ray(time, wavelength, place, aperture)
+        # Not `sample_ray`, which irradiance meters do not have.
+        return self.sensor.sample_ray_differential(time, wavelength, place, aperture)
 
     def numbers(self, pixel: mi.UInt32, width: int, path: mi.UInt32, paths: int, of: int | mi.UInt32 = 0) -> Even:
         """Even numbers of a path in a pixel (row by row, of that width) that has so many; ``of`` keeps sets apart."""

@@ -3,6 +3,7 @@
 Filter importance sampling (Ernst, Stamminger and Greiner, "Filter Importance Sampling", 2006): with density w / ∫ w the
 mean of what paths bring is the filtered pixel. No sample is shared with the neighbours, which makes a picture noisier
 than one that is splatted. Filters are products of one function of x and one of y, taken as a staircase of `STEPS`.
+Where a function is negative in places, its size is drawn, and `sign` tells.
 """
 
 from __future__ import annotations
@@ -30,15 +31,30 @@ class FilterSamples:
 
     radius: float
     until: mi.Float  # of each step, the share of the filter up to its end
+    masses: mi.Float  # integral over each step
+    total: mi.Float  # of their sizes
 
     @staticmethod
     def of(film: mi.Film) -> FilterSamples:
         """Those of the film's filter: see `is_drawable`."""
         radius = film.rfilter().radius()
-        sums = dr.cumsum(film.rfilter().eval(_middles(radius)))
-        until = sums / dr.gather(mi.Float, sums, STEPS - 1)
-        dr.eval(until)  # before loops read it
-        return FilterSamples(radius, until)
+        return FilterSamples._of(radius, film.rfilter().eval(_middles(radius)) * (2 * radius / STEPS))
+
+    @staticmethod
+    def of_slope(film: mi.Film) -> FilterSamples:
+        """Those of the filter's derivative, of which a jump (of a box) is a part."""
+        radius = film.rfilter().radius() * STEPS / (STEPS - 2)  # jumps lie within the outermost steps
+        step = 2 * radius / STEPS
+        x = _middles(radius)
+        return FilterSamples._of(radius, film.rfilter().eval(x + 0.5 * step) - film.rfilter().eval(x - 0.5 * step))
+
+    @staticmethod
+    def _of(radius: float, masses: mi.Float) -> FilterSamples:
+        sums = dr.cumsum(dr.abs(masses))
+        total = dr.gather(mi.Float, sums, STEPS - 1)
+        until = sums / total
+        dr.eval(until, masses, total)  # before loops read them
+        return FilterSamples(radius, until, masses, total)
 
     def share(self, x: mi.Float) -> mi.Float:
         """The share of the filter up to a distance."""
@@ -60,3 +76,8 @@ class FilterSamples:
         """The shares up to its begin and its end."""
         begin = dr.select(i > 0, dr.gather(mi.Float, self.until, i - 1, i > 0), 0)
         return begin, dr.gather(mi.Float, self.until, i)
+
+    def sign(self, x: mi.Float) -> mi.Float:
+        """The sign of the function at a distance."""
+        i = dr.minimum(mi.UInt32(dr.clip((x + self.radius) * (0.5 * STEPS / self.radius), 0, STEPS)), STEPS - 1)
+        return dr.sign(dr.gather(mi.Float, self.masses, i))

@@ -19,9 +19,11 @@ from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
 from ..transport.vertex import Walk
 from .boundary import Boundary
+from .camera_motion import CameraMotion
 from .camera_pass import Pass, Seed, Which
 from .diagnostics import COST_OF_EDGES, doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts, facts_of
+from .film_flow import FilmFlow
 from .interior import PathReplay
 from .lifetimes import is_recording
 from .path_integrator import UNBOUNDED, Handed, PathIntegrator
@@ -126,24 +128,37 @@ class PathReplayIntegrator(PathIntegrator):
             return (self.interior,)
         return self.interior, Boundary(inner=self.edges != "film", spp=self.edge_spp)
 
-    def _planned(self, view: Pass) -> tuple[Walk, tuple[Term, ...]]:
-        """See `PathIntegrator`. Edges are left out where none move, and where `auto` finds that they cannot be done."""
-        walk, terms = PathIntegrator._planned(self, view)
+    def _planned(self, view: Pass) -> tuple[Pass, Walk, tuple[Term, ...]]:
+        """See `PathIntegrator`. A camera that moves has a term of its own, and the others what that leaves.
+
+        Edges are left out where none move, and where `auto` finds that they cannot be done; the interior, where the
+        camera's term is all.
+        """
+        view, walk, terms = PathIntegrator._planned(self, view)
         if self.edges == "none":
-            return walk, terms
-        edges = Boundary.move(view, walk)
-        if edges and self.edges == "auto":
-            why = Boundary.obstacle(view)
-            if why:
-                self._tell_once(f"{why}; they are left out here")
-            elif EDGES not in self.told:
-                self._tell_once(COST_OF_EDGES)
-            edges = not why
-        if not edges:
-            return walk, tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
+            return view, walk, terms
+        flow, cameras = FilmFlow.of(view.scene, view.sensor), ()
+        if flow is not None:
+            view, cameras = replace(view, flow=flow), (CameraMotion(flow),)
+        if not self._needs_edges(view, walk):
+            terms = tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
+            if flow is None or flow.leaves_rest or self._reaches(view, walk):
+                cameras = (*terms, *cameras)
+            return view, walk, cameras
         if is_recording():
             walk = replace(walk, traits=replace(walk.traits, tables=self._tables(facts_of(view.scene), edges=True)))
-        return replace(walk, edges=self.edges != "film" and walk.media is None), terms
+        return view, replace(walk, edges=self.edges != "film" and walk.media is None), (*terms, *cameras)
+
+    def _needs_edges(self, view: Pass, walk: Walk) -> bool:
+        """Whether edges move, and can be differentiated where that is left to ``auto``; says what they cost."""
+        if not Boundary.move(view, walk):
+            return False
+        why = Boundary.obstacle(view) if self.edges == "auto" else ""
+        if why:
+            self._tell_once(f"{why}; they are left out here")
+        elif self.edges == "auto" and EDGES not in self.told:
+            self._tell_once(COST_OF_EDGES)
+        return not why
 
     def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
         """Whether `render_and_backward` can be used, for all pixels or for ``some``: see `pixel_obstacle`."""
@@ -183,7 +198,7 @@ class PathReplayIntegrator(PathIntegrator):
         some = None if pixels is None else mi.UInt32(pixels)
         with self._passing(), dr.isolate_grad():
             loss = pixel_loss(view, self.max_depth, offset, slope, some)
-            walk, (_, *edges) = self._planned(view)
+            view, walk, (_, *edges) = self._planned(view)
             self._learned(view, walk)
             found = self.interior.pixels(view, walk, loss, some)
             if edges:

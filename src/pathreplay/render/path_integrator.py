@@ -128,7 +128,7 @@ class PathIntegrator:
         tangent = None
         for part in self._parts(scene, sensor, seed, spp):
             with self._passing():
-                walk, terms = self._planned(part)
+                part, walk, terms = self._planned(part)
                 learned = self._learned(part, walk)
                 found = reduce(add, [term.forward(part, walk, learned) for term in terms])
                 tangent = _sum(tangent, found.image, part.share)
@@ -153,7 +153,7 @@ class PathIntegrator:
         try:
             for part in of_parts:
                 with self._passing(), dr.isolate_grad():
-                    walk, terms = self._planned(part)
+                    part, walk, terms = self._planned(part)
                     learned = self._learned(part, walk)
                     wanted = grad_in if part.share == 1 else grad_in * part.share
                     found = reduce(add, [term.backward(part, walk, wanted, learned) for term in terms])
@@ -175,9 +175,9 @@ class PathIntegrator:
             raise PathreplayError(f"{self.name}: sample() is not differentiated: use mi.render, or render_backward")
         return *primal(self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
 
-    def _planned(self, view: Pass) -> tuple[Walk, tuple[Term, ...]]:
-        """How a gradient pass walks, and the terms that it adds up."""
-        return self._walk(view.scene, view.sensor), self.terms
+    def _planned(self, view: Pass) -> tuple[Pass, Walk, tuple[Term, ...]]:
+        """A gradient pass as terms see it, how it walks, and the terms that it adds up."""
+        return view, self._walk(view.scene, view.sensor), self.terms
 
     def _learned(self, view: Pass, walk: Walk) -> Guess | None:
         """What earlier passes found out that this one may use."""
@@ -236,11 +236,15 @@ class PathIntegrator:
         """
         view = Pass.of(scene, sensor, 0, 1)
         with self._passing():
-            walk, start = self._walk(scene, view.sensor), view.rays().start
-            if walk.media is not None or walk.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
-                return True
-            at = PathState.begin(walk, start).at
-            return path_moves(walk, start, at) or weights_vary(walk, at)
+            return self._reaches(view, self._walk(scene, view.sensor))
+
+    def _reaches(self, view: Pass, walk: Walk) -> bool:
+        """Whether a parameter with gradients reaches the paths of a pass: see `is_reached`."""
+        if walk.media is not None or walk.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
+            return True
+        start = view.rays().start
+        at = PathState.begin(walk, start).at
+        return path_moves(walk, start, at) or weights_vary(walk, at)
 
     def to_hand(self, scene: mi.Scene) -> Handed:
         """What passes over this scene are to be handed if they are recorded."""

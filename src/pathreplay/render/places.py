@@ -36,8 +36,7 @@ class FilmPlaces:
         place = (self.corner + s - mi.ScalarPoint2f(film.crop_offset())) / mi.ScalarVector2f(film.crop_size())
         time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
         wavelength, aperture = numbers.next_1d(), numbers.next_2d()
-        # Not `sample_ray`, which irradiance meters do not have.
-        ray, weight = sensor.sample_ray_differential(time, wavelength, place, aperture)
+        ray, weight = self.view.camera_ray(time, wavelength, place, aperture)
         return mi.Ray3f(ray), dr.detach(weight)
 
     def undeveloped(self, grad_in: mi.TensorXf) -> mi.TensorXf:
@@ -74,16 +73,51 @@ class FilmPlaces:
         self._put(block, s, dr.select(dr.all((s >= 0) & (s < self.size)), L, 0), wavelengths)
         return self._developed(block.tensor())
 
+    def importance_of_pixels(self, wanted: mi.TensorXf, pixel: mi.UInt32, wavelengths: mi.Spectrum) -> mi.Spectrum:
+        """g_j / ∫ h_j of pixels by their number (row by row), what is wanted of radiance in them: see `importance`."""
+        border = self._border()
+        inner = wanted[border:-border, border:-border] if border else wanted
+        with dr.resume_grad():
+            L = dr.full(mi.Spectrum, 1.0, dr.width(pixel))
+            dr.enable_grad(L)
+            made = self._pixels(pixel, L, wavelengths)
+            dr.set_grad(made, inner)
+            dr.enqueue(dr.ADMode.Backward, made)
+            dr.traverse(dr.ADMode.Backward)
+            return dr.grad(L)
+
+    def image_of_pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
+        """The image of which each pixel, by its number, has the sum of its radiances, divided by ∫ h_j."""
+        border, made = self._border(), self._pixels(pixel, L, wavelengths)
+        if border:
+            height, width, channels = made.shape
+            whole = dr.zeros(mi.TensorXf, (height + 2 * border, width + 2 * border, channels))
+            whole[border:-border, border:-border] = made
+            made = whole
+        return self._developed(made)
+
+    def _pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
+        """The pixels of a block without its border, each of which is what it is given."""
+        film, like = self.view.sensor.film(), self._block()
+        offset, size = mi.ScalarPoint2i(film.crop_offset()), mi.ScalarVector2u(film.crop_size())
+        box = mi.load_dict({"type": "box"})
+        block = mi.ImageBlock(size, offset, like.channel_count(), box, border=False, normalize=False)
+        place = mi.Point2f(mi.Float(pixel % size.x), mi.Float(pixel // size.x)) + 0.5 + mi.ScalarPoint2f(offset)
+        _splat(block, film, place, L, wavelengths)
+        return block.tensor()
+
+    def _border(self) -> int:
+        """Of the film's blocks, in pixels."""
+        block = self._block()
+        return int(block.border_size()) if block.has_border() else 0
+
     def _block(self) -> mi.ImageBlock:
         film = self.view.sensor.film()
         film.prepare([])
         return film.create_block()
 
     def _put(self, block: mi.ImageBlock, s: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> None:
-        film, place = self.view.sensor.film(), self.corner + s
-        mitsuba_integrator()._splat_to_block(
-            block, film, place, value=L, weight=mi.Float(0), alpha=mi.Float(0), aovs=[], wavelengths=wavelengths
-        )
+        _splat(block, self.view.sensor.film(), self.corner + s, L, wavelengths)
 
     def _developed(self, pixels: mi.TensorXf) -> mi.TensorXf:
         """The image of a block without weights: those of its pixels are ∫ h_j."""
@@ -110,3 +144,9 @@ class FilmPlaces:
             x = (k + 0.5) * step - rfilter.radius()
             total += dr.select((pixel + x >= begin) & (pixel + x < end), rfilter.eval(mi.Float(x)), 0)
         return total * step
+
+
+def _splat(block: mi.ImageBlock, film: mi.Film, place: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> None:
+    mitsuba_integrator()._splat_to_block(
+        block, film, place, value=L, weight=mi.Float(0), alpha=mi.Float(0), aovs=[], wavelengths=wavelengths
+    )

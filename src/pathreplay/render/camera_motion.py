@@ -1,0 +1,125 @@
+"""The term of a camera that moves: what the flow of its film does to the weights of what is seen.
+
+With the filter h_j of pixel j, of which only the part on the film D counts, and the velocity v of the film's places
+
+    dI_j/dπ = 1/∫_D h_j · ( ∫_D div(h_j v) L ds - ∮_∂D h_j L v·n dl )                         (see `FilmFlow`).
+
+Filters are products, h_j = f(x) f(y), and the border of the film is the place where f(x) falls to zero at once. So both
+parts with ∂f/∂x are one integral over a measure, df(x), in which the mass beyond the border lies at the border:
+
+    ∫ f(y) dy ∫ v_x L df(x),        ∫ f(x) dx ∫ v_y L df(y),        ∫_D h_j (∂v_x/∂x + ∂v_y/∂y) L ds.
+
+df is odd: places x away from the middle of a pixel, to its right and to its left, count against each other. Their
+paths have the same random numbers, so that what they have in common cancels, as it does in a difference of two
+pictures. Paths only tell L: nothing of them is differentiated, and no edge has to be found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..gradient.adjoint import backward, tangents
+from ..gradient.baseline import Guess
+from ..gradient.primal import primal
+from ..transport.start import CameraStart
+from ..transport.vertex import Walk
+from .camera_pass import Pass
+from .film_flow import STEP, FilmFlow
+from .filter_samples import FilterSamples
+from .places import FilmPlaces
+from .term import Found
+
+GROUP = 5
+"""Paths with the same random numbers: to the right and to the left, above and below, and one for the divergence."""
+NUMBERS = 1
+"""The set of random numbers: those of the interior are another."""
+
+
+@dataclass
+class Flowing:
+    """Paths, and how the flow of their places weighs what they bring."""
+
+    pixel: mi.UInt32  # row by row
+    place: mi.Point2f  # in widths and heights of the film
+    axis: mi.UInt32  # along which places of pairs count
+    single: mi.Bool  # a path for the divergence
+    L: mi.Spectrum  # times its weight; what the velocity of places is multiplied with
+    wavelengths: mi.Spectrum
+    time: mi.Float
+    wavelength: mi.Float
+    aperture: mi.Point2f
+
+
+@dataclass(frozen=True)
+class CameraMotion:
+    """A term: all that a moving camera does to the picture, but for the rest that its `FilmFlow` leaves to others."""
+
+    flow: FilmFlow
+
+    def forward(self, view: Pass, walk: Walk, learned: Guess | None) -> Found:
+        """Tangent of the image: see `Term`."""
+        f = self._walked(view, walk)
+        with dr.resume_grad():
+            (δ,) = tangents(self._moved(view, f))
+        return Found(FilmPlaces.of(view).image_of_pixels(f.pixel, f.L * δ, f.wavelengths))
+
+    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
+        """Back-propagate the adjoint of the image: see `Term`."""
+        places, f = FilmPlaces.of(view), self._walked(view, walk)
+        W = places.importance_of_pixels(places.undeveloped(grad_in), f.pixel, f.wavelengths)
+        δ = dr.sum(W * f.L)
+        dr.eval(δ, f)  # every parameter of the camera sums over it apart, which would walk the paths as often
+        with dr.resume_grad():
+            backward(δ * self._moved(view, f))
+        dr.eval()
+        return Found(paths=dr.width(f.pixel), moves=True)
+
+    def note(self, walk: Walk) -> str:
+        """Nothing: see `Term`."""
+        return ""
+
+    def _moved(self, view: Pass, f: Flowing) -> mi.Float:
+        """Of pairs the velocity of their place along their axis, in pixels; of single paths its divergence."""
+        moved = mi.Float(0)
+        for axis, pixels in enumerate(view.size):
+            step = mi.Vector2f(*(STEP if k == axis else 0.0 for k in range(2)))
+            for side in (-1, 1):
+                place = dr.select(f.single, f.place + side * step, f.place)
+                place = self.flow.place(f.time, f.wavelength, place, f.aperture)
+                slope = dr.select(f.single, side / (2 * STEP), dr.select(f.axis == axis, 0.5 * pixels, 0))
+                moved += slope * place[axis]
+        return moved
+
+    def _walked(self, view: Pass, walk: Walk) -> Flowing:
+        """Walk the paths of a pass."""
+        width, height = view.size
+        groups = -(-view.spp // 2)
+        i = dr.arange(mi.UInt32, width * height * groups * GROUP)
+        member, group = i % GROUP, i // GROUP
+        pixel, single, axis = group // groups, member == GROUP - 1, member // 2
+        numbers = view.numbers(pixel, width, group % groups, groups, NUMBERS)
+
+        sensor, film, u = view.sensor, view.sensor.film(), numbers.next_2d()
+        places, filter, slope = FilmPlaces.of(view), FilterSamples.of(film), FilterSamples.of_slope(film)
+        middle = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + 0.5
+        middle += mi.Point2f(mi.ScalarPoint2f(film.crop_offset()) - places.corner)
+        s, weight = mi.Point2f(0), mi.Float(1 / groups)
+        for k in range(2):
+            low, high = filter.share(-middle[k]), filter.share(places.size[k] - middle[k])
+            x, away = filter.draw(u[k], low, high), slope.draw(u[k], mi.Float(0.5), mi.Float(1))
+            pairs = ~single & (axis == k)
+            x = dr.select(pairs, dr.select(member % 2 == 0, away, -away), x)
+            s[k] = dr.clip(middle[k] + x, 0, places.size[k])
+            mass = dr.select(pairs, 0.5 * slope.total * slope.sign(x), filter.total * (high - low) * filter.sign(x))
+            weight *= mass
+        place = (places.corner + s - mi.ScalarPoint2f(film.crop_offset())) / mi.ScalarVector2f(film.crop_size())
+
+        time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
+        wavelength, aperture = numbers.next_1d(), numbers.next_2d()
+        ray, brought = dr.detach(sensor.sample_ray_differential(time, wavelength, place, aperture))
+        L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, mi.Bool(True)))
+        L *= brought * weight
+        return Flowing(pixel, place, axis, single, L, ray.wavelengths, time, wavelength, aperture)
