@@ -42,13 +42,18 @@ class FilmFlow:
     sensor: mi.Sensor
     r: mi.Float  # at this distance nothing moves over the film
     leaves_rest: bool  # whether rays move with parameters beyond the flow
+    is_all: bool  # whether nothing but the places of the film depends on parameters with gradients
 
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor) -> FilmFlow | None:
         """That of a sensor; None where it does not move, or is none of `CAMERAS`."""
         if sensor.class_name() not in CAMERAS or not with_gradients(sensor, *ONLY_PLACES, *OTHERS):
             return None
-        return FilmFlow(sensor, _distance(scene, sensor), bool(with_gradients(sensor, *OTHERS)))
+        rest = bool(with_gradients(sensor, *OTHERS))
+        others = any(with_gradients(thing) for thing in (*scene.shapes(), *scene.emitters()))
+        return FilmFlow(
+            sensor, _distance(scene, sensor), rest, not (rest or others or with_gradients(sensor, "medium"))
+        )
 
     def ray(
         self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f

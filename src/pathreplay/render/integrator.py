@@ -142,9 +142,7 @@ class PathReplayIntegrator(PathIntegrator):
             view, cameras = replace(view, flow=flow), (CameraMotion(flow),)
         if not self._needs_edges(view, walk):
             terms = tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
-            if flow is None or flow.leaves_rest or self._reaches(view, walk):
-                cameras = (*terms, *cameras)
-            return view, walk, cameras
+            return view, walk, cameras if flow is not None and flow.is_all else (*terms, *cameras)
         if is_recording():
             walk = replace(walk, traits=replace(walk.traits, tables=self._tables(facts_of(view.scene), edges=True)))
         return view, replace(walk, edges=self.edges != "film" and walk.media is None), (*terms, *cameras)

@@ -236,15 +236,11 @@ class PathIntegrator:
         """
         view = Pass.of(scene, sensor, 0, 1)
         with self._passing():
-            return self._reaches(view, self._walk(scene, view.sensor))
-
-    def _reaches(self, view: Pass, walk: Walk) -> bool:
-        """Whether a parameter with gradients reaches the paths of a pass: see `is_reached`."""
-        if walk.media is not None or walk.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
-            return True
-        start = view.rays().start
-        at = PathState.begin(walk, start).at
-        return path_moves(walk, start, at) or weights_vary(walk, at)
+            walk, start = self._walk(scene, view.sensor), view.rays().start
+            if walk.media is not None or walk.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
+                return True
+            at = PathState.begin(walk, start).at
+            return path_moves(walk, start, at) or weights_vary(walk, at)
 
     def to_hand(self, scene: mi.Scene) -> Handed:
         """What passes over this scene are to be handed if they are recorded."""
