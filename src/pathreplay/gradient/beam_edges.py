@@ -19,6 +19,7 @@ import mitsuba as mi
 
 from ..transport.emitters import draw_emitter
 from ..transport.media import interaction
+from ..transport.meet import meet
 from ..transport.passage import beyond_null, passage, past
 from ..transport.path import PathState
 from ..transport.signature import edge_normal, outline_gap
@@ -131,8 +132,8 @@ def _particle(ray: mi.Ray3f, τ: mi.Float) -> mi.Interaction3f:
 
 def _hit(walk: Walk, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
     """What a ray meets behind null boundaries."""
-    hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, reorder=False, active=active)
-    return beyond_null(walk.scene, ray, hit, active)
+    hit = meet(walk, ray, active)
+    return beyond_null(walk, ray, hit, active)
 
 
 def _reach(walk: Walk, ray: mi.Ray3f) -> mi.Float:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.meet import meet
 from ..transport.signature import place_met, shape_met, turned_away
 from ..transport.vertex import Arrival, Walk
 from .crofton import at_an_angle, hides_itself
@@ -85,7 +86,7 @@ def _towards(walk: Walk, at: Arrival, p: mi.Point3f, short: mi.Float, active: mi
     gone = dr.maximum(dr.norm(line) - short, 0)
     rest = mi.Ray3f(ray)
     rest.o, rest.maxt = ray.o + gone * ray.d, dr.inf
-    hit = walk.scene.ray_intersect_preliminary(rest, coherent=False, reorder=False, active=active)
+    hit = meet(walk, rest, active)
     hit.t += gone
     places = [place_met(walk, h, active, shape_met(walk, h, r, active)) for h, r in ((hit, ray), (at.hit, at.ray))]
     same = active & (places[0] == places[1])

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.emitters import draw_emitter
+from ..transport.meet import meet
 from ..transport.passage import beyond_null
 from ..transport.signature import edge_normal, outline_gap
 from ..transport.vertex import Arrival, Walk, is_smooth
@@ -32,9 +33,9 @@ class Shade:
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
         light, lit = light_of(walk, si, u, k, active)
         ray = si.spawn_ray_to(light.p)
-        hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, active=lit & light.delta)
+        hit = meet(walk, ray, lit & light.delta)
         if walk.clear:
-            hit = beyond_null(walk.scene, ray, hit, lit)
+            hit = beyond_null(walk, ray, hit, lit)
         outside = mi.Bool(False)
         for projector in walk.traits.projectors:
             outside |= (light.pdf == 0) & (light.emitter == mi.EmitterPtr(projector))

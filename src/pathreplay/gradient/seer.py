@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..transport import arrive, scatter
 from ..transport.media import carried, span
+from ..transport.meet import meet
 from ..transport.passage import beyond_null, passage, past
 from ..transport.signature import place_met, shape_met
 from ..transport.surface import met
@@ -108,11 +109,11 @@ class Seer:
 
     def hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """What a ray from here meets."""
-        return self.walk.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        return meet(self.walk, ray, active)
 
     def behind(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """The same without null boundaries."""
-        return hit if self.walk.media is None else beyond_null(self.walk.scene, ray, hit, active)
+        return hit if self.walk.media is None else beyond_null(self.walk, ray, hit, active)
 
     def edges(
         self, rays: list[mi.Ray3f], firsts: list[mi.PreliminaryIntersection3f], active: mi.Bool

@@ -15,6 +15,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.meet import meet
 from ..transport.passage import SHORT_OF, further, passage
 from ..transport.path import PathState
 from ..transport.start import CameraStart, behind_emitters
@@ -56,7 +57,7 @@ def left_of_light(
 def going_on(walk: Walk, at: Arrival, t: mi.Float, medium: mi.MediumPtr, active: mi.Bool) -> Arrival:
     """The same arrival, as it is seen from distance ``t`` on its ray, where there is ``medium``."""
     ray = further(at.ray, t)
-    hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, reorder=False, active=active)
+    hit = meet(walk, ray, active)
     if walk.hide_emitters:
         hit = behind_emitters(walk, ray, hit, active & at.camera)
     return Arrival(ray, hit, at.pdf, at.delta, at.camera, medium, t)

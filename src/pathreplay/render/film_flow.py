@@ -11,8 +11,8 @@ and so its derivative has two parts. One belongs to the weights, with n normal t
     ∫_D div(W v) L ds - ∮_∂D W L v·n dl
 
 The other is that of L along the ray c(T, π), which moves by ∂c/∂π + ∂c/∂s v, the *rest* of the motion. Any smooth v
-will do. This one keeps points at a distance r where they are: with p = o + r d on the ray, v = -(∂p/∂s)⁺ ∂p/∂π. A camera
-that turns, or widens its view, leaves no rest; one that is carried along leaves parallax.
+will do. This one keeps points at a distance r where they are: with p = o + r d on the ray, v = -(∂p/∂s)⁺ ∂p/∂π. A
+camera that turns, or widens its view, leaves no rest; one that is carried along leaves parallax.
 """
 
 from __future__ import annotations

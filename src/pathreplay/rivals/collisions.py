@@ -41,7 +41,7 @@ def differentiate_shadow(
     """Differentiate the tentative collisions of a shadow ray that arrived. In homogeneous media there are none."""
     stretch = Stretch.begin(ray, medium, active)
     while dr.hint(stretch.active, exclude=[walk], label="pathreplay: listing, shadow"):
-        hit, a, b, inside = stretch.part(walk.scene)
+        hit, a, b, inside = stretch.part(walk)
         σ_bar = majorant(stretch.medium, stretch.ray, inside)
         tracked = inside & (σ_bar > 0)
         if dr.hint(walk.media.homogeneous, mode="scalar"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .meet import meet
 from .passage import beyond_null
 from .surface import held_point
 from .traits import is_painted
@@ -89,9 +90,9 @@ def _glued(
     """
     ray = dr.detach(origin.spawn_ray_to(still.p))
     ray.maxt = dr.largest(mi.Float)
-    hit = walk.scene.ray_intersect_preliminary(ray, active=active)
+    hit = meet(walk, ray, active)
     if walk.media is not None:
-        hit = beyond_null(walk.scene, ray, hit, active)
+        hit = beyond_null(walk, ray, hit, active)
     y = held_point(hit, ray, active)
     towards = y.p - origin.p
     facing = dr.abs(dr.dot(y.A, towards))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from .meet import meet
 from .shadow import Stretch, shadow, transmittance
 from .traits import is_null
 from .vertex import Walk
@@ -20,16 +21,16 @@ STEP = 1e-5
 
 @dr.syntax
 def beyond_null(
-    scene: mi.Scene, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+    walk: Walk, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
     """The hit, or the first one behind null boundaries; distances are told along ``ray``."""
     here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
     passing = active & _is_boundary(here)
-    while dr.hint(passing, exclude=[scene, ray], label="pathreplay: beyond null boundaries"):
+    while dr.hint(passing, exclude=[walk, ray], label="pathreplay: beyond null boundaries"):
         # On the same line, from which `spawn_ray` would depart.
         gone = t + STEP * (1 + dr.max(dr.abs(ray.o)) + t)
         onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
-        here = scene.ray_intersect_preliminary(onward, coherent=False, reorder=False, active=passing)
+        here = meet(walk, onward, passing)
         t = gone + here.t
         passing &= _is_boundary(here)
     here.t = t
@@ -50,7 +51,7 @@ def passage(
     stretch = Stretch.begin(ray, medium, active)
     T = mi.Spectrum(1)
     while dr.hint(stretch.active, exclude=[walk], label="pathreplay: passage"):
-        hit, a, b, inside = stretch.part(walk.scene)
+        hit, a, b, inside = stretch.part(walk)
         T = dr.select(inside, T * transmittance(walk, stretch.medium, stretch.ray, a, b, sampler, inside), T)
         stretch, T = stretch.beyond(hit, T)
     return T, stretch.medium

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from .meet import meet
 from .passage import beyond_null
 from .start import CameraStart, behind_emitters
 from .step import choose_step
@@ -103,9 +104,9 @@ def next_arrival(walk: Walk, at: Arrival, step: Chosen, active: mi.Bool) -> Arri
     With media a null boundary is no vertex for multiple importance sampling: what was sampled before it still counts.
     """
     kept, null, ray = step.kept, step.null, step.ray_next
-    hit = walk.scene.ray_intersect_preliminary(ray, coherent=False, reorder=False, active=active)
+    hit = meet(walk, ray, active)
     if walk.clear:
-        hit = beyond_null(walk.scene, ray, hit, active)
+        hit = beyond_null(walk, ray, hit, active)
     if walk.media is None:
         return Arrival(ray=ray, hit=hit, pdf=kept.pdf, delta=kept.delta, camera=mi.Bool(False))
     camera = null & at.camera

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .media import carried, interaction, is_grid, majorant, span
+from .meet import meet
 from .vertex import Shadow, Walk
 
 
@@ -31,10 +32,10 @@ class Stretch:
         ray = mi.Ray3f(dr.detach(ray))
         return Stretch(ray, mi.Float(ray.maxt), mi.Float(0), mi.MediumPtr(medium), mi.Bool(active))
 
-    def part(self, scene: mi.Scene) -> tuple[mi.PreliminaryIntersection3f, mi.Float, mi.Float, mi.Bool]:
+    def part(self, walk: Walk) -> tuple[mi.PreliminaryIntersection3f, mi.Float, mi.Float, mi.Bool]:
         """The surface at its end, the part [a, b] of the ray that a medium fills, and whether there is one."""
         self.ray.maxt = self.far - self.gone
-        hit = scene.ray_intersect_preliminary(self.ray, coherent=False, reorder=False, active=self.active)
+        hit = meet(walk, self.ray, self.active)
         inside = self.active & (self.medium != None)  # noqa: E711 (an array of pointers)
         a, b = span(self.medium, self.ray, dr.select(self.active & hit.is_valid(), hit.t, self.ray.maxt), inside)
         return hit, a, b, inside & (a < b)
@@ -59,7 +60,7 @@ def shadow(walk: Walk, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler,
     y, y_medium, length = mi.Float(0), dr.zeros(mi.MediumPtr), mi.Float(0)
 
     while dr.hint(stretch.active, exclude=[walk], label="pathreplay: shadow"):
-        hit, a, b, inside = stretch.part(walk.scene)
+        hit, a, b, inside = stretch.part(walk)
         T = dr.select(inside, T * transmittance(walk, stretch.medium, stretch.ray, a, b, sampler, inside), T)
         length += b - a
         u = sampler.next_1d(inside) * length
@@ -141,7 +142,7 @@ def _boundary(walk: Walk, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int
     """
     probe = mi.Ray3f(still.o + y * still.d, sign * still.d, still.time, still.wavelengths)
     probe.maxt = still.maxt - y if sign > 0 else y
-    hit = walk.scene.ray_intersect_preliminary(probe, coherent=False, reorder=False, active=active)
+    hit = meet(walk, probe, active)
     met = active & hit.is_valid()
     # The same surface, as the attached ray meets it from y on: a sphere answers for what a ray meets first.
     probe.o, probe.d = ray.o + y * ray.d, sign * ray.d

@@ -9,7 +9,9 @@ from .surface import held_point
 from .traits import FACETS, WHOLE, Tables
 from .vertex import Walk
 
-# Cosine between ray and normal of a cylinder below which an edge is its limb rather than its rim.
+TUBES = mi.ShapeType.Cylinder, mi.ShapeType.BSplineCurve, mi.ShapeType.LinearCurve
+"""Open at both ends: an edge is a limb or a rim."""
+# Cosine between ray and normal of a tube below which an edge is its limb rather than its rim.
 GRAZING = 0.05
 
 
@@ -60,7 +62,7 @@ def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
 def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
     """A unit vector normal to the ray and to the border of the shape that it just met, on which the hit all but lies.
 
-    On meshes the nearest side of the triangle, on rectangles and disks the rim, elsewhere the limb (on cylinders
+    On meshes the nearest side of the triangle, on rectangles and disks the rim, elsewhere the limb (of tubes
     the nearer of the two). Detached.
     """
     with dr.suspend_grad():
@@ -69,14 +71,16 @@ def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Boo
         on_mesh = active & si.shape.is_mesh()
         square, disk = kind == int(mi.ShapeType.Rectangle), kind == int(mi.ShapeType.Disk)
         limb = dr.abs(dr.dot(si.n, ray.d)) < GRAZING
-        cylinder = kind == int(mi.ShapeType.Cylinder)
-        rim = disk | (cylinder & ~limb)
+        tube = mi.Bool(False)
+        for of_tubes in TUBES:
+            tube |= kind == int(of_tubes)
+        rim = disk | (tube & ~limb)
         # Distance to the sides u = 0, 1 and v = 0, 1.
         to_u = dr.minimum(si.uv.x, 1 - si.uv.x) * dr.norm(si.dp_du)
         to_v = dr.minimum(si.uv.y, 1 - si.uv.y) * dr.norm(si.dp_dv)
         side = dr.select(to_u < to_v, si.dp_dv, si.dp_du)
         side = dr.select(
-            on_mesh, _nearest_side(hit, ray, on_mesh), dr.select(square, side, dr.select(cylinder, si.dp_du, si.dp_dv))
+            on_mesh, _nearest_side(hit, ray, on_mesh), dr.select(square, side, dr.select(tube, si.dp_du, si.dp_dv))
         )
         straight = on_mesh | square | rim
         n = dr.normalize(dr.select(straight, dr.cross(side, ray.d), si.n - dr.dot(si.n, ray.d) * ray.d))

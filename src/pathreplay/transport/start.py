@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .meet import meet
 from .passage import beyond_null
 from .vertex import Arrival, Walk
 
@@ -22,9 +23,9 @@ class CameraStart:
     def choose(self, walk: Walk, active: mi.Bool) -> Arrival:
         """The first arrival along the rays, detached; ``hide_emitters`` makes area emitters transparent."""
         ray = mi.Ray3f(dr.detach(self.ray))
-        hit = walk.scene.ray_intersect_preliminary(ray, coherent=True, reorder=False, active=active)
+        hit = meet(walk, ray, active, coherent=True)
         if walk.clear:
-            hit = beyond_null(walk.scene, ray, hit, active)
+            hit = beyond_null(walk, ray, hit, active)
         if walk.hide_emitters:
             hit = behind_emitters(walk, ray, hit, active)
         at = Arrival(ray=ray, hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))

@@ -69,6 +69,7 @@ class Traits:
     painted_meshes: bool  # there are meshes that emit, with a texture
     two_sides: bool  # a surface may have another BSDF on its back
     copies: bool  # there are instances
+    splines: bool  # there are B-spline curves
     veils: bool  # a surface may scatter some light and let some straight through
     masks_mirrors: bool  # a mask lies over delta lobes
     narrow: bool  # a surface may have a narrow smooth lobe
@@ -110,6 +111,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         painted_meshes=any(is_painted(lamp.emitter()) for lamp in _mesh_lamps(shapes)),
         two_sides=any(bsdf.class_name() == TWO_SIDED for bsdf in bsdfs),
         copies=any(shape.class_name() == INSTANCE for shape in shapes),
+        splines=any(shape.shape_type() == mi.ShapeType.BSplineCurve for shape in shapes),
         veils=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_null(bsdf) for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         narrow=_is_narrow(bsdfs),

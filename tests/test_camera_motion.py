@@ -1,0 +1,148 @@
+"""A camera that moves: its term is right with every film and lens, and the sum of terms the same for every flow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from edge_ordinary import LENS, UPRIGHT, WINDOW, Moving, T, film, loaded, measured, moved_camera, room, sensor
+from edge_truth import hold_agreement
+from pathreplay.check.stencil import CENTRAL
+from pathreplay.render import film_flow
+from pathreplay.render.camera_motion import CameraMotion
+from pathreplay.render.term import Found
+from pathreplay.transport.meet import meet
+from truth import add, rotate
+
+Write = Callable[[Path], Moving]
+SEEDS = 8
+PASSES = 24
+
+
+def turned(value: Any, t: mi.Float) -> Any:
+    """Where it stands; `rotate` takes a camera around the origin."""
+    return mi.Transform4f(value) @ mi.Transform4f().rotate([0.3, 1, 0], dr.rad2deg(t))
+
+
+def of_camera(camera: dict, key: str, move: Any, step: float = 0.02, **more: Any) -> Write:
+    return lambda folder: Moving(room(camera, **more), f"camera.{key}", move, step=step)
+
+
+def filtered(kind: str, **more: Any) -> dict:
+    return sensor(film=film(rfilter={"type": kind}, **more))
+
+
+WIDER = add(10.0)
+
+PLACES: dict[str, Write] = {
+    "box": of_camera(filtered("box"), "x_fov", WIDER),
+    "tent": of_camera(filtered("tent"), "x_fov", WIDER),
+    "gaussian": of_camera(filtered("gaussian"), "x_fov", WIDER),
+    "mitchell": of_camera(filtered("mitchell"), "x_fov", WIDER),
+    "catmullrom": of_camera(filtered("catmullrom"), "x_fov", WIDER),
+    "window": of_camera(filtered("gaussian", **WINDOW), "principal_point_offset_y", add(0.5)),
+    "border": of_camera(filtered("gaussian", sample_border=True), "x_fov", WIDER),
+    "rgba": of_camera(sensor(film=film(pixel_format="rgba")), "x_fov", WIDER),
+    "lens": of_camera(sensor("thinlens", **LENS), "x_fov", WIDER),
+    "point": of_camera(sensor(), "principal_point_offset_x", add(0.5)),
+}
+"""Where only places on the film move, no edge is looked for."""
+
+POSES: dict[str, Write] = {
+    "turns": of_camera(sensor(), "to_world", turned),
+    "turns, catmullrom": of_camera(filtered("catmullrom"), "to_world", turned),
+    "turns, lens": of_camera(sensor("thinlens", **LENS), "to_world", turned),
+    "goes around": of_camera(sensor(), "to_world", rotate(0.3, 1, 0)),
+    "moves, gaussian": moved_camera(filtered("gaussian")),
+    "moves, lens": moved_camera(sensor("thinlens", **LENS)),
+    "parallel, moves": moved_camera(sensor("orthographic", UPRIGHT)),
+    "parallel, turns": of_camera(sensor("orthographic", UPRIGHT), "to_world", turned, step=0.005),
+}
+
+
+QUICK = "box", "catmullrom", "window"
+
+
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in PLACES])
+def test_places_that_move_agree_with_differences(name: str, tmp_path: Path) -> None:
+    hold(name, PLACES[name], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", POSES)
+def test_poses_agree_with_differences(name: str, tmp_path: Path) -> None:
+    hold(name, POSES[name], tmp_path)
+
+
+def hold(name: str, write: Write, folder: Path) -> None:
+    found = measured(write(folder), folder, SEEDS)
+    hold_agreement(f"camera, {name}", found.gradients, found.differences, found.transpose)
+
+
+def test_a_camera_that_turns_leaves_no_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the camera's term nothing is left but the rounding of rays."""
+    objective = loaded(POSES["turns"](tmp_path), tmp_path)
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": "film"})
+    whole = objective.backward(integrator, 1, 64)
+    monkeypatch.setattr(CameraMotion, "backward", lambda *_: Found(moves=True))
+    rest = objective.backward(integrator, 1, 64)
+    objective.put(dr.opaque(mi.Float, 0))
+    assert abs(rest) < 1e-3 * abs(whole), (rest, whole)
+
+
+@pytest.mark.slow
+def test_the_gradient_is_that_of_any_flow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The distance at which nothing moves over the film decides which term tells of the motion, and not what it is."""
+    objective = loaded(moved_camera(sensor())(tmp_path), tmp_path)
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    found = []
+    for r in (2.0, 8.0):
+        monkeypatch.setattr(film_flow, "_distance", lambda scene, sensor, r=r: mi.Float(r))
+        found.append(np.array([objective.backward(integrator, seed, 256) for seed in range(SEEDS)]))
+    objective.put(dr.opaque(mi.Float, 0))
+    hold_agreement("camera, flows at two distances", *found, 0.0)
+
+
+@pytest.mark.parametrize("name", ["point", pytest.param("gaussian", marks=pytest.mark.slow)])
+def test_noise_is_below_that_of_a_difference(name: str, tmp_path: Path) -> None:
+    """Of two pictures with the same random numbers and as many samples each."""
+    moving = PLACES[name](tmp_path)
+    objective = loaded(moving, tmp_path)
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    plain = mi.load_dict({"type": "path", "max_depth": 3, "rr_depth": 1000})
+    g = np.array([objective.backward(ours, seed, 32) for seed in range(PASSES)])
+    d = [objective.dot(objective.difference(plain, CENTRAL, moving.step, seed, 32)) for seed in range(PASSES)]
+    objective.put(dr.opaque(mi.Float, 0))
+    assert g.var() < np.var(d), (g.std(), np.std(d))
+
+
+def test_in_fog_only_the_field_of_view_has_a_gradient(tmp_path: Path) -> None:
+    """Nothing else moves, and a medium is not asked."""
+    fog = {"type": "homogeneous", "sigma_t": 0.7, "albedo": 0.7}
+    cloud = {"type": "cube", "to_world": T().translate([0, 0, 0.5]), "bsdf": {"type": "null"}, "interior": fog}
+    objective = loaded(of_camera(sensor(), "x_fov", WIDER, cloud=cloud)(tmp_path), tmp_path)
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": 4})
+    plain = mi.load_dict({"type": "volpath", "max_depth": 4, "rr_depth": 1000})
+    g = np.array([objective.backward(ours, seed, 256) for seed in range(SEEDS)])
+    d = [objective.dot(objective.difference(plain, CENTRAL, 0.02, seed, 1024)) for seed in range(SEEDS)]
+    objective.put(dr.opaque(mi.Float, 0))
+    hold_agreement("camera, in fog", g, np.array(d), 0.0)
+
+
+def test_hits_stay_short_of_the_end_of_a_spline(tmp_path: Path) -> None:
+    """There Mitsuba looks for a segment that does not exist: see `meet`. Rays are aimed at the rim of the last one."""
+    (tmp_path / "tube.txt").write_text("\n".join(f"{x} 0 0 0.2" for x in range(5)))
+    scene = mi.load_dict({"type": "scene", "tube": {"type": "bsplinecurve", "filename": str(tmp_path / "tube.txt")}})
+    walk = mi.load_dict({"type": "pathreplay"})._walk(scene, None)
+    x = 3 + dr.arange(mi.Float, 4096) * np.float32(2**-22) - np.float32(2**-11)
+    hit = meet(walk, mi.Ray3f(mi.Point3f(x, 0, 1), mi.Vector3f(0, 0, -1)), mi.Bool(True))
+    met = np.array(hit.is_valid())
+    assert 1000 < met.sum() < 4096
+    v = (np.array(hit.prim_uv.x) + np.array(hit.prim_index).astype(np.float32)) / np.float32(2)
+    assert np.floor(v[met] * np.float32(2)).max() == 1
