@@ -137,9 +137,9 @@ class PathReplayIntegrator(PathIntegrator):
         view, walk, terms = PathIntegrator._planned(self, view)
         if self.edges == "none":
             return view, walk, terms
-        flow, cameras = FilmFlow.of(view.scene, view.sensor), ()
-        if flow is not None:
-            view, cameras = replace(view, flow=flow), (CameraMotion(flow),)
+        flow = FilmFlow.of(view.scene, view.sensor)
+        cameras: tuple[Term, ...] = () if flow is None else (CameraMotion(flow),)
+        view = replace(view, flow=flow)
         if not self._needs_edges(view, walk):
             terms = tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
             return view, walk, cameras if flow is not None and flow.is_all else (*terms, *cameras)
