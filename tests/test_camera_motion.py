@@ -16,6 +16,7 @@ from edge_truth import hold_agreement
 from pathreplay.check.stencil import CENTRAL
 from pathreplay.render import film_flow
 from pathreplay.render.camera_motion import CameraMotion
+from pathreplay.render.camera_pass import Pass
 from pathreplay.render.term import Found
 from pathreplay.transport.meet import meet
 from truth import add, rotate
@@ -85,10 +86,24 @@ def hold(name: str, write: Write, folder: Path) -> None:
     hold_agreement(f"camera, {name}", found.gradients, found.differences, found.transpose)
 
 
-def test_a_camera_that_turns_leaves_no_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the camera's term nothing is left but the rounding of rays."""
+@pytest.mark.parametrize(("pose", "rest"), [("turns", False), ("goes around", True), ("turns, lens", True)])
+def test_a_pinhole_that_turns_leaves_no_rest(pose: str, rest: bool, tmp_path: Path) -> None:
+    """And then nothing but its film is looked at."""
+    objective = loaded(POSES[pose](tmp_path), tmp_path)
+    integrator, t = mi.load_dict({"type": "pathreplay"}), mi.Float(0)
+    dr.enable_grad(t)
+    objective.put(t)
+    with dr.suspend_grad():
+        *_, terms = integrator._planned(Pass.of(objective.scene, 0, 1, 1))
+    objective.put(dr.opaque(mi.Float, 0))
+    assert [type(term).__name__ for term in terms] == ["PathReplay", "Boundary"] * rest + ["CameraMotion"]
+
+
+@pytest.mark.slow
+def test_the_rest_of_a_camera_that_turns_is_rounding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     objective = loaded(POSES["turns"](tmp_path), tmp_path)
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": "film"})
+    monkeypatch.setattr(film_flow, "_is_carried", lambda sensor: True)
     whole = objective.backward(integrator, 1, 64)
     monkeypatch.setattr(CameraMotion, "backward", lambda *_: Found(moves=True))
     rest = objective.backward(integrator, 1, 64)

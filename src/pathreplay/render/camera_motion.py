@@ -71,7 +71,7 @@ class CameraMotion:
         places, f = FilmPlaces.of(view), self._walked(view, walk)
         W = places.importance_of_pixels(places.undeveloped(grad_in), f.pixel, f.wavelengths)
         δ = dr.sum(W * f.L)
-        dr.eval(δ, f)  # every parameter of the camera sums over it apart, which would walk the paths as often
+        dr.eval(δ, f.place)  # every parameter of the camera sums over it apart, which would walk the paths as often
         with dr.resume_grad():
             backward(δ * self._moved(view, f))
         dr.eval()

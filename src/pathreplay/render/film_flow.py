@@ -24,7 +24,8 @@ import mitsuba as mi
 
 from ..transport.nodes import with_gradients
 
-CAMERAS = frozenset({"PerspectiveCamera", "ThinLensCamera", "OrthographicCamera"})
+PINHOLE = "PerspectiveCamera"
+CAMERAS = frozenset({PINHOLE, "ThinLensCamera", "OrthographicCamera"})
 """By class: those whose rays are smooth functions of places, beyond the border of the film, too."""
 ONLY_PLACES = "x_fov", "principal_point_offset_x", "principal_point_offset_y"
 """Parameters of cameras that move nothing but places: they leave no rest."""
@@ -49,11 +50,10 @@ class FilmFlow:
         """That of a sensor; None where it does not move, or is none of `CAMERAS`."""
         if sensor.class_name() not in CAMERAS or not with_gradients(sensor, *ONLY_PLACES, *OTHERS):
             return None
-        rest = bool(with_gradients(sensor, *OTHERS))
+        rest = _is_carried(sensor) or bool(with_gradients(sensor, *OTHERS[1:]))
         others = any(with_gradients(thing) for thing in (*scene.shapes(), *scene.emitters()))
-        return FilmFlow(
-            sensor, _distance(scene, sensor), rest, not (rest or others or with_gradients(sensor, "medium"))
-        )
+        alone = not (rest or others or with_gradients(sensor, "medium"))
+        return FilmFlow(sensor, _distance(scene, sensor), rest, alone)
 
     def ray(
         self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f
@@ -100,6 +100,15 @@ class FilmFlow:
                 o.append((b.o - a.o) / (2 * STEP))
                 d.append((b.d - a.d) / (2 * STEP))
         return o, d
+
+
+def _is_carried(sensor: mi.Sensor) -> bool:
+    """Whether its pose has gradients, and leaves a rest: a pinhole that only turns leaves none."""
+    poses = with_gradients(sensor, "to_world")
+    if sensor.class_name() != PINHOLE:
+        return bool(poses)
+    with dr.resume_grad():
+        return any(dr.grad_enabled(pose.matrix[row, 3]) for pose in poses for row in range(3))
 
 
 def _distance(scene: mi.Scene, sensor: mi.Sensor) -> mi.Float:
