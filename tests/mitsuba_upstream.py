@@ -1,6 +1,6 @@
 """Mitsuba's own test of its derivatives, with its scenes, its references and its thresholds, for one integrator more.
 
-    python tests/mitsuba_upstream.py CHECKOUT [--plugin prb] [--edges none] [NAME ...]
+    python tests/mitsuba_upstream.py CHECKOUT [--plugin prb] [--edges none] [--seed 100] [NAME ...]
 
 takes `src/integrators/tests/test_ad_integrators.py` out of a checkout of Mitsuba 3.9.1 with its data, and prints for
 each of the 24 configurations how far picture, forward and reverse derivative are off: 72 tests. The tests in
@@ -66,17 +66,17 @@ def upstream(checkout: Path) -> ModuleType:
     return module
 
 
-def passes(picture: Callable[[int, int], Any], pixels: int, spp: int) -> np.ndarray:
+def passes(picture: Callable[[int, int], Any], pixels: int, spp: int, first: int) -> np.ndarray:
     """The mean picture of passes with ``spp`` samples in all: one pass would be too large for most machines."""
     n = max(-(-spp * pixels // LANES), 1)
-    return np.mean([np.array(picture(seed, spp // n), np.float64) for seed in range(n)], axis=0)
+    return np.mean([np.array(picture(first + k, spp // n), np.float64) for k in range(n)], axis=0)
 
 
 def reference(tests: ModuleType, config: Any, kind: str) -> np.ndarray:
     return np.array(mi.TensorXf(mi.Bitmap(f"{tests.output_dir}/test_{config.name}_image_{kind}_ref.exr")), np.float64)
 
 
-def measure(tests: ModuleType, config: Any, options: dict[str, Any]) -> tuple[tuple[float, ...], Limits]:
+def measure(tests: ModuleType, config: Any, options: dict[str, Any], seed: int) -> tuple[tuple[float, ...], Limits]:
     """Errors as Mitsuba's three tests take them, and what they may be."""
     config.initialize()
     wanted = {key: value for key, value in config.integrator_dict.items() if key not in OTHERS}
@@ -85,18 +85,18 @@ def measure(tests: ModuleType, config: Any, options: dict[str, Any]) -> tuple[tu
     pixels = int(size[0] * size[1])
     primal, forward = (reference(tests, config, kind) for kind in ("primal", "fwd"))
 
-    image = passes(lambda seed, spp: integrator.render(config.scene, seed=seed, spp=spp), pixels, config.spp)
+    image = passes(lambda seed, spp: integrator.render(config.scene, seed=seed, spp=spp), pixels, config.spp, seed)
 
     def tangent(seed: int, spp: int) -> Any:
         theta = attached(config)
         dr.forward(theta, dr.ADFlag.ClearEdges)
         return dr.detach(integrator.render_forward(config.scene, seed=seed, spp=spp, params=theta))
 
-    ahead = passes(tangent, pixels, config.spp)
+    ahead = passes(tangent, pixels, config.spp, seed)
     theta = attached(config)
     spp = 256 if type(config) is tests.TranslateTexturedPlaneConfig else 128
     adjoint = dr.full(mi.TensorXf, ADJOINT, forward.shape)
-    integrator.render_backward(config.scene, grad_in=adjoint, seed=0, spp=spp, params=theta)
+    integrator.render_backward(config.scene, grad_in=adjoint, seed=seed, spp=spp, params=theta)
     gradient, expected = float(dr.grad(theta)[0]) / forward.size, forward.mean() * ADJOINT
     reverse = abs(gradient - expected) / max(abs(expected), FLOOR_REVERSE)
     errors = *relative(image, primal, FLOOR_PRIMAL), *relative(ahead, forward, FLOOR_FORWARD), reverse
@@ -142,6 +142,7 @@ def main() -> None:
     parser.add_argument("--edges", default="all", help="of pathreplay: all, film or none")
     parser.add_argument("--edge-spp", type=int, default=0, help="of pathreplay: lines per pixel")
     parser.add_argument("--share", type=float, default=1.0, help="of Mitsuba's samples: fewer are harder to pass with")
+    parser.add_argument("--seed", type=int, default=0, help="the first of the passes' seeds")
     parser.add_argument("--again", type=int, default=0, metavar="N", help="only make references again, with N seeds")
     given = parser.parse_intermixed_args()
     set_variant(VARIANT)
@@ -165,7 +166,7 @@ def main() -> None:
             continue
         begun = time.time()
         config.spp = round(config.spp * given.share)
-        errors, limits = measure(tests, config, options)
+        errors, limits = measure(tests, config, options, given.seed)
         print(f"{row(config.name, errors, limits)} ({time.time() - begun:.0f} s)", flush=True)
 
 
