@@ -165,6 +165,8 @@ def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sigh
     at = path.at
     flags = mi.RayFlags.All if walk.traits.coarse_meshes else mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
     si = at.hit.compute_surface_interaction(at.ray, flags, active)
+    if not walk.traits.copies:
+        si.shape = at.hit.shape
     kind = dr.select(turned_away(si, at.ray.d), mi.UInt32(1), 0)
     sight = Sight(mixed(place_met(walk, at.hit, active, si.shape), kind), si.p, si.n)
     if not walk.traits.coarse_meshes:
