@@ -79,15 +79,16 @@ def arc(seer: Seer, l: float, narrow: bool, key: mi.UInt32, active: mi.Bool) -> 
     The longest ones are ``l`` radians long; all are where no lobe may be ``narrow``.
     """
     numbers = Counted(key, mi.UInt32(0x100))
-    d, smooth = seer.sample(numbers.next_1d(), numbers.next_2d())
-    evenly = numbers.next_1d() < EVENLY
+    (lobe, way), turn = numbers.next_2d(), dr.two_pi * numbers.next_1d()
+    d, smooth = seer.sample(lobe, numbers.next_2d())
+    evenly = way < EVENLY
     d = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), d)
     ok = active & (evenly | smooth)
     f, pdf = seer.towards(d, ok)
     p = dr.select(ok, density_of_samples(pdf), 1)
     d = dr.select(ok, d, mi.Vector3f(0, 0, 1))
-    turn = dr.two_pi * numbers.next_1d()
-    w = mi.Frame3f(d).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
+    sin, cos = dr.sincos(turn)
+    w = mi.Frame3f(d).to_world(mi.Vector3f(cos, sin, 0))
     if not narrow:
         return Arc(d, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), mi.Float(0), p, f, None), ok
     j = length_drawn(p, numbers)

@@ -97,8 +97,8 @@ def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
         key = key_of(i, seed ^ 0x51ED270B)
         x, y, turn = quasi_random(i, n, seed, 3)
         c, density = centres.draw(mi.Point2f(x, y))
-        w = mi.Vector2f(dr.cos(dr.two_pi * turn), dr.sin(dr.two_pi * turn))
-        return FilmLine(c - centres.margin, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key)
+        sin, cos = dr.sincos(dr.two_pi * turn)
+        return FilmLine(c - centres.margin, mi.Vector2f(cos, sin), mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key)
 
     def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:
         return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)

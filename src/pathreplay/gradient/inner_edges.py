@@ -152,9 +152,10 @@ class Shaded:
 def emitter_line(walk: Walk, x: Chosen, l: float, key: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
     """A line among the samples of an emitter, and whether there is one."""
     numbers, scene = Counted(key, mi.UInt32(0)), walk.scene
-    index, share, _ = scene.sample_emitter(numbers.next_1d())
-    turn = dr.two_pi * numbers.next_1d()
-    c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(dr.cos(turn), dr.sin(turn))
+    which, turn = numbers.next_2d()
+    index, share, _ = scene.sample_emitter(which)
+    sin, cos = dr.sincos(dr.two_pi * turn)
+    c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(cos, sin)
     begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)
     for axis in range(2):  # the part that is inside
         cuts = (BORDER - c[axis]) / w[axis], (1 - BORDER - c[axis]) / w[axis]
@@ -292,7 +293,8 @@ def _views(
         ray = seer.origin.spawn_ray(line.at(t))
         first = seer.hit(ray, active & seer.may_scatter(ray.d))
         seen = seer.behind(ray, first, active)
-        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
+        counts = _counts(walk, x, seen)  # nothing else is looked at
+        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active & counts)
         if not walk.traits.copies:
             at.shape = seen.shape
         turned = dr.select(turned_away(at, ray.d), mi.UInt32(1), 0)
@@ -314,7 +316,7 @@ def _views(
         sight = Sight(mixed(place, turned), at.p, at.n, moves, near, bright)
         # As nothing, a sky would be.
         dark = replace(Sight.nothing(), signature=mi.UInt32(1), moves=moves, near=near, bright=bright)
-        return dr.select(_counts(walk, x, seen), sight, dark)
+        return dr.select(counts, sight, dark)
 
     return look, shade
 

@@ -26,7 +26,7 @@ from .film import MOST_SAMPLES
 from .places import FilmPlaces
 from .term import Found
 
-FILM_CLOSER, INNER_CLOSER = 5, 20
+FILM_CLOSER, INNER_CLOSER = 5, 16
 """For so many lines one is looked at closer, of those with an edge."""
 GRID = "SDFGrid"
 """By class: its surface is neither met nor held where its outline would have to be."""
