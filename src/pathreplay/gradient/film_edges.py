@@ -138,7 +138,8 @@ def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> S
     if walk.traits.mirrors or walk.traits.hard_lights or walk.media is not None:
         return _chain_sight(walk, ray, key, active)
     path = PathState.begin(walk, CameraStart(ray, Counted.of(key), active))
-    return dr.select(may_move(walk, path.at.hit), _sight(walk, path, key, active), Sight.nothing())
+    moves = may_move(walk, path.at.hit)
+    return dr.select(moves, _sight(walk, path, key, active & moves), Sight.nothing())
 
 
 @dr.syntax
@@ -148,7 +149,7 @@ def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> 
     sight, moves = Sight.nothing(), mi.Bool(False)
     while dr.hint(path.active, exclude=[walk], label="pathreplay: chain"):
         moves |= may_move(walk, path.at.hit)
-        here = dr.select(moves, _sight(walk, path, key, path.active), Sight.nothing())
+        here = dr.select(moves, _sight(walk, path, key, path.active & moves), Sight.nothing())
         if dr.hint(walk.traits.hard_lights, mode="scalar"):
             dark = _shade(walk, path.at, key, path.depth, path.active).dark
             here.signature = mixed(here.signature, dr.select(dark, mi.UInt32(1), 0))
