@@ -293,8 +293,11 @@ def _views(
         ray = seer.origin.spawn_ray(line.at(t))
         first = seer.hit(ray, active & seer.may_scatter(ray.d))
         seen = seer.behind(ray, first, active)
-        counts = _counts(walk, x, seen)  # nothing else is looked at
-        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active & counts)
+        counts, moves = _counts(walk, x, seen), x.moves | may_move(walk, seen)
+        close = active & counts  # nothing else is looked at closely
+        if walk.media is None:
+            close &= moves
+        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, close)
         if not walk.traits.copies:
             at.shape = seen.shape
         turned = dr.select(turned_away(at, ray.d), mi.UInt32(1), 0)
@@ -302,7 +305,6 @@ def _views(
         place = dr.select(seer.keeps, *places)
         facets = ~seer.keeps & jumps_at_facets(walk.traits.tables.blend_lengths, seer.origin, seen, at.p, at.n)
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
-        moves = x.moves | may_move(walk, seen)
         if walk.media is not None:  # directions follow null boundaries, too
             boundary = place_met(walk, first, active, shape_met(walk, first, ray, active), facets=False)
             place, moves = mixed(place, boundary), moves | may_move(walk, first)
