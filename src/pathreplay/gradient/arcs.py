@@ -44,6 +44,7 @@ class Arc:
     end: mi.Float
     t: mi.Float  # where the sample is on it
     p: mi.Float  # its density
+    f: mi.Spectrum  # what is scattered from there
     j: mi.UInt32 | None  # of its length; None: there is one only, and the sample is the centre
 
     def at(self, t: mi.Float) -> mi.Vector3f:
@@ -78,21 +79,23 @@ def arc(seer: Seer, l: float, narrow: bool, key: mi.UInt32, active: mi.Bool) -> 
     The longest ones are ``l`` radians long; all are where no lobe may be ``narrow``.
     """
     numbers = Counted(key, mi.UInt32(0x100))
-    d, smooth = seer.sample(numbers.next_1d(), numbers.next_2d())
-    evenly = numbers.next_1d() < EVENLY
+    (lobe, way), turn = numbers.next_2d(), dr.two_pi * numbers.next_1d()
+    d, smooth = seer.sample(lobe, numbers.next_2d())
+    evenly = way < EVENLY
     d = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), d)
     ok = active & (evenly | smooth)
-    p = dr.select(ok, density_of_samples(seer.towards(d, ok)[1]), 1)
+    f, pdf = seer.towards(d, ok)
+    p = dr.select(ok, density_of_samples(pdf), 1)
     d = dr.select(ok, d, mi.Vector3f(0, 0, 1))
-    turn = dr.two_pi * numbers.next_1d()
-    w = mi.Frame3f(d).to_world(mi.Vector3f(dr.cos(turn), dr.sin(turn), 0))
+    sin, cos = dr.sincos(turn)
+    w = mi.Frame3f(d).to_world(mi.Vector3f(cos, sin, 0))
     if not narrow:
-        return Arc(d, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), mi.Float(0), p, None), ok
+        return Arc(d, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), mi.Float(0), p, f, None), ok
     j = length_drawn(p, numbers)
     full = l * _length(j)
     back = -full * _place(dr.minimum(mi.UInt32(PLACES * numbers.next_1d()), PLACES - 1))
     c, s = dr.cos(back), dr.sin(back)
-    return Arc(c * d + s * w, c * w - s * d, -0.5 * full, 0.5 * full, -back, p, j), ok
+    return Arc(c * d + s * w, c * w - s * d, -0.5 * full, 0.5 * full, -back, p, f, j), ok
 
 
 def density_of_samples(pdf: mi.Float) -> mi.Float:

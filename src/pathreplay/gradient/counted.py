@@ -36,8 +36,9 @@ class Counted:
         return x
 
     def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
-        x = self.next_1d()
-        return mi.Point2f(x, self.next_1d())
+        x, y = mi.sample_tea_32(self.key, self.index, ROUNDS)  # both halves of one block of the cipher
+        self.index += 2
+        return mi.Point2f(_in_unit(x), _in_unit(y))
 
 
 def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
@@ -54,4 +55,9 @@ def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32, dimensions: int = 2) -> 
     randomly shifted."""
     steps = [dr.opaque(mi.UInt32, 2**32 // n % 2**32), *map(mi.UInt32, STEPS)][:dimensions]
     shifts = [mi.sample_tea_32(seed, mi.UInt32(k + 1), ROUNDS)[0] for k in range(dimensions)]
-    return [mi.Float((i * step + shift) >> 8) * 2**-24 for step, shift in zip(steps, shifts, strict=True)]
+    return [_in_unit(i * step + shift) for step, shift in zip(steps, shifts, strict=True)]
+
+
+def _in_unit(x: mi.UInt32) -> mi.Float:
+    """An integer as a number in [0, 1)."""
+    return mi.Float(x >> 8) * 2**-24

@@ -146,13 +146,17 @@ class Survey:
 
 def glance(look: Look, line: Any, active: mi.Bool) -> mi.Float:
     """How much a line counts, whose places are from ``line.begin`` to ``line.end``: 0 where it finds nothing."""
-    return survey(look, line, active).found
+    return survey([look(line, t, active) for t in looked_at(line)], active).found
 
 
-def survey(look: Look, line: Any, active: mi.Bool) -> Survey:
-    """The same, with what is seen along the line."""
-    at_a, at_b = (look(line, t, active) for t in (line.begin, line.end))
-    at_c = look(line, 0.5 * (line.begin + line.end), active)
+def looked_at(line: Any) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Places of a line at which one glances: its ends, and its middle."""
+    return line.begin, line.end, 0.5 * (line.begin + line.end)
+
+
+def survey(sights: list[Sight], active: mi.Bool) -> Survey:
+    """What a line tells, with so much seen at its places: see `looked_at`."""
+    at_a, at_b, at_c = sights
     ends, halves = at_a.hint(at_b), dr.maximum(at_c.hint(at_a), at_c.hint(at_b))
     # Of two crossings, which count twice, one is chosen in time, for both: see `bisect`.
     found = dr.select(ends > 0, dr.maximum(ends, halves), 4 * halves)

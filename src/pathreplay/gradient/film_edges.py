@@ -97,8 +97,8 @@ def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
         key = key_of(i, seed ^ 0x51ED270B)
         x, y, turn = quasi_random(i, n, seed, 3)
         c, density = centres.draw(mi.Point2f(x, y))
-        w = mi.Vector2f(dr.cos(dr.two_pi * turn), dr.sin(dr.two_pi * turn))
-        return FilmLine(c - centres.margin, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key)
+        sin, cos = dr.sincos(dr.two_pi * turn)
+        return FilmLine(c - centres.margin, mi.Vector2f(cos, sin), mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key)
 
     def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:
         return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)
@@ -138,7 +138,8 @@ def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> S
     if walk.traits.mirrors or walk.traits.hard_lights or walk.media is not None:
         return _chain_sight(walk, ray, key, active)
     path = PathState.begin(walk, CameraStart(ray, Counted.of(key), active))
-    return dr.select(may_move(walk, path.at.hit), _sight(walk, path, key, active), Sight.nothing())
+    moves = may_move(walk, path.at.hit)
+    return dr.select(moves, _sight(walk, path, key, active & moves), Sight.nothing())
 
 
 @dr.syntax
@@ -148,7 +149,7 @@ def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> 
     sight, moves = Sight.nothing(), mi.Bool(False)
     while dr.hint(path.active, exclude=[walk], label="pathreplay: chain"):
         moves |= may_move(walk, path.at.hit)
-        here = dr.select(moves, _sight(walk, path, key, path.active), Sight.nothing())
+        here = dr.select(moves, _sight(walk, path, key, path.active & moves), Sight.nothing())
         if dr.hint(walk.traits.hard_lights, mode="scalar"):
             dark = _shade(walk, path.at, key, path.depth, path.active).dark
             here.signature = mixed(here.signature, dr.select(dark, mi.UInt32(1), 0))
@@ -165,6 +166,8 @@ def _sight(walk: Walk, path: PathState, key: mi.UInt32, active: mi.Bool) -> Sigh
     at = path.at
     flags = mi.RayFlags.All if walk.traits.coarse_meshes else mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
     si = at.hit.compute_surface_interaction(at.ray, flags, active)
+    if not walk.traits.copies:
+        si.shape = at.hit.shape
     kind = dr.select(turned_away(si, at.ray.d), mi.UInt32(1), 0)
     sight = Sight(mixed(place_met(walk, at.hit, active, si.shape), kind), si.p, si.n)
     if not walk.traits.coarse_meshes:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -34,13 +35,13 @@ from .arcs import Arc, arc, density_of_samples
 from .bends import Bend, off_contact
 from .centres import LOOKS, Centres
 from .counted import Counted, key_of, quasi_random
-from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, survey
+from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, looked_at, survey
 from .edges import Edges, Places
 from .hard_shadows import Shade
-from .lamps import Glimpse, Lamp, followed, glimpse, towards_place
+from .lamps import Glimpse, Lamp, followed, glimpse
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
-from .seer import Seer, may_see
+from .seer import Seer, may_see, surface_sees
 from .worth import DIM, MOST, STEEP, UNFORESEEN, Worth, closeness, own_plane, radiance_of, weighed
 
 BORDER = 1e-4
@@ -85,6 +86,8 @@ def choose_vertex(walk: Walk, numbers: Counted, ray: mi.Ray3f, layout: Layout, r
     """
     walk = replace(walk, max_depth=max(walk.max_depth - 1, 0))
     path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))
+    if dr.hint(walk.max_depth == 1 and walk.media is None and records is None, mode="scalar"):
+        return None, _first_vertex(walk, path)
     none, no = mi.UInt32(0), mi.Bool(False)
     flight = None if walk.media is None else Flight.none(walk.media)
     chosen = Chosen(path.at, none, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), no, mi.Bool(False), flight)
@@ -110,6 +113,13 @@ def choose_vertex(walk: Walk, numbers: Counted, ray: mi.Ray3f, layout: Layout, r
         count += 1
     chosen.β *= mass / dr.maximum(chosen.mass, dr.smallest(mi.Float))
     return records, chosen
+
+
+def _first_vertex(walk: Walk, path: PathState) -> Chosen:
+    """The choice where there is none, without a look at what comes after."""
+    at, none = path.at, mi.UInt32(0)
+    active = path.active & surface_sees(walk, at)
+    return Chosen(at, none, none, dr.select(active, path.β, 0), mi.Float(1), may_move(walk, at.hit), active)
 
 
 @dataclass
@@ -142,9 +152,10 @@ class Shaded:
 def emitter_line(walk: Walk, x: Chosen, l: float, key: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
     """A line among the samples of an emitter, and whether there is one."""
     numbers, scene = Counted(key, mi.UInt32(0)), walk.scene
-    index, share, _ = scene.sample_emitter(numbers.next_1d())
-    turn = dr.two_pi * numbers.next_1d()
-    c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(dr.cos(turn), dr.sin(turn))
+    which, turn = numbers.next_2d()
+    index, share, _ = scene.sample_emitter(which)
+    sin, cos = dr.sincos(dr.two_pi * turn)
+    c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(cos, sin)
     begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)
     for axis in range(2):  # the part that is inside
         cuts = (BORDER - c[axis]) / w[axis], (1 - BORDER - c[axis]) / w[axis]
@@ -158,22 +169,16 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     """Find the edge of a shadow among the samples of an emitter, and weigh it: see `Search`. Detached."""
     line, inside = emitter_line(walk, x, l, key)
 
-    def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
-        seen = glimpse(walk, seer, line.lamp, line.at(t), active)
+    def sight(seen: Glimpse) -> Sight:
         moves = x.moves | _lamp_moves(walk, line.lamp.emitter) | may_move(walk, seen.hit)
-        sight = Sight(mi.UInt32(seen.hidden & moves), mi.Point3f(0), mi.Normal3f(0))
-        if search.chosen is not None:
-            return sight
-        f, pdf = seer.towards(seen.light.d, active)
-        F = dr.mean(dr.abs(x.β * f * seen.Le)) * line.share
-        F *= dr.select(seen.light.delta, 1, mis_weight(seen.density / line.share, pdf))
-        return replace(sight, near=dr.select(seen.hidden, closeness(walk, seen.hit), 0), bright=F)
+        return Sight(mi.UInt32(seen.hidden & moves), mi.Point3f(0), mi.Normal3f(0))
+
+    def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
+        return sight(glimpse(walk, seer, line.lamp, line.at(t), active))
 
     if search.chosen is None:
-        a, b = (towards_place(walk, seer, line.lamp, line.at(t), inside) for t in (line.begin, line.end))
-        turn = dr.norm(a - b) / dr.maximum(line.end - line.begin, BORDER)
-        seen = survey(look, line, inside)
-        return Worth.of(seen, seen.bright, own_plane(seer, a, b) * dr.square(1 + l) / (l * (turn + STEEP)))
+        glimpses = [glimpse(walk, seer, line.lamp, line.at(t), inside) for t in looked_at(line)]
+        return _square_worth(walk, x, seer, line, l, [(seen, sight(seen)) for seen in glimpses], inside)
     found = search.closer(look, line, inside)
     active = found.weight > 0
     a, b = (glimpse(walk, seer, line.lamp, line.at(t), active) for t in (found.a, found.b))
@@ -190,6 +195,30 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     u, u_lit = (line.at(dr.select(a.hidden, *ends)) for ends in ((found.a, found.b), (found.b, found.a)))
     own = active & seer.parts(light.d, dark.light.d)  # not that of the ray, which begins a little beside
     return Shaded(line, u, u_lit, lit, hit, dark.ray, edge_normal(hit, dark.ray, active), own, K, active)
+
+
+def _square_worth(
+    walk: Walk,
+    x: Chosen,
+    seer: Seer,
+    line: SquareLine,
+    l: float,
+    seen: list[tuple[Glimpse, Sight]],
+    active: mi.Bool,
+) -> Worth:
+    """What a line is worth where so much is seen. Where no lobe is narrow, its middle tells what x scatters."""
+    glimpses, sights = zip(*seen, strict=True)
+    a, b, c = (each.light.d for each in glimpses)
+    scattered = [seer.towards(d, active) for d in ((a, b, c) if walk.traits.narrow else (c,))]
+    bright = []
+    for each, (f, pdf) in zip(glimpses, scattered if len(scattered) > 1 else scattered * 3, strict=True):
+        F = dr.mean(dr.abs(x.β * f * each.Le)) * line.share
+        bright.append(F * dr.select(each.light.delta, 1, mis_weight(each.density / line.share, pdf)))
+    first = reduce(lambda p, q: dr.select(q.hidden & ~(p.hidden & (p.hit.t <= q.hit.t)), q, p), glimpses)
+    told = survey([replace(sight, bright=F) for sight, F in zip(sights, bright, strict=True)], active)
+    told.near = dr.select(first.hidden, closeness(walk, first.hit), 0)
+    turn = dr.norm(a - b) / dr.maximum(line.end - line.begin, BORDER)
+    return Worth.of(told, told.bright, own_plane(seer, a, b) * dr.square(1 + l) / (l * (turn + STEEP)))
 
 
 def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
@@ -264,13 +293,18 @@ def _views(
         ray = seer.origin.spawn_ray(line.at(t))
         first = seer.hit(ray, active & seer.may_scatter(ray.d))
         seen = seer.behind(ray, first, active)
-        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
+        counts, moves = _counts(walk, x, seen), x.moves | may_move(walk, seen)
+        close = active & counts  # nothing else is looked at closely
+        if walk.media is None:
+            close &= moves
+        at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, close)
+        if not walk.traits.copies:
+            at.shape = seen.shape
         turned = dr.select(turned_away(at, ray.d), mi.UInt32(1), 0)
         places = [place_met(walk, seen, active, at.shape, facets) for facets in (True, False)]
         place = dr.select(seer.keeps, *places)
         facets = ~seer.keeps & jumps_at_facets(walk.traits.tables.blend_lengths, seer.origin, seen, at.p, at.n)
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
-        moves = x.moves | may_move(walk, seen)
         if walk.media is not None:  # directions follow null boundaries, too
             boundary = place_met(walk, first, active, shape_met(walk, first, ray, active), facets=False)
             place, moves = mixed(place, boundary), moves | may_move(walk, first)
@@ -284,7 +318,7 @@ def _views(
         sight = Sight(mixed(place, turned), at.p, at.n, moves, near, bright)
         # As nothing, a sky would be.
         dark = replace(Sight.nothing(), signature=mi.UInt32(1), moves=moves, near=near, bright=bright)
-        return dr.select(_counts(walk, x, seen), sight, dark)
+        return dr.select(counts, sight, dark)
 
     return look, shade
 
@@ -298,9 +332,11 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
     hard = walk.traits.hard_lights and walk.media is None
     look, shade = _views(walk, x, seer, key, hard)
     if search.chosen is None:
-        f = dr.mean(dr.abs(x.β * seer.towards(line.at(line.t), ok)[0]))
-        light, own = dr.select(ok, f / line.p, 0), own_plane(seer, line.at(line.begin), line.at(line.end))
-        seen = survey(look, line, ok)
+        light, own = (
+            dr.select(ok, dr.mean(dr.abs(x.β * line.f)) / line.p, 0),
+            own_plane(seer, line.at(line.begin), line.at(line.end)),
+        )
+        seen = survey([look(line, t, ok) for t in looked_at(line)], ok)
         return Worth.of(replace(seen, found=seen.found * line.importance()), light, light * own / l)
     found = search.closer(look, line, ok)
     active = found.weight > 0

@@ -110,13 +110,6 @@ def direction(lamp: Lamp, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi
     return frame.to_world(mi.Vector3f(across * p.x, across * p.y, 1 - s * n)), dr.two_pi * s
 
 
-def towards_place(walk: Walk, seer: Seer, lamp: Lamp, u: mi.Point2f, active: mi.Bool) -> mi.Vector3f:
-    """The direction to a place of a lamp. Detached."""
-    in_cone = active & (lamp.radius > 0)
-    light, _ = lamp.emitter.sample_direction(seer.origin, sample_at(walk, lamp, u), active & ~in_cone)
-    return light.d if not walk.traits.mesh_lights else dr.select(in_cone, direction(lamp, seer.origin.p, u)[0], light.d)
-
-
 def followed(
     walk: Walk, lamp: Lamp, origin: mi.Interaction3f, u: mi.Point2f, glue: Glimpse, active: mi.Bool
 ) -> mi.Vector3f:

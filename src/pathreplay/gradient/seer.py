@@ -24,12 +24,16 @@ NEAR = 10.0
 
 def may_see(walk: Walk, at: Arrival, step: Chosen) -> tuple[mi.Bool, mi.Spectrum]:
     """Whether the vertex that a path arrived at scatters smoothly, and the weight of the flight before it."""
-    valid = at.hit.is_valid()
-    surface = valid & is_smooth(shape_met(walk, at.hit, at.ray, valid).bsdf())
     if walk.media is None:
-        return surface, mi.Spectrum(1)
+        return surface_sees(walk, at), mi.Spectrum(1)
     flight = step.kept.media.flight
-    return surface | flight.event, flight.weight
+    return surface_sees(walk, at) | flight.event, flight.weight
+
+
+def surface_sees(walk: Walk, at: Arrival) -> mi.Bool:
+    """Whether a path arrived at a surface that scatters smoothly."""
+    valid = at.hit.is_valid()
+    return valid & is_smooth(shape_met(walk, at.hit, at.ray, valid).bsdf())
 
 
 class Seer:
