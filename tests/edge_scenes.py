@@ -194,7 +194,7 @@ def copies_shade() -> dict:
     return scene(30, wall=shape(BACK, patterned()), lamp=lamp(OVERHEAD), group=group, copy=copy)
 
 
-def copies_turn() -> dict:
+def two_copies() -> dict:
     """Two copies of a box that are seen, and shade a wall and each other."""
     box = shape(T().rotate([1, 0.4, 0], 30).scale(0.35), paint(0.6, 0.4, 0.3), "cube", face_normals=True)
     group = {"type": "shapegroup", "box": box}
@@ -405,7 +405,7 @@ SHADOWS = [
     cell("shadow_sphere", shadow(lambda: shape(SHADE.scale(0.3), BLACK, "sphere")), OBJECT, translate(*ASIDE)),
     cell("shadow_cube8", shadow(lambda: cube8(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
     cell("shadow_cube24", shadow(lambda: cube24(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
-    cell("copies_turn", copies_turn, "group.box.vertex_positions", TURN, 3),
+    cell("copies_move", two_copies, "group.box.vertex_positions", translate_vertices(*ASIDE), 3),
     cell("shadow_copy", copies_shade, "group.box.vertex_positions", translate_vertices(*ASIDE)),
     cell("copy_is_shaded", copy_is_shaded, OBJECT, translate(*ASIDE)),
     cell("sphere_lamp", shadow(light=ball_lamp), "lamp.to_world", translate(*ASIDE)),
