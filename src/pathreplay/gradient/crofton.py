@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -104,6 +104,13 @@ def bend_or_edge(a: Sight, b: Sight) -> mi.Float:
     """How likely one sheet hides the other: on a bend each point is on the same side of the other's tangent plane."""
     across = b.p - a.p
     return dr.select(dr.dot(a.n, across) * dr.dot(b.n, across) < 0, BENDS, HIDES)
+
+
+class Line(Protocol):
+    """A line, whose places are numbers."""
+
+    begin: mi.Float
+    end: mi.Float
 
 
 @dataclass
@@ -198,7 +205,7 @@ def alone(m: mi.Float) -> mi.Float:
 
 
 @dr.syntax
-def part_seen(look: Look, line: Any, active: mi.Bool) -> mi.Float:
+def part_seen(look: Look, line: Line, active: mi.Bool) -> mi.Float:
     """The share of a line around its middle in which it looks as it does there, to some sixteenths."""
     middle, half = 0.5 * (line.begin + line.end), 0.5 * (line.end - line.begin)
     at_middle = look(line, middle, active)
