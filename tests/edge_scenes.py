@@ -16,7 +16,7 @@ import numpy as np
 
 from mitsuba_configs import ball as sphere
 from mitsuba_configs import square
-from truth import RES, Case, Move, add, bitmap, camera, noise, rgb, translate, translate_vertices, turn_vertices
+from truth import RES, Case, Move, add, bitmap, camera, noise, rgb, rotate, translate, translate_vertices, turn_vertices
 
 Place = Any
 T = mi.ScalarTransform4f
@@ -194,6 +194,17 @@ def copies_shade() -> dict:
     return scene(30, wall=shape(BACK, patterned()), lamp=lamp(OVERHEAD), group=group, copy=copy)
 
 
+def two_copies() -> dict:
+    """Two copies of a box that are seen, and shade a wall and each other."""
+    box = shape(T().rotate([1, 0.4, 0], 30).scale(0.35), paint(0.6, 0.4, 0.3), "cube", face_normals=True)
+    group = {"type": "shapegroup", "box": box}
+    one, two = (
+        {"type": "instance", "to_world": T().translate([x, 0.1, 0.1]), "group": {"type": "ref", "id": "group"}}
+        for x in (-0.5, 0.6)
+    )
+    return scene(wall=shape(BACK, patterned()), lamp=lamp(OVERHEAD), group=group, one=one, two=two)
+
+
 def copied(thing: dict, place: Place) -> dict:
     """The parts of a scene that has a copy of something; its name is 'group.thing'."""
     copy = {"type": "instance", "to_world": place, "group": {"type": "ref", "id": "group"}}
@@ -214,6 +225,29 @@ def projected() -> dict:
         lamp={"type": "projector", "to_world": turned, "fov": 25, "irradiance": {**bitmap(noise(8, 3, 2, 9)),
               "filter_type": "bilinear"}},
     )  # fmt: skip
+
+
+def spotted(beam: float) -> Callable[[], dict]:
+    """A spot whose light does not fade, since its beam is as wide as its cone, or wider."""
+    turned = T().look_at([1.2, 0.8, 2.5], [0, 0, -1], [0, 1, 0])
+    return lambda: scene(
+        wall=shape(BACK, plain()),
+        lamp={"type": "spot", "to_world": turned, "intensity": rgb(9, 8, 7), "cutoff_angle": 15.0, "beam_width": beam},
+    )
+
+
+def in_the_sun(thing: Callable[[], Any]) -> Callable[[], dict]:
+    """Something before a wall, in parallel light."""
+    sun = {"type": "directional", "to_world": T().look_at([1.6, 2.2, 2.0], [0, 0, -0.5], [0, 1, 0]),
+           "irradiance": rgb(9, 8, 7)}  # fmt: skip
+    return lambda: scene(wall=shape(BACK, patterned()), lamp=sun, object=thing())
+
+
+def behind_a_post() -> dict:
+    """A lamp that the camera sees, half behind a post."""
+    light = T().translate([0.3, 0.1, -0.3]).scale([0.45, 0.3, 1])
+    post = T().translate([0.1, 0, 0.4]).scale([0.15, 1.5, 1])
+    return scene(wall=shape(BACK, patterned()), lamp=lamp(light, 3), object=shape(post, paint(0.5)))
 
 
 def by_a_side_wall(wall: Callable[[], dict], side: Callable[[], dict], light: dict | None = None) -> Callable[[], dict]:
@@ -355,6 +389,11 @@ SEEN = [
          seeds=24),
     cell("projector_moves", projected, "lamp.to_world", translate(*ASIDE)),
     cell("camera_moves", before_a_glow(lambda: shape(CARD, BLACK)), "camera.to_world", translate(*ASIDE)),
+    cell("spot_sharp", spotted(15.0), "lamp.to_world", translate(*ASIDE)),
+    cell("spot_turns", spotted(15.0), "lamp.to_world", rotate(0.3, 1, 0)),
+    cell("spot_widens", spotted(20.0), "lamp.cutoff_angle", add(10.0)),
+    cell("sun_turns", in_the_sun(lambda: cube24(BOX, paint(0.6, 0.4, 0.3))), "lamp.to_world", rotate(0.3, 1, 0), 3),
+    cell("lamp_by_post", behind_a_post, "lamp.to_world", translate(*ASIDE)),
     cell("lamp_seen", lamp_seen, "lamp.to_world", translate(*ASIDE)),
 ]  # fmt: skip
 """What the camera sees."""
@@ -366,6 +405,7 @@ SHADOWS = [
     cell("shadow_sphere", shadow(lambda: shape(SHADE.scale(0.3), BLACK, "sphere")), OBJECT, translate(*ASIDE)),
     cell("shadow_cube8", shadow(lambda: cube8(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
     cell("shadow_cube24", shadow(lambda: cube24(SHADE_BOX, BLACK)), VERTICES, turn_vertices(0, 0, 1)),
+    cell("copies_move", two_copies, "group.box.vertex_positions", translate_vertices(*ASIDE), 3),
     cell("shadow_copy", copies_shade, "group.box.vertex_positions", translate_vertices(*ASIDE)),
     cell("copy_is_shaded", copy_is_shaded, OBJECT, translate(*ASIDE)),
     cell("sphere_lamp", shadow(light=ball_lamp), "lamp.to_world", translate(*ASIDE)),

@@ -149,7 +149,8 @@ def test_vertices_that_differ_in_their_last_bits_are_in_one_place(centre: float)
     assert list(np.flatnonzero(np.bincount(pieces)[pieces] == 1)) == [n - 1, n]
 
 
-def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
+@pytest.mark.parametrize("width", [0.5, 0.08], ids=["wide", "thinner than a line"])
+def test_lines_count_crossings_with_the_sides_of_a_rectangle(width: float) -> None:
     """Crofton: four sides and four corners, at which two crossings of one line go unseen by its ends."""
 
     def count(n: int, l: float, seed: int) -> mi.Float:
@@ -162,7 +163,7 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
 
         def look(line: PlaneLine, t: mi.Float, active: mi.Bool) -> Sight:
             p = line.at(t)
-            inside = (p.x > 0.3) & (p.y > 0.4) & (p.x < 0.8) & (p.y < 0.7)
+            inside = (p.x > 0.3) & (p.y > 0.4) & (p.x < 0.3 + width) & (p.y < 0.7)
             return Sight(mi.UInt32(inside), mi.Point3f(0), mi.Normal3f(0))
 
         mass = glance(look, line(dr.arange(mi.UInt32, n)), mi.Bool(True))
@@ -173,7 +174,7 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle() -> None:
     lengths = [count(1 << 18, 0.1, seed)[0] for seed in range(1, 9)]
     error = np.std(lengths, ddof=1) / len(lengths) ** 0.5
     assert error < 0.01
-    assert abs(np.mean(lengths) - 1.6) < 4 * error
+    assert abs(np.mean(lengths) - 2 * (width + 0.3)) < 4 * error
 
 
 @pytest.mark.parametrize("at", [-0.5, 0.0, 0.5], ids=["begin", "middle", "end"])

@@ -5,7 +5,7 @@ of their centres and directions that are uniform, the expected sum of g / p(c) o
 2 l / π times the integral of g along the edges. Signatures tell that there is a crossing; bisection finds where.
 
 Two crossings of one line go unseen, as at a corner. So lines whose ends agree are looked at in the middle, too; what
-only the middle finds counts twice in each half, which takes out the error of first order in l.
+only the middle finds counts by how long it is, for lines that have it elsewhere and do not find it. See `alone`.
 
 Most lines find nothing. So all of them are glanced at first, which is one kernel; of those that found something a fixed
 number is looked at closer, in another, which thus wastes no lane, and has the same width each time.
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -34,6 +34,10 @@ ANGLE = 1e-3
 """Between two surfaces, from which on they meet at an edge."""
 STILL = 8
 """Halvings in a row that leave one end of a line where it was: of a line with an edge on it 1 in 2^7 does."""
+PARTS = 3
+"""Halvings of half a line that tell where what the middle sees ends."""
+LEAST = 9 / 32
+"""Share of a line: see `alone`. Halfway between two that `part_seen` tells apart."""
 BEYOND = 1.5
 """Lengths of what is left of a line, by which one looks beyond such an end. (Within the `BORDER` of inner edges.)"""
 
@@ -100,6 +104,13 @@ def bend_or_edge(a: Sight, b: Sight) -> mi.Float:
     """How likely one sheet hides the other: on a bend each point is on the same side of the other's tangent plane."""
     across = b.p - a.p
     return dr.select(dr.dot(a.n, across) * dr.dot(b.n, across) < 0, BENDS, HIDES)
+
+
+class Line(Protocol):
+    """A line, whose places are numbers."""
+
+    begin: mi.Float
+    end: mi.Float
 
 
 @dataclass
@@ -187,17 +198,46 @@ class Picked:
         return Picked(index, dr.select(own > 0, mi.Float(total / lanes) / own, 0))
 
 
+def alone(m: mi.Float) -> mi.Float:
+    """The weight of a line that looks the same at both ends and otherwise in the middle, on a share ``m`` of it.
+
+    Such a part lies within a line if the line begins within 1 - m of its length; in the middle it is found from
+    min(m, 1 - m) of that. Their ratio has no bounds for small parts, and is constant below `LEAST`, so that it is right
+    on average over parts that a corner cuts off: there all m are as likely.
+    """
+    return dr.select(m < LEAST, 2 / LEAST - 1, dr.select(m < 0.5, (1 - m) / m, 1))
+
+
+@dr.syntax
+def part_seen(look: Look, line: Line, active: mi.Bool) -> mi.Float:
+    """The share of a line around its middle in which it looks as it does there, to some sixteenths."""
+    middle, half = 0.5 * (line.begin + line.end), 0.5 * (line.end - line.begin)
+    at_middle = look(line, middle, active)
+    n, share, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)
+    while dr.hint(active & (n < 2 * PARTS), exclude=[look, line], label="pathreplay: part of a line"):
+        side = dr.select(n < PARTS, mi.Float(-1), 1)
+        further = reach + step
+        same = ~look(line, middle + side * half * further, mi.Bool(True)).differs(at_middle)
+        reach, step = dr.select(same, further, reach), 0.5 * step
+        n += 1
+        done = (n == PARTS) | (n == 2 * PARTS)
+        share += dr.select(done, 0.5 * (reach + step), 0)
+        reach, step = dr.select(done, 0, reach), dr.select(done, 0.5, step)
+    return share
+
+
 @dr.syntax
 def bisect(look: Look, line: Any, weight: mi.Float, pick: mi.PCG32) -> Crossed:
     """A piece of each line with an edge, 2^-12 as long as the line, where ``weight`` is not zero.
 
-    Of several crossings one is chosen, by how likely they are edges; what only the middle found counts twice in each
-    half. None, where a surface was merely bent, weighs 0. Nor does a crack between two triangles count, through which
+    Of several crossings one is chosen, by how likely they are edges; what only the middle found counts as `alone` says.
+    None, where a surface was merely bent, weighs 0. Nor does a crack between two triangles count, through which
     very few rays slip: an end in a crack never moves, and beyond it all is as at the other end.
     """
     a, b, weight = mi.Float(line.begin), mi.Float(line.end), mi.Float(weight)
     at_a, at_b = look(line, a, weight > 0), look(line, b, weight > 0)
-    weight = dr.select(at_a.differs(at_b), weight, 2 * weight)
+    only_middle = (weight > 0) & ~at_a.differs(at_b)
+    weight = dr.select(only_middle, alone(part_seen(look, line, only_middle)) * weight, weight)
     n, still, was_left = mi.UInt32(0), mi.UInt32(0), mi.Bool(False)
     while dr.hint(
         (weight > 0) & ((n < BISECTIONS) | ((n == BISECTIONS) & (still >= STILL))),

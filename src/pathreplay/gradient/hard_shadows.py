@@ -19,19 +19,21 @@ from ..transport.vertex import Arrival, Walk, is_smooth
 
 @dataclass
 class Shade:
-    """What keeps a light from a point: something between, or the border of a projector's picture."""
+    """What keeps a light from a point: something between, or that it is outside of a projector's picture or a cone."""
 
     u: mi.Point2f  # which light
     ray: mi.Ray3f  # towards it
     hit: mi.PreliminaryIntersection3f
-    outside: mi.Bool  # of the picture
+    outside: mi.Bool  # of the picture, or of the cone of a spot that ends at once
     uv: mi.Point2f  # place in it
 
     @staticmethod
     def of(walk: Walk, at: Arrival, u: mi.Point2f, k: mi.UInt32, active: mi.Bool) -> Shade:
         """That of the light which ``u`` samples where a path arrives as its k-th vertex, if that has no extent."""
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
-        light, lit = light_of(walk, si, u, k, active)
+        scatters = _scatters(walk, si, k, active)
+        light, Le = draw_emitter(walk.scene, si, u, scatters, visible=False)
+        lit = scatters & (light.pdf != 0)
         ray = si.spawn_ray_to(light.p)
         hit = meet(walk, ray, lit & light.delta)
         if walk.clear:
@@ -39,7 +41,9 @@ class Shade:
         outside = mi.Bool(False)
         for projector in walk.traits.projectors:
             outside |= (light.pdf == 0) & (light.emitter == mi.EmitterPtr(projector))
-        return Shade(u, ray, hit, outside & _scatters(walk, si, k, active), light.uv)
+        for spot in walk.traits.spots:
+            outside |= (light.emitter == mi.EmitterPtr(spot)) & _ends_at_once(spot) & dr.all(Le == 0)
+        return Shade(u, ray, hit, outside & scatters, light.uv)
 
     @property
     def dark(self) -> mi.Bool:
@@ -59,11 +63,26 @@ class Shade:
         si = met.compute_surface_interaction(ray, mi.RayFlags.All, active)
         light, _ = walk.scene.sample_emitter_direction(si, self.u, False, active)
         shadow = outline_gap(n, si.p, light.d, self.hit, self.ray, active & ~self.outside)
-        if not walk.traits.projectors:
+        if not walk.traits.projectors and not walk.traits.spots:
             return shadow
         beside = (self.uv.x < 0) | (self.uv.x > 1)
         border = dr.select(dr.select(beside, self.uv.x, self.uv.y) > 0.5, mi.Float(1), 0)
-        return dr.select(active & self.outside, dr.select(beside, light.uv.x, light.uv.y) - border, shadow)
+        gap = dr.select(beside, light.uv.x, light.uv.y) - border
+        for spot in walk.traits.spots:
+            gap = dr.select(light.emitter == mi.EmitterPtr(spot), _inside_cone(spot, light), gap)
+        return dr.select(active & self.outside, gap, shadow)
+
+
+def _ends_at_once(spot: mi.Emitter) -> mi.Bool:
+    """Whether the light of a spot does not fade towards the border of its cone, which is an edge then."""
+    angles = mi.traverse(spot)
+    return dr.detach(angles["beam_width"]) >= dr.detach(angles["cutoff_angle"])
+
+
+def _inside_cone(spot: mi.Emitter, light: mi.DirectionSample3f) -> mi.Float:
+    """How far its sample is inside of the cone of a spot, as a difference of cosines; differentiable in both."""
+    axis = dr.normalize(spot.world_transform() @ mi.Vector3f(0, 0, 1))
+    return -dr.dot(axis, light.d) - dr.cos(dr.deg2rad(mi.traverse(spot)["cutoff_angle"]))
 
 
 def light_of(

@@ -53,9 +53,11 @@ def edges_move(walk: Walk, start: CameraStart, at: Arrival) -> bool:
     """Whether something that can hide light, or what is seen or lit from, depends on parameters with gradients.
 
     As `path_moves`, but for texture coordinates and the tangents that follow them: what is painted on a surface hides
-    nothing. A projector that turns moves the border of what it lights, though its light comes from where it came.
+    nothing. A projector or a spot that turns moves the border of what it lights, though its light comes from where it
+    came.
     """
-    turns = walk.attach != "none" and any(with_gradients(light, "to_world") for light in walk.traits.projectors)
+    lights = [*walk.traits.projectors, *walk.traits.spots]
+    turns = walk.attach != "none" and any(with_gradients(light, "to_world", "cutoff_angle") for light in lights)
     return turns or _depends(walk, start, at, painted=False)
 
 

@@ -24,7 +24,7 @@ RELIEFS = frozenset({"NormalMap", "BumpMap"})
 FRAMES = RELIEFS | {TWO_SIDED}
 # Those without a narrow lobe of their own, and a texture that jumps within itself.
 DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
-INSTANCE, PROJECTOR = "Instance", "Projector"
+INSTANCE, PROJECTOR, SPOT = "Instance", "Projector", "SpotLight"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
 COARSE = 1.0
@@ -62,6 +62,7 @@ class Traits:
     area_lights: bool  # there are emitters with an edge
     hard_lights: bool  # there are emitters whose shadows are hard
     projectors: tuple[mi.Emitter, ...]  # of these also the border of what they light is hard
+    spots: tuple[mi.Emitter, ...]  # and of these, if the light does not fade before
     mesh_lights: bool  # there are meshes that emit
     ball_lights: bool  # there are spheres that emit
     coarse_meshes: bool  # there are meshes that are shaded as if they were smooth, and are not: see `is_coarse`
@@ -104,6 +105,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         area_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Surface) for light in scene.emitters()),
         hard_lights=any(mi.has_flag(light.flags(), mi.EmitterFlags.Delta) for light in scene.emitters()),
         projectors=tuple(light for light in scene.emitters() if light.class_name() == PROJECTOR),
+        spots=tuple(light for light in scene.emitters() if light.class_name() == SPOT),
         mesh_lights=any(_ball(lamp)[3] > 0 for lamp in _mesh_lamps(shapes)),
         ball_lights=any(shape.is_emitter() and shape.shape_type() == mi.ShapeType.Sphere for shape in shapes),
         coarse_meshes=bool(coarse),
