@@ -12,8 +12,8 @@ PYTEST := -q --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 help:
 	@echo "make demo      recover a texture, two wall colours and a light from rendered pictures, write a report"
-	@echo "make test      lint and the quick tests"
-	@echo "make test-all  lint and every test but those that take hours"
+	@echo "make test      lint and the quick tests, with kernels that LLVM does not optimise"
+	@echo "make test-all  lint and every test but those that take hours, with kernels as users have them"
 	@echo "make test-hours  those: tails of all cells in 256 passes each, 300 random scenes in one process"
 	@echo "make lint      ruff and mypy"
 	@echo "make bench     time, memory and variance next to Mitsuba's own integrators"
