@@ -17,6 +17,10 @@ from typing import Any
 
 import pytest
 
+import unoptimised
+
+if unoptimised.is_asked_for():
+    unoptimised.keep_apart()
 from pathreplay.backend import set_variant  # before mitsuba: points Dr.Jit at a libLLVM
 
 import drjit as dr  # isort: skip
@@ -45,6 +49,8 @@ LONGEST = ("test_truth_edges_inner", "test_truth_edges", "test_truth_media", "te
 def pytest_configure() -> None:
     """Set the variant before test modules are imported, so that module-level `mi.<Type>` works in them."""
     set_variant(VARIANT)
+    if unoptimised.is_asked_for():
+        unoptimised.leave_unoptimised()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

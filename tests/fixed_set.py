@@ -125,7 +125,7 @@ class Opened:
             assert integrator.sweeps_pixels(self.loaded, sensor, spp)
             slope = numbers(1, (SIZE, SIZE, 3))
             loss = mi.TensorXf(-0.2 * slope), mi.TensorXf(slope)
-            image = integrator.render_and_backward(self.loaded, *loss, sensor, mi.UInt32(seed), spp)
+            image = integrator.render_and_backward(self.loaded, *loss, sensor, seed, spp)
             found["image"] = np.array(image)
         else:
             film = sensor.film()

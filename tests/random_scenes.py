@@ -3,7 +3,8 @@
     python tests/random_scenes.py COUNT [--first SEED] [--no-gc]
 
 A scene has random shapes, materials, lights, media and instances, one of several variants, and one parameter with a
-gradient. Some scenes outlive the next one, and some integrators serve several scenes. Prints a line for each.
+gradient. Some scenes outlive the next one, and some integrators serve several scenes. Prints a line for each. Every
+scene is a handful of kernels that nobody runs again, and so LLVM does not optimise them: this is about lifetimes.
 """
 
 from __future__ import annotations
@@ -14,6 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from unoptimised import keep_apart, leave_unoptimised
+
+if __name__ == "__main__":
+    keep_apart()
 import pathreplay
 from pathreplay.backend import set_variant
 
@@ -97,7 +102,7 @@ class Draw:
         import mitsuba as mi
 
         T = mi.ScalarTransform4f
-        film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": self.one("box", "gaussian")}}
+        film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": self.one("box", "gaussian")}}
         camera = {"type": "perspective", "fov": 45, "to_world": T().look_at([0, 0.5, 4], [0, 0, 0], [0, 1, 0])}
         camera |= {"film": film, "sampler": {"type": "independent"}}
         floor = {"type": "rectangle", "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(3)}
@@ -128,7 +133,7 @@ def differentiate(scene: Any, integrator: Any, key: str, seed: int) -> float:
     dr.enable_grad(t)
     params[key] = mi.Transform4f().translate([t, 0, 0]) @ value if hasattr(value, "matrix") else value + t
     params.update()
-    dr.backward(dr.mean(mi.render(scene, params, integrator=integrator, spp=4, seed=seed), axis=None))
+    dr.backward(dr.mean(mi.render(scene, params, integrator=integrator, spp=2, seed=seed), axis=None))
     g = float(dr.grad(t)[0])
     params[key] = dr.detach(value)
     params.update()
@@ -183,4 +188,5 @@ if __name__ == "__main__":
     parser.add_argument("--no-gc", action="store_true")
     options = parser.parse_args()
     set_variant(VARIANTS[0])
+    leave_unoptimised("-regalloc=fast")
     run(options.count, options.first, not options.no_gc)

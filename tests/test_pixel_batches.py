@@ -56,7 +56,7 @@ def swept(bench: Bench, integrator: mi.Integrator, seed: int, count: int, offset
     pixels = np.sort(np.random.default_rng(seed).choice(RES**2, count, replace=False))
     loss = (mi.TensorXf((each * term.reshape(-1, 1, 3)[pixels]).astype(np.float32)) for term in (offset, slope))
     rows = integrator.render_and_backward(
-        bench.scene, *loss, 0, mi.UInt32(seed), bench.case.spp, mi.UInt32(pixels.astype(np.uint32))
+        bench.scene, *loss, 0, seed, bench.case.spp, mi.UInt32(pixels.astype(np.uint32))
     )
     return np.array(rows)[:, 0], pixels, bench.collect(t)
 

@@ -68,7 +68,7 @@ def swept(bench: Bench, integrator: mi.Integrator, seed: int, offset: np.ndarray
     bench.put(t)
     loss = (mi.TensorXf(offset.astype(np.float32)), mi.TensorXf(slope.astype(np.float32)))
     sensor = bench.scene.sensors()[0]
-    image = integrator.render_and_backward(bench.scene, *loss, sensor, mi.UInt32(seed), bench.case.spp)
+    image = integrator.render_and_backward(bench.scene, *loss, sensor, seed, bench.case.spp)
     return np.array(image), bench.collect(t)
 
 
