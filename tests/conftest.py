@@ -49,7 +49,7 @@ LONGEST = ("test_truth_edges_inner", "test_truth_edges", "test_truth_media", "te
 def pytest_configure() -> None:
     """Set the variant before test modules are imported, so that module-level `mi.<Type>` works in them."""
     set_variant(VARIANT)
-    if unoptimised.is_asked_for():
+    if unoptimised.is_asked_for() and VARIANT.startswith("llvm"):
         unoptimised.leave_unoptimised()
 
 
