@@ -264,12 +264,13 @@ def test_another_word_is_refused() -> None:
         mi.load_dict({"type": "pathreplay", "numbers": "odd"})
 
 
-def test_another_seed_is_no_other_kernel() -> None:
+@pytest.mark.parametrize("seed", [int, mi.UInt32])
+def test_another_seed_is_no_other_kernel(seed: type) -> None:
     gc.collect()  # Dr.Jit traces calls through all scenes alive: one that goes between the two makes another kernel
     made, integrator = scene(4), mi.load_dict({**METHODS["even"], "max_depth": 3})
-    dr.eval(mi.render(made, integrator=integrator, spp=4, seed=1))
+    dr.eval(mi.render(made, integrator=integrator, spp=4, seed=seed(1)))
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        dr.eval(mi.render(made, integrator=integrator, spp=4, seed=2))
+        dr.eval(mi.render(made, integrator=integrator, spp=4, seed=seed(2)))
         kernels = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
     assert kernels and all(entry["cache_hit"] for entry in kernels)

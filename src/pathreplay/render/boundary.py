@@ -106,7 +106,7 @@ class Boundary:
         if walk.media is None:  # there boundaries that move are no vertices, and paths pass them unseen
             walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
         lines = lines_of(view, places, self.spp)
-        seed = dr.opaque(mi.UInt32, view.seed) if isinstance(view.seed, int) else mi.UInt32(view.seed)
+        seed = view.opaque_seed
         if self.film:
             yield film_edges(walk, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
             if walk.media is not None and walk.traits.hard_lights:

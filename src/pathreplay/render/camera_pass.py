@@ -128,9 +128,15 @@ class Pass:
         place = in_order(pixel % width, pixel // width)
         # What does not fit into 32 bits tells sets apart, too.
         beyond = place >> (32 - bits) if bits else mi.UInt32(0)
-        # No constant of the kernel, which would be another one for each seed.
-        seed = dr.opaque(mi.UInt32, self.seed) if isinstance(self.seed, int) else mi.UInt32(self.seed)
-        return Even.of((place << bits) | path, key_of(seed, mi.UInt32(of), beyond))
+        return Even.of((place << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), beyond))
+
+    @property
+    def opaque_seed(self) -> mi.UInt32:
+        """The seed, as no constant of a kernel, which would be another one for each seed."""
+        seed = mi.UInt32(self.seed)
+        if seed.state == dr.VarState.Literal:
+            dr.make_opaque(seed)
+        return seed
 
     def of_pixels(self, pixel: mi.UInt32) -> PixelNumbers:
         """Random numbers for a lane per pixel (row by row), which walks all paths of it."""
