@@ -149,6 +149,8 @@ def test_what_cannot_be_swept_by_pixels_is_refused(opened) -> None:
             integrator.render_and_backward(bench.scene, adjoint, adjoint, spp=spp)
     with pytest.raises(PathreplayError, match="shape"):
         integrator.render_and_backward(bench.scene, adjoint[:, :, :1], adjoint, spp=4)
+    with pytest.raises(PathreplayError, match="none has gradients: check that the key"):
+        integrator.render_and_backward(bench.scene, adjoint, adjoint, spp=4)
 
 
 def test_the_derivative_of_a_quadratic_loss_is_found_at_any_brightness() -> None:

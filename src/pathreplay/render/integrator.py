@@ -26,7 +26,7 @@ from .facts import SceneFacts, facts_of
 from .film_flow import FilmFlow
 from .interior import PathReplay
 from .lifetimes import is_recording
-from .path_integrator import UNBOUNDED, Handed, PathIntegrator
+from .path_integrator import UNBOUNDED, Handed, PathIntegrator, reached
 from .pixels import among, obstacle, pixel_loss
 from .properties import choice, deviation, whole_number
 from .term import Found, Term
@@ -194,7 +194,7 @@ class PathReplayIntegrator(PathIntegrator):
         self._require_active(scene)
         view = Pass.of(scene, sensor, seed, spp, self.even)
         some = None if pixels is None else mi.UInt32(pixels)
-        with self._passing(), dr.isolate_grad():
+        with reached(scene, sensor, zero_is_told=True), self._passing(), dr.isolate_grad():
             loss = pixel_loss(view, self.max_depth, offset, slope, some)
             view, walk, (_, *edges) = self._planned(view)
             self._learned(view, walk)

@@ -44,13 +44,17 @@ def _sum(total: Any, image: Any, share: float) -> Any:
 
 
 @contextmanager
-def _reached(scene: mi.Scene, sensor: Which) -> Iterator[None]:
-    """Within this block, which differentiates, a gradient that is plainly zero is no error: see `unreached_note`."""
+def reached(scene: mi.Scene, sensor: Which, zero_is_told: bool = False) -> Iterator[None]:
+    """Within this block, which differentiates, a gradient that is plainly zero is no error: see `unreached_note`.
+
+    Unless ``zero_is_told``: then it is one, too.
+    """
     try:
         yield
     except Unreached as error:
-        if note := unreached_note(scene, Pass.of(scene, sensor, 0, 1).sensor):
-            raise Unreached(note) from error
+        note = unreached_note(scene, Pass.of(scene, sensor, 0, 1).sensor)
+        if note or zero_is_told:
+            raise Unreached(note or str(error)) from error
 
 
 @dataclass
@@ -143,7 +147,7 @@ class PathIntegrator:
         Warns of what terms tell: a part of the gradient was not finite and had to be left out, edges move. Raises
         PathreplayError where no parameter with gradients reaches the paths, unless all are those of other cameras.
         """
-        with _reached(scene, sensor):
+        with reached(scene, sensor):
             self._backward(scene, grad_in, sensor, seed, spp)
 
     def _backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: Which, seed: Seed, spp: int) -> None:
