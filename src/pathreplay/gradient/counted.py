@@ -37,7 +37,7 @@ class Counted:
 
     def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
         x, y = mi.sample_tea_32(self.key, self.index, ROUNDS)  # both halves of one block of the cipher
-        self.index += 2
+        self.index += 2  # as for two single numbers: see `at_vertex`
         return mi.Point2f(_in_unit(x), _in_unit(y))
 
 

@@ -5,7 +5,7 @@ of their centres and directions that are uniform, the expected sum of g / p(c) o
 2 l / π times the integral of g along the edges. Signatures tell that there is a crossing; bisection finds where.
 
 Two crossings of one line go unseen, as at a corner. So lines whose ends agree are looked at in the middle, too; what
-only the middle finds counts by how long it is, for lines that have it elsewhere and do not find it. See `alone`.
+only the middle finds is weighted by its length, for the lines that have such a part elsewhere: see `alone`.
 
 Most lines find nothing. So all of them are glanced at first, which is one kernel; of those that found something a fixed
 number is looked at closer, in another, which thus wastes no lane, and has the same width each time.
@@ -169,7 +169,7 @@ def survey(sights: list[Sight], active: mi.Bool) -> Survey:
     """What a line tells, with so much seen at its places: see `looked_at`."""
     at_a, at_b, at_c = sights
     ends, halves = at_a.hint(at_b), dr.maximum(at_c.hint(at_a), at_c.hint(at_b))
-    # Of two crossings, which count twice, one is chosen in time, for both: see `bisect`.
+    # Of two crossings one is chosen, for both, and counts more than once: see `alone`.
     found = dr.select(ends > 0, dr.maximum(ends, halves), 4 * halves)
     near = dr.maximum(dr.maximum(at_a.near, at_b.near), at_c.near)
     bright = dr.maximum(dr.maximum(at_a.bright, at_b.bright), at_c.bright)
@@ -201,8 +201,8 @@ class Picked:
 def alone(m: mi.Float) -> mi.Float:
     """The weight of a line that looks the same at both ends and otherwise in the middle, on a share ``m`` of it.
 
-    Such a part lies within a line if the line begins within 1 - m of its length; in the middle it is found from
-    min(m, 1 - m) of that. Their ratio has no bounds for small parts, and is constant below `LEAST`, so that it is right
+    Such a part lies within the line for beginnings along 1 - m of its length, and in the middle, too, for min(m, 1 - m)
+    of it. The ratio has no bounds for small parts, and is constant below `LEAST`, so that it is right
     on average over parts that a corner cuts off: there all m are as likely.
     """
     return dr.select(m < LEAST, 2 / LEAST - 1, dr.select(m < 0.5, (1 - m) / m, 1))
@@ -210,7 +210,7 @@ def alone(m: mi.Float) -> mi.Float:
 
 @dr.syntax
 def part_seen(look: Look, line: Line, active: mi.Bool) -> mi.Float:
-    """The share of a line around its middle in which it looks as it does there, to some sixteenths."""
+    """The share of a line around its middle in which it looks as it does there, within a sixteenth on each side."""
     middle, half = 0.5 * (line.begin + line.end), 0.5 * (line.end - line.begin)
     at_middle = look(line, middle, active)
     n, share, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)

@@ -116,7 +116,7 @@ def choose_vertex(walk: Walk, numbers: Counted, ray: mi.Ray3f, layout: Layout, r
 
 
 def _first_vertex(walk: Walk, path: PathState) -> Chosen:
-    """The choice where there is none, without a look at what comes after."""
+    """The first vertex, which is the only candidate; nothing is traced beyond it."""
     at, none = path.at, mi.UInt32(0)
     active = path.active & surface_sees(walk, at)
     return Chosen(at, none, none, dr.select(active, path.β, 0), mi.Float(1), may_move(walk, at.hit), active)
@@ -209,9 +209,12 @@ def _square_worth(
     """What a line is worth where so much is seen. Where no lobe is narrow, its middle tells what x scatters."""
     glimpses, sights = zip(*seen, strict=True)
     a, b, c = (each.light.d for each in glimpses)
-    scattered = [seer.towards(d, active) for d in ((a, b, c) if walk.traits.narrow else (c,))]
+    if walk.traits.narrow:
+        scattered = [seer.towards(d, active) for d in (a, b, c)]
+    else:
+        scattered = [seer.towards(c, active)] * 3
     bright = []
-    for each, (f, pdf) in zip(glimpses, scattered if len(scattered) > 1 else scattered * 3, strict=True):
+    for each, (f, pdf) in zip(glimpses, scattered, strict=True):
         F = dr.mean(dr.abs(x.β * f * each.Le)) * line.share
         bright.append(F * dr.select(each.light.delta, 1, mis_weight(each.density / line.share, pdf)))
     first = reduce(lambda p, q: dr.select(q.hidden & ~(p.hidden & (p.hit.t <= q.hit.t)), q, p), glimpses)
@@ -303,7 +306,7 @@ def _views(
         turned = dr.select(turned_away(at, ray.d), mi.UInt32(1), 0)
         places = [place_met(walk, seen, active, at.shape, facets) for facets in (True, False)]
         place = dr.select(seer.keeps, *places)
-        facets = ~seer.keeps & jumps_at_facets(walk.traits.tables.blend_lengths, seer.origin, seen, at.p, at.n)
+        facets = close & ~seer.keeps & jumps_at_facets(walk.traits.tables.blend_lengths, seer.origin, seen, at.p, at.n)
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
         if walk.media is not None:  # directions follow null boundaries, too
             boundary = place_met(walk, first, active, shape_met(walk, first, ray, active), facets=False)
@@ -332,10 +335,8 @@ def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, searc
     hard = walk.traits.hard_lights and walk.media is None
     look, shade = _views(walk, x, seer, key, hard)
     if search.chosen is None:
-        light, own = (
-            dr.select(ok, dr.mean(dr.abs(x.β * line.f)) / line.p, 0),
-            own_plane(seer, line.at(line.begin), line.at(line.end)),
-        )
+        light = dr.select(ok, dr.mean(dr.abs(x.β * line.f)) / line.p, 0)
+        own = own_plane(seer, line.at(line.begin), line.at(line.end))
         seen = survey([look(line, t, ok) for t in looked_at(line)], ok)
         return Worth.of(replace(seen, found=seen.found * line.importance()), light, light * own / l)
     found = search.closer(look, line, ok)

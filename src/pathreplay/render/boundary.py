@@ -104,7 +104,7 @@ class Boundary:
         if why := self.obstacle(view):
             raise PathreplayError(f"{why}, or use edges = 'none'")
         if walk.media is None:  # there boundaries that move are no vertices, and paths pass them unseen
-            walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene)))
+            walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene, _still_cameras(view))))
         lines = lines_of(view, places, self.spp)
         seed = view.opaque_seed
         if self.film:
@@ -125,6 +125,12 @@ def lines_of(view: Pass, places: FilmPlaces, spp: int) -> int:
             f"takes at once; take edge_spp up to {MOST_SAMPLES // pixels}, or 0"
         )
     return max(lines, 1)
+
+
+def _still_cameras(view: Pass) -> list[mi.Sensor]:
+    """Those whose gradients do not reach the rays of a pass, but for the flow of its film."""
+    moves = view.flow is None or view.flow.leaves_rest
+    return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or not moves]
 
 
 def _move(walk: Walk, places: FilmPlaces) -> bool:

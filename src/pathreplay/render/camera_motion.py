@@ -35,7 +35,7 @@ from .term import Found
 GROUP = 5
 """Paths with the same random numbers: to the right and to the left, above and below, and one for the divergence."""
 NUMBERS = 1
-"""The set of random numbers: those of the interior are another."""
+"""Number of the set of random numbers; the interior uses 0."""
 
 
 @dataclass
@@ -75,7 +75,7 @@ class CameraMotion:
         with dr.resume_grad():
             backward(δ * self._moved(view, f))
         dr.eval()
-        return Found(paths=dr.width(f.pixel), moves=True)
+        return Found()
 
     def note(self, walk: Walk) -> str:
         """Nothing: see `Term`."""
@@ -115,7 +115,7 @@ class CameraMotion:
             s[k] = dr.clip(middle[k] + x, 0, places.size[k])
             mass = dr.select(pairs, 0.5 * slope.total * slope.sign(x), filter.total * (high - low) * filter.sign(x))
             weight *= mass
-        place = (places.corner + s - mi.ScalarPoint2f(film.crop_offset())) / mi.ScalarVector2f(film.crop_size())
+        place = places.in_sensor(s)
 
         time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
         wavelength, aperture = numbers.next_1d(), numbers.next_2d()

@@ -30,8 +30,8 @@ CAMERAS = frozenset({PINHOLE, "ThinLensCamera", "OrthographicCamera"})
 ONLY_PLACES = "x_fov", "principal_point_offset_x", "principal_point_offset_y"
 """Parameters of cameras that move nothing but places: they leave no rest."""
 OTHERS = "to_world", "focus_distance", "aperture_radius"
-STEP = 1 / 64
-"""Of central differences, in widths of the film: at a field of view of 40 degrees they are off by less than 1e-5."""
+STEP = 1 / 256
+"""Of central differences, in widths of the film: off by 4e-6 at a field of view of 40 degrees, by 1e-4 at 120."""
 GLANCES = 16
 """Rays in a row, and in a column, that tell how far away things are."""
 
@@ -47,7 +47,7 @@ class FilmFlow:
 
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor) -> FilmFlow | None:
-        """That of a sensor; None where it does not move, or is none of `CAMERAS`."""
+        """The flow of a sensor; None if it has no gradients, or its class is not one of `CAMERAS`."""
         if sensor.class_name() not in CAMERAS or not with_gradients(sensor, *ONLY_PLACES, *OTHERS):
             return None
         rest = _is_carried(sensor) or bool(with_gradients(sensor, *OTHERS[1:]))
@@ -60,10 +60,10 @@ class FilmFlow:
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         """The sensor's ray through a place and its weight: see Mitsuba's Sensor.
 
-        Attached to the place, if that has gradients; else with the rest of the motion to the parameters.
+        If the place has gradients, the ray depends on it; otherwise it carries the rest of the camera's motion.
         """
         ray, weight = self.sensor.sample_ray_differential(time, wavelength, place, aperture)
-        if dr.grad_enabled(place):
+        if dr.grad_enabled(place) or not dr.grad_enabled(ray.o, ray.d):
             return ray, weight
         if not self.leaves_rest:
             return dr.detach(ray), weight

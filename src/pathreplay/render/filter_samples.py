@@ -36,14 +36,14 @@ class FilterSamples:
 
     @staticmethod
     def of(film: mi.Film) -> FilterSamples:
-        """Those of the film's filter: see `is_drawable`."""
+        """Those of the film's filter."""
         radius = film.rfilter().radius()
         return FilterSamples._of(radius, film.rfilter().eval(_middles(radius)) * (2 * radius / STEPS))
 
     @staticmethod
     def of_slope(film: mi.Film) -> FilterSamples:
-        """Those of the filter's derivative, of which a jump (of a box) is a part."""
-        radius = film.rfilter().radius() * STEPS / (STEPS - 2)  # jumps lie within the outermost steps
+        """Those of the filter's derivative; a jump, as at the ends of a box, counts as much as it is high."""
+        radius = film.rfilter().radius() * STEPS / (STEPS - 1)  # jumps at its ends lie in the middle of steps
         step = 2 * radius / STEPS
         x = _middles(radius)
         return FilterSamples._of(radius, film.rfilter().eval(x + 0.5 * step) - film.rfilter().eval(x - 0.5 * step))

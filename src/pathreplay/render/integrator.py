@@ -123,7 +123,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """The interior, and edges unless they are switched off: see `_planned`."""
+        """The interior, and edges unless they are switched off; `_planned` adds that of a camera that moves."""
         if self.edges == "none":
             return (self.interior,)
         return self.interior, Boundary(inner=self.edges != "film", spp=self.edge_spp)
@@ -197,6 +197,10 @@ class PathReplayIntegrator(PathIntegrator):
         with reached(scene, sensor, zero_is_told=True), self._passing(), dr.isolate_grad():
             loss = pixel_loss(view, self.max_depth, offset, slope, some)
             view, walk, (_, *edges) = self._planned(view)
+            if view.flow is not None:
+                raise PathreplayError(
+                    f"pathreplay: sensor '{view.sensor.id()}' moves, and cannot be swept: hold it, or use mi.render"
+                )
             self._learned(view, walk)
             found = self.interior.pixels(view, walk, loss, some)
             if edges:

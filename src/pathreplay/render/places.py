@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -32,12 +33,16 @@ class FilmPlaces:
 
     def ray(self, s: mi.Point2f, key: mi.UInt32) -> tuple[mi.Ray3f, mi.Spectrum]:
         """The camera ray through a place, and its weight: see `Places`."""
-        sensor, film, numbers = self.view.sensor, self.view.sensor.film(), Counted(key, mi.UInt32(0x40000))
-        place = (self.corner + s - mi.ScalarPoint2f(film.crop_offset())) / mi.ScalarVector2f(film.crop_size())
+        sensor, numbers, place = self.view.sensor, Counted(key, mi.UInt32(0x40000)), self.in_sensor(s)
         time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
         wavelength, aperture = numbers.next_1d(), numbers.next_2d()
         ray, weight = self.view.camera_ray(time, wavelength, place, aperture)
         return mi.Ray3f(ray), dr.detach(weight)
+
+    def in_sensor(self, s: mi.Point2f) -> mi.Point2f:
+        """A place in widths and heights of the crop window, as sensors want it."""
+        film = self.view.sensor.film()
+        return (self.corner + s - mi.ScalarPoint2f(film.crop_offset())) / mi.ScalarVector2f(film.crop_size())
 
     def undeveloped(self, grad_in: mi.TensorXf) -> mi.TensorXf:
         """The adjoint of a film block's pixels, from that of the image: g_j / ∫ h_j, with the filter h_j of pixel j."""
@@ -56,68 +61,40 @@ class FilmPlaces:
         ``wanted`` is the adjoint of a block: see `undeveloped`.
         """
         inside = dr.all((s >= 0) & (s < self.size))
-        with dr.resume_grad():
-            L = dr.full(mi.Spectrum, 1.0, dr.width(s))
-            dr.enable_grad(L)
-            block = self._block()
-            self._put(block, s, L, wavelengths)
-            made = block.tensor()
-            dr.set_grad(made, wanted)
-            dr.enqueue(dr.ADMode.Backward, made)
-            dr.traverse(dr.ADMode.Backward)
-            return dr.select(inside, dr.grad(L), 0)
+        return dr.select(inside, _adjoint(lambda L: self._put(s, L, wavelengths), dr.width(s), wanted), 0)
 
     def image(self, s: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
         """The image that radiances make which arrive at places, each for a pixel's area of film."""
-        block = self._block()
-        self._put(block, s, dr.select(dr.all((s >= 0) & (s < self.size)), L, 0), wavelengths)
-        return self._developed(block.tensor())
+        inside = dr.all((s >= 0) & (s < self.size))
+        return self._developed(self._put(s, dr.select(inside, L, 0), wavelengths))
 
     def importance_of_pixels(self, wanted: mi.TensorXf, pixel: mi.UInt32, wavelengths: mi.Spectrum) -> mi.Spectrum:
         """g_j / ∫ h_j of pixels by their number (row by row), what is wanted of radiance in them: see `importance`."""
-        border = self._border()
-        inner = wanted[border:-border, border:-border] if border else wanted
-        with dr.resume_grad():
-            L = dr.full(mi.Spectrum, 1.0, dr.width(pixel))
-            dr.enable_grad(L)
-            made = self._pixels(pixel, L, wavelengths)
-            dr.set_grad(made, inner)
-            dr.enqueue(dr.ADMode.Backward, made)
-            dr.traverse(dr.ADMode.Backward)
-            return dr.grad(L)
+        return _adjoint(lambda L: self._pixels(pixel, L, wavelengths), dr.width(pixel), wanted)
 
     def image_of_pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
         """The image of which each pixel, by its number, has the sum of its radiances, divided by ∫ h_j."""
-        border, made = self._border(), self._pixels(pixel, L, wavelengths)
-        if border:
-            height, width, channels = made.shape
-            whole = dr.zeros(mi.TensorXf, (height + 2 * border, width + 2 * border, channels))
-            whole[border:-border, border:-border] = made
-            made = whole
-        return self._developed(made)
+        return self._developed(self._pixels(pixel, L, wavelengths))
 
     def _pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
-        """The pixels of a block without its border, each of which is what it is given."""
+        """The pixels of a block without a filter: each is the sum of the radiances that are given for it."""
         film, like = self.view.sensor.film(), self._block()
         offset, size = mi.ScalarPoint2i(film.crop_offset()), mi.ScalarVector2u(film.crop_size())
-        box = mi.load_dict({"type": "box"})
-        block = mi.ImageBlock(size, offset, like.channel_count(), box, border=False, normalize=False)
+        block = mi.ImageBlock(size, offset, like.channel_count())
         place = mi.Point2f(mi.Float(pixel % size.x), mi.Float(pixel // size.x)) + 0.5 + mi.ScalarPoint2f(offset)
         _splat(block, film, place, L, wavelengths)
         return block.tensor()
-
-    def _border(self) -> int:
-        """Of the film's blocks, in pixels."""
-        block = self._block()
-        return int(block.border_size()) if block.has_border() else 0
 
     def _block(self) -> mi.ImageBlock:
         film = self.view.sensor.film()
         film.prepare([])
         return film.create_block()
 
-    def _put(self, block: mi.ImageBlock, s: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> None:
+    def _put(self, s: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
+        """The pixels of a block under the film's filter."""
+        block = self._block()
         _splat(block, self.view.sensor.film(), self.corner + s, L, wavelengths)
+        return block.tensor()
 
     def _developed(self, pixels: mi.TensorXf) -> mi.TensorXf:
         """The image of a block without weights: those of its pixels are ∫ h_j."""
@@ -144,6 +121,18 @@ class FilmPlaces:
             x = (k + 0.5) * step - rfilter.radius()
             total += dr.select((pixel + x >= begin) & (pixel + x < end), rfilter.eval(mi.Float(x)), 0)
         return total * step
+
+
+def _adjoint(make: Callable[[mi.Spectrum], mi.TensorXf], lanes: int, wanted: mi.TensorXf) -> mi.Spectrum:
+    """The adjoint of radiances of which pixels are made, linearly, from that of the pixels."""
+    with dr.resume_grad():
+        L = dr.full(mi.Spectrum, 1.0, lanes)
+        dr.enable_grad(L)
+        made = make(L)
+        dr.set_grad(made, wanted)
+        dr.enqueue(dr.ADMode.Backward, made)
+        dr.traverse(dr.ADMode.Backward)
+        return dr.grad(L)
 
 
 def _splat(block: mi.ImageBlock, film: mi.Film, place: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> None:

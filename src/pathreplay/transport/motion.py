@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import drjit as dr
 import mitsuba as mi
 
@@ -17,11 +19,15 @@ FEW = 8
 COPIES = frozenset({"Instance", "ShapeGroup"})
 
 
-def moving_shapes(scene: mi.Scene) -> tuple[mi.Shape, ...] | None:
-    """Those that have gradients, in whatever belongs to them; None where other things have gradients, or too many."""
+def moving_shapes(scene: mi.Scene, still: Collection[mi.Object]) -> tuple[mi.Shape, ...] | None:
+    """Those that have gradients, in whatever belongs to them; None where other things have gradients, or too many.
+
+    Things that are known to be ``still`` do not count.
+    """
     params = mi.traverse(scene)
     with dr.resume_grad():
         attached = {params.properties[key][2] for key, value in known_values(params) if dr.grad_enabled(value)}
+    attached.difference_update(still)
     shapes = {shape: nodes_of(shape) | {shape} for shape in scene.shapes()}
     moving = tuple(shape for shape, nodes in shapes.items() if not attached.isdisjoint(nodes))
     rest = attached.difference(*(shapes[shape] for shape in moving))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .meet import meet
+from .meet import meet, short_of_end
 from .passage import beyond_null
 from .vertex import Arrival, Walk
 
@@ -47,7 +47,7 @@ def behind_emitters(
     passed = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
     si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, passed)
     onward = si.spawn_ray(ray.d)
-    behind = walk.skip_area_emitters(walk.scene, onward, True, passed)
+    behind = short_of_end(walk, onward, walk.skip_area_emitters(walk.scene, onward, True, passed), passed)
     behind.t += dr.norm(onward.o - ray.o)
     hit[passed] = behind
     return hit

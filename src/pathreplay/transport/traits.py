@@ -62,7 +62,7 @@ class Traits:
     area_lights: bool  # there are emitters with an edge
     hard_lights: bool  # there are emitters whose shadows are hard
     projectors: tuple[mi.Emitter, ...]  # of these also the border of what they light is hard
-    spots: tuple[mi.Emitter, ...]  # and of these, if the light does not fade before
+    spots: tuple[mi.Emitter, ...]  # and of these where beam_width is at least cutoff_angle
     mesh_lights: bool  # there are meshes that emit
     ball_lights: bool  # there are spheres that emit
     coarse_meshes: bool  # there are meshes that are shaded as if they were smooth, and are not: see `is_coarse`
