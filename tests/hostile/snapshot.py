@@ -13,9 +13,13 @@ State = dict[str, tuple[object, ...]]
 
 
 def snapshot(folder: Path) -> State:
-    """Kind, size and content of everything below ``folder``, by relative path. Large files by time of change."""
+    """Kind, size and content of everything below ``folder``, by relative path. Large files by time of change.
+
+    Python's cache of imported modules is left out: it is there or not as the environment has it.
+    """
     state: State = {}
     for where, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if name != "__pycache__"]
         for name in (*folders, *files):
             path = os.path.join(where, name)
             state[os.path.relpath(path, folder)] = _of(path)
