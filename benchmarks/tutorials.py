@@ -114,7 +114,7 @@ def errors(name: str, config: Config, found: dict[str, np.ndarray]) -> dict[str,
     ((key, value),) = found.items()
     params[key] = mi.TensorXf(value) if value.ndim > 2 else to_value(params[key], value)
     params.update()
-    judge = mi.load_dict(config.target.integrator.model_dump())
+    judge = mi.load_dict((config.target.integrator or config.integrator).model_dump())
     squares = []
     for view in range(len(scene.sensors())):
         a, b, s, t = (

@@ -428,7 +428,9 @@ def test_other_variants_make_and_recover_them(variant: str) -> None:
     target = {"scene": "room.xml", "values": {FLOOR: 0.49, WALL: 0.49}, "spp": 256}
     tables = [free("share", 1, initial=0.5)], [made("*.reflectance.value", "grey", "share")]
     Path("job.json").write_text(
-        json.dumps(config(*tables, target=target, iterations=30, variant=variant, output="run"))
+        json.dumps(
+            config(*tables, target=target, iterations=30, learning_rate_decay=0.1, variant=variant, output="run")
+        )
     )
     command = [sys.executable, "-m", "pathreplay.cli", "optimize", "job.json", "--quiet"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
