@@ -36,13 +36,13 @@ class FilterSamples:
 
     @staticmethod
     def of(film: mi.Film) -> FilterSamples:
-        """Those of the film's filter."""
+        """Samples of the film's filter."""
         radius = film.rfilter().radius()
         return FilterSamples._of(radius, film.rfilter().eval(_middles(radius)) * (2 * radius / STEPS))
 
     @staticmethod
     def of_slope(film: mi.Film) -> FilterSamples:
-        """Those of the filter's derivative; a jump, as at the ends of a box, counts as much as it is high."""
+        """Samples of the filter's derivative. A jump, as at the ends of a box, is a point mass of its height."""
         radius = film.rfilter().radius() * STEPS / (STEPS - 1)  # jumps at its ends lie in the middle of steps
         step = 2 * radius / STEPS
         x = _middles(radius)
@@ -58,8 +58,7 @@ class FilterSamples:
 
     def share(self, x: mi.Float) -> mi.Float:
         """The share of the filter up to a distance."""
-        place = dr.clip((x + self.radius) * (0.5 * STEPS / self.radius), 0, STEPS)
-        i = dr.minimum(mi.UInt32(place), STEPS - 1)
+        place, i = self._place(x)
         begin, end = self._step(i)
         return dr.lerp(begin, end, place - mi.Float(i))
 
@@ -79,5 +78,9 @@ class FilterSamples:
 
     def sign(self, x: mi.Float) -> mi.Float:
         """The sign of the function at a distance."""
-        i = dr.minimum(mi.UInt32(dr.clip((x + self.radius) * (0.5 * STEPS / self.radius), 0, STEPS)), STEPS - 1)
-        return dr.sign(dr.gather(mi.Float, self.masses, i))
+        return dr.sign(dr.gather(mi.Float, self.masses, self._place(x)[1]))
+
+    def _place(self, x: mi.Float) -> tuple[mi.Float, mi.UInt32]:
+        """A distance in steps, and the number of its step."""
+        place = dr.clip((x + self.radius) * (0.5 * STEPS / self.radius), 0, STEPS)
+        return place, dr.minimum(mi.UInt32(place), STEPS - 1)
