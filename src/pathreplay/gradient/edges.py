@@ -33,6 +33,9 @@ class Places(Protocol):
         What else is random about it (time, wavelengths, aperture) comes from the ``key``.
         """
 
+    def flows(self, s: mi.Point2f) -> mi.Bool:
+        """Whether what stands still may slide under a place."""
+
 
 @dataclass
 class Edges:

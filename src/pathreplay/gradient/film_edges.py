@@ -101,7 +101,8 @@ def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
         return FilmLine(c - centres.margin, mi.Vector2f(cos, sin), mi.Float(-0.5 * l), mi.Float(0.5 * l), density, key)
 
     def look(line: FilmLine, t: mi.Float, active: mi.Bool) -> Sight:
-        return chain_sight(walk, places.ray(line.at(t), line.key)[0], line.key, active)
+        s = line.at(t)
+        return chain_sight(walk, places.ray(s, line.key)[0], line.key, active, places.flows(s))
 
     centres = Centres.even(places.size, l)
     few = max(lines // LOOKS, 1)
@@ -133,20 +134,23 @@ def steadied(walk: Walk) -> Walk:
     return replace(walk, steady=walk.traits.coarse_meshes and not walk.traits.brushed_meshes)
 
 
-def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> Sight:
-    """What a path meets from the camera to the first vertex where it is scattered; until something moves, nothing."""
+def chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool, flows: mi.Bool) -> Sight:
+    """What a path meets from the camera to the first vertex where it is scattered; until something moves, nothing.
+
+    ``flows``: all that is met may move under the place where the path begins.
+    """
     if walk.traits.mirrors or walk.traits.hard_lights or walk.media is not None:
-        return _chain_sight(walk, ray, key, active)
+        return _chain_sight(walk, ray, key, active, flows)
     path = PathState.begin(walk, CameraStart(ray, Counted.of(key), active))
-    moves = may_move(walk, path.at.hit)
+    moves = flows | may_move(walk, path.at.hit)
     return dr.select(moves, _sight(walk, path, key, active & moves), Sight.nothing())
 
 
 @dr.syntax
-def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> Sight:
+def _chain_sight(walk: Walk, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool, flows: mi.Bool) -> Sight:
     numbers = Counted.of(key)
     path = PathState.begin(walk, CameraStart(ray, numbers, active))
-    sight, moves = Sight.nothing(), mi.Bool(False)
+    sight, moves = Sight.nothing(), mi.Bool(flows)
     while dr.hint(path.active, exclude=[walk], label="pathreplay: chain"):
         moves |= may_move(walk, path.at.hit)
         here = dr.select(moves, _sight(walk, path, key, path.active & moves), Sight.nothing())

@@ -78,8 +78,12 @@ class SquareLine(PlaneLine):
 
 
 @dr.syntax
-def choose_vertex(walk: Walk, numbers: Counted, ray: mi.Ray3f, layout: Layout, records: Any) -> tuple[Any, Chosen]:
+def choose_vertex(
+    walk: Walk, numbers: Counted, ray: mi.Ray3f, flows: mi.Bool, layout: Layout, records: Any
+) -> tuple[Any, Chosen]:
     """Walk along a camera path, and choose one of the vertices that scatter smoothly, by what they count.
+
+    ``flows``: all vertices may move under the place where the path begins.
 
     Vertices up to the chosen one are recorded, if there are ``records``. The last vertex that ``walk`` allows scatters
     nothing: the walk ends before.
@@ -87,13 +91,13 @@ def choose_vertex(walk: Walk, numbers: Counted, ray: mi.Ray3f, layout: Layout, r
     walk = replace(walk, max_depth=max(walk.max_depth - 1, 0))
     path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))
     if dr.hint(walk.max_depth == 1 and walk.media is None and records is None, mode="scalar"):
-        return None, _first_vertex(walk, path)
+        return None, _first_vertex(walk, path, flows)
     none, no = mi.UInt32(0), mi.Bool(False)
     flight = None if walk.media is None else Flight.none(walk.media)
     chosen = Chosen(path.at, none, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), no, mi.Bool(False), flight)
     mass = mi.Float(0)
     count = mi.UInt32(0)
-    moves = mi.Bool(False)
+    moves = mi.Bool(flows)
     while dr.hint(path.active, exclude=[walk, layout], label="pathreplay: choose a vertex"):
         choice = numbers.next_1d()
         u, step = path.choose(walk, numbers)
@@ -115,11 +119,11 @@ def choose_vertex(walk: Walk, numbers: Counted, ray: mi.Ray3f, layout: Layout, r
     return records, chosen
 
 
-def _first_vertex(walk: Walk, path: PathState) -> Chosen:
+def _first_vertex(walk: Walk, path: PathState, flows: mi.Bool) -> Chosen:
     """The first vertex, which is the only candidate; nothing is traced beyond it."""
     at, none = path.at, mi.UInt32(0)
     active = path.active & surface_sees(walk, at)
-    return Chosen(at, none, none, dr.select(active, path.β, 0), mi.Float(1), may_move(walk, at.hit), active)
+    return Chosen(at, none, none, dr.select(active, path.β, 0), mi.Float(1), flows | may_move(walk, at.hit), active)
 
 
 @dataclass
@@ -434,7 +438,7 @@ def inner_edges(
         key = key_of(i, seed ^ 0x2545F491)
         s, density = centres.draw(mi.Point2f(quasi_random(i, n, seed)))
         ray, weight = dr.detach(places.ray(s, key))
-        records, x = choose_vertex(walk, Counted.of(key), ray, layout, records)
+        records, x = choose_vertex(walk, Counted.of(key), ray, places.flows(s), layout, records)
         x.β *= weight / (density * dr.opaque(mi.Float, n))
         return s, density, key, records, x
 

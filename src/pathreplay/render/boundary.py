@@ -128,9 +128,8 @@ def lines_of(view: Pass, places: FilmPlaces, spp: int) -> int:
 
 
 def _still_cameras(view: Pass) -> list[mi.Sensor]:
-    """Those whose gradients do not reach the rays of a pass, but for the flow of its film."""
-    moves = view.flow is None or view.flow.leaves_rest
-    return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or not moves]
+    """Those whose gradients do not reach the rays of a pass, but for what the flow of its film knows."""
+    return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
 
 
 def _move(walk: Walk, places: FilmPlaces) -> bool:

@@ -120,6 +120,6 @@ class CameraMotion:
         time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
         wavelength, aperture = numbers.next_1d(), numbers.next_2d()
         ray, brought = dr.detach(sensor.sample_ray_differential(time, wavelength, place, aperture))
-        L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, mi.Bool(True)))
+        L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, self.flow.moves_at(place)))
         L *= brought * weight
         return Flowing(pixel, place, axis, single, L, ray.wavelengths, time, wavelength, aperture)

@@ -17,12 +17,15 @@ camera that turns, or widens its view, leaves no rest; one that is carried along
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
+from ..gradient.adjoint import tangents
 from ..transport.nodes import with_gradients
+from ..transport.vertex import Walk
+from .seen_flow import SeenFlow, Slopes, followed
 
 PINHOLE = "PerspectiveCamera"
 CAMERAS = frozenset({PINHOLE, "ThinLensCamera", "OrthographicCamera"})
@@ -42,8 +45,21 @@ class FilmFlow:
 
     sensor: mi.Sensor
     r: mi.Float  # at this distance nothing moves over the film
-    leaves_rest: bool  # whether rays move with parameters beyond the flow
+    camera_moves: bool  # whether the camera has gradients
+    leaves_rest: bool  # whether its rays move with parameters beyond its flow
     is_all: bool  # whether nothing but the places of the film depends on parameters with gradients
+    seen: SeenFlow | None = None  # of the motion that the rest of the flow does not follow
+
+    @staticmethod
+    def following(walk: Walk, sensor: mi.Sensor, camera: FilmFlow | None) -> FilmFlow:
+        """The flow of a sensor that follows all that moves, with that of the ``camera`` as a part of it."""
+        flow = camera or FilmFlow(sensor, mi.Float(1), False, False, False)
+
+        def glance(place: mi.Point2f) -> tuple[mi.Ray3f, Slopes]:
+            of_ray = sensor.shutter_open(), mi.Float(0.5), place, mi.Point2f(0.5)
+            return mi.Ray3f(flow.ray(*of_ray)[0]), flow._slopes(*of_ray)
+
+        return replace(flow, seen=SeenFlow.of(walk, glance, flow.leaves_rest))
 
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor) -> FilmFlow | None:
@@ -53,7 +69,7 @@ class FilmFlow:
         rest = _is_carried(sensor) or bool(with_gradients(sensor, *OTHERS[1:]))
         others = any(with_gradients(thing) for thing in (*scene.shapes(), *scene.emitters()))
         alone = not (rest or others or with_gradients(sensor, "medium"))
-        return FilmFlow(sensor, _distance(scene, sensor), rest, alone)
+        return FilmFlow(sensor, _distance(scene, sensor), True, rest, alone)
 
     def ray(
         self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f
@@ -63,33 +79,50 @@ class FilmFlow:
         If the place has gradients, the ray depends on it; otherwise it carries the rest of the camera's motion.
         """
         ray, weight = self.sensor.sample_ray_differential(time, wavelength, place, aperture)
-        if dr.grad_enabled(place) or not dr.grad_enabled(ray.o, ray.d):
+        if dr.grad_enabled(place):
             return ray, weight
-        if not self.leaves_rest:
-            return dr.detach(ray), weight
-        o, d = self._slopes(time, wavelength, place, aperture)
-        v = self._followed(ray, o, d)
-        ray.o += o[0] * v.x + o[1] * v.y
-        ray.d += d[0] * v.x + d[1] * v.y
+        carried = self.leaves_rest and dr.grad_enabled(ray.o, ray.d)
+        if not carried:
+            ray.o, ray.d = dr.detach(ray.o), dr.detach(ray.d)
+        if carried or self._sees_motion():
+            o, d = slopes = self._slopes(time, wavelength, place, aperture)
+            v = self._velocity(ray, slopes, place)
+            ray.o += o[0] * v.x + o[1] * v.y
+            ray.d += d[0] * v.x + d[1] * v.y
         return ray, weight
 
     def place(self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f) -> mi.Point2f:
         """T: the place, attached to the parameters."""
         ray, _ = self.sensor.sample_ray_differential(time, wavelength, place, aperture)
-        return place + self._followed(ray, *self._slopes(time, wavelength, place, aperture))
+        return place + self._velocity(ray, self._slopes(time, wavelength, place, aperture), place)
 
-    def _followed(self, ray: mi.Ray3f, o: list[mi.Vector3f], d: list[mi.Vector3f]) -> mi.Vector2f:
-        """T - s, of which the value is zero, by least squares: from a ray, and its slopes."""
-        δp = (ray.o - dr.detach(ray.o)) + self.r * (ray.d - dr.detach(ray.d))
-        p_x, p_y = (o_k + self.r * d_k for o_k, d_k in zip(o, d, strict=True))
-        xx, xy, yy = dr.dot(p_x, p_x), dr.dot(p_x, p_y), dr.dot(p_y, p_y)
-        x, y = dr.dot(p_x, δp), dr.dot(p_y, δp)
-        return mi.Vector2f(yy * x - xy * y, xx * y - xy * x) / (xy * xy - xx * yy)
+    def moves_at(self, place: mi.Point2f) -> mi.Bool:
+        """Whether a place may move over the film."""
+        return mi.Bool(True) if self.seen is None or self.camera_moves else self.seen.is_at(place)
+
+    def leaves_rest_at(self, place: mi.Point2f) -> mi.Bool:
+        """Whether the ray through a place may move beyond the flow."""
+        return mi.Bool(self.leaves_rest) if self.seen is None or self.leaves_rest else self.seen.is_at(place)
+
+    def carry_tangents(self) -> None:
+        """Carry tangents from the parameters to what terms ask for, once for all of them."""
+        if self.seen is not None:
+            with dr.resume_grad():
+                tangents(self.seen.nodes)
+
+    def _sees_motion(self) -> bool:
+        return self.seen is not None and dr.grad_enabled(self.seen.nodes)
+
+    def _velocity(self, ray: mi.Ray3f, slopes: Slopes, place: mi.Point2f) -> mi.Vector2f:
+        """T - s, of which the value is zero."""
+        v = mi.Vector2f(0)
+        if dr.grad_enabled(ray.o, ray.d):
+            v -= followed((ray.o - dr.detach(ray.o)) + self.r * (ray.d - dr.detach(ray.d)), *slopes, self.r)
+        return v + self.seen.velocity(place) if self._sees_motion() else v
 
     def _slopes(
         self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f
-    ) -> tuple[list[mi.Vector3f], list[mi.Vector3f]]:
-        """∂o/∂s and ∂d/∂s, along both axes."""
+    ) -> Slopes:
         o, d = [], []
         with dr.suspend_grad():
             for step in (mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP)):
@@ -100,6 +133,16 @@ class FilmFlow:
                 o.append((b.o - a.o) / (2 * STEP))
                 d.append((b.d - a.d) / (2 * STEP))
         return o, d
+
+
+def can_follow(walk: Walk, sensor: mi.Sensor) -> bool:
+    """Whether places may follow what is seen: then all else slides under them, and all of its edges have to be found.
+
+    Those in textures, behind mirrors, glass and sheets, and on bent curves are not, and media are not asked.
+    """
+    traits = walk.traits
+    hidden = traits.seams or traits.mirrors or traits.veils or traits.splines
+    return walk.media is None and not hidden and sensor.class_name() in CAMERAS
 
 
 def _is_carried(sensor: mi.Sensor) -> bool:

@@ -17,13 +17,14 @@ from ..errors import PathreplayError
 from ..gradient.baseline import SLOTS, Baseline, Guess, Seen
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
+from ..transport.motion import moving_shapes
 from ..transport.vertex import Walk
 from .boundary import Boundary
 from .camera_motion import CameraMotion
 from .camera_pass import Pass, Seed, Which
 from .diagnostics import COST_OF_EDGES, doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts, facts_of
-from .film_flow import FilmFlow
+from .film_flow import FilmFlow, can_follow
 from .interior import PathReplay
 from .lifetimes import is_recording
 from .path_integrator import UNBOUNDED, Handed, PathIntegrator, reached
@@ -138,14 +139,19 @@ class PathReplayIntegrator(PathIntegrator):
         if self.edges == "none":
             return view, walk, terms
         flow = FilmFlow.of(view.scene, view.sensor)
-        cameras: tuple[Term, ...] = () if flow is None else (CameraMotion(flow),)
         view = replace(view, flow=flow)
-        if not self._needs_edges(view, walk):
+        needs_edges = self._needs_edges(view, walk)
+        if needs_edges and self.edges != "film" and can_follow(walk, view.sensor):
+            moving = moving_shapes(view.scene, view.scene.sensors())
+            flow = FilmFlow.following(replace(walk, traits=replace(walk.traits, moving=moving)), view.sensor, flow)
+            view = replace(view, flow=flow)
+        motion: tuple[Term, ...] = () if flow is None else (CameraMotion(flow),)
+        if not needs_edges:
             terms = tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
-            return view, walk, cameras if flow is not None and flow.is_all else (*terms, *cameras)
+            return view, walk, motion if flow is not None and flow.is_all else (*terms, *motion)
         if is_recording():
             walk = replace(walk, traits=replace(walk.traits, tables=self._tables(facts_of(view.scene), edges=True)))
-        return view, replace(walk, edges=self.edges != "film" and walk.media is None), (*terms, *cameras)
+        return view, replace(walk, edges=self.edges != "film" and walk.media is None), (*terms, *motion)
 
     def _needs_edges(self, view: Pass, walk: Walk) -> bool:
         """Whether edges move, and can be differentiated where that is left to ``auto``; says what they cost."""

@@ -134,6 +134,8 @@ class PathIntegrator:
             with self._passing():
                 part, walk, terms = self._planned(part)
                 learned = self._learned(part, walk)
+                if part.flow is not None:
+                    part.flow.carry_tangents()
                 found = reduce(add, [term.forward(part, walk, learned) for term in terms])
                 tangent = _sum(tangent, found.image, part.share)
             self._told(part, walk, found)
@@ -160,7 +162,8 @@ class PathIntegrator:
                     part, walk, terms = self._planned(part)
                     learned = self._learned(part, walk)
                     wanted = grad_in if part.share == 1 else grad_in * part.share
-                    found = reduce(add, [term.backward(part, walk, wanted, learned) for term in terms])
+                    with dr.isolate_grad():  # of terms, one by one, from the flow that they share
+                        found = reduce(add, [term.backward(part, walk, wanted, learned) for term in terms])
                 self._told(part, walk, found)
                 if sums is not None:
                     sums.take()

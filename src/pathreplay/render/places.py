@@ -39,6 +39,11 @@ class FilmPlaces:
         ray, weight = self.view.camera_ray(time, wavelength, place, aperture)
         return mi.Ray3f(ray), dr.detach(weight)
 
+    def flows(self, s: mi.Point2f) -> mi.Bool:
+        """Whether what stands still may slide under a place: see `Places`."""
+        flow = self.view.flow
+        return mi.Bool(False) if flow is None else flow.leaves_rest_at(self.in_sensor(s))
+
     def in_sensor(self, s: mi.Point2f) -> mi.Point2f:
         """A place in widths and heights of the crop window, as sensors want it."""
         film = self.view.sensor.film()

@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import PathreplayError
 from .nodes import nodes_of
 from .pieces import mesh_pieces
+from .seams import has_seams
 from .velocity import blend_length
 
 # Classes by name: Mitsuba's objects do not tell these things of themselves.
@@ -76,6 +77,7 @@ class Traits:
     narrow: bool  # a surface may have a narrow smooth lobe
     glossy: bool  # a surface may have a narrow smooth lobe, and no texture has a seam that it would slide over
     outlines: bool  # a point of a surface may see where a shape, a lamp or a texture ends
+    seams: bool  # a texture jumps within itself: see `has_seams`
     tables: Tables = None  # type: ignore[assignment]  # of single BSDFs and shapes; of now, as all that follows
     # What has gradients:
     lights_deform: bool = False  # vertex positions of a mesh that emits
@@ -119,6 +121,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         narrow=_is_narrow(bsdfs),
         glossy=_is_narrow(bsdfs) and not any(node.class_name() == CHECKERED for node in nodes),
         outlines=not _seamless(shapes, nodes),
+        seams=has_seams(nodes),
     )
 
 

@@ -1,0 +1,67 @@
+"""Textures that jump within themselves: checkerboards, bitmaps without interpolation, attributes of faces.
+
+No edge is looked for at their seams, so that nothing that stands still may slide over them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+CHECKERBOARD, BITMAP, ATTRIBUTE = "Checkerboard", "BitmapTextureImpl", "MeshAttribute"
+"""By class; that of bitmaps has the type of their texels behind it."""
+PROBES, BESIDE = 64, 1e-3
+"""Texels of a bitmap that are looked at, and how far beside their borders, in texels."""
+WAVELENGTHS = 440.0, 510.0, 580.0, 650.0
+JUMPS = 0.5
+"""Share of what two texels differ by, from which on a difference beside their border is a jump."""
+
+
+def has_seams(nodes: Iterable[mi.Object]) -> bool:
+    """Whether one of the nodes of a scene is a texture that jumps within itself.
+
+    Bitmaps do not tell their filter, so they are evaluated. A function that `dr.freeze` records cannot look at what
+    comes of that: there any bitmap may jump.
+    """
+    return any(_jumps(node) for node in nodes if isinstance(node, mi.Texture))
+
+
+def _jumps(texture: mi.Texture) -> bool:
+    kind = texture.class_name()
+    if kind.startswith(BITMAP):
+        return bool(dr.flag(dr.JitFlag.FreezingScope)) or _is_nearest(texture)
+    return kind == CHECKERBOARD or (kind == ATTRIBUTE and 'name = "face_' in str(texture))
+
+
+def _is_nearest(texture: mi.Texture) -> bool:
+    """Whether a bitmap differs as much close to the borders of texels as between their middles."""
+    params = mi.traverse(texture)
+    height, width, channels = params["data"].shape
+    raw = texture.eval_3 if channels == 3 else texture.eval_1
+    values = raw if "raw = 1" in str(texture) else texture.eval
+    along, across = (width, height) if width >= height else (height, width)
+    if along < 2:
+        return False
+    random = np.random.default_rng(1)
+    border, middle = random.integers(1, along, PROBES), (random.integers(0, across, PROBES) + 0.5) / across
+    from_texels = np.linalg.inv(np.array(params["to_uv"].matrix, np.float64))
+
+    def differences(beside: float) -> np.ndarray:
+        """Of values so many texels to both sides of borders."""
+        sides = []
+        for side in (-1, 1):
+            at = (border + side * beside) / along, middle
+            x, y, _ = from_texels @ (*(at if width >= height else at[::-1]), np.ones(PROBES))
+            si = dr.zeros(mi.SurfaceInteraction3f, PROBES)
+            si.uv = mi.Point2f(x, y)
+            if mi.is_spectral:
+                si.wavelengths = type(si.wavelengths)(*WAVELENGTHS)
+            sides.append(np.array(values(si)))
+        return np.abs(sides[1] - sides[0])
+
+    with dr.suspend_grad():
+        close, apart = differences(BESIDE), differences(0.5)
+    return bool(np.any(close > JUMPS * apart, where=apart > 0))
