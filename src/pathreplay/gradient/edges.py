@@ -57,7 +57,9 @@ def edges_backward(walk: Walk, places: Places, found: Edges, W: mi.Spectrum, los
     with dr.resume_grad():
         ray, _ = places.ray(found.s, found.key)
         if dr.grad_enabled(ray.o, ray.d):
-            dr.eval(q)  # every parameter of the camera sums over it apart, which would run the loops as often
+            dr.eval(
+                q, found.s, found.key
+            )  # every parameter of the camera sums over it apart, which would search as often
             backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
 
 

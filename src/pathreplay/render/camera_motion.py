@@ -34,6 +34,8 @@ from .term import Found
 
 GROUP = 5
 """Paths with the same random numbers: to the right and to the left, above and below, and one for the divergence."""
+CAMERA, THINGS = 2, 4
+"""Samples of the pass for which there is one group, where a camera moves and where only what it sees does."""
 NUMBERS = 1
 """Number of the set of random numbers; the interior uses 0."""
 
@@ -96,7 +98,7 @@ class CameraMotion:
     def _walked(self, view: Pass, walk: Walk) -> Flowing:
         """Walk the paths of a pass."""
         width, height = view.size
-        groups = -(-view.spp // 2)
+        groups = -(-view.spp // (CAMERA if self.flow.camera_moves else THINGS))
         i = dr.arange(mi.UInt32, width * height * groups * GROUP)
         member, group = i % GROUP, i // GROUP
         pixel, single, axis = group // groups, member == GROUP - 1, member // 2

@@ -120,9 +120,7 @@ class FilmFlow:
             v -= followed((ray.o - dr.detach(ray.o)) + self.r * (ray.d - dr.detach(ray.d)), *slopes, self.r)
         return v + self.seen.velocity(place) if self._sees_motion() else v
 
-    def _slopes(
-        self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f
-    ) -> Slopes:
+    def _slopes(self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f) -> Slopes:
         o, d = [], []
         with dr.suspend_grad():
             for step in (mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP)):

@@ -45,7 +45,7 @@ class SeenFlow:
     """A velocity of places, by its nodes."""
 
     nodes: mi.Vector2f  # attached to what moves; their values are zero
-    flows: mi.Bool  # whether anything that moves is seen around a node
+    flows: mi.Bool  # whether anything that moves is seen around the corners of a node's cell, or of those beside it
 
     @staticmethod
     def of(walk: Walk, glance: Callable[[mi.Point2f], tuple[mi.Ray3f, Slopes]], all_moves: bool) -> SeenFlow:
@@ -75,8 +75,14 @@ class SeenFlow:
             total = K_0 + dr.block_sum(K, GLANCES * GLANCES)
             v = [dr.block_sum(K * dr.gather(mi.Float, u[axis], i), GLANCES * GLANCES) / total for axis in range(2)]
             nodes = mi.Vector2f(*v)
-        flows = dr.block_sum(dr.select(dr.gather(mi.Bool, moves, i), K, 0), GLANCES * GLANCES) > 0
-        dr.eval(nodes, flows)
+        moved = dr.block_sum(dr.select(dr.gather(mi.Bool, moves, i), K, 0), GLANCES * GLANCES)
+        dr.eval(nodes, moved)
+        n = dr.arange(mi.UInt32, side * side)
+        cell, flows = mi.Point2i(n % side, n // side) - MARGIN, mi.Bool(False)
+        for x in range(-1, 3):
+            for y in range(-1, 3):
+                flows |= dr.gather(mi.Float, moved, _node(cell, x, y)) > 0
+        dr.eval(flows)
         return SeenFlow(nodes, flows)
 
     def velocity(self, place: mi.Point2f) -> mi.Vector2f:
@@ -88,12 +94,7 @@ class SeenFlow:
 
     def is_at(self, place: mi.Point2f) -> mi.Bool:
         """Whether there may be a velocity at a place, or within a cell of it."""
-        at, _ = _cell(place)
-        found = mi.Bool(False)
-        for x in range(-1, 3):
-            for y in range(-1, 3):
-                found |= dr.gather(mi.Bool, self.flows, _node(at, x, y))
-        return found
+        return dr.gather(mi.Bool, self.flows, _node(_cell(place)[0], 0, 0))
 
 
 def followed(δp: mi.Vector3f, o: list[mi.Vector3f], d: list[mi.Vector3f], t: mi.Float) -> mi.Vector2f:
