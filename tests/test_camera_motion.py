@@ -15,7 +15,7 @@ from edge_ordinary import LENS, UPRIGHT, WINDOW, Moving, T, film, loaded, measur
 from edge_truth import hold_agreement
 from pathreplay.check.stencil import CENTRAL
 from pathreplay.render import film_flow
-from pathreplay.render.camera_motion import CameraMotion
+from pathreplay.render.film_motion import FilmMotion
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.term import Found
 from pathreplay.transport.meet import meet
@@ -96,7 +96,7 @@ def test_a_pinhole_that_turns_leaves_no_rest(pose: str, rest: bool, tmp_path: Pa
     with dr.suspend_grad():
         *_, terms = integrator._planned(Pass.of(objective.scene, 0, 1, 1))
     objective.put(dr.opaque(mi.Float, 0))
-    assert [type(term).__name__ for term in terms] == ["PathReplay", "Boundary"] * rest + ["CameraMotion"]
+    assert [type(term).__name__ for term in terms] == ["PathReplay", "Boundary"] * rest + ["FilmMotion"]
 
 
 @pytest.mark.slow
@@ -105,7 +105,7 @@ def test_the_rest_of_a_camera_that_turns_is_rounding(tmp_path: Path, monkeypatch
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": "film"})
     monkeypatch.setattr(film_flow, "_is_carried", lambda sensor: True)
     whole = objective.backward(integrator, 1, 64)
-    monkeypatch.setattr(CameraMotion, "backward", lambda *_: Found(moves=True))
+    monkeypatch.setattr(FilmMotion, "backward", lambda *_: Found(moves=True))
     rest = objective.backward(integrator, 1, 64)
     objective.put(dr.opaque(mi.Float, 0))
     assert abs(rest) < 1e-3 * abs(whole), (rest, whole)

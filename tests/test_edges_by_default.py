@@ -13,7 +13,7 @@ import pytest
 
 from pathreplay.check import check_gradient
 from pathreplay.render.boundary import Boundary
-from pathreplay.render.camera_motion import CameraMotion
+from pathreplay.render.film_motion import FilmMotion
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.integrator import EDGES
 from pathreplay.threads import one_thread
@@ -117,7 +117,7 @@ def test_what_moves_edges_is_what_can_hide_light_or_is_seen_from(room: mi.Scene)
             view = Pass.of(room, 0, 0, 1)
             found[key] = Boundary.move(view, integrator._walk(room, view.sensor))
             *_, terms = integrator._planned(view)
-            assert any(isinstance(term, Boundary | CameraMotion) for term in terms) == found[key]
+            assert any(isinstance(term, Boundary | FilmMotion) for term in terms) == found[key]
     assert found == dict.fromkeys(MOVES, True) | dict.fromkeys(STAYS, False)
 
 

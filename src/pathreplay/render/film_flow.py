@@ -6,7 +6,7 @@ with weights W does not depend on how places are parametrised:
 
     ∫ W(s) L(c(s, π)) ds = ∫ W(T) L(c(T, π)) |∂T/∂s| ds,
 
-and so its derivative has two parts. One belongs to the weights, with n normal to the border of D (see `CameraMotion`):
+and so its derivative has two parts. One belongs to the weights, with n normal to the border of D (see `FilmMotion`):
 
     ∫_D div(W v) L ds - ∮_∂D W L v·n dl
 
@@ -23,6 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..gradient.adjoint import tangents
+from ..transport.motion import moving_shapes
 from ..transport.nodes import with_gradients
 from ..transport.vertex import Walk
 from .seen_flow import SeenFlow, Slopes, followed
@@ -51,8 +52,9 @@ class FilmFlow:
     seen: SeenFlow | None = None  # of the motion that the rest of the flow does not follow
 
     @staticmethod
-    def following(walk: Walk, sensor: mi.Sensor, camera: FilmFlow | None) -> FilmFlow:
-        """The flow of a sensor that follows all that moves, with that of the ``camera`` as a part of it."""
+    def following(scene: mi.Scene, sensor: mi.Sensor, walk: Walk, camera: FilmFlow | None) -> FilmFlow:
+        """The flow of a sensor that follows all that it sees move, with that of the ``camera`` as a part of it."""
+        walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(scene, scene.sensors())))
         flow = camera or FilmFlow(sensor, mi.Float(1), False, False, False)
 
         def glance(place: mi.Point2f) -> tuple[mi.Ray3f, Slopes]:

@@ -17,14 +17,13 @@ from ..errors import PathreplayError
 from ..gradient.baseline import SLOTS, Baseline, Guess, Seen
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
-from ..transport.motion import moving_shapes
 from ..transport.vertex import Walk
 from .boundary import Boundary
-from .camera_motion import CameraMotion
 from .camera_pass import Pass, Seed, Which
 from .diagnostics import COST_OF_EDGES, doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts, facts_of
 from .film_flow import FilmFlow, can_follow
+from .film_motion import FilmMotion
 from .interior import PathReplay
 from .lifetimes import is_recording
 from .path_integrator import UNBOUNDED, Handed, PathIntegrator, reached
@@ -129,29 +128,30 @@ class PathReplayIntegrator(PathIntegrator):
             return (self.interior,)
         return self.interior, Boundary(inner=self.edges != "film", spp=self.edge_spp)
 
-    def _planned(self, view: Pass) -> tuple[Pass, Walk, tuple[Term, ...]]:
-        """See `PathIntegrator`. A camera that moves has a term of its own, and the others what that leaves.
+    def _planned(self, view: Pass, follow: bool = True) -> tuple[Pass, Walk, tuple[Term, ...]]:
+        """See `PathIntegrator`. What moves over the film has a term of its own, and the others what that leaves.
 
-        Edges are left out where none move, and where `auto` finds that they cannot be done; the interior, where the
-        camera's term is all.
+        Where it may, the film's flow is to ``follow`` what is seen. Edges are left out where none move, and where
+        `auto` finds that they cannot be done; the interior, where the film's term is all.
         """
         view, walk, terms = PathIntegrator._planned(self, view)
         if self.edges == "none":
             return view, walk, terms
-        flow = FilmFlow.of(view.scene, view.sensor)
-        view = replace(view, flow=flow)
+        view = replace(view, flow=FilmFlow.of(view.scene, view.sensor))
         needs_edges = self._needs_edges(view, walk)
-        if needs_edges and self.edges != "film" and can_follow(walk, view.sensor):
-            moving = moving_shapes(view.scene, view.scene.sensors())
-            flow = FilmFlow.following(replace(walk, traits=replace(walk.traits, moving=moving)), view.sensor, flow)
-            view = replace(view, flow=flow)
-        motion: tuple[Term, ...] = () if flow is None else (CameraMotion(flow),)
+        if needs_edges and follow and self._may_follow(view, walk):
+            view = replace(view, flow=FilmFlow.following(view.scene, view.sensor, walk, view.flow))
+        motion: tuple[Term, ...] = () if view.flow is None else (FilmMotion(view.flow),)
         if not needs_edges:
             terms = tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
-            return view, walk, motion if flow is not None and flow.is_all else (*terms, *motion)
+            return view, walk, motion if view.flow is not None and view.flow.is_all else (*terms, *motion)
         if is_recording():
             walk = replace(walk, traits=replace(walk.traits, tables=self._tables(facts_of(view.scene), edges=True)))
         return view, replace(walk, edges=self.edges != "film" and walk.media is None), (*terms, *motion)
+
+    def _may_follow(self, view: Pass, walk: Walk) -> bool:
+        """Whether the film may follow what it sees: all edges are found of what then slides under it."""
+        return self.edges != "film" and can_follow(walk, view.sensor)
 
     def _needs_edges(self, view: Pass, walk: Walk) -> bool:
         """Whether edges move, and can be differentiated where that is left to ``auto``; says what they cost."""
@@ -175,7 +175,16 @@ class PathReplayIntegrator(PathIntegrator):
             return f"driver = '{self.driver}' walks paths one by one; take 'sweep'"
         if facts_of(scene).has_media:
             return "the scene has media; leave them out"
-        return obstacle(view.sensor, self.max_depth, view.spp, some)
+        return obstacle(view.sensor, self.max_depth, view.spp, some) or ("" if some else self._followed(view))
+
+    def _followed(self, view: Pass) -> str:
+        """Why whole pictures are better rendered than swept: the film follows what moves, which no sweep of it does."""
+        if self.edges in ("none", "film"):
+            return ""
+        with self._passing():
+            walk = self._walk(view.scene, view.sensor)
+            follows = self._may_follow(view, walk) and Boundary.move(view, walk) and not Boundary.obstacle(view)
+        return "the film follows what moves; take edges = 'none'" if follows else ""
 
     def render_and_backward(
         self,
@@ -202,7 +211,7 @@ class PathReplayIntegrator(PathIntegrator):
         some = None if pixels is None else mi.UInt32(pixels)
         with reached(scene, sensor, zero_is_told=True), self._passing(), dr.isolate_grad():
             loss = pixel_loss(view, self.max_depth, offset, slope, some)
-            view, walk, (_, *edges) = self._planned(view)
+            view, walk, (_, *edges) = self._planned(view, follow=False)
             if view.flow is not None:
                 raise PathreplayError(
                     f"pathreplay: sensor '{view.sensor.id()}' moves, and cannot be swept: hold it, or use mi.render"

@@ -56,7 +56,7 @@ class Flowing:
 
 
 @dataclass(frozen=True)
-class CameraMotion:
+class FilmMotion:
     """A term: all that a moving camera does to the picture, but for the rest that its `FilmFlow` leaves to others."""
 
     flow: FilmFlow

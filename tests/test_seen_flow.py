@@ -1,0 +1,180 @@
+"""The film follows what is seen: the gradient is that of any flow, its noise is less, and not all scenes allow it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from edge_ordinary import PAINT, Moving, T, film, grey, loaded, measured, panel, sensor
+from edge_truth import hold_agreement
+from pathreplay.check.statistics import gap
+from pathreplay.check.stencil import CENTRAL
+from pathreplay.check.verdict import Z_LIMIT
+from pathreplay.render import integrator as integrators
+from pathreplay.render.camera_pass import Pass
+from pathreplay.transport.nodes import nodes_of
+from pathreplay.transport.seams import has_seams
+from truth import bitmap, noise, translate, turn_vertices
+
+Write = Callable[[Path], Moving]
+SEEDS, PASSES = 8, 24
+SKY = {"type": "constant", "radiance": 0.8}
+
+
+def texture(**more: Any) -> dict:
+    """Made anew for each scene, which takes its texels away."""
+    return {**bitmap(noise(8, 3, 0.1, 0.9)), **more}
+
+
+def painted(reflectance: dict) -> dict:
+    return {"type": "twosided", "inner": {"type": "diffuse", "reflectance": reflectance}}
+
+
+def floor(bsdf: dict) -> dict:
+    place = T().translate([0, -0.5, 0]).rotate([1, 0, 0], -90).scale(3)
+    return {"type": "rectangle", "to_world": place, "bsdf": bsdf}
+
+
+def ball(bsdf: dict) -> dict:
+    return {"type": "sphere", "to_world": T().scale(0.5), "bsdf": bsdf}
+
+
+def box(bsdf: dict) -> dict:
+    return {
+        "type": "cube",
+        "to_world": T().translate([-0.3, 0.1, 0.4]).rotate([1, 0.4, 0], 30).scale(0.3),
+        "bsdf": bsdf,
+    }
+
+
+def moving(key: str, move: Any, camera: dict | None = None, **parts: Any) -> Write:
+    """Parts that are functions are made anew for each scene."""
+
+    def write(folder: Path) -> Moving:
+        made = {name: part() if callable(part) else part for name, part in parts.items()}
+        return Moving({"type": "scene", "camera": camera or sensor(), **made}, key, move)
+
+    return write
+
+
+CELLS: dict[str, Write] = {
+    "painted ball before a sky": moving(
+        "ball.to_world", translate(1, 0.3, 0), ball=lambda: ball(painted(texture())), sky=SKY
+    ),
+    "box before a painted floor": moving(
+        "box.vertex_positions", turn_vertices(0.3, 1, 0), box=box(PAINT), floor=lambda: floor(painted(texture())), lamp=panel()
+    ),
+    "ball before a shadow": moving(
+        "ball.to_world",
+        translate(1, 0, 0.3),
+        ball=ball(PAINT),
+        box=box(PAINT),
+        floor=floor(PAINT),
+        lamp=panel(),
+        camera=sensor(place=T().look_at([0, 1.2, 3.5], [0, -0.2, 0], [0, 1, 0])),
+    ),
+    "gaussian": moving(
+        "ball.to_world",
+        translate(0, 1, 0),
+        ball=ball(PAINT),
+        floor=floor(PAINT),
+        lamp=panel(),
+        sky=SKY,
+        camera=sensor(film=film(rfilter={"type": "gaussian"})),
+    ),
+    "lens": moving(
+        "ball.to_world",
+        translate(1, 0.3, 0),
+        ball=ball(PAINT),
+        floor=floor(PAINT),
+        lamp=panel(),
+        camera=sensor("thinlens", aperture_radius=0.1, focus_distance=3.0),
+    ),
+    "parallel": moving(
+        "ball.to_world",
+        translate(1, 0.3, 0),
+        ball=ball(PAINT),
+        floor=floor(PAINT),
+        lamp=panel(),
+        camera=sensor("orthographic", T().look_at([0, 0.6, 4], [0, 0, 0], [0, 1, 0]).scale([1.3, 1.3, 1])),
+    ),
+}
+QUICK = "painted ball before a sky"
+
+
+@pytest.mark.parametrize("name", [n if n == QUICK else pytest.param(n, marks=pytest.mark.slow) for n in CELLS])
+def test_gradients_agree_with_differences(name: str, tmp_path: Path) -> None:
+    found = measured(CELLS[name](tmp_path), tmp_path, SEEDS)
+    hold_agreement(f"flow, {name}", found.gradients, found.differences, found.transpose)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CELLS)
+def test_the_gradient_is_that_without_a_flow(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    objective = loaded(CELLS[name](tmp_path), tmp_path)
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    found = []
+    for follows in (True, False):
+        if not follows:
+            monkeypatch.setattr(integrators, "can_follow", lambda walk, sensor: False)
+        found.append(np.array([objective.backward(ours, seed, 64) for seed in range(PASSES)]))
+    objective.put(dr.opaque(mi.Float, 0))
+    assert abs(gap(*found).z) < Z_LIMIT, gap(*found)
+
+
+def test_noise_is_below_that_of_a_difference(tmp_path: Path) -> None:
+    """Of two pictures with the same random numbers and as many samples each."""
+    cell = CELLS[QUICK](tmp_path)
+    objective = loaded(cell, tmp_path)
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    plain = mi.load_dict({"type": "path", "max_depth": 3, "rr_depth": 1000})
+    g = np.array([objective.backward(ours, seed, 32) for seed in range(PASSES)])
+    d = [objective.dot(objective.difference(plain, CENTRAL, cell.step, seed, 32)) for seed in range(PASSES)]
+    objective.put(dr.opaque(mi.Float, 0))
+    assert g.var() < np.var(d), (g.std(), np.std(d))
+
+
+FLOORS: dict[str, tuple[Callable[[], dict], bool]] = {
+    "painted": (lambda: painted(texture()), True),
+    "checks": (lambda: painted({"type": "checkerboard"}), False),
+    "texels": (lambda: painted(texture(filter_type="nearest")), False),
+    "mirror": (lambda: {"type": "conductor"}, False),
+    "veil": (lambda: {"type": "mask", "opacity": 0.5, "nested": grey(0.5, 0.5, 0.5)}, False),
+}
+
+
+@pytest.mark.parametrize("name", FLOORS)
+def test_nothing_slides_whose_edges_are_not_found(name: str) -> None:
+    bsdf, follows = FLOORS[name]
+    parts = {"ball": ball(PAINT), "floor": floor(bsdf()), "sky": SKY}
+    scene = mi.load_dict({"type": "scene", "camera": sensor(), **parts})
+    params, integrator = mi.traverse(scene), mi.load_dict({"type": "pathreplay"})
+    dr.enable_grad(params["ball.to_world"])
+    params.update()
+    with dr.suspend_grad():
+        view, _, terms = integrator._planned(Pass.of(scene, 0, 1, 1))
+    assert (view.flow is not None) is follows
+    assert [type(term).__name__ for term in terms] == ["PathReplay", "Boundary"] + ["FilmMotion"] * follows
+
+
+@pytest.mark.parametrize("filter", ["bilinear", "nearest"])
+@pytest.mark.parametrize("shape", [(4, 4, 3), (1, 8, 1), (8, 1, 3), (64, 32, 1)])
+@pytest.mark.parametrize(
+    "more", [{}, {"wrap_mode": "mirror"}, {"to_uv": mi.ScalarTransform3f().rotate(30).scale([3, 2])}]
+)
+def test_bitmaps_without_interpolation_are_found(filter: str, shape: tuple[int, ...], more: dict) -> None:
+    texels = np.random.default_rng(1).random(shape).astype(np.float32)
+    painting = {"type": "bitmap", "raw": True, "data": mi.TensorXf(texels), "filter_type": filter, **more}
+    body = mi.load_dict({"type": "rectangle", "bsdf": painted(painting)})
+    assert has_seams(nodes_of(body)) is (filter == "nearest")
+
+
+def test_attributes_of_faces_have_seams_and_those_of_vertices_none() -> None:
+    for name, seams in (("face_color", True), ("vertex_color", False)):
+        assert has_seams([mi.load_dict({"type": "mesh_attribute", "name": name})]) is seams
