@@ -173,6 +173,29 @@ def test_nothing_is_written_into_what_gets_the_name_of_the_folder_meanwhile(what
     assert what_follows != "a folder" or not list((tmp_path / "run").iterdir())
 
 
+@pytest.mark.parametrize("link", ["run", "run/within", ""])
+def test_files_are_discarded_in_the_folder_only(link: str, tmp_path: Path) -> None:
+    (tmp_path / "run/within").mkdir(parents=True)
+    folder = run_folder.RunFolder(tmp_path / "run")
+    for name in ("one", "within/two"):
+        (tmp_path / "run" / name).touch()
+    if link:
+        (tmp_path / link).rename(tmp_path / "elsewhere")
+        (tmp_path / link).symlink_to(tmp_path / "elsewhere")
+        if link == "run":  # another folder that looks like it
+            shutil.copytree(tmp_path / "elsewhere", tmp_path / "outside")
+            (tmp_path / "run").unlink()
+            (tmp_path / "run").symlink_to("outside")
+    folder.discard(["one", "gone", "within/two", "nowhere/three"])
+    folder.lock.close()
+    left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert {path for path in left if not path.endswith(LOCK)} == {
+        "": set(),
+        "run": {"elsewhere/one", "elsewhere/within/two", "outside/one", "outside/within/two"},
+        "run/within": {"elsewhere/two"},
+    }[link]
+
+
 def test_links_in_the_folder_are_not_followed(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     precious = room / "precious"
     precious.write_text("x")

@@ -125,20 +125,33 @@ class RunFolder:
                     raise PathreplayError(self._failure(error)) from error
                 raise
 
+    def discard(self, names: Iterable[str]) -> None:
+        """Remove files of it, where it still is the folder that was made. Links to folders are not followed.
+
+        Raises nothing.
+        """
+        with _held(self.path) as held:
+            if _identity(self.path if held is None else held) != self.identity:
+                return
+            base = self.path if held is None else Path()
+            for name in names:
+                parent = os.path.dirname(name)
+                with contextlib.suppress(OSError):
+                    if not (parent and _is_link(base / parent, held)):
+                        os.unlink(base / name, dir_fd=held)
+
     def _make_parent(self, name: str, made: list[str], held: int | None) -> None:
         parent = os.path.dirname(name)
         if not parent:
             return
         folder = self.path / parent if held is None else Path(parent)
         try:
-            about = os.stat(folder, dir_fd=held, follow_symlinks=False)
+            if _is_link(folder, held):
+                what = f"{self.path / parent} is a link that may lead out of the run folder"
+                raise PathreplayError(f"{what}; replace it by the folder that it leads to")
         except FileNotFoundError:
             os.mkdir(folder, dir_fd=held)
             made.append(parent)
-        else:
-            if stat.S_ISLNK(about.st_mode):
-                what = f"{self.path / parent} is a link that may lead out of the run folder"
-                raise PathreplayError(f"{what}; replace it by the folder that it leads to")
 
     def _failure(self, error: OSError) -> str:
         if (self.path / CHECKPOINT).exists():
@@ -339,6 +352,11 @@ def _identity(path: Path | int) -> tuple[int, int] | None:
     except OSError:
         return None
     return about.st_dev, about.st_ino
+
+
+def _is_link(path: Path, held: int | None) -> bool:
+    """Raises OSError if there is nothing of that name."""
+    return stat.S_ISLNK(os.stat(path, dir_fd=held, follow_symlinks=False).st_mode)
 
 
 def _write_through(path: Path, content: Content, held: int | None) -> None:
