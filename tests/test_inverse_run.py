@@ -167,13 +167,13 @@ def full_disk_at(write: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The given write (from 1) and all later ones find the disk full, after half of their bytes."""
     real, count = folders._write_through, []
 
-    def write_through(path: Path, content: Content) -> None:
+    def write_through(path: Path, content: Content, held: int | None) -> None:
         count.append(path)
         data = b"".join(chunks(content))
         if len(count) >= write:
-            path.write_bytes(data[: len(data) // 2])
+            real(path, data[: len(data) // 2], held)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-        real(path, data)
+        real(path, data, held)
 
     monkeypatch.setattr(folders, "_write_through", write_through)
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
+import PIL.Image
 import pytest
 
 from hostile.picture_bytes import HUGE, claiming, exr, picture_files, radiance
@@ -155,6 +157,45 @@ def test_damaged_heads_are_told_in_one_line(name: str, room: Path) -> None:  # n
         with pytest.raises(PathreplayError, match=re.escape(name)) as told:
             read_image(room / name)
         assert "\n" not in str(told.value)
+
+
+def spoiled_tga(how: str) -> bytes:
+    """Of runs, with a head or packets that do not fit what follows; Mitsuba writes beyond the end of some of them."""
+    data = bytearray(FILES["runs.tga"])
+    if how == "other pixels":  # grey
+        data[2], data[16] = 11, 8
+    elif how == "shorter rows":
+        data[12] -= 1
+    elif how == "more rows":
+        data[14] += 1
+    elif how == "a longer packet":
+        data[18] |= 127
+    elif how == "too wide":
+        data[12:16] = struct.pack("<HH", 2**15, 1)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("file", ["a.tga", "a.png"])
+@pytest.mark.parametrize("how", ["other pixels", "shorter rows", "more rows", "a longer packet", "too wide"])
+def test_packets_that_do_not_fill_a_tga_are_told_in_one_line(how: str, file: str, room: Path) -> None:  # noqa: F811
+    """Whatever its ending: Mitsuba knows the format by the last bytes."""
+    (room / file).write_bytes(spoiled_tga(how))
+    (room / "odd.xml").write_text(SCENE.replace("texture.exr", file))
+    for read in (lambda: read_image(room / file), lambda: load_scene("odd.xml")):
+        with pytest.raises(PathreplayError, match=rf"{re.escape(file)} is (a damaged TGA|32768 x 1)") as told:
+            read()
+        assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_runs_of_a_tga_are_unpacked(channels: int, tmp_path: Path) -> None:
+    """Runs and single pixels, over the ends of rows."""
+    stored = np.repeat(np.random.default_rng(2).integers(0, 256, (43, channels), np.uint8), 7, 0)[:300]
+    stored[100:103] = np.arange(3 * channels).reshape(3, channels)
+    path = tmp_path / "a.tga"
+    image = PIL.Image.fromarray(np.squeeze(stored.reshape(20, 15, channels)))
+    image.save(path, compression="tga_rle")
+    assert read_image(path, raw=True).ravel() == pytest.approx(stored.ravel() / 255, abs=1e-6)
 
 
 @pytest.mark.parametrize("name", sorted(FILES.keys() - {"a.exr"}))

@@ -105,7 +105,7 @@ def test_file_systems_without_locks_do_without(room: Path, monkeypatch: pytest.M
 
 
 def test_a_folder_that_cannot_be_written_is_gone_and_let_go_of(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(path: Path, data: bytes) -> None:
+    def full(path: Path, data: bytes, held: int | None) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     job = write_job(room, **ONE)
@@ -150,18 +150,50 @@ def test_a_vanished_folder_ends_the_run_and_does_not_come_back(
         assert optimize(resume="elsewhere", progress=False).iterations == 2
 
 
-def test_nothing_half_written_stays_in_a_folder_that_is_renamed_meanwhile(tmp_path: Path) -> None:
+@pytest.mark.parametrize("what_follows", ["nothing", "a folder", "a link"])
+def test_nothing_is_written_into_what_gets_the_name_of_the_folder_meanwhile(what_follows: str, tmp_path: Path) -> None:
+    """And nothing half-written stays in the folder itself."""
     (tmp_path / "run").mkdir()
     folder = run_folder.RunFolder(tmp_path / "run")
+    (tmp_path / "outside").mkdir()
 
     def content() -> list[bytes]:
         (tmp_path / "run").rename(tmp_path / "elsewhere")
-        return [b"2"]
+        if what_follows == "a folder":
+            (tmp_path / "run").mkdir()
+        elif what_follows == "a link":
+            (tmp_path / "run").symlink_to("outside")
+        return [b"1"]
 
-    with pytest.raises(PathreplayError, match="cannot be written"):
-        folder.write({"one": b"1", "within/two": content})
+    with pytest.raises(PathreplayError, match="run was removed or renamed during the run, which ends here"):
+        folder.write({"within/one": content, "two": b"2", "other/three": b"3"})
     folder.lock.close()
     assert [path.name for path in (tmp_path / "elsewhere").rglob("*")] == [LOCK]
+    assert not list((tmp_path / "outside").iterdir())
+    assert what_follows != "a folder" or not list((tmp_path / "run").iterdir())
+
+
+@pytest.mark.parametrize("link", ["run", "run/within", ""])
+def test_files_are_discarded_in_the_folder_only(link: str, tmp_path: Path) -> None:
+    (tmp_path / "run/within").mkdir(parents=True)
+    folder = run_folder.RunFolder(tmp_path / "run")
+    for name in ("one", "within/two"):
+        (tmp_path / "run" / name).touch()
+    if link:
+        (tmp_path / link).rename(tmp_path / "elsewhere")
+        (tmp_path / link).symlink_to(tmp_path / "elsewhere")
+        if link == "run":  # another folder that looks like it
+            shutil.copytree(tmp_path / "elsewhere", tmp_path / "outside")
+            (tmp_path / "run").unlink()
+            (tmp_path / "run").symlink_to("outside")
+    folder.discard(["one", "gone", "within/two", "nowhere/three"])
+    folder.lock.close()
+    left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
+    assert {path for path in left if not path.endswith(LOCK)} == {
+        "": set(),
+        "run": {"elsewhere/one", "elsewhere/within/two", "outside/one", "outside/within/two"},
+        "run/within": {"elsewhere/two"},
+    }[link]
 
 
 def test_links_in_the_folder_are_not_followed(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ NAMES = pytest.mark.parametrize("name", some([*SHADOWS, *INDIRECT, *VEILED]))
 MANY = 32
 """Passes where a small difference is to be seen, or where small lamps are looked for by chance."""
 COUNTED_TWICE = {
-    "shadow_lamp": MANY,
+    "shadow_lamp": 4 * MANY,
     "shadow_all": 6 * MANY,
     "lamp_lights": MANY,
     "sphere_lamp": 3 * MANY,

@@ -209,16 +209,19 @@ def alone(m: mi.Float) -> mi.Float:
 
 
 @dr.syntax
-def part_seen(look: Look, line: Line, active: mi.Bool) -> mi.Float:
-    """The share of a line around its middle in which it looks as it does there, within a sixteenth on each side."""
+def part_seen(look: Look, line: Line, at_a: Sight, at_b: Sight, active: mi.Bool) -> mi.Float:
+    """The share of a line around its middle in which it looks as at neither end, within a sixteenth on each side.
+
+    There may be edges within: what counts is that a line with its middle there finds something.
+    """
     middle, half = 0.5 * (line.begin + line.end), 0.5 * (line.end - line.begin)
-    at_middle = look(line, middle, active)
     n, share, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)
     while dr.hint(active & (n < 2 * PARTS), exclude=[look, line], label="pathreplay: part of a line"):
         side = dr.select(n < PARTS, mi.Float(-1), 1)
         further = reach + step
-        same = ~look(line, middle + side * half * further, mi.Bool(True)).differs(at_middle)
-        reach, step = dr.select(same, further, reach), 0.5 * step
+        there = look(line, middle + side * half * further, mi.Bool(True))
+        within = there.differs(at_a) | there.differs(at_b)
+        reach, step = dr.select(within, further, reach), 0.5 * step
         n += 1
         done = (n == PARTS) | (n == 2 * PARTS)
         share += dr.select(done, 0.5 * (reach + step), 0)
@@ -237,7 +240,7 @@ def bisect(look: Look, line: Any, weight: mi.Float, pick: mi.PCG32) -> Crossed:
     a, b, weight = mi.Float(line.begin), mi.Float(line.end), mi.Float(weight)
     at_a, at_b = look(line, a, weight > 0), look(line, b, weight > 0)
     only_middle = (weight > 0) & ~at_a.differs(at_b)
-    weight = dr.select(only_middle, alone(part_seen(look, line, only_middle)) * weight, weight)
+    weight = dr.select(only_middle, alone(part_seen(look, line, at_a, at_b, only_middle)) * weight, weight)
     n, still, was_left = mi.UInt32(0), mi.UInt32(0), mi.Bool(False)
     while dr.hint(
         (weight > 0) & ((n < BISECTIONS) | ((n == BISECTIONS) & (still >= STILL))),

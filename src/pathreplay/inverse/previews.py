@@ -130,8 +130,7 @@ class Previews:
         return tuple(found)
 
     def _take_wish(self) -> None:
-        with contextlib.suppress(OSError):
-            (self.folder.path / STOP).unlink()
+        self.folder.discard([STOP])
 
     def finished(self, after: Mapping[str, Image]) -> dict[str, tuple[Still, ...]]:
         """Films for the report, by view-NAME, texture-NAME and volume-NAME; their last frames are the results."""
@@ -164,10 +163,8 @@ class Previews:
         return passed
 
     def _forget(self, passed: Callable[[int], bool]) -> None:
-        for iteration, _, path in frames(self.folder.path):
-            if passed(iteration):
-                with contextlib.suppress(OSError):
-                    path.unlink()
+        found = frames(self.folder.path)
+        self.folder.discard(f"{FOLDER}/{path.name}" for iteration, _, path in found if passed(iteration))
 
     def _look(self, done: int) -> dict[str, bytes]:
         """Pictures of the views as they are now."""

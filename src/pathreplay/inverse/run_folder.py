@@ -8,6 +8,7 @@ import json
 import os
 import secrets
 import shutil
+import stat
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,9 +79,12 @@ class RunFolder:
                 shutil.rmtree(path, ignore_errors=True)
         _remove_empty(self.made_for_it)
 
-    def require_in_place(self, lost: str) -> None:
-        """Raise PathreplayError if the folder is no longer where it was; ``lost`` names what was not saved."""
-        if _identity(self.path) != self.identity:
+    def require_in_place(self, lost: str, held: int | None = None) -> None:
+        """Raise PathreplayError if the folder is no longer where it was; ``lost`` names what was not saved.
+
+        Or if one that is ``held`` is not this.
+        """
+        if _identity(self.path if held is None else held) != self.identity:
             raise PathreplayError(
                 f"Run folder {self.name} was removed or renamed during the run, which ends here: {lost} lost; if it "
                 "was renamed, go on with: pathreplay optimize --resume NEW_NAME, else start the job again"
@@ -99,19 +103,21 @@ class RunFolder:
         """
         parts: list[str] = []
         made: list[str] = []
-        self.require_in_place("what was not yet written is")
+        lost = "what was not yet written is"
         with _held(self.path) as held:
+            self.require_in_place(lost, held)
+            # By the folder itself: another one, or a link, may get its name meanwhile.
+            base = self.path if held is None else Path()
             try:
                 for name, content in files.items():
-                    self._make_parent(name, made)
+                    self._make_parent(name, made, held)
                     parts.append(name)
-                    _write_through(self.path / f"{name}{PART}", content)
+                    _write_through(base / f"{name}{PART}", content, held)
+                self.require_in_place(lost)
                 with undisturbed():  # all or none: a second Ctrl-C waits
                     for name in parts:
-                        os.replace(self.path / f"{name}{PART}", self.path / name)
+                        os.replace(base / f"{name}{PART}", base / name, src_dir_fd=held, dst_dir_fd=held)
             except BaseException as error:  # a second Ctrl-C, too
-                # By the folder itself: it may have been renamed meanwhile.
-                base = self.path if held is None else Path()
                 for remove, name in (*((os.unlink, f"{name}{PART}") for name in parts), *((os.rmdir, n) for n in made)):
                     with contextlib.suppress(OSError):
                         remove(base / name, dir_fd=held)
@@ -119,17 +125,33 @@ class RunFolder:
                     raise PathreplayError(self._failure(error)) from error
                 raise
 
-    def _make_parent(self, name: str, made: list[str]) -> None:
-        folder = (self.path / name).parent
-        if folder == self.path:
+    def discard(self, names: Iterable[str]) -> None:
+        """Remove files of it, where it still is the folder that was made. Links to folders are not followed.
+
+        Raises nothing.
+        """
+        with _held(self.path) as held:
+            if _identity(self.path if held is None else held) != self.identity:
+                return
+            base = self.path if held is None else Path()
+            for name in names:
+                parent = os.path.dirname(name)
+                with contextlib.suppress(OSError):
+                    if not (parent and _is_link(base / parent, held)):
+                        os.unlink(base / name, dir_fd=held)
+
+    def _make_parent(self, name: str, made: list[str], held: int | None) -> None:
+        parent = os.path.dirname(name)
+        if not parent:
             return
-        if folder.is_symlink():
-            raise PathreplayError(
-                f"{folder} is a link that may lead out of the run folder; replace it by the folder that it leads to"
-            )
-        if not folder.exists():
-            folder.mkdir()
-            made.append(os.path.relpath(folder, self.path))
+        folder = self.path / parent if held is None else Path(parent)
+        try:
+            if _is_link(folder, held):
+                what = f"{self.path / parent} is a link that may lead out of the run folder"
+                raise PathreplayError(f"{what}; replace it by the folder that it leads to")
+        except FileNotFoundError:
+            os.mkdir(folder, dir_fd=held)
+            made.append(parent)
 
     def _failure(self, error: OSError) -> str:
         if (self.path / CHECKPOINT).exists():
@@ -323,8 +345,8 @@ def _held(folder: Path) -> Iterator[int | None]:
         yield held
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
-    """What tells a folder from another one of the same name; None if there is none."""
+def _identity(path: Path | int) -> tuple[int, int] | None:
+    """What tells a folder, by its path or open, from another one of the same name; None if there is none."""
     try:
         about = os.stat(path)
     except OSError:
@@ -332,11 +354,17 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return about.st_dev, about.st_ino
 
 
-def _write_through(path: Path, content: Content) -> None:
+def _is_link(path: Path, held: int | None) -> bool:
+    """Raises OSError if there is nothing of that name."""
+    return stat.S_ISLNK(os.stat(path, dir_fd=held, follow_symlinks=False).st_mode)
+
+
+def _write_through(path: Path, content: Content, held: int | None) -> None:
+    """Write a file and wait until it is on the disk; the path is one in a folder that is ``held``, if there is one."""
     # What a killed run has left is removed, and a link by that name is not followed.
     with contextlib.suppress(FileNotFoundError):
-        path.unlink()
-    with open(path, "xb") as file:
+        os.unlink(path, dir_fd=held)
+    with open(path, "xb", opener=lambda name, flags: os.open(name, flags, 0o666, dir_fd=held)) as file:
         for chunk in chunks(content):
             file.write(chunk)
             del chunk

@@ -14,6 +14,7 @@ from typing import BinaryIO
 
 from pathreplay import memory
 from pathreplay.errors import PathreplayError
+from pathreplay.scenes.tga_files import is_tga, require_sound_tga, tga_size
 
 MOST_PIXELS = 2**27
 """Of a picture that is brought to another size."""
@@ -105,7 +106,10 @@ def size_of_picture(path: Path) -> tuple[int, int] | None:
 
 
 def require_readable_picture(path: Path, pixels: int = MOST_PIXELS) -> None:
-    """Raise PathreplayError where a picture has none, or more than so many ``pixels``, or does not fit the memory."""
+    """Raise PathreplayError where a picture has none, or more than so many ``pixels``, or does not fit the memory.
+
+    And where it is a TGA that Mitsuba would unpack beyond its last pixel.
+    """
     size = size_of_picture(path)
     if size is None:
         return  # who reads it says what is wrong
@@ -115,6 +119,7 @@ def require_readable_picture(path: Path, pixels: int = MOST_PIXELS) -> None:
     if prod(size) > pixels:
         raise PathreplayError(f"{what}, and images of up to {pixels} pixels are read; scale it down")
     memory.require(prod(size) * _A_PIXEL, f"{what}, and", "scale it down")
+    require_sound_tga(path)
 
 
 def _size(file: BinaryIO, data: bytes, path: Path) -> tuple[int, int] | None:
@@ -138,8 +143,8 @@ def _size(file: BinaryIO, data: bytes, path: Path) -> tuple[int, int] | None:
     if data[:2] == b"#?":
         radiance = radiance_head(data)
         return radiance.counts if radiance.axes == "XY" else radiance.counts[::-1]
-    if path.suffix.lower() == ".tga":
-        return struct.unpack_from("<HH", data, 12)
+    if path.suffix.lower() == ".tga" or is_tga(file):
+        return tga_size(data)
     return None
 
 
