@@ -16,6 +16,7 @@ pictures. Paths only tell L: nothing of them is differentiated, and no edge has 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import drjit as dr
@@ -36,6 +37,8 @@ GROUP = 5
 """Paths with the same random numbers: to the right and to the left, above and below, and one for the divergence."""
 CAMERA, THINGS = 2, 4
 """Samples of the pass for which there is one group, where a camera moves and where only what it sees does."""
+BLUR = 3
+"""Pixels to each side, over which what is wanted of pixels counts as smooth."""
 NUMBERS = 1
 """Number of the set of random numbers; the interior uses 0."""
 
@@ -48,6 +51,7 @@ class Flowing:
     place: mi.Point2f  # in widths and heights of the film
     axis: mi.UInt32  # along which places of pairs count
     single: mi.Bool  # a path for the divergence
+    offset: mi.Float  # of pairs, from the middle of the pixel along their axis
     L: mi.Spectrum  # times its weight; what the velocity of places is multiplied with
     wavelengths: mi.Spectrum
     time: mi.Float
@@ -63,15 +67,22 @@ class FilmMotion:
 
     def forward(self, view: Pass, walk: Walk, learned: Guess | None) -> Found:
         """Tangent of the image: see `Term`."""
-        f = self._walked(view, walk)
+        places, f = FilmPlaces.of(view), self._walked(view, walk)
         with dr.resume_grad():
             (δ,) = tangents(self._moved(view, f))
-        return Found(FilmPlaces.of(view).image_of_pixels(f.pixel, f.L * δ, f.wavelengths))
+        pixels = places.pixels(f.pixel, f.L * δ, f.wavelengths)
+        apart = [(f.pixel, dr.select(f.single, 0, mi.Float(-1))), *self._sharers(view, f)]
+        pixels += blurred(sum(places.pixels(i, f.L * δ * share, f.wavelengths) for i, share in apart))
+        return Found(places.developed(pixels))
 
     def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
         """Back-propagate the adjoint of the image: see `Term`."""
         places, f = FilmPlaces.of(view), self._walked(view, walk)
-        W = places.importance_of_pixels(places.undeveloped(grad_in), f.pixel, f.wavelengths)
+        wanted = places.undeveloped(grad_in)
+        smooth = blurred(wanted)
+        W = places.importance_of_pixels(wanted, f.pixel, f.wavelengths)
+        apart = [(f.pixel, dr.select(f.single, 0, mi.Float(-1))), *self._sharers(view, f)]
+        W += sum(share * places.importance_of_pixels(smooth, i, f.wavelengths) for i, share in apart)
         δ = dr.sum(W * f.L)
         dr.eval(δ, f.place)  # every parameter of the camera sums over it apart, which would walk the paths as often
         with dr.resume_grad():
@@ -95,6 +106,27 @@ class FilmMotion:
                 moved += slope * place[axis]
         return moved
 
+    def _sharers(self, view: Pass, f: Flowing) -> list[tuple[mi.UInt32, mi.Float]]:
+        """Pixels along the axis of a pair that its places belong to as well, and how much of their weights it has.
+
+        As shares of that of its own: all pixels of a row draw places, with a density that is the sum of theirs.
+        """
+        width, height = view.size
+        slope = FilterSamples.of_slope(view.sensor.film())
+        first = mi.Int32(dr.ceil(f.offset - slope.radius))
+        own = mi.Int32(dr.select(f.axis == 0, f.pixel % width, f.pixel // width))
+        most = dr.select(f.axis == 0, mi.Int32(width), height)
+        found, total = [], mi.Float(0)
+        for k in range(math.ceil(2 * slope.radius)):
+            i = first + k
+            inside = ~f.single & (own + i >= 0) & (own + i < most)
+            mass = dr.select(inside, slope.mass(f.offset - mi.Float(i)), 0)
+            pixel = mi.Int32(f.pixel) + i * dr.select(f.axis == 0, mi.Int32(1), width)
+            found.append((mi.UInt32(dr.select(inside, pixel, f.pixel)), mass))
+            total += dr.abs(mass)
+        scale = dr.select(total > 0, slope.sign(f.offset) / total, 0)
+        return [(pixel, mass * scale) for pixel, mass in found]
+
     def _walked(self, view: Pass, walk: Walk) -> Flowing:
         """Walk the paths of a pass."""
         width, height = view.size
@@ -108,12 +140,13 @@ class FilmMotion:
         places, filter, slope = FilmPlaces.of(view), FilterSamples.of(film), FilterSamples.of_slope(film)
         middle = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + 0.5
         middle += mi.Point2f(mi.ScalarPoint2f(film.crop_offset()) - places.corner)
-        s, weight = mi.Point2f(0), mi.Float(1 / groups)
+        s, weight, offset = mi.Point2f(0), mi.Float(1 / groups), mi.Float(0)
         for k in range(2):
             low, high = filter.share(-middle[k]), filter.share(places.size[k] - middle[k])
             x, away = filter.draw(u[k], low, high), slope.draw(u[k], mi.Float(0.5), mi.Float(1))
             pairs = ~single & (axis == k)
             x = dr.select(pairs, dr.select(member % 2 == 0, away, -away), x)
+            offset = dr.select(pairs, x, offset)
             s[k] = dr.clip(middle[k] + x, 0, places.size[k])
             mass = dr.select(pairs, 0.5 * slope.total * slope.sign(x), filter.total * (high - low) * filter.sign(x))
             weight *= mass
@@ -124,4 +157,23 @@ class FilmMotion:
         ray, brought = dr.detach(sensor.sample_ray_differential(time, wavelength, place, aperture))
         L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, self.flow.moves_at(place)))
         L *= brought * weight
-        return Flowing(pixel, place, axis, single, L, ray.wavelengths, time, wavelength, aperture)
+        return Flowing(pixel, place, axis, single, offset, L, ray.wavelengths, time, wavelength, aperture)
+
+
+def blurred(pixels: mi.TensorXf) -> mi.TensorXf:
+    """The mean of pixels over squares around each, beyond the border of which there is zero: its own transpose."""
+    height, width, channels = pixels.shape
+    index = dr.arange(mi.UInt32, height * width * channels)
+    values = pixels.array
+    for at, stride, most in (
+        (index // channels % width, channels, width),
+        (index // (channels * width), channels * width, height),
+    ):
+        total = mi.Float(0)
+        for k in range(-BLUR, BLUR + 1):
+            there = mi.Int32(at) + k
+            inside = (there >= 0) & (there < most)
+            total += dr.gather(mi.Float, values, mi.UInt32(mi.Int32(index) + k * stride), inside)
+        values = total / (2 * BLUR + 1)
+        dr.eval(values)
+    return mi.TensorXf(values, pixels.shape)

@@ -76,6 +76,10 @@ class FilterSamples:
         begin = dr.select(i > 0, dr.gather(mi.Float, self.until, i - 1, i > 0), 0)
         return begin, dr.gather(mi.Float, self.until, i)
 
+    def mass(self, x: mi.Float) -> mi.Float:
+        """The integral of the function over the step that a distance is in; beyond the filter, zero."""
+        return dr.select(dr.abs(x) <= self.radius, dr.gather(mi.Float, self.masses, self._place(x)[1]), 0)
+
     def sign(self, x: mi.Float) -> mi.Float:
         """The sign of the function at a distance."""
         return dr.sign(dr.gather(mi.Float, self.masses, self._place(x)[1]))

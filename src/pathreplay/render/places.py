@@ -54,7 +54,7 @@ class FilmPlaces:
         with dr.resume_grad():
             pixels = mi.TensorXf(self._block().tensor())
             dr.enable_grad(pixels)
-            image = self._developed(pixels)
+            image = self.developed(pixels)
             dr.set_grad(image, grad_in)
             dr.enqueue(dr.ADMode.Backward, image)
             dr.traverse(dr.ADMode.Backward)
@@ -71,18 +71,14 @@ class FilmPlaces:
     def image(self, s: mi.Point2f, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
         """The image that radiances make which arrive at places, each for a pixel's area of film."""
         inside = dr.all((s >= 0) & (s < self.size))
-        return self._developed(self._put(s, dr.select(inside, L, 0), wavelengths))
+        return self.developed(self._put(s, dr.select(inside, L, 0), wavelengths))
 
     def importance_of_pixels(self, wanted: mi.TensorXf, pixel: mi.UInt32, wavelengths: mi.Spectrum) -> mi.Spectrum:
         """g_j / ∫ h_j of pixels by their number (row by row), what is wanted of radiance in them: see `importance`."""
-        return _adjoint(lambda L: self._pixels(pixel, L, wavelengths), dr.width(pixel), wanted)
+        return _adjoint(lambda L: self.pixels(pixel, L, wavelengths), dr.width(pixel), wanted)
 
-    def image_of_pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
-        """The image of which each pixel, by its number, has the sum of its radiances, divided by ∫ h_j."""
-        return self._developed(self._pixels(pixel, L, wavelengths))
-
-    def _pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
-        """The pixels of a block without a filter: each is the sum of the radiances that are given for it."""
+    def pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
+        """The pixels of a block without a filter: each is the sum of the radiances that are given for its number."""
         film, like = self.view.sensor.film(), self._block()
         offset, size = mi.ScalarPoint2i(film.crop_offset()), mi.ScalarVector2u(film.crop_size())
         block = mi.ImageBlock(size, offset, like.channel_count())
@@ -101,8 +97,8 @@ class FilmPlaces:
         _splat(block, self.view.sensor.film(), self.corner + s, L, wavelengths)
         return block.tensor()
 
-    def _developed(self, pixels: mi.TensorXf) -> mi.TensorXf:
-        """The image of a block without weights: those of its pixels are ∫ h_j."""
+    def developed(self, pixels: mi.TensorXf) -> mi.TensorXf:
+        """The image of a block without weights: each pixel is divided by ∫ h_j."""
         film, block = self.view.sensor.film(), self._block()
         height, width, channels = pixels.shape
         index = dr.arange(mi.UInt32, height * width * channels)
