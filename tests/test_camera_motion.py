@@ -15,8 +15,8 @@ from edge_ordinary import LENS, UPRIGHT, WINDOW, Moving, T, film, loaded, measur
 from edge_truth import hold_agreement
 from pathreplay.check.stencil import CENTRAL
 from pathreplay.render import film_flow
-from pathreplay.render.film_motion import FilmMotion
 from pathreplay.render.camera_pass import Pass
+from pathreplay.render.film_motion import FilmMotion
 from pathreplay.render.term import Found
 from pathreplay.transport.meet import meet
 from truth import add, rotate

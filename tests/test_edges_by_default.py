@@ -13,8 +13,8 @@ import pytest
 
 from pathreplay.check import check_gradient
 from pathreplay.render.boundary import Boundary
-from pathreplay.render.film_motion import FilmMotion
 from pathreplay.render.camera_pass import Pass
+from pathreplay.render.film_motion import FilmMotion
 from pathreplay.render.integrator import EDGES
 from pathreplay.threads import one_thread
 

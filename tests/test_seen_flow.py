@@ -68,7 +68,11 @@ CELLS: dict[str, Write] = {
         "ball.to_world", translate(1, 0.3, 0), ball=lambda: ball(painted(texture())), sky=SKY
     ),
     "box before a painted floor": moving(
-        "box.vertex_positions", turn_vertices(0.3, 1, 0), box=box(PAINT), floor=lambda: floor(painted(texture())), lamp=panel()
+        "box.vertex_positions",
+        turn_vertices(0.3, 1, 0),
+        box=box(PAINT),
+        floor=lambda: floor(painted(texture())),
+        lamp=panel(),
     ),
     "ball before a shadow": moving(
         "ball.to_world",

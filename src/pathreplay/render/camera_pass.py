@@ -13,7 +13,7 @@ from ..gradient.pixel_numbers import Alone, EvenSets, PixelNumbers
 from ..plugins import mitsuba_integrator
 from ..transport.even import Even, in_order, key_of
 from ..transport.start import CameraStart
-from .film_flow import FilmFlow
+from .film_flow import FilmFlow, Sample
 from .lifetimes import is_recording
 
 Seed: TypeAlias = "int | mi.UInt32"
@@ -84,7 +84,7 @@ class Pass:
     spp: int = 0
     share: float = 1.0  # of a larger pass, whose part this is: see `parts`
     even: bool = False
-    flow: FilmFlow | None = None  # of a camera whose rays move by the rest only
+    flow: FilmFlow | None = None  # of the film, if rays move by the rest only
 
     @staticmethod
     def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int, even: bool = False) -> Pass:
@@ -118,7 +118,7 @@ class Pass:
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         """The sensor's ray and its weight (see Mitsuba's Sensor), attached to the camera as the pass has it."""
         if self.flow is not None:
-            return self.flow.ray(time, wavelength, place, aperture)
+            return self.flow.ray(Sample(time, wavelength, place, aperture))
         # Not `sample_ray`, which irradiance meters do not have.
         return self.sensor.sample_ray_differential(time, wavelength, place, aperture)
 

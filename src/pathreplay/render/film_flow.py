@@ -6,27 +6,25 @@ with weights W does not depend on how places are parametrised:
 
     ∫ W(s) L(c(s, π)) ds = ∫ W(T) L(c(T, π)) |∂T/∂s| ds,
 
-and so its derivative has two parts. One belongs to the weights, with n normal to the border of D (see `FilmMotion`):
+and so its derivative has two parts. One belongs to the weights, with n normal to the border of D (see `CameraMotion`):
 
     ∫_D div(W v) L ds - ∮_∂D W L v·n dl
 
 The other is that of L along the ray c(T, π), which moves by ∂c/∂π + ∂c/∂s v, the *rest* of the motion. Any smooth v
-will do. This one keeps points at a distance r where they are: with p = o + r d on the ray, v = -(∂p/∂s)⁺ ∂p/∂π. A
-camera that turns, or widens its view, leaves no rest; one that is carried along leaves parallax.
+will do. `CameraFlow` keeps points at a distance r where they are: with p = o + r d on the ray, v = -(∂p/∂s)⁺ ∂p/∂π. A
+camera that turns, or widens its view, leaves no rest; one that is carried along leaves parallax. Where the camera
+stands still, `SeenFlow` follows what it sees.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Protocol, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 
-from ..gradient.adjoint import tangents
-from ..transport.motion import moving_shapes
 from ..transport.nodes import with_gradients
-from ..transport.vertex import Walk
-from .seen_flow import SeenFlow, Slopes, followed
 
 PINHOLE = "PerspectiveCamera"
 CAMERAS = frozenset({PINHOLE, "ThinLensCamera", "OrthographicCamera"})
@@ -40,109 +38,140 @@ GLANCES = 16
 """Rays in a row, and in a column, that tell how far away things are."""
 
 
+Slopes: TypeAlias = "tuple[list[mi.Vector3f], list[mi.Vector3f]]"
+"""∂o/∂s and ∂d/∂s of a ray, along both axes."""
+
+
 @dataclass(frozen=True)
-class FilmFlow:
-    """The flow of a sensor's film, whose places are in widths and heights of it."""
+class Sample:
+    """What decides on a camera ray: see Mitsuba's Sensor. Places are in widths and heights of the film."""
+
+    time: mi.Float
+    wavelength: mi.Float
+    place: mi.Point2f
+    aperture: mi.Point2f
+
+    def ray(self, sensor: mi.Sensor) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+        """Of a sensor: the ray, attached to it and to the place, and its weight."""
+        return sensor.sample_ray_differential(self.time, self.wavelength, self.place, self.aperture)
+
+    def at(self, place: mi.Point2f) -> Sample:
+        """The same at another place."""
+        return Sample(self.time, self.wavelength, place, self.aperture)
+
+
+class FilmFlow(Protocol):
+    """A flow of the places of a film."""
+
+    @property
+    def is_all(self) -> bool:
+        """Whether nothing but the places of the film depends on parameters with gradients."""
+
+    @property
+    def samples(self) -> int:
+        """Samples of a pass for which there is one group of paths that tell what the flow does."""
+
+    def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+        """The sensor's ray and its weight.
+
+        If the place has gradients, the ray depends on it; otherwise it carries the rest of the motion.
+        """
+
+    def velocity(self, sample: Sample) -> mi.Vector2f:
+        """v: a vector of zeros, attached to the parameters."""
+
+    def divergence(self, sample: Sample) -> mi.Float:
+        """∂v_x/∂x + ∂v_y/∂y: zero, attached to the parameters."""
+
+    def moves_at(self, place: mi.Point2f) -> mi.Bool:
+        """Whether there may be a velocity at a place."""
+
+    def leaves_rest_at(self, place: mi.Point2f) -> mi.Bool:
+        """Whether the ray through a place may move beyond the flow."""
+
+    def carry_tangents(self) -> None:
+        """Carry tangents of the parameters as far as terms share what the flow knows, once for all of them."""
+
+
+@dataclass(frozen=True)
+class CameraFlow:
+    """The flow of a sensor that moves: see `FilmFlow`."""
 
     sensor: mi.Sensor
     r: mi.Float  # at this distance nothing moves over the film
-    camera_moves: bool  # whether the camera has gradients
-    leaves_rest: bool  # whether its rays move with parameters beyond its flow
-    is_all: bool  # whether nothing but the places of the film depends on parameters with gradients
-    seen: SeenFlow | None = None  # of the motion that the rest of the flow does not follow
+    leaves_rest: bool  # whether rays move with parameters beyond the flow
+    is_all: bool
+    samples: int = 2
 
     @staticmethod
-    def following(scene: mi.Scene, sensor: mi.Sensor, walk: Walk, camera: FilmFlow | None) -> FilmFlow:
-        """The flow of a sensor that follows all that it sees move, with that of the ``camera`` as a part of it."""
-        walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(scene, scene.sensors())))
-        flow = camera or FilmFlow(sensor, mi.Float(1), False, False, False)
-
-        def glance(place: mi.Point2f) -> tuple[mi.Ray3f, Slopes]:
-            of_ray = sensor.shutter_open(), mi.Float(0.5), place, mi.Point2f(0.5)
-            return mi.Ray3f(flow.ray(*of_ray)[0]), flow._slopes(*of_ray)
-
-        return replace(flow, seen=SeenFlow.of(walk, glance, flow.leaves_rest))
-
-    @staticmethod
-    def of(scene: mi.Scene, sensor: mi.Sensor) -> FilmFlow | None:
+    def of(scene: mi.Scene, sensor: mi.Sensor) -> CameraFlow | None:
         """The flow of a sensor; None if it has no gradients, or its class is not one of `CAMERAS`."""
         if sensor.class_name() not in CAMERAS or not with_gradients(sensor, *ONLY_PLACES, *OTHERS):
             return None
         rest = _is_carried(sensor) or bool(with_gradients(sensor, *OTHERS[1:]))
         others = any(with_gradients(thing) for thing in (*scene.shapes(), *scene.emitters()))
         alone = not (rest or others or with_gradients(sensor, "medium"))
-        return FilmFlow(sensor, _distance(scene, sensor), True, rest, alone)
+        return CameraFlow(sensor, _distance(scene, sensor), rest, alone)
 
-    def ray(
-        self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f
-    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """The sensor's ray through a place and its weight: see Mitsuba's Sensor.
-
-        If the place has gradients, the ray depends on it; otherwise it carries the rest of the camera's motion.
-        """
-        ray, weight = self.sensor.sample_ray_differential(time, wavelength, place, aperture)
-        if dr.grad_enabled(place):
+    def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+        """See `FilmFlow`."""
+        ray, weight = sample.ray(self.sensor)
+        if dr.grad_enabled(sample.place) or not dr.grad_enabled(ray.o, ray.d):
             return ray, weight
-        carried = self.leaves_rest and dr.grad_enabled(ray.o, ray.d)
-        if not carried:
-            ray.o, ray.d = dr.detach(ray.o), dr.detach(ray.d)
-        if carried or self._sees_motion():
-            o, d = slopes = self._slopes(time, wavelength, place, aperture)
-            v = self._velocity(ray, slopes, place)
-            ray.o += o[0] * v.x + o[1] * v.y
-            ray.d += d[0] * v.x + d[1] * v.y
+        if not self.leaves_rest:
+            return dr.detach(ray), weight
+        o, d = slopes = slopes_of(self.sensor, sample)
+        v = self._followed(ray, slopes)
+        ray.o += o[0] * v.x + o[1] * v.y
+        ray.d += d[0] * v.x + d[1] * v.y
         return ray, weight
 
-    def place(self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f) -> mi.Point2f:
-        """T: the place, attached to the parameters."""
-        ray, _ = self.sensor.sample_ray_differential(time, wavelength, place, aperture)
-        return place + self._velocity(ray, self._slopes(time, wavelength, place, aperture), place)
+    def velocity(self, sample: Sample) -> mi.Vector2f:
+        """See `FilmFlow`."""
+        return self._followed(sample.ray(self.sensor)[0], slopes_of(self.sensor, sample))
+
+    def divergence(self, sample: Sample) -> mi.Float:
+        """See `FilmFlow`."""
+        found = mi.Float(0)
+        for axis, step in enumerate((mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP))):
+            before, after = (self.velocity(sample.at(sample.place + side * step))[axis] for side in (-1, 1))
+            found += (after - before) / (2 * STEP)
+        return found
 
     def moves_at(self, place: mi.Point2f) -> mi.Bool:
-        """Whether a place may move over the film."""
-        return mi.Bool(True) if self.seen is None or self.camera_moves else self.seen.is_at(place)
+        """Everywhere."""
+        return mi.Bool(True)
 
     def leaves_rest_at(self, place: mi.Point2f) -> mi.Bool:
-        """Whether the ray through a place may move beyond the flow."""
-        return mi.Bool(self.leaves_rest) if self.seen is None or self.leaves_rest else self.seen.is_at(place)
+        """Everywhere or nowhere."""
+        return mi.Bool(self.leaves_rest)
 
     def carry_tangents(self) -> None:
-        """Carry tangents from the parameters to what terms ask for, once for all of them."""
-        if self.seen is not None:
-            with dr.resume_grad():
-                tangents(self.seen.nodes)
+        """Nothing: terms ask the sensor."""
 
-    def _sees_motion(self) -> bool:
-        return self.seen is not None and dr.grad_enabled(self.seen.nodes)
-
-    def _velocity(self, ray: mi.Ray3f, slopes: Slopes, place: mi.Point2f) -> mi.Vector2f:
-        """T - s, of which the value is zero."""
-        v = mi.Vector2f(0)
-        if dr.grad_enabled(ray.o, ray.d):
-            v -= followed((ray.o - dr.detach(ray.o)) + self.r * (ray.d - dr.detach(ray.d)), *slopes, self.r)
-        return v + self.seen.velocity(place) if self._sees_motion() else v
-
-    def _slopes(self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f) -> Slopes:
-        o, d = [], []
-        with dr.suspend_grad():
-            for step in (mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP)):
-                a, b = (
-                    self.sensor.sample_ray_differential(time, wavelength, place + side * step, aperture)[0]
-                    for side in (-1, 1)
-                )
-                o.append((b.o - a.o) / (2 * STEP))
-                d.append((b.d - a.d) / (2 * STEP))
-        return o, d
+    def _followed(self, ray: mi.Ray3f, slopes: Slopes) -> mi.Vector2f:
+        """The velocity, of which the value is zero, from a ray and its slopes."""
+        δp = (ray.o - dr.detach(ray.o)) + self.r * (ray.d - dr.detach(ray.d))
+        return -followed(δp, slopes, self.r)
 
 
-def can_follow(walk: Walk, sensor: mi.Sensor) -> bool:
-    """Whether places may follow what is seen: then all else slides under them, and all of its edges have to be found.
+def followed(δp: mi.Vector3f, slopes: Slopes, t: mi.Float) -> mi.Vector2f:
+    """How places move if points at a distance t on their rays move by δp: by least squares, from the rays' slopes."""
+    x, y = (o_k + t * d_k for o_k, d_k in zip(*slopes, strict=True))
+    xx, xy, yy = dr.dot(x, x), dr.dot(x, y), dr.dot(y, y)
+    a, b = dr.dot(x, δp), dr.dot(y, δp)
+    return mi.Vector2f(yy * a - xy * b, xx * b - xy * a) / (xx * yy - xy * xy)
 
-    Those in textures, behind mirrors, glass and sheets, and on bent curves are not, and media are not asked.
-    """
-    traits = walk.traits
-    hidden = traits.seams or traits.mirrors or traits.veils or traits.splines
-    return walk.media is None and not hidden and sensor.class_name() in CAMERAS
+
+def slopes_of(sensor: mi.Sensor, sample: Sample) -> Slopes:
+    """How a ray changes with its place. Detached."""
+    o, d = [], []
+    with dr.suspend_grad():
+        for step in (mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP)):
+            a, b = (sample.at(sample.place + side * step).ray(sensor)[0] for side in (-1, 1))
+            o.append((b.o - a.o) / (2 * STEP))
+            d.append((b.d - a.d) / (2 * STEP))
+    return o, d
 
 
 def _is_carried(sensor: mi.Sensor) -> bool:

@@ -28,15 +28,13 @@ from ..gradient.primal import primal
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 from .camera_pass import Pass
-from .film_flow import STEP, FilmFlow
+from .film_flow import FilmFlow, Sample
 from .filter_samples import FilterSamples
 from .places import FilmPlaces
 from .term import Found
 
 GROUP = 5
 """Paths with the same random numbers: to the right and to the left, above and below, and one for the divergence."""
-CAMERA, THINGS = 2, 4
-"""Samples of the pass for which there is one group, where a camera moves and where only what it sees does."""
 BLUR = 3
 """Pixels to each side, over which what is wanted of pixels counts as smooth."""
 NUMBERS = 1
@@ -96,15 +94,9 @@ class FilmMotion:
 
     def _moved(self, view: Pass, f: Flowing) -> mi.Float:
         """Of pairs the velocity of their place along their axis, in pixels; of single paths its divergence."""
-        moved = mi.Float(0)
-        for axis, pixels in enumerate(view.size):
-            step = mi.Vector2f(*(STEP if k == axis else 0.0 for k in range(2)))
-            for side in (-1, 1):
-                place = dr.select(f.single, f.place + side * step, f.place)
-                place = self.flow.place(f.time, f.wavelength, place, f.aperture)
-                slope = dr.select(f.single, side / (2 * STEP), dr.select(f.axis == axis, 0.5 * pixels, 0))
-                moved += slope * place[axis]
-        return moved
+        sample = Sample(f.time, f.wavelength, f.place, f.aperture)
+        v = self.flow.velocity(sample) * mi.Vector2f(*view.size)
+        return dr.select(f.single, self.flow.divergence(sample), dr.select(f.axis == 0, v.x, v.y))
 
     def _sharers(self, view: Pass, f: Flowing) -> list[tuple[mi.UInt32, mi.Float]]:
         """Pixels along the axis of a pair that its places belong to as well, and how much of their weights it has.
@@ -130,7 +122,7 @@ class FilmMotion:
     def _walked(self, view: Pass, walk: Walk) -> Flowing:
         """Walk the paths of a pass."""
         width, height = view.size
-        groups = -(-view.spp // (CAMERA if self.flow.camera_moves else THINGS))
+        groups = -(-view.spp // self.flow.samples)
         i = dr.arange(mi.UInt32, width * height * groups * GROUP)
         member, group = i % GROUP, i // GROUP
         pixel, single, axis = group // groups, member == GROUP - 1, member // 2
@@ -154,7 +146,7 @@ class FilmMotion:
 
         time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
         wavelength, aperture = numbers.next_1d(), numbers.next_2d()
-        ray, brought = dr.detach(sensor.sample_ray_differential(time, wavelength, place, aperture))
+        ray, brought = dr.detach(Sample(time, wavelength, place, aperture).ray(sensor))
         L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, self.flow.moves_at(place)))
         L *= brought * weight
         return Flowing(pixel, place, axis, single, offset, L, ray.wavelengths, time, wavelength, aperture)

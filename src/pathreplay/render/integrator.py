@@ -22,13 +22,14 @@ from .boundary import Boundary
 from .camera_pass import Pass, Seed, Which
 from .diagnostics import COST_OF_EDGES, doubts, lost_note, missing_edges, used_before_note
 from .facts import SceneFacts, facts_of
-from .film_flow import FilmFlow, can_follow
+from .film_flow import CameraFlow
 from .film_motion import FilmMotion
 from .interior import PathReplay
 from .lifetimes import is_recording
 from .path_integrator import UNBOUNDED, Handed, PathIntegrator, reached
 from .pixels import among, obstacle, pixel_loss
 from .properties import choice, deviation, whole_number
+from .seen_flow import SeenFlow, can_follow
 from .term import Found, Term
 
 DRIVERS = ("auto", "sweep", "replay")
@@ -137,10 +138,10 @@ class PathReplayIntegrator(PathIntegrator):
         view, walk, terms = PathIntegrator._planned(self, view)
         if self.edges == "none":
             return view, walk, terms
-        view = replace(view, flow=FilmFlow.of(view.scene, view.sensor))
+        view = replace(view, flow=CameraFlow.of(view.scene, view.sensor))
         needs_edges = self._needs_edges(view, walk)
         if needs_edges and follow and self._may_follow(view, walk):
-            view = replace(view, flow=FilmFlow.following(view.scene, view.sensor, walk, view.flow))
+            view = replace(view, flow=SeenFlow.of(view.scene, view.sensor, walk))
         motion: tuple[Term, ...] = () if view.flow is None else (FilmMotion(view.flow),)
         if not needs_edges:
             terms = tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))

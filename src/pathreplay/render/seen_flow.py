@@ -1,122 +1,158 @@
-"""Seen flow: a velocity of places on the film that follows what is seen there, so that little slides under a pixel.
+"""Seen flow: places of the film follow what is seen there, so that little slides under a pixel.
 
-A few rays glance at the scene. A point p that one of them hits at a distance t, glued to its surface, moves over the
-film by
+A few rays glance at the scene. A point p that one of them hits, glued to its surface, moves over the film by
 
-    u = (∂(o + t d)/∂s)⁺ ∂(p - (o + t d))/∂π,
+    u = (∂(o + t d)/∂s)⁺ ∂p/∂π,
 
-where o + t d is the point at the distance t on the ray through the place s. Where places stand still and surfaces do
-not, what is seen there slides over its surface by u / cos, with the angle between normal and ray, which has no bounds
-at an outline; so points that are seen aslant count most. The velocity at a node of a grid is the mean of those around it,
+where o + t d is the point at its distance t on the ray through the place s. If places stand still, surfaces slide
+under them by u / cos, with the angle between normal and ray, which has no bounds at an outline. So points that are seen
+aslant count most: the velocity at a node of a grid is the mean of those around it,
 
-    v = Σ K W u / (K_0 + Σ K W),        W = 1 / (cos² + GRAZING²),        K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²,
+    v = Σ K W u / (K_0 + Σ K W),       W = 1 / (cos² + GRAZING²),       K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²,
 
-with r their distance on the film. Between nodes it is interpolated. Points that stand still have u = 0, and count as
-much. Any v will do (see `FilmFlow`): this one leaves little to the interior and to edges.
+with r their distance on the film; between nodes it is interpolated. Points that stand still have u = 0 and count, too.
+Any v gives the same derivative (see `FilmFlow`). This one leaves little to the interior and to edges.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TypeAlias
+from dataclasses import dataclass, replace
+from itertools import product
 
 import drjit as dr
 import mitsuba as mi
 
+from ..gradient.adjoint import tangents
 from ..transport.meet import meet
-from ..transport.motion import may_move
+from ..transport.motion import may_move, moving_shapes
+from ..transport.nodes import with_gradients
 from ..transport.vertex import Walk
+from .film_flow import CAMERAS, Sample, followed, slopes_of
 
 GLANCES, CELLS = 32, 16
 """Rays in a row and a column, and cells of the grid."""
 MARGIN = 2
 """Nodes beyond the border of the film: filters reach there."""
+NODES = CELLS + 1 + 2 * MARGIN
 REACH, NEAR, K_0 = 0.25, 0.03, 1e3
-"""In widths of the film; and the weight of standing still, of which a point counts half as much at a tenth of a width."""
+"""In widths of the film; and how much it counts that a place would rather stand still."""
 GRAZING = 0.1
-
-Slopes: TypeAlias = "tuple[list[mi.Vector3f], list[mi.Vector3f]]"
-"""∂o/∂s and ∂d/∂s, along both axes."""
 
 
 @dataclass(frozen=True)
 class SeenFlow:
-    """A velocity of places, by its nodes."""
+    """The flow of a sensor that stands still: see `FilmFlow`."""
 
-    nodes: mi.Vector2f  # attached to what moves; their values are zero
-    flows: mi.Bool  # whether anything that moves is seen around the corners of a node's cell, or of those beside it
+    sensor: mi.Sensor
+    nodes: mi.Vector2f  # velocities: zeros, attached to what moves
+    flows: mi.Bool  # by node: whether something that moves is seen around its cell, or one beside that
+    is_all: bool = False
+    samples: int = 4
 
     @staticmethod
-    def of(walk: Walk, glance: Callable[[mi.Point2f], tuple[mi.Ray3f, Slopes]], all_moves: bool) -> SeenFlow:
-        """By rays through places, attached as paths have them; ``all_moves``: beyond the shapes that `may_move`."""
-        side = CELLS + 1 + 2 * MARGIN
+    def of(scene: mi.Scene, sensor: mi.Sensor, walk: Walk) -> SeenFlow | None:
+        """The flow of a sensor; None where nothing that it might see moves."""
+        walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(scene, scene.sensors())))
         i = dr.arange(mi.UInt32, GLANCES * GLANCES)
+        sample = Sample(sensor.shutter_open(), mi.Float(0.5), _glanced_at(i), mi.Point2f(0.5))
+        ray = mi.Ray3f(sample.ray(sensor)[0])
+        hit = meet(walk, ray, mi.Bool(True), coherent=True)
+        seen, t = hit.is_valid(), dr.select(hit.is_valid(), hit.t, 1)
         with dr.resume_grad():
-            ray, (o, d) = glance(_glanced_at(i))
-            still = dr.detach(ray)
-            hit = meet(walk, still, mi.Bool(True), coherent=True)
-            seen = hit.is_valid()
-            p = hit.compute_surface_interaction(still, mi.RayFlags.Minimal | mi.RayFlags.FollowShape, seen)
-            t = dr.select(seen, hit.t, 1)
-            δ = p.p - (ray.o + t * ray.d)
-            u = followed(δ - dr.detach(δ), o, d, t)
-            u = dr.select(seen & dr.all(dr.isfinite(dr.detach(u))), u, 0)
-            cos = dr.dot(dr.detach(p.n), still.d)
+            flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
+            si = hit.compute_surface_interaction(ray, flags, seen)
+            if not dr.grad_enabled(si.p):
+                return None
+            u = followed(si.p - dr.detach(si.p), slopes_of(sensor, sample), t)
+            cos = dr.dot(dr.detach(si.n), ray.d)
             W = dr.select(seen, dr.rcp(cos * cos + GRAZING * GRAZING), 0)
-            moves = seen & (mi.Bool(all_moves) | may_move(walk, hit))
-            dr.eval(u, W, moves)
+            moves = seen & may_move(walk, hit)
+            dr.eval(u, W, moves)  # before all nodes read them
 
-            j = dr.arange(mi.UInt32, side * side * GLANCES * GLANCES)
-            node, i = j // (GLANCES * GLANCES), j % (GLANCES * GLANCES)
-            at = (mi.Point2f(node % side, node // side) - MARGIN) / CELLS
-            r2 = dr.squared_norm(at - _glanced_at(i))
+            pair = dr.arange(mi.UInt32, NODES * NODES * GLANCES * GLANCES)
+            node, i = pair // (GLANCES * GLANCES), pair % (GLANCES * GLANCES)
+            r2 = dr.squared_norm(mi.Point2f(_cell_of(node)) / CELLS - _glanced_at(i))
             K = dr.square(dr.maximum(1 - r2 / REACH**2, 0) / (r2 + NEAR**2)) * dr.gather(mi.Float, W, i)
-            total = K_0 + dr.block_sum(K, GLANCES * GLANCES)
-            v = [dr.block_sum(K * dr.gather(mi.Float, u[axis], i), GLANCES * GLANCES) / total for axis in range(2)]
-            nodes = mi.Vector2f(*v)
-        moved = dr.block_sum(dr.select(dr.gather(mi.Bool, moves, i), K, 0), GLANCES * GLANCES)
+            total = K_0 + _sums(K)
+            nodes = mi.Vector2f(*(_sums(dr.select(K > 0, K * dr.gather(mi.Float, u[k], i), 0)) / total for k in (0, 1)))
+        moved = _sums(dr.select(dr.gather(mi.Bool, moves, i), K, 0))
         dr.eval(nodes, moved)
-        n = dr.arange(mi.UInt32, side * side)
-        cell, flows = mi.Point2i(n % side, n // side) - MARGIN, mi.Bool(False)
-        for x in range(-1, 3):
-            for y in range(-1, 3):
-                flows |= dr.gather(mi.Float, moved, _node(cell, x, y)) > 0
+        cell, flows = _cell_of(dr.arange(mi.UInt32, NODES * NODES)), mi.Bool(False)
+        for x, y in product(range(-1, 3), repeat=2):
+            flows |= dr.gather(mi.Float, moved, _node(cell, x, y)) > 0
         dr.eval(flows)
-        return SeenFlow(nodes, flows)
+        return SeenFlow(sensor, nodes, flows)
 
-    def velocity(self, place: mi.Point2f) -> mi.Vector2f:
-        """At a place in widths and heights of the film; attached as the nodes are, its value is zero."""
-        at, f = _cell(place)
-        corners = [[dr.gather(mi.Vector2f, self.nodes, _node(at, x, y)) for x in range(2)] for y in range(2)]
-        below, above = (dr.lerp(left, right, f.x) for left, right in corners)
-        return dr.lerp(below, above, f.y)
+    def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+        """See `FilmFlow`."""
+        ray, weight = sample.ray(self.sensor)
+        if not dr.grad_enabled(sample.place) and dr.grad_enabled(self.nodes):
+            v, (o, d) = self.velocity(sample), slopes_of(self.sensor, sample)
+            ray.o += o[0] * v.x + o[1] * v.y
+            ray.d += d[0] * v.x + d[1] * v.y
+        return ray, weight
 
-    def is_at(self, place: mi.Point2f) -> mi.Bool:
-        """Whether there may be a velocity at a place, or within a cell of it."""
-        return dr.gather(mi.Bool, self.flows, _node(_cell(place)[0], 0, 0))
+    def velocity(self, sample: Sample) -> mi.Vector2f:
+        """See `FilmFlow`."""
+        (a, b, c, d), f = self._corners(sample.place)
+        return dr.lerp(dr.lerp(a, b, f.x), dr.lerp(c, d, f.x), f.y)
+
+    def divergence(self, sample: Sample) -> mi.Float:
+        """See `FilmFlow`."""
+        (a, b, c, d), f = self._corners(sample.place)
+        return CELLS * (dr.lerp(b.x - a.x, d.x - c.x, f.y) + dr.lerp(c.y - a.y, d.y - b.y, f.x))
+
+    def moves_at(self, place: mi.Point2f) -> mi.Bool:
+        """Where something that moves is seen not far away."""
+        return dr.gather(mi.Bool, self.flows, _node(_cell_at(place)[0], 0, 0))
+
+    def leaves_rest_at(self, place: mi.Point2f) -> mi.Bool:
+        """Where places move."""
+        return self.moves_at(place)
+
+    def carry_tangents(self) -> None:
+        """To the nodes."""
+        with dr.resume_grad():
+            tangents(self.nodes)
+
+    def _corners(self, place: mi.Point2f) -> tuple[list[mi.Vector2f], mi.Point2f]:
+        """The velocities at the corners of a place's cell, row by row, and where it is in there."""
+        cell, f = _cell_at(place)
+        return [dr.gather(mi.Vector2f, self.nodes, _node(cell, x, y)) for y in (0, 1) for x in (0, 1)], f
 
 
-def followed(δp: mi.Vector3f, o: list[mi.Vector3f], d: list[mi.Vector3f], t: mi.Float) -> mi.Vector2f:
-    """How places on the film move if points at a distance t on their rays move by δp, by least squares."""
-    x, y = (o_k + t * d_k for o_k, d_k in zip(o, d, strict=True))
-    xx, xy, yy = dr.dot(x, x), dr.dot(x, y), dr.dot(y, y)
-    a, b = dr.dot(x, δp), dr.dot(y, δp)
-    return mi.Vector2f(yy * a - xy * b, xx * b - xy * a) / (xx * yy - xy * xy)
+def can_follow(walk: Walk, sensor: mi.Sensor) -> bool:
+    """Whether places may follow what is seen: then all else slides under them, and all of its edges have to be found.
+
+    Those in textures, behind mirrors, glass and sheets, and on bent curves are not, and media are not asked.
+    """
+    traits = walk.traits
+    hidden = traits.seams or traits.mirrors or traits.veils or traits.splines
+    return walk.media is None and not hidden and sensor.class_name() in CAMERAS and not with_gradients(sensor)
 
 
 def _glanced_at(i: mi.UInt32) -> mi.Point2f:
     return (mi.Point2f(i % GLANCES, i // GLANCES) + 0.5) / GLANCES
 
 
-def _cell(place: mi.Point2f) -> tuple[mi.Point2i, mi.Point2f]:
-    """The cell of the grid that a place is in, and where it is in there; beyond the grid at its border."""
-    at = dr.clip(dr.detach(place) * CELLS, -MARGIN, CELLS + MARGIN - 1e-3)
-    cell = dr.floor(at)
-    return mi.Point2i(cell), mi.Point2f(at - cell)
+def _sums(values: mi.Float) -> mi.Float:
+    """Of each node, over all glances."""
+    return dr.block_sum(values, GLANCES * GLANCES)
+
+
+def _cell_at(place: mi.Point2f) -> tuple[mi.Point2i, mi.Point2f]:
+    """The cell that a place is in, and where in there; beyond the grid, at its border."""
+    at = dr.clip(dr.detach(place) * CELLS, -MARGIN, CELLS + MARGIN)
+    cell = dr.minimum(mi.Point2i(dr.floor(at)), CELLS + MARGIN - 1)
+    return cell, at - mi.Point2f(cell)
+
+
+def _cell_of(node: mi.UInt32) -> mi.Point2i:
+    """The cell that begins at a node."""
+    return mi.Point2i(node % NODES, node // NODES) - MARGIN
 
 
 def _node(cell: mi.Point2i, x: int, y: int) -> mi.UInt32:
-    side = CELLS + 1 + 2 * MARGIN
-    at = dr.clip(cell + mi.Point2i(x + MARGIN, y + MARGIN), 0, side - 1)
-    return mi.UInt32(at.x + at.y * side)
+    """The node so many columns and rows from that where a cell begins; beyond the grid, at its border."""
+    at = dr.clip(cell + mi.Point2i(x + MARGIN, y + MARGIN), 0, NODES - 1)
+    return mi.UInt32(at.x + at.y * NODES)
