@@ -98,6 +98,21 @@ class FilmMotion:
         v = self.flow.velocity(sample) * mi.Vector2f(*view.size)
         return dr.select(f.single, self.flow.divergence(sample), dr.select(f.axis == 0, v.x, v.y))
 
+    def _usual(self, view: Pass, walk: Walk) -> mi.Float:
+        """What is usually seen, as one number, by paths of its own: all radiance less that has the same derivative.
+
+        For no picture that is the same everywhere changes while its places move.
+        """
+        width, height = view.size
+        pixel = dr.arange(mi.UInt32, width * height)
+        numbers = view.numbers(pixel, width, mi.UInt32(0), 1, NUMBERS + 1)
+        place = (mi.Point2f(pixel % width, pixel // width) + numbers.next_2d()) / mi.Point2f(width, height)
+        sample = Sample(view.sensor.shutter_open(), numbers.next_1d(), place, numbers.next_2d())
+        ray, brought = dr.detach(sample.ray(view.sensor))
+        there = dr.full(mi.Bool, True, width * height) & self.flow.moves_at(place)
+        L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, there))
+        return dr.sum(dr.mean(L * brought)) / dr.maximum(mi.Float(dr.count(there)), 1)
+
     def _sharers(self, view: Pass, f: Flowing) -> list[tuple[mi.UInt32, mi.Float]]:
         """Pixels along the axis of a pair that its places belong to as well, and how much of their weights it has.
 
@@ -148,7 +163,7 @@ class FilmMotion:
         wavelength, aperture = numbers.next_1d(), numbers.next_2d()
         ray, brought = dr.detach(Sample(time, wavelength, place, aperture).ray(sensor))
         L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, self.flow.moves_at(place)))
-        L *= brought * weight
+        L = (L * brought - self._usual(view, walk)) * weight
         return Flowing(pixel, place, axis, single, offset, L, ray.wavelengths, time, wavelength, aperture)
 
 
