@@ -13,8 +13,11 @@ import pytest
 
 from edge_ordinary import LENS, UPRIGHT, WINDOW, Moving, T, film, loaded, measured, moved_camera, room, sensor
 from edge_truth import hold_agreement
+from pathreplay.check.objective import smooth_weights
+from pathreplay.check.statistics import gap
 from pathreplay.check.stencil import CENTRAL
-from pathreplay.render import film_flow
+from pathreplay.check.verdict import Z_LIMIT
+from pathreplay.render import film_flow, film_motion
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.film_motion import FilmMotion
 from pathreplay.render.term import Found
@@ -135,6 +138,20 @@ def test_noise_is_below_that_of_a_difference(name: str, tmp_path: Path) -> None:
     d = [objective.dot(objective.difference(plain, CENTRAL, moving.step, seed, 32)) for seed in range(PASSES)]
     objective.put(dr.opaque(mi.Float, 0))
     assert g.var() < np.var(d), (g.std(), np.std(d))
+
+
+def test_on_a_large_film_neighbours_cancel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pairs within pixels, which are all that is left where no weight is smooth, see little but noise."""
+    objective = loaded(of_camera(sensor(film=film(width=64, height=64)), "x_fov", WIDER)(tmp_path), tmp_path)
+    objective.weigh(smooth_weights((64, 64, 3), alpha=False))
+    ours, found = mi.load_dict({"type": "pathreplay", "max_depth": 2}), []
+    for pairs_only in (False, True):
+        if pairs_only:
+            monkeypatch.setattr(film_motion, "blurred", dr.zeros_like)
+        found.append(np.array([objective.backward(ours, seed, 2) for seed in range(PASSES)]))
+    objective.put(dr.opaque(mi.Float, 0))
+    assert abs(gap(*found).z) < Z_LIMIT
+    assert found[0].var() < 0.5 * found[1].var(), [g.std() for g in found]
 
 
 def test_in_fog_only_the_field_of_view_has_a_gradient(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The term of a camera that moves: what the flow of its film does to the weights of what is seen.
+"""The term of a film whose places move: what their flow does to the weights of what is seen.
 
 With the filter h_j of pixel j, of which only the part on the film D counts, and the velocity v of the film's places
 
@@ -12,6 +12,14 @@ parts with ∂f/∂x are one integral over a measure, df(x), in which the mass b
 df is odd: places x away from the middle of a pixel, to its right and to its left, count against each other. Their
 paths have the same random numbers, so that what they have in common cancels, as it does in a difference of two
 pictures. Paths only tell L: nothing of them is differentiated, and no edge has to be found.
+
+On a film of many pixels the two places are close to each other, and most that is left is noise. So the adjoint W_j of
+pixels is taken apart. Its mean over some pixels around, W̄_j, is smooth, and with it neighbours cancel better than pairs
+do: a path at x counts for all pixels of its row at once,
+
+    (W_j - W̄_j) sgn df(x - x_j) + Σ_i W̄_i df(x - x_i) / Σ_i |df(x - x_i)|,
+
+where the sum in the denominator is the density of all places of the row. Forward mode is the transpose.
 """
 
 from __future__ import annotations
@@ -59,7 +67,7 @@ class Flowing:
 
 @dataclass(frozen=True)
 class FilmMotion:
-    """A term: all that a moving camera does to the picture, but for the rest that its `FilmFlow` leaves to others."""
+    """A term: what the flow of a film does to the picture; the rest of the motion is left to other terms."""
 
     flow: FilmFlow
 
@@ -69,8 +77,7 @@ class FilmMotion:
         with dr.resume_grad():
             (δ,) = tangents(self._moved(view, f))
         pixels = places.pixels(f.pixel, f.L * δ, f.wavelengths)
-        apart = [(f.pixel, dr.select(f.single, 0, mi.Float(-1))), *self._sharers(view, f)]
-        pixels += blurred(sum(places.pixels(i, f.L * δ * share, f.wavelengths) for i, share in apart))
+        pixels += blurred(sum(places.pixels(i, f.L * δ * share, f.wavelengths) for i, share in self._shared(view, f)))
         return Found(places.developed(pixels))
 
     def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
@@ -79,8 +86,7 @@ class FilmMotion:
         wanted = places.undeveloped(grad_in)
         smooth = blurred(wanted)
         W = places.importance_of_pixels(wanted, f.pixel, f.wavelengths)
-        apart = [(f.pixel, dr.select(f.single, 0, mi.Float(-1))), *self._sharers(view, f)]
-        W += sum(share * places.importance_of_pixels(smooth, i, f.wavelengths) for i, share in apart)
+        W += sum(share * places.importance_of_pixels(smooth, i, f.wavelengths) for i, share in self._shared(view, f))
         δ = dr.sum(W * f.L)
         dr.eval(δ, f.place)  # every parameter of the camera sums over it apart, which would walk the paths as often
         with dr.resume_grad():
@@ -98,10 +104,30 @@ class FilmMotion:
         v = self.flow.velocity(sample) * mi.Vector2f(*view.size)
         return dr.select(f.single, self.flow.divergence(sample), dr.select(f.axis == 0, v.x, v.y))
 
-    def _usual(self, view: Pass, walk: Walk) -> mi.Float:
-        """What is usually seen, as one number, by paths of its own: all radiance less that has the same derivative.
+    def _shared(self, view: Pass, f: Flowing) -> list[tuple[mi.UInt32, mi.Float]]:
+        """How much of the smooth weight of which pixels a path of a pair has, as shares of the weight of its own.
 
-        For no picture that is the same everywhere changes while its places move.
+        Less all of its own, which has that already.
+        """
+        width, height = view.size
+        slope, along_x = FilterSamples.of_slope(view.sensor.film()), f.axis == 0
+        place, most = dr.select(along_x, f.pixel % width, f.pixel // width), dr.select(along_x, mi.Int32(width), height)
+        first, total = mi.Int32(dr.ceil(f.offset - slope.radius)), mi.Float(0)
+        masses = []
+        for k in range(math.ceil(2 * slope.radius)):
+            i = first + k
+            inside = ~f.single & (mi.Int32(place) + i >= 0) & (mi.Int32(place) + i < most)
+            mass = dr.select(inside, slope.mass(f.offset - mi.Float(i)), 0)
+            pixel = mi.UInt32(mi.Int32(f.pixel) + i * dr.select(along_x, mi.Int32(1), width))
+            masses.append((dr.select(inside, pixel, f.pixel), mass))
+            total += dr.abs(mass)
+        scale = dr.select(total > 0, slope.sign(f.offset) / total, 0)
+        return [(f.pixel, dr.select(f.single, 0, mi.Float(-1))), *((pixel, mass * scale) for pixel, mass in masses)]
+
+    def _usual(self, view: Pass, walk: Walk) -> mi.Float:
+        """What is usually seen, as one number, by paths of its own.
+
+        A picture that is the same everywhere does not change while its places move, so that radiance counts less that.
         """
         width, height = view.size
         pixel = dr.arange(mi.UInt32, width * height)
@@ -112,27 +138,6 @@ class FilmMotion:
         there = dr.full(mi.Bool, True, width * height) & self.flow.moves_at(place)
         L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, there))
         return dr.sum(dr.mean(L * brought)) / dr.maximum(mi.Float(dr.count(there)), 1)
-
-    def _sharers(self, view: Pass, f: Flowing) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Pixels along the axis of a pair that its places belong to as well, and how much of their weights it has.
-
-        As shares of that of its own: all pixels of a row draw places, with a density that is the sum of theirs.
-        """
-        width, height = view.size
-        slope = FilterSamples.of_slope(view.sensor.film())
-        first = mi.Int32(dr.ceil(f.offset - slope.radius))
-        own = mi.Int32(dr.select(f.axis == 0, f.pixel % width, f.pixel // width))
-        most = dr.select(f.axis == 0, mi.Int32(width), height)
-        found, total = [], mi.Float(0)
-        for k in range(math.ceil(2 * slope.radius)):
-            i = first + k
-            inside = ~f.single & (own + i >= 0) & (own + i < most)
-            mass = dr.select(inside, slope.mass(f.offset - mi.Float(i)), 0)
-            pixel = mi.Int32(f.pixel) + i * dr.select(f.axis == 0, mi.Int32(1), width)
-            found.append((mi.UInt32(dr.select(inside, pixel, f.pixel)), mass))
-            total += dr.abs(mass)
-        scale = dr.select(total > 0, slope.sign(f.offset) / total, 0)
-        return [(pixel, mass * scale) for pixel, mass in found]
 
     def _walked(self, view: Pass, walk: Walk) -> Flowing:
         """Walk the paths of a pass."""
@@ -168,19 +173,14 @@ class FilmMotion:
 
 
 def blurred(pixels: mi.TensorXf) -> mi.TensorXf:
-    """The mean of pixels over squares around each, beyond the border of which there is zero: its own transpose."""
+    """The mean of pixels over a square around each, with zero beyond the border: its own transpose."""
     height, width, channels = pixels.shape
-    index = dr.arange(mi.UInt32, height * width * channels)
-    values = pixels.array
-    for at, stride, most in (
-        (index // channels % width, channels, width),
-        (index // (channels * width), channels * width, height),
-    ):
-        total = mi.Float(0)
+    index, values = dr.arange(mi.UInt32, height * width * channels), pixels.array
+    for stride, most in ((channels, width), (channels * width, height)):
+        place, total = mi.Int32(index // stride % most), mi.Float(0)
         for k in range(-BLUR, BLUR + 1):
-            there = mi.Int32(at) + k
-            inside = (there >= 0) & (there < most)
+            inside = (place + k >= 0) & (place + k < most)
             total += dr.gather(mi.Float, values, mi.UInt32(mi.Int32(index) + k * stride), inside)
         values = total / (2 * BLUR + 1)
-        dr.eval(values)
+        dr.eval(values)  # before it is read at other places
     return mi.TensorXf(values, pixels.shape)
