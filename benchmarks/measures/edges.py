@@ -17,6 +17,7 @@ from pathreplay.check.stencil import CENTRAL
 from pathreplay.inverse.losses import l2
 from pathreplay.inverse.recorded import Recordings, differentiate
 from pathreplay.render.boundary import Boundary
+from pathreplay.render.term import Found
 
 from ..scenes import SCENES
 from ..scenes.movers import MOVERS
@@ -25,13 +26,27 @@ from .methods import DIFFERENCE, METHODS, RECORDED, TRACED, parts
 from .scene import stopwatch
 from .spread import spreads
 
-#: Parts of our boundary alone, by method.
-PARTS = {"film edges alone": {"inner": False}, "inner edges alone": {"film": False}, "edges alone": {}}
+#: Parts of our boundary alone, by method; and all that edges add, the film's flow included.
+PARTS = {"film edges alone": {"inner": False}, "inner edges alone": {"film": False}}
+ALL = "edges alone"
 #: Around which axis vertices turn, by scene.
 AXES = {"shadow": (0, 0, 1)}
 UPRIGHT = (0, 1, 0)
 #: Of finite differences.
 PICTURES = {"type": "path"}
+
+
+class Nothing:
+    """A term that is zero."""
+
+    def forward(self, *_: Any) -> Found:
+        return Found()
+
+    def backward(self, *_: Any) -> Found:
+        return Found()
+
+    def note(self, *_: Any) -> str:
+        return ""
 
 
 class EdgePass:
@@ -88,11 +103,12 @@ class EdgePass:
 
     def _integrator(self, name: str) -> Any:
         if name not in self.integrators:
-            plugin = METHODS["auto" if name in PARTS else name]
-            alone = {"edges": "none"} if name in PARTS else {}  # the boundary takes the interior's place
-            self.integrators[name] = mi.load_dict(plugin | self.job.limits | alone)
-            if name in PARTS:
-                self.integrators[name].interior = Boundary(**PARTS[name])
+            alone = name in PARTS or name == ALL  # something takes the interior's place
+            plugin = METHODS["auto" if alone else name]
+            edges = {"edges": "all" if name == ALL else "none"} if alone else {}
+            self.integrators[name] = mi.load_dict(plugin | self.job.limits | edges)
+            if alone:
+                self.integrators[name].interior = Nothing() if name == ALL else Boundary(**PARTS[name])
         return self.integrators[name]
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
