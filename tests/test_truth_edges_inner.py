@@ -55,8 +55,8 @@ def test_without_edges_they_do_not(name: str) -> None:
 def test_nor_do_they_where_edges_ignore_what_the_interior_follows(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """∫ (f_near - f_far) n·V_edge over all edges that a surface sees is right for directions that are kept only.
 
-    So emitters are looked for by arcs alone, with all of their light, and directions at both sides stand still. Nor does
-    the film follow what is seen: where that moves with it, there is nothing to be counted twice.
+    So emitters are looked for by arcs alone, with all of their light, and directions at both sides stand still. Nor
+    does the film follow what is seen: where that moves with it, there is nothing to be counted twice.
     """
     monkeypatch.setattr(integrators, "can_follow", lambda walk, sensor: False)
     arrival, kept = seer.Arrival, (mi.Bool(True), mi.Bool(False))
