@@ -25,7 +25,7 @@ COUNTED_TWICE = {
     "shadow_lamp": 4 * MANY,
     "shadow_all": 6 * MANY,
     "lamp_lights": MANY,
-    "sphere_lamp": 3 * MANY,
+    "sphere_lamp": 6 * MANY,
     "cube8_lit": 4 * MANY,
 }
 """Cells in which something moves that the interior follows, and that edges could add again, and passes that show it."""
