@@ -19,7 +19,7 @@ import numpy as np
 import ordinary_scenes
 from ordinary_files import Patch, write_obj, write_ply
 from pathreplay.check.objective import Move, Objective
-from pathreplay.check.stencil import WIDE
+from pathreplay.check.stencil import CENTRAL, WIDE
 from truth import add, bitmap, noise, rgb, rotate, translate, translate_vertices, turn_vertices
 
 T = mi.ScalarTransform4f
@@ -95,6 +95,17 @@ def measured(moving: Moving, folder: Path, seeds: int = 8, **options: Any) -> Me
     return Measured(g, np.array([objective.dot(image) for image in differences]), transpose)
 
 
+def hold_quiet(moving: Moving, folder: Path, passes: int = 24, spp: int = 32) -> None:
+    """The noise of a gradient to be below that of a difference, whose pictures have as many samples each."""
+    objective = loaded(moving, folder)
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": moving.depth})
+    plain = mi.load_dict({"type": "path", "max_depth": moving.depth, "rr_depth": NEVER})
+    g = [objective.backward(ours, seed, spp) for seed in range(passes)]
+    d = [objective.dot(objective.difference(plain, CENTRAL, moving.step, seed, spp)) for seed in range(passes)]
+    objective.put(dr.opaque(mi.Float, 0))
+    assert np.var(g) < np.var(d), (np.std(g), np.std(d))
+
+
 # ------------------------------ Parts ------------------------------
 
 
@@ -116,8 +127,12 @@ def quad() -> Patch:
     return Patch(p, np.tile([0.0, 0, 1], (4, 1)), (p[:, :2] + 1) / 2, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
+def painted(reflectance: dict) -> dict:
+    return {"type": "twosided", "inner": {"type": "diffuse", "reflectance": reflectance}}
+
+
 def grey(*value: float) -> dict:
-    return {"type": "twosided", "inner": {"type": "diffuse", "reflectance": rgb(*value)}}
+    return painted(rgb(*value))
 
 
 PAINT = grey(0.6, 0.4, 0.3)

@@ -57,9 +57,8 @@ def edges_backward(walk: Walk, places: Places, found: Edges, W: mi.Spectrum, los
     with dr.resume_grad():
         ray, _ = places.ray(found.s, found.key)
         if dr.grad_enabled(ray.o, ray.d):
-            dr.eval(
-                q, found.s, found.key
-            )  # every parameter of the camera sums over it apart, which would search as often
+            # Every parameter of the camera sums over these apart, which would search as often.
+            dr.eval(q, found.s, found.key)
             backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
 
 

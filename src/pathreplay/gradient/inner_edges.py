@@ -83,10 +83,8 @@ def choose_vertex(
 ) -> tuple[Any, Chosen]:
     """Walk along a camera path, and choose one of the vertices that scatter smoothly, by what they count.
 
-    ``flows``: all vertices may move under the place where the path begins.
-
-    Vertices up to the chosen one are recorded, if there are ``records``. The last vertex that ``walk`` allows scatters
-    nothing: the walk ends before.
+    ``flows``: all vertices may move under the place where the path begins. Vertices up to the chosen one are recorded,
+    if there are ``records``. The last vertex that ``walk`` allows scatters nothing: the walk ends before.
     """
     walk = replace(walk, max_depth=max(walk.max_depth - 1, 0))
     path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))

@@ -346,7 +346,7 @@ def _held(folder: Path) -> Iterator[int | None]:
 
 
 def _identity(path: Path | int) -> tuple[int, int] | None:
-    """What tells a folder, by its path or open, from another one of the same name; None if there is none."""
+    """Device and number of a folder, given by its path or its descriptor; None if there is none."""
     try:
         about = os.stat(path)
     except OSError:

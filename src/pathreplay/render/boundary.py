@@ -85,6 +85,13 @@ class Boundary:
         return _move(walk, FilmPlaces.of(view))
 
     @staticmethod
+    def informed(view: Pass, walk: Walk) -> Walk:
+        """The walk, knowing which shapes may move. With media all may: paths pass boundaries that move unseen."""
+        if walk.media is not None or walk.traits.moving is not None:
+            return walk
+        return replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene, _still_cameras(view))))
+
+    @staticmethod
     def obstacle(view: Pass) -> str:
         """Why edges cannot be differentiated, with the way out; "" where they can."""
         if view.sensor.class_name() == BATCH:
@@ -103,8 +110,7 @@ class Boundary:
         """The edges of each search."""
         if why := self.obstacle(view):
             raise PathreplayError(f"{why}, or use edges = 'none'")
-        if walk.media is None:  # there boundaries that move are no vertices, and paths pass them unseen
-            walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene, _still_cameras(view))))
+        walk = self.informed(view, walk)
         lines = lines_of(view, places, self.spp)
         seed = view.opaque_seed
         if self.film:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..transport.media import Media, scene_media, wants_branch
 from ..transport.nodes import nodes_of, with_gradients
+from ..transport.seams import has_seams
 from ..transport.traits import (
     INSTANCE,
     MASK,
@@ -20,7 +21,7 @@ from ..transport.traits import (
     tables_of,
 )
 from ..transport.traits import Tables as Tables
-from .lifetimes import SCENES
+from .lifetimes import SCENES, is_recording
 
 
 class SceneFacts:
@@ -39,6 +40,8 @@ class SceneFacts:
         self._lamps = [shape for shape in self._shapes if shape.is_mesh() and shape.is_emitter()]
         self._instances = [shape for shape in self._shapes if shape.class_name() == INSTANCE]
         self._masks = [node for node in nodes if isinstance(node, mi.BSDF) and node.class_name() == MASK]
+        self._textures = [node for node in nodes if isinstance(node, mi.Texture)]
+        self._seams: bool | None = None
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
 
     def are_about(self, scene: mi.Scene) -> bool:
@@ -49,6 +52,13 @@ class SceneFacts:
     @property
     def has_media(self) -> bool:
         return bool(self._media)
+
+    @property
+    def has_seams(self) -> bool:
+        """Whether a texture jumps within itself. A recording cannot look: there one may, unless it is known."""
+        if self._seams is None and not is_recording():
+            self._seams = has_seams(self._textures)
+        return self._seams is not False
 
     def media(self, sensor: mi.Sensor | None, branches: bool | None = None) -> Media | None:
         """What the walk wants to know of media now; ``sensor`` (or None) may be in one. For the rest: see there."""

@@ -120,10 +120,8 @@ class CameraFlow:
             return ray, weight
         if not self.leaves_rest:
             return dr.detach(ray), weight
-        o, d = slopes = slopes_of(self.sensor, sample)
-        v = self._followed(ray, slopes)
-        ray.o += o[0] * v.x + o[1] * v.y
-        ray.d += d[0] * v.x + d[1] * v.y
+        slopes = slopes_of(self.sensor, sample)
+        move_with_place(ray, slopes, self._followed(ray, slopes))
         return ray, weight
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
@@ -163,6 +161,24 @@ def followed(δp: mi.Vector3f, slopes: Slopes, t: mi.Float) -> mi.Vector2f:
     return mi.Vector2f(yy * a - xy * b, xx * b - xy * a) / (xx * yy - xy * xy)
 
 
+def move_with_place(ray: mi.Ray3f, slopes: Slopes, v: mi.Vector2f) -> None:
+    """Add to a ray's motion what comes of its place moving by v."""
+    o, d = slopes
+    ray.o += o[0] * v.x + o[1] * v.y
+    ray.d += d[0] * v.x + d[1] * v.y
+
+
+def glances_of(sensor: mi.Sensor, n: int) -> Sample:
+    """What decides on n x n rays that are spread evenly over a film, row by row."""
+    i = dr.arange(mi.UInt32, n * n)
+    return Sample(sensor.shutter_open(), mi.Float(0.5), glanced_at(i, n), mi.Point2f(0.5))
+
+
+def glanced_at(i: mi.UInt32, n: int) -> mi.Point2f:
+    """The place of a ray by its number: see `glances_of`."""
+    return (mi.Point2f(i % n, i // n) + 0.5) / n
+
+
 def slopes_of(sensor: mi.Sensor, sample: Sample) -> Slopes:
     """How a ray changes with its place. Detached."""
     o, d = [], []
@@ -186,9 +202,7 @@ def _is_carried(sensor: mi.Sensor) -> bool:
 def _distance(scene: mi.Scene, sensor: mi.Sensor) -> mi.Float:
     """The harmonic mean of distances to what a sensor sees: places move by parallax in proportion to 1 / distance."""
     with dr.suspend_grad():
-        i = dr.arange(mi.UInt32, GLANCES * GLANCES)
-        place = (mi.Point2f(i % GLANCES, i // GLANCES) + 0.5) / GLANCES
-        ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
+        ray, _ = glances_of(sensor, GLANCES).ray(sensor)
         hit = scene.ray_intersect_preliminary(ray, coherent=True)
         closeness = dr.mean(dr.select(hit.is_valid(), dr.rcp(hit.t), 0))
         return dr.select(closeness > 0, dr.rcp(closeness), 1)

@@ -33,6 +33,7 @@ import mitsuba as mi
 from ..gradient.adjoint import backward, tangents
 from ..gradient.baseline import Guess
 from ..gradient.primal import primal
+from ..transport.even import Even
 from ..transport.start import CameraStart
 from ..transport.vertex import Walk
 from .camera_pass import Pass
@@ -54,15 +55,13 @@ class Flowing:
     """Paths, and how the flow of their places weighs what they bring."""
 
     pixel: mi.UInt32  # row by row
-    place: mi.Point2f  # in widths and heights of the film
+    sample: Sample  # of their camera rays
     axis: mi.UInt32  # along which places of pairs count
     single: mi.Bool  # a path for the divergence
     offset: mi.Float  # of pairs, from the middle of the pixel along their axis
+    slope: FilterSamples  # which these are drawn from
     L: mi.Spectrum  # times its weight; what the velocity of places is multiplied with
     wavelengths: mi.Spectrum
-    time: mi.Float
-    wavelength: mi.Float
-    aperture: mi.Point2f
 
 
 @dataclass(frozen=True)
@@ -88,7 +87,8 @@ class FilmMotion:
         W = places.importance_of_pixels(wanted, f.pixel, f.wavelengths)
         W += sum(share * places.importance_of_pixels(smooth, i, f.wavelengths) for i, share in self._shared(view, f))
         δ = dr.sum(W * f.L)
-        dr.eval(δ, f.place)  # every parameter of the camera sums over it apart, which would walk the paths as often
+        # Every parameter of the camera sums over these apart, which would walk the paths as often.
+        dr.eval(δ, f.sample.place)
         with dr.resume_grad():
             backward(δ * self._moved(view, f))
         dr.eval()
@@ -100,9 +100,8 @@ class FilmMotion:
 
     def _moved(self, view: Pass, f: Flowing) -> mi.Float:
         """Of pairs the velocity of their place along their axis, in pixels; of single paths its divergence."""
-        sample = Sample(f.time, f.wavelength, f.place, f.aperture)
-        v = self.flow.velocity(sample) * mi.Vector2f(*view.size)
-        return dr.select(f.single, self.flow.divergence(sample), dr.select(f.axis == 0, v.x, v.y))
+        v = self.flow.velocity(f.sample) * mi.Vector2f(*view.size)
+        return dr.select(f.single, self.flow.divergence(f.sample), dr.select(f.axis == 0, v.x, v.y))
 
     def _shared(self, view: Pass, f: Flowing) -> list[tuple[mi.UInt32, mi.Float]]:
         """How much of the smooth weight of which pixels a path of a pair has, as shares of the weight of its own.
@@ -110,7 +109,7 @@ class FilmMotion:
         Less all of its own, which has that already.
         """
         width, height = view.size
-        slope, along_x = FilterSamples.of_slope(view.sensor.film()), f.axis == 0
+        slope, along_x = f.slope, f.axis == 0
         place, most = dr.select(along_x, f.pixel % width, f.pixel // width), dr.select(along_x, mi.Int32(width), height)
         first, total = mi.Int32(dr.ceil(f.offset - slope.radius)), mi.Float(0)
         masses = []
@@ -134,10 +133,9 @@ class FilmMotion:
         numbers = view.numbers(pixel, width, mi.UInt32(0), 1, NUMBERS + 1)
         place = (mi.Point2f(pixel % width, pixel // width) + numbers.next_2d()) / mi.Point2f(width, height)
         sample = Sample(view.sensor.shutter_open(), numbers.next_1d(), place, numbers.next_2d())
-        ray, brought = dr.detach(sample.ray(view.sensor))
         there = dr.full(mi.Bool, True, width * height) & self.flow.moves_at(place)
-        L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, there))
-        return dr.sum(dr.mean(L * brought)) / dr.maximum(mi.Float(dr.count(there)), 1)
+        L, _ = _seen(view, walk, sample, numbers, there)
+        return dr.sum(dr.mean(L)) / dr.maximum(mi.Float(dr.count(there)), 1)
 
     def _walked(self, view: Pass, walk: Walk) -> Flowing:
         """Walk the paths of a pass."""
@@ -165,11 +163,17 @@ class FilmMotion:
         place = places.in_sensor(s)
 
         time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
-        wavelength, aperture = numbers.next_1d(), numbers.next_2d()
-        ray, brought = dr.detach(Sample(time, wavelength, place, aperture).ray(sensor))
-        L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, self.flow.moves_at(place)))
-        L = (L * brought - self._usual(view, walk)) * weight
-        return Flowing(pixel, place, axis, single, offset, L, ray.wavelengths, time, wavelength, aperture)
+        sample = Sample(time, numbers.next_1d(), place, numbers.next_2d())
+        L, wavelengths = _seen(view, walk, sample, numbers, self.flow.moves_at(place))
+        L = (L - self._usual(view, walk)) * weight
+        return Flowing(pixel, sample, axis, single, offset, slope, L, wavelengths)
+
+
+def _seen(view: Pass, walk: Walk, sample: Sample, numbers: Even, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """What a path brings that begins with the camera ray of a sample, times the ray's weight; and its wavelengths."""
+    ray, weight = dr.detach(sample.ray(view.sensor))
+    L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, active))
+    return L * weight, ray.wavelengths
 
 
 def blurred(pixels: mi.TensorXf) -> mi.TensorXf:

@@ -141,7 +141,8 @@ class PathReplayIntegrator(PathIntegrator):
         view = replace(view, flow=CameraFlow.of(view.scene, view.sensor))
         needs_edges = self._needs_edges(view, walk)
         if needs_edges and follow and self._may_follow(view, walk):
-            view = replace(view, flow=SeenFlow.of(view.scene, view.sensor, walk))
+            walk = Boundary.informed(view, walk)
+            view = replace(view, flow=SeenFlow.of(view.sensor, walk))
         motion: tuple[Term, ...] = () if view.flow is None else (FilmMotion(view.flow),)
         if not needs_edges:
             terms = tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
@@ -152,7 +153,7 @@ class PathReplayIntegrator(PathIntegrator):
 
     def _may_follow(self, view: Pass, walk: Walk) -> bool:
         """Whether the film may follow what it sees: all edges are found of what then slides under it."""
-        return self.edges != "film" and can_follow(walk, view.sensor)
+        return self.edges != "film" and can_follow(walk, view.sensor) and not facts_of(view.scene).has_seams
 
     def _needs_edges(self, view: Pass, walk: Walk) -> bool:
         """Whether edges move, and can be differentiated where that is left to ``auto``; says what they cost."""
@@ -176,15 +177,15 @@ class PathReplayIntegrator(PathIntegrator):
             return f"driver = '{self.driver}' walks paths one by one; take 'sweep'"
         if facts_of(scene).has_media:
             return "the scene has media; leave them out"
-        return obstacle(view.sensor, self.max_depth, view.spp, some) or ("" if some else self._followed(view))
+        return obstacle(view.sensor, self.max_depth, view.spp, some) or ("" if some else self._loss_of_sweep(view))
 
-    def _followed(self, view: Pass) -> str:
+    def _loss_of_sweep(self, view: Pass) -> str:
         """Why whole pictures are better rendered than swept: the film follows what moves, which no sweep of it does."""
         if self.edges in ("none", "film"):
             return ""
         with self._passing():
             walk = self._walk(view.scene, view.sensor)
-            follows = self._may_follow(view, walk) and Boundary.move(view, walk) and not Boundary.obstacle(view)
+            follows = Boundary.move(view, walk) and not Boundary.obstacle(view) and self._may_follow(view, walk)
         return "the film follows what moves; take edges = 'none'" if follows else ""
 
     def render_and_backward(

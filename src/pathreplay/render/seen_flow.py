@@ -16,7 +16,7 @@ Any v gives the same derivative (see `FilmFlow`). This one leaves little to the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import drjit as dr
@@ -24,10 +24,10 @@ import mitsuba as mi
 
 from ..gradient.adjoint import tangents
 from ..transport.meet import meet
-from ..transport.motion import may_move, moving_shapes
+from ..transport.motion import may_move
 from ..transport.nodes import with_gradients
 from ..transport.vertex import Walk
-from .film_flow import CAMERAS, Sample, followed, slopes_of
+from .film_flow import CAMERAS, Sample, followed, glanced_at, glances_of, move_with_place, slopes_of
 
 GLANCES, CELLS = 32, 16
 """Rays in a row and a column, and cells of the grid."""
@@ -50,11 +50,9 @@ class SeenFlow:
     samples: int = 4
 
     @staticmethod
-    def of(scene: mi.Scene, sensor: mi.Sensor, walk: Walk) -> SeenFlow | None:
-        """The flow of a sensor; None where nothing that it might see moves."""
-        walk = replace(walk, traits=replace(walk.traits, moving=moving_shapes(scene, scene.sensors())))
-        i = dr.arange(mi.UInt32, GLANCES * GLANCES)
-        sample = Sample(sensor.shutter_open(), mi.Float(0.5), _glanced_at(i), mi.Point2f(0.5))
+    def of(sensor: mi.Sensor, walk: Walk) -> SeenFlow | None:
+        """The flow of a sensor, in a ``walk`` that knows what moves; None where nothing that it might see does."""
+        sample = glances_of(sensor, GLANCES)
         ray = mi.Ray3f(sample.ray(sensor)[0])
         hit = meet(walk, ray, mi.Bool(True), coherent=True)
         seen, t = hit.is_valid(), dr.select(hit.is_valid(), hit.t, 1)
@@ -71,7 +69,7 @@ class SeenFlow:
 
             pair = dr.arange(mi.UInt32, NODES * NODES * GLANCES * GLANCES)
             node, i = pair // (GLANCES * GLANCES), pair % (GLANCES * GLANCES)
-            r2 = dr.squared_norm(mi.Point2f(_cell_of(node)) / CELLS - _glanced_at(i))
+            r2 = dr.squared_norm(mi.Point2f(_cell_of(node)) / CELLS - glanced_at(i, GLANCES))
             K = dr.square(dr.maximum(1 - r2 / REACH**2, 0) / (r2 + NEAR**2)) * dr.gather(mi.Float, W, i)
             total = K_0 + _sums(K)
             nodes = mi.Vector2f(*(_sums(dr.select(K > 0, K * dr.gather(mi.Float, u[k], i), 0)) / total for k in (0, 1)))
@@ -87,9 +85,7 @@ class SeenFlow:
         """See `FilmFlow`."""
         ray, weight = sample.ray(self.sensor)
         if not dr.grad_enabled(sample.place) and dr.grad_enabled(self.nodes):
-            v, (o, d) = self.velocity(sample), slopes_of(self.sensor, sample)
-            ray.o += o[0] * v.x + o[1] * v.y
-            ray.d += d[0] * v.x + d[1] * v.y
+            move_with_place(ray, slopes_of(self.sensor, sample), self.velocity(sample))
         return ray, weight
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
@@ -124,15 +120,12 @@ class SeenFlow:
 def can_follow(walk: Walk, sensor: mi.Sensor) -> bool:
     """Whether places may follow what is seen: then all else slides under them, and all of its edges have to be found.
 
-    Those in textures, behind mirrors, glass and sheets, and on bent curves are not, and media are not asked.
+    Those behind mirrors, glass and sheets and on bent curves are not, and media are not asked. (Nor are those in
+    textures: see `has_seams`.)
     """
     traits = walk.traits
-    hidden = traits.seams or traits.mirrors or traits.veils or traits.splines
+    hidden = traits.mirrors or traits.veils or traits.splines
     return walk.media is None and not hidden and sensor.class_name() in CAMERAS and not with_gradients(sensor)
-
-
-def _glanced_at(i: mi.UInt32) -> mi.Point2f:
-    return (mi.Point2f(i % GLANCES, i // GLANCES) + 0.5) / GLANCES
 
 
 def _sums(values: mi.Float) -> mi.Float:
@@ -153,6 +146,6 @@ def _cell_of(node: mi.UInt32) -> mi.Point2i:
 
 
 def _node(cell: mi.Point2i, x: int, y: int) -> mi.UInt32:
-    """The node so many columns and rows from that where a cell begins; beyond the grid, at its border."""
+    """The node that is x columns and y rows after the first node of a cell, or the nearest one of the grid."""
     at = dr.clip(cell + mi.Point2i(x + MARGIN, y + MARGIN), 0, NODES - 1)
     return mi.UInt32(at.x + at.y * NODES)

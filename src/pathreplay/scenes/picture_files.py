@@ -106,9 +106,9 @@ def size_of_picture(path: Path) -> tuple[int, int] | None:
 
 
 def require_readable_picture(path: Path, pixels: int = MOST_PIXELS) -> None:
-    """Raise PathreplayError where a picture has none, or more than so many ``pixels``, or does not fit the memory.
+    """Raise PathreplayError for a picture without pixels, with more than ``pixels``, or too large for the memory.
 
-    And where it is a TGA that Mitsuba would unpack beyond its last pixel.
+    Also for a TGA that Mitsuba would unpack beyond its last pixel.
     """
     size = size_of_picture(path)
     if size is None:

@@ -57,7 +57,7 @@ def require_sound_tga(path: Path) -> None:
 
 
 def _filled(data: bytes, pixels: int, pixel: int) -> int:
-    """How many pixels there are in packets, up to that which brings them to so many ``pixels`` or beyond.
+    """Number of pixels in the packets of a file; counting ends once there are ``pixels`` or more.
 
     A packet is a byte, with the number of its pixels less one, and then these pixels, of ``pixel`` bytes each, or where
     the highest bit of the byte is set a single one for all. Ends with the last that is whole.

@@ -20,19 +20,15 @@ JUMPS = 0.5
 """Share of what two texels differ by, from which on a difference beside their border is a jump."""
 
 
-def has_seams(nodes: Iterable[mi.Object]) -> bool:
-    """Whether one of the nodes of a scene is a texture that jumps within itself.
-
-    Bitmaps do not tell their filter, so they are evaluated. A function that `dr.freeze` records cannot look at what
-    comes of that: there any bitmap may jump.
-    """
-    return any(_jumps(node) for node in nodes if isinstance(node, mi.Texture))
+def has_seams(textures: Iterable[mi.Texture]) -> bool:
+    """Whether one of the textures jumps within itself. Bitmaps do not tell their filter, so they are evaluated."""
+    return any(map(_jumps, textures))
 
 
 def _jumps(texture: mi.Texture) -> bool:
     kind = texture.class_name()
     if kind.startswith(BITMAP):
-        return bool(dr.flag(dr.JitFlag.FreezingScope)) or _is_nearest(texture)
+        return _is_nearest(texture)
     return kind == CHECKERBOARD or (kind == ATTRIBUTE and 'name = "face_' in str(texture))
 
 
@@ -50,7 +46,7 @@ def _is_nearest(texture: mi.Texture) -> bool:
     from_texels = np.linalg.inv(np.array(params["to_uv"].matrix, np.float64))
 
     def differences(beside: float) -> np.ndarray:
-        """Of values so many texels to both sides of borders."""
+        """How much values differ that are so many texels before and after a border."""
         sides = []
         for side in (-1, 1):
             at = (border + side * beside) / along, middle

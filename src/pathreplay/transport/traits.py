@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import PathreplayError
 from .nodes import nodes_of
 from .pieces import mesh_pieces
-from .seams import has_seams
+from .seams import CHECKERBOARD
 from .velocity import blend_length
 
 # Classes by name: Mitsuba's objects do not tell these things of themselves.
@@ -23,8 +23,8 @@ ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
 MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
 RELIEFS = frozenset({"NormalMap", "BumpMap"})
 FRAMES = RELIEFS | {TWO_SIDED}
-# Those without a narrow lobe of their own, and a texture that jumps within itself.
-DULL, CHECKERED = FRAMES | {MASK, "SmoothDiffuse"}, "Checkerboard"
+# Those without a narrow lobe of their own.
+DULL = FRAMES | {MASK, "SmoothDiffuse"}
 INSTANCE, PROJECTOR, SPOT = "Instance", "Projector", "SpotLight"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
@@ -77,7 +77,6 @@ class Traits:
     narrow: bool  # a surface may have a narrow smooth lobe
     glossy: bool  # a surface may have a narrow smooth lobe, and no texture has a seam that it would slide over
     outlines: bool  # a point of a surface may see where a shape, a lamp or a texture ends
-    seams: bool  # a texture jumps within itself: see `has_seams`
     tables: Tables = None  # type: ignore[assignment]  # of single BSDFs and shapes; of now, as all that follows
     # What has gradients:
     lights_deform: bool = False  # vertex positions of a mesh that emits
@@ -119,9 +118,8 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
         veils=any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_null(bsdf) for bsdf in bsdfs),
         masks_mirrors=any(_delta_lobes(_nested(bsdf)) for bsdf in bsdfs if bsdf.class_name() == MASK),
         narrow=_is_narrow(bsdfs),
-        glossy=_is_narrow(bsdfs) and not any(node.class_name() == CHECKERED for node in nodes),
+        glossy=_is_narrow(bsdfs) and not any(node.class_name() == CHECKERBOARD for node in nodes),
         outlines=not _seamless(shapes, nodes),
-        seams=has_seams(nodes),
     )
 
 
