@@ -8,10 +8,12 @@ where o + t d is the point at its distance t on the ray through the place s. If 
 under them by u / cos, with the angle between normal and ray, which has no bounds at an outline. So points that are seen
 aslant count most: the velocity at a node of a grid is the mean of those around it,
 
-    v = Σ K W u / (K_0 + Σ K W),       W = 1 / (cos² + GRAZING²),       K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²,
+    v = Σ K W u / (K_0 + Σ K (W + S)),     W = 1 / (cos² + GRAZING²),     K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²,
 
 with r their distance on the film; between nodes it is interpolated. Points that stand still have u = 0 and count, too.
-Any v gives the same derivative (see `FilmFlow`). This one leaves little to the interior and to edges.
+On a film that sees a narrow part of the world, u is large, and following it costs more noise than sliding: there S
+holds places where they are. Any v gives the same derivative (see `FilmFlow`). This one leaves little to the interior
+and to edges.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ MARGIN = 2
 NODES = CELLS + 1 + 2 * MARGIN
 REACH, NEAR, K_0 = 0.25, 0.03, 1e3
 """In widths of the film; and how much it counts that a place would rather stand still."""
-GRAZING = 0.1
+GRAZING, NARROW = 0.1, 0.004
+"""Least slope that counts; and S, over the square of the film's width in radians: see there."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +64,11 @@ class SeenFlow:
             si = hit.compute_surface_interaction(ray, flags, seen)
             if not dr.grad_enabled(si.p):
                 return None
-            u = followed(si.p - dr.detach(si.p), slopes_of(sensor, sample), t)
-            cos = dr.dot(dr.detach(si.n), ray.d)
-            W = dr.select(seen, dr.rcp(cos * cos + GRAZING * GRAZING), 0)
+            slopes = slopes_of(sensor, sample)
+            cos, wide = dr.dot(dr.detach(si.n), ray.d), dr.squared_norm(slopes[0][0] + t * slopes[1][0])
+            aslant, S = dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / wide
+            W = dr.select(seen, aslant + S, 0)
+            u = followed(si.p - dr.detach(si.p), slopes, t) * aslant / (aslant + S)
             moves = seen & may_move(walk, hit)
             dr.eval(u, W, moves)  # before all nodes read them
 
