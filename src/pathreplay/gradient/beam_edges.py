@@ -29,7 +29,7 @@ from ..transport.vertex import Arrival, Flight, Numbers, Walk
 from .adjoint import derivative_by_place
 from .centres import Centres
 from .counted import Counted, key_of, quasi_random
-from .crofton import Picked, PlaneLine, Sight, bisect, glance
+from .crofton import Picked, PlaneLine, Sight, bisect, glance, passed
 from .edges import Edges, Places
 from .record import Layout, deepest, record, record_type, room_for
 from .seer import Seer
@@ -115,7 +115,7 @@ def beam_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
     def along(s: mi.Point2f) -> mi.Float:
         return gap(_particle(places.ray(s, line.key)[0], line.τ))
 
-    K = line.passed(jump, derivative_by_place(s, along), active)
+    K = passed(line.w, jump, derivative_by_place(s, along), active)
     return Edges(s, line.key, dr.select(active, k, 0), at.ray, layout, records, lambda ray: -K * gap(seer.moved(ray)))
 
 

@@ -31,7 +31,8 @@ class Centres:
         return Centres(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
 
     def refined(self, c: mi.Point2f, found: mi.Float, evenly: float = EVENLY) -> Centres:
-        """More often where there was something, at places ``c`` so much, and around: edges go on.
+        """More often where there was something, at places ``c`` so much, and around: edges go on. ``evenly`` is the
+        share of places that are drawn as before.
 
         By the root of how much: variance is a sum of (what lines find, squared) / density, which is then least.
         """
@@ -44,9 +45,17 @@ class Centres:
             dr.scatter_add(counts, part * dr.minimum(found, 1), mi.UInt32(y * self.width + x), inside)
         counts = dr.sqrt(counts)
         total = dr.sum(counts)
-        share = dr.select(total > 0, dr.fma(counts, (1 - evenly) / total, evenly / n), 1 / n)
+        before = self._share(dr.arange(mi.UInt32, n))
+        share = dr.select(total > 0, dr.fma(counts, (1 - evenly) / total, evenly * before), before)
         until = dr.cumsum(share)
         return Centres(self.width, self.height, self.margin, until / dr.gather(mi.Float, until, n - 1))
+
+    def _share(self, i: mi.UInt32) -> mi.Float:
+        """The probability of a pixel."""
+        if self.until is None:
+            return mi.Float(1 / (self.width * self.height))
+        begin = dr.select(i > 0, dr.gather(mi.Float, self.until, i - 1, i > 0), 0)
+        return dr.gather(mi.Float, self.until, i) - begin
 
     def draw(self, u: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
         """A place, from the corner of the grid, and its density, from random numbers in the unit square."""
@@ -55,7 +64,7 @@ class Centres:
             return u * mi.Point2f(self.width, self.height), mi.Float(1 / n)
         below = lambda i: dr.gather(mi.Float, self.until, i) <= u.x  # noqa: E731
         i = mi.UInt32(dr.minimum(dr.binary_search(0, n - 1, below), n - 1))  # a number where there is one pixel
-        begin = dr.select(i > 0, dr.gather(mi.Float, self.until, i - 1, i > 0), 0)
-        share = dr.gather(mi.Float, self.until, i) - begin
+        share = self._share(i)
+        begin = dr.gather(mi.Float, self.until, i) - share
         x = dr.clip((u.x - begin) / share, 0, dr.one_minus_epsilon(mi.Float))
         return mi.Point2f(mi.Float(i % self.width) + x, mi.Float(i // self.width) + u.y), share

@@ -125,11 +125,12 @@ class PlaneLine:
     def at(self, t: mi.Float) -> mi.Point2f:
         return self.c + t * self.w
 
-    def passed(self, jump: mi.Spectrum, slope: mi.Vector2f, active: mi.Bool) -> mi.Spectrum:
-        """K: jump · sgn(w·∂B) / |∂B|, zero where that is not finite; ``slope`` is ∂B, ``jump`` the rest of K."""
-        n = dr.norm(slope)
-        K = jump * (dr.sign(dr.dot(self.w, slope)) / n)
-        return dr.select(active & (n > 0) & dr.all(dr.isfinite(K)), K, 0)
+
+def passed(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f, active: mi.Bool) -> mi.Spectrum:
+    """K: jump · sgn(w·∂B) / |∂B|, zero where that is not finite; ``slope`` is ∂B, ``jump`` the rest of K."""
+    n = dr.norm(slope)
+    K = jump * (dr.sign(dr.dot(w, slope)) / n)
+    return dr.select(active & (n > 0) & dr.all(dr.isfinite(K)), K, 0)
 
 
 @dataclass

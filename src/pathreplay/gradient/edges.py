@@ -36,6 +36,9 @@ class Places(Protocol):
     def flows(self, s: mi.Point2f) -> mi.Bool:
         """Whether what stands still may slide under a place."""
 
+    def of_point(self, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
+        """The place where a point of space would be seen, and whether there is one that the sensor knows."""
+
 
 @dataclass
 class Edges:

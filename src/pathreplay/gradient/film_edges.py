@@ -38,7 +38,7 @@ from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
 from .bends import Bend, off_contact
 from .centres import LOOKS, Centres
 from .counted import Counted, key_of, quasi_random
-from .crofton import Crossed, Picked, PlaneLine, Sight, bisect, glance
+from .crofton import Crossed, Picked, PlaneLine, Sight, bisect, glance, passed
 from .edges import Edges, Places, ray_to_camera
 from .hard_shadows import Shade, light_of
 from .primal import walk_on
@@ -120,7 +120,7 @@ def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
     c = replace(c, active=reached, k=dr.select(reached, c.k, 0))
 
     edges = Edges(c.s, c.line.key, c.k, c.near.ray, layout, records, lambda ray: mi.Spectrum(_gap(walk, c, ray)))
-    K = c.line.passed(c.jump, _slope(walk, places, edges), c.active)
+    K = passed(c.line.w, c.jump, _slope(walk, places, edges), c.active)
     return replace(edges, motion=lambda ray: -K * _gap(walk, c, ray))
 
 

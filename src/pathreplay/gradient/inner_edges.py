@@ -33,9 +33,10 @@ from ..transport.vertex import Arrival, Flight, Numbers, Walk, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
 from .arcs import Arc, arc, density_of_samples
 from .bends import Bend, off_contact
+from .cast_shadows import cast_shadows
 from .centres import LOOKS, Centres
 from .counted import Counted, key_of, quasi_random
-from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, looked_at, survey
+from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, looked_at, passed, survey
 from .edges import Edges, Places
 from .hard_shadows import Shade
 from .lamps import Glimpse, Lamp, followed, glimpse
@@ -46,12 +47,13 @@ from .worth import DIM, MOST, STEEP, UNFORESEEN, Worth, closeness, own_plane, ra
 
 BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
+INSIDE = 1 - 2 * BORDER
 JUMP = 4.0
 """So many times as far from an edge as its slope says is the other end of a line where a sample of an emitter jumps."""
 BEYOND = 0x20000
 """The first of the random numbers of what comes from beyond an edge."""
 
-WIDELY = 0.5
+WIDELY = 0.8
 """Share of the lines that are thrown evenly over the film: where things touch, few lines find what counts much."""
 
 
@@ -71,10 +73,23 @@ class Chosen:
 
 @dataclass
 class SquareLine(PlaneLine):
-    """A line in the unit square of one emitter: see `lamps`."""
+    """A line in the unit square of one emitter (see `lamps`), which is reflected at the border."""
 
     lamp: Lamp
     share: mi.Float  # 1 / probability of the emitter
+
+    def at(self, t: mi.Float) -> mi.Point2f:
+        return self._folded(t)[0]
+
+    def way(self, t: mi.Float) -> mi.Vector2f:
+        """Its direction there."""
+        return self._folded(t)[1]
+
+    def _folded(self, t: mi.Float) -> tuple[mi.Point2f, mi.Vector2f]:
+        x = (self.c + t * self.w - BORDER) / INSIDE
+        x -= 2 * dr.floor(0.5 * x)
+        back = x > 1
+        return BORDER + INSIDE * dr.select(back, 2 - x, x), dr.select(back, -self.w, self.w)
 
 
 @dr.syntax
@@ -139,7 +154,8 @@ class Search:
 class Shaded:
     """A crossing in the square of an emitter: where the lit side ends."""
 
-    line: SquareLine
+    lamp: Lamp
+    w: mi.Vector2f  # direction of the line
     u: mi.Point2f  # at the side in the shadow
     u_lit: mi.Point2f  # and at the other
     lit: Glimpse  # there
@@ -151,25 +167,20 @@ class Shaded:
     active: mi.Bool
 
 
-def emitter_line(walk: Walk, x: Chosen, l: float, key: mi.UInt32) -> tuple[SquareLine, mi.Bool]:
-    """A line among the samples of an emitter, and whether there is one."""
+def emitter_line(walk: Walk, x: Chosen, l: float, key: mi.UInt32) -> SquareLine:
+    """A line among the samples of an emitter."""
     numbers, scene = Counted(key, mi.UInt32(0)), walk.scene
     which, turn = numbers.next_2d()
     index, share, _ = scene.sample_emitter(which)
     sin, cos = dr.sincos(dr.two_pi * turn)
-    c, w = numbers.next_2d() * (1 + l) - 0.5 * l, mi.Vector2f(cos, sin)
-    begin, end = mi.Float(-0.5 * l), mi.Float(0.5 * l)
-    for axis in range(2):  # the part that is inside
-        cuts = (BORDER - c[axis]) / w[axis], (1 - BORDER - c[axis]) / w[axis]
-        begin, end = dr.maximum(begin, dr.minimum(*cuts)), dr.minimum(end, dr.maximum(*cuts))
-    inside = x.active & (begin < end)
-    begin, end = dr.select(inside, begin, 0), dr.select(inside, end, 0)
-    return SquareLine(c, w, begin, end, Lamp.of(walk, index, x.active), share), inside
+    c = BORDER + INSIDE * numbers.next_2d()
+    lamp = Lamp.of(walk, index, x.active)
+    return SquareLine(mi.Point2f(c), mi.Vector2f(cos, sin), mi.Float(-0.5 * l), mi.Float(0.5 * l), lamp, share)
 
 
 def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
     """Find the edge of a shadow among the samples of an emitter, and weigh it: see `Search`. Detached."""
-    line, inside = emitter_line(walk, x, l, key)
+    line = emitter_line(walk, x, l, key)
 
     def sight(seen: Glimpse) -> Sight:
         moves = x.moves | _lamp_moves(walk, line.lamp.emitter) | may_move(walk, seen.hit)
@@ -179,9 +190,9 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
         return sight(glimpse(walk, seer, line.lamp, line.at(t), active))
 
     if search.chosen is None:
-        glimpses = [glimpse(walk, seer, line.lamp, line.at(t), inside) for t in looked_at(line)]
-        return _square_worth(walk, x, seer, line, l, [(seen, sight(seen)) for seen in glimpses], inside)
-    found = search.closer(look, line, inside)
+        glimpses = [glimpse(walk, seer, line.lamp, line.at(t), x.active) for t in looked_at(line)]
+        return _square_worth(walk, x, seer, line, l, [(seen, sight(seen)) for seen in glimpses], x.active)
+    found = search.closer(look, line, x.active)
     active = found.weight > 0
     a, b = (glimpse(walk, seer, line.lamp, line.at(t), active) for t in (found.a, found.b))
     active &= a.hidden != b.hidden
@@ -192,11 +203,13 @@ def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, s
     f, pdf = seer.towards(light.d, active)
     F = x.β * f * lit.Le * seer.past(light, hit.t, key, active) * line.share
     F *= dr.select(light.delta, 1, mis_weight(lit.density / line.share, pdf))
-    K = 0.5 * dr.pi * dr.square(1 + l) / l * found.weight * F * dr.select(a.hidden, -1, 1)
+    K = 0.5 * dr.pi * INSIDE**2 / l * found.weight * F * dr.select(a.hidden, -1, 1)
     active &= dr.any(K != 0) & dr.all(dr.isfinite(K))
     u, u_lit = (line.at(dr.select(a.hidden, *ends)) for ends in ((found.a, found.b), (found.b, found.a)))
     own = active & seer.parts(light.d, dark.light.d)  # not that of the ray, which begins a little beside
-    return Shaded(line, u, u_lit, lit, hit, dark.ray, edge_normal(hit, dark.ray, active), own, K, active)
+    return Shaded(
+        line.lamp, line.way(found.a), u, u_lit, lit, hit, dark.ray, edge_normal(hit, dark.ray, active), own, K, active
+    )
 
 
 def _square_worth(
@@ -222,8 +235,8 @@ def _square_worth(
     first = reduce(lambda p, q: dr.select(q.hidden & ~(p.hidden & (p.hit.t <= q.hit.t)), q, p), glimpses)
     told = survey([replace(sight, bright=F) for sight, F in zip(sights, bright, strict=True)], active)
     told.near = dr.select(first.hidden, closeness(walk, first.hit), 0)
-    turn = dr.norm(a - b) / dr.maximum(line.end - line.begin, BORDER)
-    return Worth.of(told, told.bright, own_plane(seer, a, b) * dr.square(1 + l) / (l * (turn + STEEP)))
+    turn = dr.norm(a - c) + dr.norm(c - b)
+    return Worth.of(told, told.bright, own_plane(seer, a, b) / (turn + l * STEEP))
 
 
 def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
@@ -238,7 +251,7 @@ def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
 def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
     """B: distance of the line to the emitter sample from the edge; differentiable in all that moves."""
     origin = seer.moved(at)
-    d = followed(seer.walk, c.line.lamp, origin, u, c.lit, c.active)
+    d = followed(seer.walk, c.lamp, origin, u, c.lit, c.active)
     return dr.select(c.own, dr.dot(origin.n, d), outline_gap(c.n, origin.p, d, c.hit, c.ray, c.active))
 
 
@@ -248,7 +261,7 @@ def shadow_weight(seer: Seer, c: Shaded) -> mi.Spectrum:
     # Where a sample of the emitter jumps there is no edge: its other side is far off.
     off = dr.abs(shadow_gap(seer, c, seer.at.ray, c.u_lit) - shadow_gap(seer, c, seer.at.ray, c.u))
     jumps = off > JUMP * dr.norm(slope) * dr.norm(c.u_lit - c.u) + ROUNDING * (dr.norm(c.ray.o) + c.hit.t)
-    return c.line.passed(c.K, slope, c.active & ~jumps)
+    return passed(c.w, c.K, slope, c.active & ~jumps)
 
 
 @dataclass
@@ -440,24 +453,30 @@ def inner_edges(
         x.β *= weight / (density * dr.opaque(mi.Float, n))
         return s, density, key, records, x
 
-    def glances(centres: Centres, n: int, seed: mi.UInt32) -> tuple[mi.Point2f, list[Worth]]:
+    def glances(centres: Centres, n: int, seed: mi.UInt32) -> tuple[mi.Point2f, mi.Float, list[Worth]]:
         s, density, key, _, x = path(centres, dr.arange(mi.UInt32, n), n, seed, None)
         seer = Seer(walk, x.at, x.flight, x.active)
         in_squares = emitter_edges(walk, x, seer, square, key ^ 0x1B873593, Search())
         on_arcs = arc_edges(walk, x, seer, arc, key ^ 0x38B34AE5, Search())
         none = dr.zeros(mi.Float, n)
-        worths = [replace(w, found=w.found / density + none, edges=w.edges + none) for w in (in_squares, on_arcs)]
-        dr.eval(s, worths)
-        return s, worths
+        density += none  # as many as lines, as all of these
+        worths = [replace(w, found=w.found / density, edges=w.edges + none) for w in (in_squares, on_arcs)]
+        dr.eval(s, density, worths)
+        return s, density, worths
 
     centres = Centres(int(places.size.x), int(places.size.y), 0.0)
-    s, first = glances(centres, max(lines // LOOKS, 1), seed ^ 0x7F4A7C15)
+    if walk.traits.moving:
+        s, shaded = cast_shadows(walk, places, seed ^ 0x2C1B3C6D)
+        centres = centres.refined(s, dr.select(shaded, mi.Float(1), 0), WIDELY)
+    s, density, first = glances(centres, max(lines // LOOKS, 1), seed ^ 0x7F4A7C15)
     radiance = radiance_of(first)
     worth = weighed(first, radiance)[1]
-    usual = dr.rcp(dr.maximum(dr.sum(dr.select(worth > 0, mi.Float(1), 0)), 1))
     of_both = mi.Point2f(dr.concat([s.x, s.x]), dr.concat([s.y, s.y]))
-    centres = centres.refined(of_both, dr.square(dr.minimum(worth / (MOST * usual), 1)), WIDELY)
-    found, worth = weighed(glances(centres, lines, seed)[1], radiance)
+    often = dr.concat([density, density]) * (centres.width * centres.height)
+    usual = dr.rcp(dr.maximum(dr.sum(dr.select(worth > 0, dr.rcp(often), 0)), dr.smallest(mi.Float)))
+    relative = dr.minimum(worth * often / (MOST * usual), 1)
+    centres = centres.refined(of_both, dr.square(relative) / often, WIDELY)
+    found, worth = weighed(glances(centres, lines, seed)[2], radiance)
     chosen = Picked.of(worth + UNFORESEEN * found, closer, seed)
 
     on_arc = chosen.index >= lines

@@ -12,6 +12,8 @@ from ..gradient.counted import Counted
 from ..plugins import mitsuba_integrator
 from .camera_pass import Pass
 
+PROJECTING = frozenset({"PerspectiveCamera", "ThinLensCamera"})
+"""By class: sensors that know where a point is seen."""
 QUADRATURE = 128
 """Points of the integral over a filter."""
 
@@ -43,6 +45,16 @@ class FilmPlaces:
         """Whether what stands still may slide under a place: see `Places`."""
         flow = self.view.flow
         return mi.Bool(False) if flow is None else flow.leaves_rest_at(self.in_sensor(s))
+
+    def of_point(self, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
+        """The place where a point of space would be seen: see `Places`."""
+        sensor = self.view.sensor
+        if sensor.class_name() not in PROJECTING:
+            return mi.Point2f(0), mi.Bool(False)
+        at = dr.zeros(mi.Interaction3f)
+        at.p = p
+        direction, _ = sensor.sample_direction(at, mi.Point2f(0.5), True)
+        return direction.uv + (mi.ScalarPoint2f(sensor.film().crop_offset()) - self.corner), direction.pdf > 0
 
     def in_sensor(self, s: mi.Point2f) -> mi.Point2f:
         """A place in widths and heights of the crop window, as sensors want it."""
