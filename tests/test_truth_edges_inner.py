@@ -26,7 +26,7 @@ COUNTED_TWICE = {
     "shadow_all": 6 * MANY,
     "lamp_lights": MANY,
     "sphere_lamp": 6 * MANY,
-    "cube8_lit": 4 * MANY,
+    "cube8_lit": 16 * MANY,
 }
 """Cells in which something moves that the interior follows, and that edges could add again, and passes that show it."""
 
