@@ -2,7 +2,7 @@
 
 The shadow of something small covers few pixels, which few lines would find. Light tells where it falls: a point in the
 bounding box of a shape that moves, and a direction from which light arrives there, give a ray that goes on to what the
-shape may shade. Whether the camera sees that is not asked.
+shape may shade. Whether the camera sees that is not asked. What `dr.freeze` records keeps the boxes of its first pass.
 """
 
 from __future__ import annotations

@@ -31,10 +31,10 @@ class Centres:
         return Centres(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
 
     def refined(self, c: mi.Point2f, found: mi.Float, evenly: float = EVENLY) -> Centres:
-        """More often where there was something, at places ``c`` so much, and around: edges go on. ``evenly`` is the
-        share of places that are drawn as before.
+        """More often where there was something, at places ``c`` so much, and around: edges go on.
 
         By the root of how much: variance is a sum of (what lines find, squared) / density, which is then least.
+        ``evenly`` is the share of places that are drawn as before.
         """
         n = self.width * self.height
         counts = dr.zeros(mi.Float, n)

@@ -54,7 +54,7 @@ BEYOND = 0x20000
 """The first of the random numbers of what comes from beyond an edge."""
 
 WIDELY = 0.8
-"""Share of the lines that are thrown evenly over the film: where things touch, few lines find what counts much."""
+"""Share of the lines that are thrown as if nobody had looked first: shadows are seen by way of other surfaces, too."""
 
 
 @dataclass
