@@ -8,12 +8,17 @@ from itertools import product
 import drjit as dr
 import mitsuba as mi
 
-LOOKS = 8
-"""For so many lines one takes a first look."""
+LOOKS, PER_PIXEL = 8, 2
+"""For so many lines one takes a first look, and with so many lines per pixel at most."""
 AROUND = 1.0
 """Lines that are thrown at the pixels around what was found, for one at its own."""
 EVENLY = 0.25
 """Share of the lines that are thrown evenly, unless one asks for more: the first look misses some."""
+
+
+def looks_of(lines: int, size: mi.ScalarVector2f) -> int:
+    """How many of so many lines take a first look, on a film of so many pixels."""
+    return max(min(lines // LOOKS, PER_PIXEL * int(size.x) * int(size.y)), 1)
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from ..transport.surface import steady
 from ..transport.vertex import Arrival, Numbers, Walk
 from .adjoint import LostPaths, derivative_by_place, derivative_by_ray
 from .bends import Bend, off_contact
-from .centres import LOOKS, Centres
+from .centres import Centres, looks_of
 from .counted import Counted, key_of, quasi_random
 from .crofton import Crossed, Picked, PlaneLine, Sight, bisect, glance, passed
 from .edges import Edges, Places, ray_to_camera
@@ -89,7 +89,7 @@ class FilmCrossing:
 def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UInt32, l: float) -> Edges:
     """Find edges on the film by so many lines of length ``l`` (pixels), and look ``closer`` at as many. Detached.
 
-    A first look, with one line for `LOOKS`, decides where lines are thrown.
+    A first look, with few lines (see `looks_of`), decides where they are thrown.
     """
     full, walk = walk, clear(without_roulette(walk))
 
@@ -105,7 +105,7 @@ def film_edges(walk: Walk, places: Places, lines: int, closer: int, seed: mi.UIn
         return chain_sight(walk, places.ray(s, line.key)[0], line.key, active, places.flows(s))
 
     centres = Centres.even(places.size, l)
-    few = max(lines // LOOKS, 1)
+    few = looks_of(lines, places.size)
     first = line(centres, dr.arange(mi.UInt32, few), few, seed ^ 0x7F4A7C15, 2 * l)
     centres = centres.refined(first.c + centres.margin, glance(look, first, mi.Bool(True)))
     every = line(centres, dr.arange(mi.UInt32, lines), lines, seed, l)

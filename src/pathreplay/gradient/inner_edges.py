@@ -34,7 +34,7 @@ from .adjoint import derivative_by_place, derivative_by_ray
 from .arcs import Arc, arc, density_of_samples
 from .bends import Bend, off_contact
 from .cast_shadows import cast_shadows
-from .centres import LOOKS, Centres
+from .centres import Centres, looks_of
 from .counted import Counted, key_of, quasi_random
 from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, looked_at, passed, survey
 from .edges import Edges, Places
@@ -468,7 +468,7 @@ def inner_edges(
     if walk.traits.moving:
         s, shaded = cast_shadows(walk, places, seed ^ 0x2C1B3C6D)
         centres = centres.refined(s, dr.select(shaded, mi.Float(1), 0), WIDELY)
-    s, density, first = glances(centres, max(lines // LOOKS, 1), seed ^ 0x7F4A7C15)
+    s, density, first = glances(centres, looks_of(lines, places.size), seed ^ 0x7F4A7C15)
     radiance = radiance_of(first)
     worth = weighed(first, radiance)[1]
     of_both = mi.Point2f(dr.concat([s.x, s.x]), dr.concat([s.y, s.y]))
