@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_ordinary import T, film, sensor
-from pathreplay.gradient.cast_shadows import cast_shadows
+from pathreplay.gradient.cast_shadows import cast_shadows, casters
 from pathreplay.gradient.inner_edges import BORDER, SquareLine
 from pathreplay.gradient.lamps import Lamp
 from pathreplay.render.boundary import Boundary
@@ -50,7 +50,7 @@ def test_a_shadow_falls_where_the_picture_is_darker() -> None:
     view = Pass.of(scene, 0, 0, 1)
     with dr.suspend_grad():
         walk = Boundary.informed(view, ours._walk(scene, view.sensor))
-        s, found = cast_shadows(walk, FilmPlaces.of(view), mi.UInt32(3))
+        s, found = cast_shadows(walk, casters(walk), FilmPlaces.of(view), mi.UInt32(3))
     found = np.array(found)
     x, y = np.array(mi.Point2u(s))[:, found]
     assert found.sum() > 300

@@ -1,8 +1,8 @@
 """Where shadows of what moves fall on the film: they decide where a first look is taken, and nothing else.
 
-The shadow of something small covers few pixels, which few lines would find. Light tells where it falls: a point in the
-bounding box of a shape that moves, and a direction from which light arrives there, give a ray that goes on to what the
-shape may shade. Whether the camera sees that is not asked. What `dr.freeze` records keeps the boxes of its first pass.
+The shadow of something small covers few pixels, which few lines would find. Light tells where it falls: a point of a
+shape that moves, and a direction from which light arrives there, give a ray that goes on to what the shape may shade.
+Whether the camera sees that is not asked.
 """
 
 from __future__ import annotations
@@ -11,30 +11,32 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.meet import meet
-from ..transport.traits import boxes_of
 from ..transport.vertex import Walk
 from .counted import Counted, key_of
 from .edges import Places
 
+SAMPLED = frozenset(map(int, (mi.ShapeType.Sphere, mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Cylinder)))
 RAYS = 1024
 THROUGH = 4
 """Surfaces of the shape itself that a ray passes at most."""
 
 
+def casters(walk: Walk) -> list[mi.Shape]:
+    """The shapes that are known to move, and of which points can be drawn."""
+    return [shape for shape in walk.traits.moving or () if shape.is_mesh() or int(shape.shape_type()) in SAMPLED]
+
+
 @dr.syntax
-def cast_shadows(walk: Walk, places: Places, seed: mi.UInt32) -> tuple[mi.Point2f, mi.Bool]:
-    """Places of the film, and whether a shadow may fall there. The shapes that move have to be known."""
-    moving = walk.traits.moving
-    assert moving
+def cast_shadows(walk: Walk, shapes: list[mi.Shape], places: Places, seed: mi.UInt32) -> tuple[mi.Point2f, mi.Bool]:
+    """Places of the film, and whether a shadow of one of the shapes may fall there."""
     numbers = Counted.of(key_of(dr.arange(mi.UInt32, RAYS), seed))
-    number = dr.minimum(mi.UInt32(numbers.next_1d() * len(moving)), len(moving) - 1)
-    shape = mi.ShapePtr(moving[0])
-    for k in range(1, len(moving)):
-        shape = dr.select(number == k, mi.ShapePtr(moving[k]), shape)
-    low, high = (dr.gather(mi.Point3f, boxes_of(moving), 2 * number + k) for k in (0, 1))
-    u = mi.Point3f(*numbers.next_2d(), numbers.next_1d())
-    at = dr.zeros(mi.Interaction3f)
-    at.p = low + u * (high - low)
+    number, u = dr.minimum(mi.UInt32(numbers.next_1d() * len(shapes)), len(shapes) - 1), numbers.next_2d()
+    which = numbers.next_1d()
+    shape, at = mi.ShapePtr(shapes[0]), dr.zeros(mi.Interaction3f)
+    for k in range(len(shapes)):
+        there = number == k
+        shape = dr.select(there, mi.ShapePtr(shapes[k]), shape)
+        at.p = dr.select(there, _point(shapes[k], which, u), at.p)
     light, _ = walk.scene.sample_emitter_direction(at, numbers.next_2d(), False, True)
     active = light.pdf > 0
     ray = mi.Ray3f(at.p, -light.d)
@@ -46,3 +48,14 @@ def cast_shadows(walk: Walk, places: Places, seed: mi.UInt32) -> tuple[mi.Point2
         n += 1
     s, inside = places.of_point(ray.o + hit.t * ray.d)
     return s, active & hit.is_valid() & inside
+
+
+def _point(shape: mi.Shape, which: mi.Float, u: mi.Point2f) -> mi.Point3f:
+    """A point of a shape; of a mesh in a triangle, each of which is as likely."""
+    if not shape.is_mesh():
+        return shape.sample_position(0, u).p
+    n = shape.face_count()
+    corners = shape.face_indices(dr.minimum(mi.UInt32(which * n), n - 1))
+    a, b, c = (shape.vertex_position(corners[k]) for k in range(3))
+    x, y = mi.warp.square_to_uniform_triangle(u)
+    return a + x * (b - a) + y * (c - a)

@@ -33,7 +33,7 @@ from ..transport.vertex import Arrival, Flight, Numbers, Walk, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
 from .arcs import Arc, arc, density_of_samples
 from .bends import Bend, off_contact
-from .cast_shadows import cast_shadows
+from .cast_shadows import cast_shadows, casters
 from .centres import Centres, looks_of
 from .counted import Counted, key_of, quasi_random
 from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, looked_at, passed, survey
@@ -465,8 +465,8 @@ def inner_edges(
         return s, density, worths
 
     centres = Centres(int(places.size.x), int(places.size.y), 0.0)
-    if walk.traits.moving:
-        s, shaded = cast_shadows(walk, places, seed ^ 0x2C1B3C6D)
+    if shapes := casters(walk):
+        s, shaded = cast_shadows(walk, shapes, places, seed ^ 0x2C1B3C6D)
         centres = centres.refined(s, dr.select(shaded, mi.Float(1), 0), WIDELY)
     s, density, first = glances(centres, looks_of(lines, places.size), seed ^ 0x7F4A7C15)
     radiance = radiance_of(first)

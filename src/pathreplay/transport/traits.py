@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -161,12 +161,6 @@ def _array(kind: type, values: Any) -> Any:
 def blend_lengths(shapes: list[mi.Shape]) -> mi.Float:
     """The table of each shape's `blend_length`."""
     return _array(mi.Float, _by_index(mi.ShapePtr, shapes, blend_length, 0.0))
-
-
-def boxes_of(shapes: Sequence[mi.Shape]) -> mi.Float:
-    """The corners of each shape's bounding box, least and most, in a row; zeros of one without bounds."""
-    corners = np.array([(shape.bbox().min, shape.bbox().max) for shape in shapes]).reshape(-1, 6)
-    return _array(mi.Float, np.where(np.isfinite(corners).all(axis=1, keepdims=True), corners, 0).ravel())
 
 
 def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
