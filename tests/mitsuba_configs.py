@@ -378,7 +378,7 @@ EDGES = {
         spp=4192 * 4,
     ),
     "receiver of a shadow": Config(
-        lambda n: shadowed(n, square()), PLANE, along_x, Limits(0.02, 0.5, 0.25), step=SWEPT, rise=0, spp=4096 // 4
+        lambda n: shadowed(n, square()), PLANE, along_x, Limits(0.02, 0.5, 0.25), step=SWEPT, rise=0, spp=4096 // 2
     ),
     "plane and lamp": Config(
         lamp_below, PLANE + LIGHT, along_z, Limits(0.01, 0.1, 0.25), step=2 * SWEPT, spp=4096 // 4

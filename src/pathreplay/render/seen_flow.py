@@ -50,7 +50,7 @@ class SeenFlow:
     nodes: mi.Vector2f  # velocities: zeros, attached to what moves
     flows: mi.Bool  # by node: whether something that moves is seen around its cell, or one beside that
     is_all: bool = False
-    samples: int = 8
+    samples: int = 5
 
     @staticmethod
     def of(sensor: mi.Sensor, walk: Walk) -> SeenFlow | None:
