@@ -14,6 +14,7 @@ from pathreplay.gradient.lamps import Lamp
 from pathreplay.render.boundary import Boundary
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.places import FilmPlaces
+from pathreplay.transport.vertex import Walk
 
 SIDE = 48
 KEY = "ball.to_world"
@@ -37,6 +38,13 @@ def room(*, ball: bool = True, size: float = 0.1) -> mi.Scene:
     return mi.load_dict(parts)
 
 
+def informed(scene: mi.Scene) -> tuple[Pass, Walk]:
+    """A pass, and a walk that knows what moves."""
+    view = Pass.of(scene, 0, 0, 1)
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+    return view, Boundary.informed(view, ours._walk(scene, view.sensor))
+
+
 def test_a_shadow_falls_where_the_picture_is_darker() -> None:
     scene, bare = room(), room(ball=False)
     direct = mi.load_dict({"type": "path", "max_depth": 2})
@@ -46,15 +54,13 @@ def test_a_shadow_falls_where_the_picture_is_darker() -> None:
     dr.enable_grad(moved)
     params[KEY] = moved
     params.update()
-    ours = mi.load_dict({"type": "pathreplay", "max_depth": 2})
-    view = Pass.of(scene, 0, 0, 1)
     with dr.suspend_grad():
-        walk = Boundary.informed(view, ours._walk(scene, view.sensor))
+        view, walk = informed(scene)
         s, found = cast_shadows(walk, casters(walk), FilmPlaces.of(view), mi.UInt32(3))
     found = np.array(found)
     x, y = np.array(mi.Point2u(s))[:, found]
     assert found.sum() > 300
-    # Half of the rays are those of the lamp, which is far brighter than the sky.
+    # Lamp and sky send as many rays; in the picture only the shadow of the lamp, which is far brighter, is seen.
     dark = with_ball[y, x] < 0.5 * without[y, x]
     assert 0.4 < dark.mean() < 0.75
     fair = (with_ball < 0.5 * without).mean()
@@ -69,6 +75,8 @@ def test_nothing_is_cast_where_nothing_is_known_to_move() -> None:
     dr.enable_grad(place)
     params["camera.to_world"] = place
     params.update()
+    with dr.suspend_grad():
+        assert not casters(informed(scene)[1])
     ours = mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": "all"})
     dr.backward(dr.sum(mi.render(scene, params, integrator=ours, spp=4), axis=None))
     assert np.isfinite(np.array(dr.grad(place).matrix)).all()

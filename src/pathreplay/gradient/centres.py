@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 LOOKS, PER_PIXEL = 8, 2
-"""For so many lines one takes a first look, and with so many lines per pixel at most."""
+"""Of so many lines one belongs to the first look, which has at most so many lines per pixel."""
 AROUND = 1.0
 """Lines that are thrown at the pixels around what was found, for one at its own."""
 EVENLY = 0.25
@@ -17,7 +17,7 @@ EVENLY = 0.25
 
 
 def looks_of(lines: int, size: mi.ScalarVector2f) -> int:
-    """How many of so many lines take a first look, on a film of so many pixels."""
+    """How many lines the first look has, of ``lines`` in all, on a film of ``size`` pixels."""
     return max(min(lines // LOOKS, PER_PIXEL * int(size.x) * int(size.y)), 1)
 
 

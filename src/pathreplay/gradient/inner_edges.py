@@ -466,8 +466,8 @@ def inner_edges(
 
     centres = Centres(int(places.size.x), int(places.size.y), 0.0)
     if shapes := casters(walk):
-        s, shaded = cast_shadows(walk, shapes, places, seed ^ 0x2C1B3C6D)
-        centres = centres.refined(s, dr.select(shaded, mi.Float(1), 0), WIDELY)
+        s, falls = cast_shadows(walk, shapes, places, seed ^ 0x2C1B3C6D)
+        centres = centres.refined(s, dr.select(falls, mi.Float(1), 0), WIDELY)
     s, density, first = glances(centres, looks_of(lines, places.size), seed ^ 0x7F4A7C15)
     radiance = radiance_of(first)
     worth = weighed(first, radiance)[1]
