@@ -3,7 +3,7 @@
     python -m benchmarks.schedule [--measure]
 
 prints seconds of a step for 1 to 1000 devices and 10^6 to 10^9 parameters, for three ways to bring gradients together,
-and then what the schedule that jobs use (`pathreplay.inverse.sharing`) makes of the first of them: devices that are
+and then what the schedule that jobs use (`pathreplay.inverse.scheduler`) makes of the first of them: devices that are
 slower and faster, shards that get stuck, devices that are lost. With `--measure` the costs of this machine are measured
 first and used; without it, those below, which were measured so. Takes a minute.
 """
@@ -20,7 +20,7 @@ import numpy as np
 import typer
 
 from pathreplay.inverse.evaluate import Shard
-from pathreplay.inverse.sharing import Sharing, Step
+from pathreplay.inverse.scheduler import Scheduler, Step
 
 DEVICES, PARAMETERS = (1, 10, 100, 1000), (10**6, 10**7, 10**8, 10**9)
 BYTES = 4
@@ -91,7 +91,7 @@ def simulated(costs: Costs, shards: int, devices: int, parameters: float, troubl
     random = np.random.default_rng(seed)
     speeds = np.exp(trouble.spread * random.standard_normal(devices))
     speeds *= devices / speeds.sum()  # as much in all as without
-    sharing, work = Sharing(), [Shard((view,), 1, (view,)) for view in range(shards)]
+    sharing, work = Scheduler(), [Shard((view,), 1, (view,)) for view in range(shards)]
     devices_ = _Devices(costs, parameters, trouble, random, speeds, free=[0.0] * devices)
     return mean([devices_.step(Step(sharing, work)) for _ in range(STEPS)][-COUNTED:])
 

@@ -33,7 +33,7 @@ from pathreplay.check.verdict import Z_LIMIT
 from pathreplay.render import film_flow, film_motion
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.film_motion import FilmMotion
-from pathreplay.render.term import Found
+from pathreplay.render.term import TermResult
 from pathreplay.transport.meet import meet
 from truth import add, rotate
 
@@ -121,7 +121,7 @@ def test_the_rest_of_a_camera_that_turns_is_rounding(tmp_path: Path, monkeypatch
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": "film"})
     monkeypatch.setattr(film_flow, "_is_carried", lambda sensor: True)
     whole = objective.backward(integrator, 1, 64)
-    monkeypatch.setattr(FilmMotion, "backward", lambda *_: Found(moves=True))
+    monkeypatch.setattr(FilmMotion, "backward", lambda *_: TermResult(moves=True))
     rest = objective.backward(integrator, 1, 64)
     objective.put(dr.opaque(mi.Float, 0))
     assert abs(rest) < 1e-3 * abs(whole), (rest, whole)
@@ -176,9 +176,9 @@ def test_hits_stay_short_of_the_end_of_a_spline(tmp_path: Path) -> None:
     """There Mitsuba looks for a segment that does not exist: see `meet`. Rays are aimed at the rim of the last one."""
     (tmp_path / "tube.txt").write_text("\n".join(f"{x} 0 0 0.2" for x in range(5)))
     scene = mi.load_dict({"type": "scene", "tube": {"type": "bsplinecurve", "filename": str(tmp_path / "tube.txt")}})
-    walk = mi.load_dict({"type": "pathreplay"})._walk(scene, None)
+    trace = mi.load_dict({"type": "pathreplay"})._walk(scene, None)
     x = 3 + dr.arange(mi.Float, 4096) * np.float32(2**-22) - np.float32(2**-11)
-    hit = meet(walk, mi.Ray3f(mi.Point3f(x, 0, 1), mi.Vector3f(0, 0, -1)), mi.Bool(True))
+    hit = meet(trace, mi.Ray3f(mi.Point3f(x, 0, 1), mi.Vector3f(0, 0, -1)), mi.Bool(True))
     met = np.array(hit.is_valid())
     assert 1000 < met.sum() < 4096
     v = (np.array(hit.prim_uv.x) + np.array(hit.prim_index).astype(np.float32)) / np.float32(2)

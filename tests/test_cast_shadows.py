@@ -9,12 +9,12 @@ import pytest
 
 from edge_ordinary import T, film, sensor
 from pathreplay.gradient.cast_shadows import cast_shadows, casters
-from pathreplay.gradient.inner_edges import BORDER, SquareLine
 from pathreplay.gradient.lamps import Lamp
+from pathreplay.gradient.secondary_boundary import BORDER, SquareLine
 from pathreplay.render.boundary import Boundary
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.places import FilmPlaces
-from pathreplay.transport.vertex import Walk
+from pathreplay.transport.vertex import TraceConfig
 
 SIDE = 48
 KEY = "ball.to_world"
@@ -38,7 +38,7 @@ def room(*, ball: bool = True, size: float = 0.1) -> mi.Scene:
     return mi.load_dict(parts)
 
 
-def informed(scene: mi.Scene) -> tuple[Pass, Walk]:
+def informed(scene: mi.Scene) -> tuple[Pass, TraceConfig]:
     """A pass, and a walk that knows what moves."""
     view = Pass.of(scene, 0, 0, 1)
     ours = mi.load_dict({"type": "pathreplay", "max_depth": 2})
@@ -55,8 +55,8 @@ def test_a_shadow_falls_where_the_picture_is_darker() -> None:
     params[KEY] = moved
     params.update()
     with dr.suspend_grad():
-        view, walk = informed(scene)
-        s, found = cast_shadows(walk, casters(walk), FilmPlaces.of(view), mi.UInt32(3))
+        view, trace = informed(scene)
+        s, found = cast_shadows(trace, casters(trace), FilmPlaces.of(view), mi.UInt32(3))
     found = np.array(found)
     x, y = np.array(mi.Point2u(s))[:, found]
     assert found.sum() > 300

@@ -53,14 +53,14 @@ def pretend(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 @pytest.mark.parametrize("media", [False, True])
 def test_the_size_of_a_record_is_that_of_its_type(media: bool) -> None:
-    walk = walk_of(mi.load_dict(cloud(heterogeneous(smooth(0.5, 3), 0.8))) if media else room())
+    trace = walk_of(mi.load_dict(cloud(heterogeneous(smooth(0.5, 3), 0.8))) if media else room())
     sizes = []
     for moves in (False, True):
-        kind = record_type(Layout.of(walk, moves))
+        kind = record_type(Layout.of(trace, moves))
         blank = {name: dr.zeros(field.type) for name, field in kind.__dataclass_fields__.items()}
         sizes.append(sum(4 * len(np.ravel(np.array(value))) for value in blank.values()))
     print(f"{sizes} bytes a vertex")
-    assert largest_record(walk) == max(sizes) <= (210 if media else LARGEST_RECORD)
+    assert largest_record(trace) == max(sizes) <= (210 if media else LARGEST_RECORD)
 
 
 @pytest.mark.parametrize(
@@ -76,8 +76,8 @@ def test_the_deepest_sweep_is_the_last_that_keeps_its_share(made_up: Device, med
 
 
 def test_what_cannot_be_asked_has_the_stack_of_a_thread() -> None:
-    walk = walk_of(room())
-    assert deepest(walk, UNKNOWN) == deepest(walk, H100) < deepest(walk, PROCESSOR) == record.MAX_DEPTH
+    trace = walk_of(room())
+    assert deepest(trace, UNKNOWN) == deepest(trace, H100) < deepest(trace, PROCESSOR) == record.MAX_DEPTH
     assert PROCESSOR.keeps_order and not H100.keeps_order
 
 

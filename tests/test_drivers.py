@@ -57,7 +57,7 @@ def test_conformance_is_looked_at() -> None:
     """What looks at signatures tells a driver from others."""
     assert not conforms(forward, Driver) and not conforms(sweep, ForwardDriver)
 
-    def demanding(walk: Any, start: Any, δL: Any, lost: Any, more: Any) -> bool:
+    def demanding(trace: Any, start: Any, δL: Any, lost: Any, more: Any) -> bool:
         return False
 
     assert not conforms(demanding, Driver)

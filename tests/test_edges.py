@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 import edge_scenes as scenes
-from pathreplay.gradient.centres import Centres
-from pathreplay.gradient.counted import ROUNDS, Counted, key_of, quasi_random
-from pathreplay.gradient.crofton import BEYOND, BISECTIONS, Picked, PlaneLine, Sight, bisect, glance
-from pathreplay.gradient.inner_edges import BORDER
+from pathreplay.gradient.counter_sampler import ROUNDS, CounterSampler, key_of, quasi_random
+from pathreplay.gradient.crofton import BEYOND, BISECTIONS, PlaneLine, Resampled, VisibilityProbe, bisect, detect
 from pathreplay.gradient.lamps import sample_at
-from pathreplay.gradient.seer import Seer
+from pathreplay.gradient.observer import ObserverVertex
+from pathreplay.gradient.secondary_boundary import BORDER
+from pathreplay.gradient.segment_density import SegmentDensity
 from pathreplay.render.boundary import INNER_LENGTHS
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.facts import SceneFacts
 from pathreplay.render.places import FilmPlaces
 from pathreplay.threads import one_thread
-from pathreplay.transport.pieces import smooth_pieces
+from pathreplay.transport.smoothing_groups import smoothing_groups
 
 
 def world(**film: Any) -> mi.Scene:
@@ -88,7 +88,7 @@ def test_nothing_comes_from_outside_of_the_film() -> None:
 
 
 def test_centres_are_drawn_with_their_density() -> None:
-    even = Centres.even(mi.ScalarVector2f(5, 3), 0.5)
+    even = SegmentDensity.even(mi.ScalarVector2f(5, 3), 0.5)
     rng = np.random.default_rng(1)
     seen = mi.Point2f(2.5, 1.5) + 0 * mi.Float(rng.random(50))
     centres = even.refined(seen, mi.Float(1))
@@ -105,8 +105,8 @@ def test_centres_are_drawn_with_their_density() -> None:
     assert np.mean(1 / np.array(density)) == pytest.approx(centres.width * centres.height, rel=0.01)
 
 
-def sight(signature: int, p: list[float], n: list[float]) -> Sight:
-    return Sight(mi.UInt32(signature), mi.Point3f(p), mi.Normal3f(n))
+def sight(signature: int, p: list[float], n: list[float]) -> VisibilityProbe:
+    return VisibilityProbe(mi.UInt32(signature), mi.Point3f(p), mi.Normal3f(n))
 
 
 def test_a_shape_that_hides_itself_is_seen() -> None:
@@ -114,24 +114,24 @@ def test_a_shape_that_hides_itself_is_seen() -> None:
     assert not here.differs(sight(7, [1, 0.3, 0.01], [0, 0.1, 1]))[0]  # on, around a slight bend
     assert here.differs(sight(7, [0.1, 0, -3], [0, 0, 1]))[0]  # behind
     assert here.differs(sight(8, [0.1, 0, 0], [0, 0, 1]))[0]
-    assert not Sight.nothing().differs(Sight.nothing())[0]
+    assert not VisibilityProbe.nothing().differs(VisibilityProbe.nothing())[0]
 
 
 def test_a_mesh_falls_into_pieces_where_vertices_are_written_twice() -> None:
     """Where a piece meets itself, the triangles at the tear are pieces of their own."""
     square = np.array([[0, 1, 2], [0, 2, 3]])
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    assert not smooth_pieces(square, corners).any()
-    assert not smooth_pieces(np.zeros((0, 3), int), np.zeros((0, 3))).any()
+    assert not smoothing_groups(square, corners).any()
+    assert not smoothing_groups(np.zeros((0, 3), int), np.zeros((0, 3))).any()
     folded = np.concatenate([corners, corners[[0, 1]], [[1, 0, 1], [0, 0, 1]]])
-    assert list(smooth_pieces(np.concatenate([square, square + 4]), folded)) == [0, 0, 1, 1]
+    assert list(smoothing_groups(np.concatenate([square, square + 4]), folded)) == [0, 0, 1, 1]
     n = 8
     turns = 2 * np.pi * np.append(np.arange(n), 0) / n  # closed by places, open by vertices
     ring = np.stack([np.cos(turns), np.sin(turns), 0 * turns], 1)
     i = np.arange(n)
     faces = np.concatenate([np.stack([i, i + 1, i + n + 2], 1), np.stack([i, i + n + 2, i + n + 1], 1)])
-    pieces = smooth_pieces(faces, np.concatenate([ring, ring + np.array([0, 0, 1])]))
-    apart = np.bincount(pieces)[pieces] == 1
+    groups = smoothing_groups(faces, np.concatenate([ring, ring + np.array([0, 0, 1])]))
+    apart = np.bincount(groups)[groups] == 1
     assert list(np.flatnonzero(apart)) == [n - 1, n]  # the triangles at the tear
 
 
@@ -145,8 +145,8 @@ def test_vertices_that_differ_in_their_last_bits_are_in_one_place(centre: float)
     positions[n] = np.nextafter(positions[n], np.float32(np.inf))
     i = np.arange(n)
     faces = np.concatenate([np.stack([i, i + 1, i + n + 2], 1), np.stack([i, i + n + 2, i + n + 1], 1)])
-    pieces = smooth_pieces(faces, positions)
-    assert list(np.flatnonzero(np.bincount(pieces)[pieces] == 1)) == [n - 1, n]
+    groups = smoothing_groups(faces, positions)
+    assert list(np.flatnonzero(np.bincount(groups)[groups] == 1)) == [n - 1, n]
 
 
 @pytest.mark.parametrize(
@@ -169,15 +169,15 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle(width: float, halve
             turn = dr.two_pi * mi.sample_tea_float32(i, number)
             return PlaneLine(c, mi.Vector2f(dr.cos(turn), dr.sin(turn)), mi.Float(-l / 2), mi.Float(l / 2))
 
-        def look(line: PlaneLine, t: mi.Float, active: mi.Bool) -> Sight:
+        def probe(line: PlaneLine, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
             p = line.at(t)
             half = dr.select((p.x - 0.3) * 0.3 > (p.y - 0.4) * width, mi.UInt32(halves), 1)
-            return Sight(dr.select(inside(p), half, 0), mi.Point3f(0), mi.Normal3f(0))
+            return VisibilityProbe(dr.select(inside(p), half, 0), mi.Point3f(0), mi.Normal3f(0))
 
-        mass = glance(look, line(dr.arange(mi.UInt32, n)), mi.Bool(True))
-        picked = Picked.of(mass, n // 4, number)
+        mass = detect(probe, line(dr.arange(mi.UInt32, n)), mi.Bool(True))
+        picked = Resampled.of(mass, n // 4, number)
         chosen = line(picked.index)
-        found = bisect(look, chosen, picked.weight, mi.PCG32(n // 4, initstate=number))
+        found = bisect(probe, chosen, picked.weight, mi.PCG32(n // 4, initstate=number))
         side = inside(chosen.at(found.a)) != inside(chosen.at(found.b))
         return 0.5 * dr.pi * dr.sum(dr.select(side, found.weight, 0)) * (1 + 2 * l) ** 2 / (l * n)
 
@@ -193,12 +193,12 @@ def test_cracks_are_no_edges(at: float) -> None:
     line = PlaneLine(mi.Point2f(0), mi.Vector2f(1, 0), mi.Float(-0.5), mi.Float(0.5))
 
     def halved(differs: Callable[[mi.Float], mi.Bool]) -> float:
-        def look(line: PlaneLine, t: mi.Float, active: mi.Bool) -> Sight:
-            return Sight(mi.UInt32(differs(t)), mi.Point3f(0), mi.Normal3f(0))
+        def probe(line: PlaneLine, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
+            return VisibilityProbe(mi.UInt32(differs(t)), mi.Point3f(0), mi.Normal3f(0))
 
-        found = glance(look, line, mi.Bool(True))
+        found = detect(probe, line, mi.Bool(True))
         assert found[0] > 0
-        return bisect(look, line, found, mi.PCG32(1)).weight[0]
+        return bisect(probe, line, found, mi.PCG32(1)).weight[0]
 
     assert halved(lambda t: dr.abs(t - at) < 1e-6) == 0
     assert BEYOND * INNER_LENGTHS[0] < BORDER * 2**BISECTIONS  # among samples of an emitter one looks at samples
@@ -212,21 +212,21 @@ def test_lines_are_picked_as_often_as_they_count() -> None:
     mass = np.where(rng.random(1000) < 0.1, rng.choice([1, 4], 1000), 0).astype(np.float32)
     found = np.zeros(1000)
     for seed in range(200):
-        picked = Picked.of(mi.Float(mass), 50, dr.opaque(mi.UInt32, seed))
+        picked = Resampled.of(mi.Float(mass), 50, dr.opaque(mi.UInt32, seed))
         np.add.at(found, np.array(picked.index), np.array(picked.weight) / 200)
     assert (found[mass == 0] == 0).all()
     assert np.abs(found[mass > 0] - 1).max() < 5 * (mass.sum() / 50 / 200) ** 0.5
     assert found.sum() == pytest.approx((mass > 0).sum(), rel=0.02)
-    assert dr.all(Picked.of(dr.zeros(mi.Float, 100), 50, mi.UInt32(1)).weight == 0)
+    assert dr.all(Resampled.of(dr.zeros(mi.Float, 100), 50, mi.UInt32(1)).weight == 0)
 
 
 def test_one_line_of_one_pixel_finds_its_place() -> None:
     """As a meter of light has it: Dr.Jit gives numbers in place of arrays where tables have one entry."""
     (x, y), one = quasi_random(mi.UInt32(0), 1, mi.UInt32(5)), dr.ones(mi.Float, 1)
     assert 0 <= x[0] < 1 and 0 <= y[0] < 1
-    place, density = Centres(1, 1, 0.0).refined(mi.Point2f(0.5), one).draw(mi.Point2f(x, y))
+    place, density = SegmentDensity(1, 1, 0.0).refined(mi.Point2f(0.5), one).draw(mi.Point2f(x, y))
     assert dr.all((place >= 0) & (place < 1)) and dr.allclose(density, 1)
-    picked = Picked.of(one, 1, dr.opaque(mi.UInt32, 3))
+    picked = Resampled.of(one, 1, dr.opaque(mi.UInt32, 3))
     assert picked.index == 0 and picked.weight == 1
 
 
@@ -296,7 +296,7 @@ def most_together(numbers: list[np.ndarray]) -> float:
 def test_numbers_of_a_key_know_nothing_of_each_other() -> None:
     """With four rounds they do: what a vertex sees went together with how paths had come to it."""
     keys = key_of(dr.arange(mi.UInt32, 2**20), mi.UInt32(3))
-    numbers = Counted.of(keys)
+    numbers = CounterSampler.of(keys)
     found = [np.array(numbers.next_1d()) for _ in range(12)]
     assert most_together(found) < 5
     fewer = [np.array(mi.sample_tea_float32(keys, mi.UInt32(i), ROUNDS // 2)) for i in range(12)]
@@ -308,23 +308,23 @@ def test_what_is_closer_than_rays_begin_is_rounding() -> None:
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.p, si.n = mi.Point3f(2, -7, 0.5), mi.Normal3f(0, 0, 1)
     beside = dr.norm(si.spawn_ray(mi.Vector3f(0, 0, 1)).o - si.p)
-    seer: Any = SimpleNamespace(origin=si)
-    far = Seer.is_off(seer, beside * mi.Float(0, 1e-5, 9.9, 10.1, 100))
+    observer: Any = SimpleNamespace(origin=si)
+    far = ObserverVertex.is_off(observer, beside * mi.Float(0, 1e-5, 9.9, 10.1, 100))
     assert np.array(far).tolist() == [False, False, False, True, True]
 
 
 def test_samples_of_a_ball_are_asked_for_on_a_disk() -> None:
     """As many by area, and places that are close to each other have directions that are."""
-    walk: Any = SimpleNamespace(traits=SimpleNamespace(ball_lights=True))
+    trace: Any = SimpleNamespace(traits=SimpleNamespace(ball_lights=True))
     lamp: Any = SimpleNamespace(around=mi.Bool(True))
     x, y = dr.meshgrid(*2 * (dr.linspace(mi.Float, 0.005, 0.995, 100),))
-    u = sample_at(walk, lamp, mi.Point2f(x, y))
+    u = sample_at(trace, lamp, mi.Point2f(x, y))
     counts, *_ = np.histogram2d(*np.array(u), bins=4, range=((0, 1), (0, 1)))
     assert counts.sum() == 10_000 and np.abs(counts - 625).max() < 40
-    close = [sample_at(walk, lamp, mi.Point2f(0.5 + d, 0.5)) for d in (-1e-3, 1e-3)]
+    close = [sample_at(trace, lamp, mi.Point2f(0.5 + d, 0.5)) for d in (-1e-3, 1e-3)]
     there = [dr.sqrt(p.x) * mi.Point2f(dr.cos(dr.two_pi * p.y), dr.sin(dr.two_pi * p.y)) for p in close]
     assert dr.all(dr.norm(there[1] - there[0]) < 1e-2)
-    assert dr.all(sample_at(walk, SimpleNamespace(around=mi.Bool(False)), close[0]).x == close[0].x)
+    assert dr.all(sample_at(trace, SimpleNamespace(around=mi.Bool(False)), close[0]).x == close[0].x)
 
 
 def test_a_single_line_has_a_place() -> None:

@@ -53,8 +53,8 @@ def test_roughness_moves_no_edge_where_lobes_follow_their_samples() -> None:
     for key, moves in (("ball.bsdf.alpha.value", False), ("ball.to_world", True)):
         with attached(scene, key):
             view = Pass.of(scene, 0, 0, 1)
-            walk = by._walk(scene, view.sensor)
-            assert walk.follows and Boundary.move(view, walk) is moves, key
+            trace = by._walk(scene, view.sensor)
+            assert trace.follows and Boundary.move(view, trace) is moves, key
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ import pytest
 from pathreplay.gradient.pixel_numbers import SETS
 from pathreplay.inverse import make_config, optimize
 from pathreplay.render.camera_pass import Pass
-from pathreplay.transport.even import Even, in_order, key_of
+from pathreplay.transport.owen_sobol import OwenSobolSampler, in_order, key_of
 
 METHODS: dict[str, dict[str, Any]] = {
     "even": {"type": "pathreplay"},
@@ -26,7 +26,7 @@ POINTS = 256
 DRAWS = 4
 
 
-def points(even: Even) -> list[np.ndarray]:
+def points(even: OwenSobolSampler) -> list[np.ndarray]:
     """Pairs that are drawn one after the other, each (2, n)."""
     return [np.array(even.next_2d(), dtype=np.float64) for _ in range(DRAWS)]
 
@@ -42,19 +42,19 @@ def require_net(pairs: np.ndarray) -> None:
 @pytest.mark.parametrize("first", [0, 3 * POINTS, 2**32 - POINTS])
 @pytest.mark.parametrize("seed", [0, 1, 2**32 - 1])
 def test_points_are_nets(first: int, seed: int) -> None:
-    for pairs in points(Even.of(dr.arange(mi.UInt32, POINTS) + first, key_of(mi.UInt32(seed)))):
+    for pairs in points(OwenSobolSampler.of(dr.arange(mi.UInt32, POINTS) + first, key_of(mi.UInt32(seed)))):
         require_net(pairs)
 
 
 def test_numbers_alone_are_even_too() -> None:
-    even = Even.of(dr.arange(mi.UInt32, POINTS), key_of(mi.UInt32(7)))
+    even = OwenSobolSampler.of(dr.arange(mi.UInt32, POINTS), key_of(mi.UInt32(7)))
     for _ in range(DRAWS):
         assert len(np.unique((np.array(even.next_1d()) * POINTS).astype(int))) == POINTS
 
 
 def test_numbers_by_chance_of_the_key_are_uniform_and_know_nothing_of_each_other() -> None:
     n = 2**20
-    even = Even.of(dr.full(mi.UInt32, 5, n), key_of(dr.arange(mi.UInt32, n), mi.UInt32(3)))
+    even = OwenSobolSampler.of(dr.full(mi.UInt32, 5, n), key_of(dr.arange(mi.UInt32, n), mi.UInt32(3)))
     drawn = np.concatenate([*points(even), np.array(even.next_1d())[None]])
     assert np.abs((drawn.mean(axis=1) - 0.5) * np.sqrt(12 * n)).max() < 4.5
     assert np.abs((np.square(drawn - 0.5).mean(axis=1) - 1 / 12) * np.sqrt(180 * n)).max() < 4.5
@@ -67,7 +67,7 @@ def test_numbers_by_chance_of_the_key_are_uniform_and_know_nothing_of_each_other
 
 
 def test_clones_repeat() -> None:
-    even = Even.of(dr.arange(mi.UInt32, 8), key_of(mi.UInt32(1)))
+    even = OwenSobolSampler.of(dr.arange(mi.UInt32, 8), key_of(mi.UInt32(1)))
     even.next_2d()
     again = even.clone()
     first = [*points(even), np.array(even.next_1d())]

@@ -18,7 +18,7 @@ from pathreplay.interrupts import Stop
 from pathreplay.inverse import load_config, make_config, optimize
 from pathreplay.inverse.checkpoint import Entry
 from pathreplay.inverse.evaluate import Evaluation, Local, Shard
-from pathreplay.inverse.events import Faint
+from pathreplay.inverse.events import LowSNR
 from pathreplay.inverse.loop import iterate, new_run
 from pathreplay.inverse.noise import WINDOW, next_spp, ratios
 from pathreplay.inverse.noise_options import AutoSpp
@@ -191,8 +191,8 @@ def test_a_gradient_that_is_noise_is_told_of_once(capsys: pytest.CaptureFixture[
     problem = build_problem(config, Path.cwd())
     run = replace(new_run(problem, problem.integrator), executor=Noise())
     heard = list(iterate(problem, config, run, Stop()))
-    told = [event for event in heard if isinstance(event, Faint)]
-    assert told == [Faint(KEY, 0.0, WINDOW - 1, 8)]
+    told = [event for event in heard if isinstance(event, LowSNR)]
+    assert told == [LowSNR(KEY, 0.0, WINDOW - 1, 8)]
     with Progress(True) as bar:
         for event in (*told, *told):
             bar.observe(event)

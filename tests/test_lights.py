@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.gradient import lights as module
-from pathreplay.gradient.lights import lights, lights_alone
+from pathreplay.gradient import emission_only as module
+from pathreplay.gradient.emission_only import emission_only, only_emission_varies
 from pathreplay.gradient.sweep import sweep
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.lifetimes import careful
@@ -43,8 +43,8 @@ def alone(scene: mi.Scene, *keys: str, **options: Any) -> bool:
     """What the driver says of a scene where these parameters have gradients."""
     with attached(scene, *keys), careful(), dr.suspend_grad():
         integrator = mi.load_dict({"type": "pathreplay", "max_depth": 4, **options})
-        walk = integrator._walk(scene, scene.sensors()[0])
-        return lights_alone(walk, Pass.of(scene, 0, SEED, SPP).rays().start)
+        trace = integrator._walk(scene, scene.sensors()[0])
+        return only_emission_varies(trace, Pass.of(scene, 0, SEED, SPP).rays().start)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def alone(scene: mi.Scene, *keys: str, **options: Any) -> bool:
 )
 def test_it_has_the_gradient_of_the_sweep(bsdf: dict[str, Any], key: str) -> None:
     scene = world(bsdf, None if key in (LAMP, SKY) else {"lamp": painted_lamp(), "bulb": BULB})
-    found, moves = driven(lights, scene, key)
+    found, moves = driven(emission_only, scene, key)
     assert moves is False
     close(found, driven(sweep, scene, key)[0])
 
@@ -103,7 +103,7 @@ def test_it_sees_a_texture_that_a_lamp_shares_with_paint() -> None:
 
 def test_it_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     used = []
-    monkeypatch.setattr(module, "lights", lambda *args: used.append(args) or lights(*args))
+    monkeypatch.setattr(module, "emission_only", lambda *args: used.append(args) or emission_only(*args))
     scene, named = world(), mi.load_dict({"type": "pathreplay", "max_depth": 2, "driver": "sweep"})
     for integrator, *keys in ((ours(2), LAMP), (ours(2), LAMP, FLOOR), (named, LAMP)):
         with attached(scene, *keys) as params:

@@ -192,7 +192,7 @@ def test_the_mean_of_batches_is_the_whole_where_all_is_rendered_alike(
 
     Whole pictures of what moves would be followed by the film, which no sweep of pixels does.
     """
-    monkeypatch.setattr(integrators, "can_follow", lambda walk, sensor: False)
+    monkeypatch.setattr(integrators, "can_follow", lambda trace, sensor: False)
     pose = {"key": "large-box.vertex_positions", "pose": "translation", "start": {"translation": [0, 0, 0.3]}}
     colour = {"key": RED, "initial": 0.2}
     boxed = {"scene": "cornell-box-photo", "scene_parameters": {"resolution": 16, "texture": 8}, "sensors": [0]}

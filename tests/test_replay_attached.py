@@ -16,7 +16,7 @@ import pytest
 from pathreplay.check.statistics import gap
 from pathreplay.gradient import replay as replay_module
 from pathreplay.gradient.ray_jacobian import Recovery, independence, random_sign
-from pathreplay.transport.vertex import Numbers
+from pathreplay.transport.vertex import VertexSamples
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the benchmarks run from the checkout and are not installed
 
@@ -156,7 +156,7 @@ def test_noise_leaves_the_expected_product_of_jacobians_alone(place: str) -> Non
     expected = np.eye(4)
     for k, A in enumerate(CHAIN):
         numbers = [rng.next_float32() for _ in range(6)]
-        u = Numbers(mi.Point2f(*numbers[:2]), numbers[2], mi.Point2f(*numbers[3:5]), numbers[5])
+        u = VertexSamples(mi.Point2f(*numbers[:2]), numbers[2], mi.Point2f(*numbers[3:5]), numbers[5])
         recovery = OtherRecovery(noise=0.7, place=place)
         product = recovery.regularised(real(A), random_sign(u), mi.Bool(k % 2 == 1)) @ product
         expected = A @ expected
@@ -170,7 +170,7 @@ def test_noise_leaves_the_expected_product_of_jacobians_alone(place: str) -> Non
 def test_the_sign_repeats_and_has_mean_zero() -> None:
     rng = mi.PCG32(size=100_000)
     numbers = [rng.next_float32() for _ in range(6)]
-    u = Numbers(mi.Point2f(*numbers[:2]), numbers[2], mi.Point2f(*numbers[3:5]), numbers[5])
+    u = VertexSamples(mi.Point2f(*numbers[:2]), numbers[2], mi.Point2f(*numbers[3:5]), numbers[5])
     signs = np.array(random_sign(u))
     assert np.array_equal(signs, np.array(random_sign(u)))
     assert set(signs) == {-1.0, 1.0}

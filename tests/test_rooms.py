@@ -48,7 +48,7 @@ DRIVERS = {
     "replay": "gradient/replay.py",
     "replay_attached": "gradient/replay_attached.py",
     "pixel_sweep": "gradient/pixel_sweep.py",
-    "lights": "gradient/lights.py",
+    "emission_only": "gradient/emission_only.py",
     "forward": "gradient/forward.py",
     "primal": "gradient/primal.py",
     "tape": "rivals/tape.py",
@@ -198,8 +198,8 @@ def test_a_gradient_request_goes_down_and_up_again(
 ) -> None:
     """All calls from room to room go down, so that whoever follows one meets each room once.
 
-    But for functions that a room has handed down with a pass: the baseline (`Walk.baseline`), which guesses radiance in
-    media, and the camera of a pixel sweep.
+    But for functions that a room has handed down with a pass: the baseline (`TraceConfig.baseline`), which guesses
+    radiance in media, and the camera of a pixel sweep.
     """
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3})
     with followed() as calls:

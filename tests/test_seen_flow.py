@@ -102,7 +102,7 @@ def test_the_gradient_is_that_without_a_flow(name: str, tmp_path: Path, monkeypa
     found = []
     for follows in (True, False):
         if not follows:
-            monkeypatch.setattr(integrators, "can_follow", lambda walk, sensor: False)
+            monkeypatch.setattr(integrators, "can_follow", lambda trace, sensor: False)
         found.append(np.array([objective.backward(ours, seed, 64) for seed in range(PASSES)]))
     objective.put(dr.opaque(mi.Float, 0))
     assert abs(gap(*found).z) < Z_LIMIT, gap(*found)

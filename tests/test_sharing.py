@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pathreplay.inverse.evaluate import Shard
-from pathreplay.inverse.sharing import LATE, TOGETHER, Sharing, Step, kind_of
+from pathreplay.inverse.scheduler import LATE, TOGETHER, Scheduler, Step, kind_of
 
 BOTH = (0, 1)
 
@@ -17,9 +17,11 @@ def shards_of(count: int) -> list[Shard]:
     return [Shard((view,), 4, (view,)) for view in range(count)]
 
 
-def played(sharing: Sharing, shards: list[Shard], speeds: dict[int, float], costs: list[float]) -> tuple[float, dict]:
+def played(
+    scheduler: Scheduler, shards: list[Shard], speeds: dict[int, float], costs: list[float]
+) -> tuple[float, dict]:
     """A step in which actors take cost/speed seconds: when it ended, and who began what."""
-    step, begun = Step(sharing, shards), {actor: [] for actor in speeds}
+    step, begun = Step(scheduler, shards), {actor: [] for actor in speeds}
     events: list[tuple[float, int, list[int]]] = []
     idle, now = sorted(speeds), 0.0
     while len(step.done) < len(shards):
@@ -44,18 +46,18 @@ def played(sharing: Sharing, shards: list[Shard], speeds: dict[int, float], cost
 
 
 def test_every_shard_is_done_once_by_actors_that_are_alike() -> None:
-    sharing, shards = Sharing(), shards_of(10)
+    scheduler, shards = Scheduler(), shards_of(10)
     for _ in range(6):
-        _, begun = played(sharing, shards, {0: 1, 1: 1}, [1.0] * 10)
+        _, begun = played(scheduler, shards, {0: 1, 1: 1}, [1.0] * 10)
         assert sorted(begun[0] + begun[1]) == list(range(10))
         assert len(begun[0]) == 5
 
 
 def test_actors_keep_their_views() -> None:
     """From the second step on, whoever had a view has it again: its kernels are there."""
-    sharing, shards = Sharing(), shards_of(8)
+    scheduler, shards = Scheduler(), shards_of(8)
     costs = [1.0, 1.1, 0.9, 1.0, 1.2, 0.8, 1.0, 1.0]
-    first, *later = (played(sharing, shards, {0: 1, 1: 1}, costs)[1] for _ in range(4))
+    first, *later = (played(scheduler, shards, {0: 1, 1: 1}, costs)[1] for _ in range(4))
     for begun in later:
         assert {actor: sorted(indices) for actor, indices in begun.items()} == {
             actor: sorted(indices) for actor, indices in first.items()
@@ -67,19 +69,19 @@ def test_actors_keep_their_views() -> None:
 def test_all_end_together(speeds: dict[int, float], seconds: float) -> None:
     """Views of unequal costs, actors of unequal speeds: within the longest shard of the best that can be."""
     costs = list(seconds * np.random.default_rng(3).uniform(0.5, 2.0, 40))
-    sharing = Sharing()
+    scheduler = Scheduler()
     for _ in range(8):
-        end, _ = played(sharing, shards_of(40), speeds, costs)
+        end, _ = played(scheduler, shards_of(40), speeds, costs)
     best = sum(costs) / sum(speeds.values())
     print(f"{end:.2f} s, at best {best:.2f} s")
     assert best <= end <= best + max(costs) / min(speeds.values())
 
 
 def test_what_is_late_is_given_to_an_idle_actor_as_well() -> None:
-    sharing, shards = Sharing(), shards_of(2)
+    scheduler, shards = Scheduler(), shards_of(2)
     for _ in range(4):
-        played(sharing, shards, {0: 1, 1: 1}, [1.0, 1.0])
-    step = Step(sharing, shards)
+        played(scheduler, shards, {0: 1, 1: 1}, [1.0, 1.0])
+    step = Step(scheduler, shards)
     first, second = step.next(0, 0.0, BOTH), step.next(1, 0.0, BOTH)
     assert {first, second} == {0, 1}
     assert step.finished(first, 0, 1.0)
@@ -91,26 +93,26 @@ def test_what_is_late_is_given_to_an_idle_actor_as_well() -> None:
 
 
 def test_what_was_never_done_is_not_late() -> None:
-    step = Step(Sharing(), shards_of(1))
+    step = Step(Scheduler(), shards_of(1))
     assert step.next(0, 0.0, BOTH) == 0
     assert step.patience() is None and step.next(1, 100.0, BOTH) is None
 
 
 def test_what_is_lost_waits_again() -> None:
-    sharing, shards = Sharing(), shards_of(3)
-    step = Step(sharing, shards)
+    scheduler, shards = Scheduler(), shards_of(3)
+    step = Step(scheduler, shards)
     index = step.next(0, 0.0, BOTH)
     assert index is not None
-    sharing.forget(0)
+    scheduler.forget(0)
     step.lost(index, 0)
     assert index in step.waiting[None]
     assert sorted(step.next(1, now, BOTH) for now in (1.0, 2.0, 3.0)) == [0, 1, 2]  # type: ignore[type-var]
 
 
 def test_a_loss_after_another_has_taken_over_is_none() -> None:
-    sharing, shards = Sharing(), shards_of(1)
-    played(sharing, shards, {0: 1}, [1.0])
-    step = Step(sharing, shards)
+    scheduler, shards = Scheduler(), shards_of(1)
+    played(scheduler, shards, {0: 1}, [1.0])
+    step = Step(scheduler, shards)
     assert step.next(0, 0.0, BOTH) == 0 and step.next(1, 10.0, BOTH) == 0
     step.lost(0, 0)
     assert not any(step.waiting.values())
@@ -120,20 +122,20 @@ def test_a_loss_after_another_has_taken_over_is_none() -> None:
 
 
 def test_the_views_of_a_lost_actor_are_nobodys() -> None:
-    sharing, shards = Sharing(), shards_of(4)
+    scheduler, shards = Scheduler(), shards_of(4)
     for _ in range(3):
-        played(sharing, shards, {0: 1, 1: 1}, [1.0] * 4)
-    sharing.forget(0)
-    assert set(sharing.owner.values()) == {1}
+        played(scheduler, shards, {0: 1, 1: 1}, [1.0] * 4)
+    scheduler.forget(0)
+    assert set(scheduler.owner.values()) == {1}
     kind = kind_of(shards[0])
-    assert sharing.expected(0, kind) == sharing.seconds[kind] + sharing.extra
+    assert scheduler.expected(0, kind) == scheduler.seconds[kind] + scheduler.extra
 
 
-def known(views: int, seconds: float = 1.0) -> Sharing:
+def known(views: int, seconds: float = 1.0) -> Scheduler:
     """Actor 0 has done all views, a second each; one that has not would take ten more."""
     kinds = [kind_of(shard) for shard in shards_of(views)]
     times = {(0, kind): 3 for kind in kinds}
-    return Sharing(dict.fromkeys(kinds, seconds), set(kinds), 10 * seconds, dict.fromkeys(kinds, 0), times)
+    return Scheduler(dict.fromkeys(kinds, seconds), set(kinds), 10 * seconds, dict.fromkeys(kinds, 0), times)
 
 
 def test_what_would_take_longer_is_not_taken_from_one_that_is_about_to_go_on() -> None:
@@ -166,9 +168,9 @@ def test_the_shards_of_one_that_is_stuck_are_taken_at_any_price() -> None:
 
 def test_an_actor_that_comes_late_has_its_share_after_a_while() -> None:
     """Each step is shorter than it takes to make kernels, a run of them is not."""
-    sharing, taken = known(8), []
+    scheduler, taken = known(8), []
     for _ in range(3):
-        step = Step(sharing, shards_of(8))
+        step = Step(scheduler, shards_of(8))
         assert step.next(0, 0.0, BOTH) == 0
         taken.append(step.next(1, 0.0, [1]))
     assert taken[0] is None and taken[1] is not None
@@ -185,15 +187,15 @@ def test_a_shard_that_was_answered_late_is_not_done_again() -> None:
 
 def test_kernels_cost_what_warm_evaluations_do_not() -> None:
     """A first evaluation, and one that records, are both slow: their difference is no price."""
-    sharing, (shard,) = Sharing(), shards_of(1)
+    scheduler, (shard,) = Scheduler(), shards_of(1)
     kind = kind_of(shard)
     for seconds in (3.0, 5.0):
-        sharing.measured(0, kind, seconds)
-    assert sharing.extra == 0.0
-    sharing.measured(0, kind, 1.0)
-    assert sharing.seconds[kind] == 1.0 and sharing.extra == pytest.approx(1.0)
-    sharing.measured(1, kind, 4.0)
-    assert sharing.extra == pytest.approx(2.0) and sharing.expected(1, kind) == pytest.approx(3.0)
+        scheduler.measured(0, kind, seconds)
+    assert scheduler.extra == 0.0
+    scheduler.measured(0, kind, 1.0)
+    assert scheduler.seconds[kind] == 1.0 and scheduler.extra == pytest.approx(1.0)
+    scheduler.measured(1, kind, 4.0)
+    assert scheduler.extra == pytest.approx(2.0) and scheduler.expected(1, kind) == pytest.approx(3.0)
 
 
 def test_an_actor_that_was_asked_again_is_at_its_next_shard() -> None:
@@ -236,20 +238,20 @@ def test_large_gradients_come_by_themselves() -> None:
 
 def test_shards_without_kernels_come_by_themselves() -> None:
     """Actor 1 takes from 0, and does first and second evaluations, which may take long."""
-    sharing = known(40, 0.02)
-    step = Step(sharing, shards_of(40))
+    scheduler = known(40, 0.02)
+    step = Step(scheduler, shards_of(40))
     assert len(asked(step, 0)) == 5 and len(asked(step, 1)) == 1
-    sharing.owner.clear()
-    assert len(asked(Step(sharing, shards_of(40)), 0)) == 1, "nobody's"
+    scheduler.owner.clear()
+    assert len(asked(Step(scheduler, shards_of(40)), 0)) == 1, "nobody's"
 
 
 def test_a_question_that_is_lost_waits_again_but_for_what_another_has_done() -> None:
-    sharing = known(16, 0.005)
-    step = Step(sharing, shards_of(16))
+    scheduler = known(16, 0.005)
+    step = Step(scheduler, shards_of(16))
     indices = asked(step, 0)
     late = step.patience()
     assert late is not None and step.next(1, late, []) == 0 and step.finished(0, 1, 0.05)
-    sharing.forget(0)
+    scheduler.forget(0)
     for index in indices:
         step.lost(index, 0)
     assert sorted(step.waiting[None]) == list(range(1, 16))
@@ -268,13 +270,13 @@ def test_a_question_is_late_when_all_of_it_might_be_done() -> None:
 
 def test_a_question_has_no_more_than_an_even_share() -> None:
     """Parts of a view are of one kind, and wait for whoever had one of them last: the others are idle."""
-    sharing, shards = known(1, 0.005), [Shard((0,), 4, (part,)) for part in range(16)]
-    step = Step(sharing, shards)
-    assert len(asked(step, 0, actors=16)) == 1 and len(asked(Step(sharing, shards), 0, actors=8)) == 2
+    scheduler, shards = known(1, 0.005), [Shard((0,), 4, (part,)) for part in range(16)]
+    step = Step(scheduler, shards)
+    assert len(asked(step, 0, actors=16)) == 1 and len(asked(Step(scheduler, shards), 0, actors=8)) == 2
     for actor in range(8):
-        sharing.times[actor, kind_of(shards[0])] = 3
+        scheduler.times[actor, kind_of(shards[0])] = 3
     for _ in range(3):
-        end, begun = played(sharing, shards, dict.fromkeys(range(8), 1.0), [0.005] * 16)
+        end, begun = played(scheduler, shards, dict.fromkeys(range(8), 1.0), [0.005] * 16)
         assert end == pytest.approx(0.01) and all(len(indices) == 2 for indices in begun.values())
 
 

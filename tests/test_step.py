@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from media_scenes import constant, grid
-from pathreplay.gradient.adjoint import LostPaths, RayDerivative
+from pathreplay.gradient.adjoint import NonFiniteCounter, RayDerivative
 from pathreplay.gradient.record import Layout, record_type, room_for
 from pathreplay.gradient.two_walks import first_walk, walk_back
 from pathreplay.render.lifetimes import careful
@@ -20,7 +20,7 @@ from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.step import choose_step, repeat_step
-from pathreplay.transport.vertex import Arrival, Chosen, Numbers, Replayed, Walk
+from pathreplay.transport.vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples
 
 
 @pytest.fixture(autouse=True)
@@ -50,7 +50,7 @@ def fog(bsdf: dict[str, Any]) -> mi.Scene:
     return scene(bsdf, cube=cube)
 
 
-def walk_of(scene: mi.Scene, **properties: Any) -> Walk:
+def walk_of(scene: mi.Scene, **properties: Any) -> TraceConfig:
     return mi.load_dict({"type": "pathreplay", **properties})._walk(scene, None)
 
 
@@ -67,20 +67,20 @@ def rays(spread: float = 0.9) -> mi.Ray3f:
     return mi.Ray3f(mi.Point3f(x, y, 0.5), dr.normalize(mi.Vector3f(0.1 * y, 0.2, -1)))
 
 
-def first_step(walk: Walk, ctx: mi.BSDFContext | None = None) -> tuple[Arrival, Numbers, Chosen]:
+def first_step(trace: TraceConfig, ctx: mi.BSDFContext | None = None) -> tuple[Arrival, VertexSamples, SampledStep]:
     """An arrival, the numbers, and the step that they choose."""
     on = mi.Bool(True)
     drawn = sampler()
-    at = CameraStart(rays(), drawn, on).choose(walk, on)
-    if walk.media is not None:
-        at.medium = mi.MediumPtr(next(filter(None, (shape.interior_medium() for shape in walk.scene.shapes()))))
-    u = Numbers.draw(drawn)
-    return at, u, choose_step(walk, at, u, drawn, mi.Spectrum(1), on, on, ctx=ctx)
+    at = CameraStart(rays(), drawn, on).choose(trace, on)
+    if trace.media is not None:
+        at.medium = mi.MediumPtr(next(filter(None, (shape.interior_medium() for shape in trace.scene.shapes()))))
+    u = VertexSamples.draw(drawn)
+    return at, u, choose_step(trace, at, u, drawn, mi.Spectrum(1), on, on, ctx=ctx)
 
 
-def replayed(walk: Walk, at: Arrival, u: Numbers, chosen: Chosen) -> Replayed:
-    hit_next = walk.scene.ray_intersect_preliminary(chosen.ray_next)
-    return Replayed(at, u, chosen.kept, chosen.active, hit_next, mi.Float(1), mi.Spectrum(1))
+def replayed(trace: TraceConfig, at: Arrival, u: VertexSamples, chosen: SampledStep) -> VertexRecord:
+    hit_next = trace.scene.ray_intersect_preliminary(chosen.ray_next)
+    return VertexRecord(at, u, chosen.kept, chosen.active, hit_next, mi.Float(1), mi.Spectrum(1))
 
 
 @pytest.mark.parametrize("attached", [False, True])
@@ -95,10 +95,10 @@ def replayed(walk: Walk, at: Arrival, u: Numbers, chosen: Chosen) -> Replayed:
     ids=["plastic", "glass", "fog", "fog before gauze"],
 )
 def test_a_repeated_step_is_the_chosen_one(world: Any, attached: bool) -> None:
-    walk = walk_of(world())
+    trace = walk_of(world())
     with dr.suspend_grad():
-        at, u, chosen = first_step(walk)
-        again = repeat_step(walk, replayed(walk, at, u, chosen), attached, mi.Bool(True))
+        at, u, chosen = first_step(trace)
+        again = repeat_step(trace, replayed(trace, at, u, chosen), attached, mi.Bool(True))
     for name in ("e", "w"):
         assert np.allclose(getattr(again, name), getattr(chosen, name), rtol=1e-4, atol=1e-6), name
     goes_on = np.array(chosen.active)
@@ -108,7 +108,7 @@ def test_a_repeated_step_is_the_chosen_one(world: Any, attached: bool) -> None:
         assert np.allclose(a, b, atol=1e-5), name
     for name in ("met", "shape", "lobe"):
         assert np.array_equal(getattr(again.signature, name), getattr(chosen.signature, name)), name
-    if walk.media is not None:
+    if trace.media is not None:
         event = np.array(chosen.kept.media.flight.event)
         assert 0.1 < event.mean() < 0.9  # both kinds of vertices
         assert (np.array(chosen.signature.shape)[event] == 0).all()
@@ -116,13 +116,13 @@ def test_a_repeated_step_is_the_chosen_one(world: Any, attached: bool) -> None:
 
 def test_the_transport_mode_reaches_the_bsdf() -> None:
     """Radiance is squeezed on the way into glass, by the square of the index; importance is not."""
-    walk = walk_of(scene(GLASS))
+    trace = walk_of(scene(GLASS))
     weights = {}
     with dr.suspend_grad():
         for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
             ctx = mi.BSDFContext(mode)
-            at, u, chosen = first_step(walk, ctx)
-            again = repeat_step(walk, replayed(walk, at, u, chosen), False, mi.Bool(True), ctx)
+            at, u, chosen = first_step(trace, ctx)
+            again = repeat_step(trace, replayed(trace, at, u, chosen), False, mi.Bool(True), ctx)
             through = np.array(chosen.ray_next.d.z) < 0
             weights[mode] = np.array(chosen.w)[:, through]
             assert np.allclose(np.array(again.w)[:, through], weights[mode], rtol=1e-4)
@@ -133,11 +133,11 @@ def test_the_transport_mode_reaches_the_bsdf() -> None:
 
 @pytest.mark.parametrize(("lobe", "down"), [(0, False), (1, True)])
 def test_a_lobe_can_be_asked_for(lobe: int, down: bool) -> None:
-    walk, ctx = walk_of(scene(GLASS)), mi.BSDFContext()
+    trace, ctx = walk_of(scene(GLASS)), mi.BSDFContext()
     ctx.component = lobe
     with dr.suspend_grad():
-        at, u, chosen = first_step(walk, ctx)
-        again = repeat_step(walk, replayed(walk, at, u, chosen), False, mi.Bool(True), ctx)
+        at, u, chosen = first_step(trace, ctx)
+        again = repeat_step(trace, replayed(trace, at, u, chosen), False, mi.Bool(True), ctx)
     assert np.array_equal(np.array(chosen.ray_next.d.z) < 0, np.full(LANES, down))
     assert (np.array(chosen.signature.lobe) == lobe).all()
     assert np.allclose(again.w, chosen.w, rtol=1e-4)
@@ -145,13 +145,13 @@ def test_a_lobe_can_be_asked_for(lobe: int, down: bool) -> None:
 
 def test_signatures_tell_the_edge_of_a_shape() -> None:
     ball = {"type": "sphere", "radius": 0.4}
-    walk = walk_of(scene({"type": "diffuse"}, ball=ball))
+    trace = walk_of(scene({"type": "diffuse"}, ball=ball))
     down = mi.Ray3f(mi.Point3f(mi.Float([0, 0.39, 0.41, 5]), 0, 2), mi.Vector3f(0, 0, -1))
     with dr.suspend_grad():
         drawn, on = mi.load_dict({"type": "independent"}), mi.Bool(True)
         drawn.seed(0, 4)
-        at = CameraStart(down, drawn, on).choose(walk, on)
-        step = choose_step(walk, at, Numbers.draw(drawn), drawn, mi.Spectrum(1), on, on)
+        at = CameraStart(down, drawn, on).choose(trace, on)
+        step = choose_step(trace, at, VertexSamples.draw(drawn), drawn, mi.Spectrum(1), on, on)
     shape = np.array(step.signature.shape)
     assert shape[0] == shape[1] != shape[2]
     assert list(step.signature.met) == [True, True, True, False]
@@ -162,17 +162,17 @@ def test_signatures_tell_the_edge_of_a_shape() -> None:
 
 def back(scene: mi.Scene, L: float, q: RayDerivative, δL: float) -> mi.Spectrum:
     """Paths onto the square, taken back from the ray that left it, along which comes ``L`` with the adjoint ``q``."""
-    walk = walk_of(scene, max_depth=2)
+    trace = walk_of(scene, max_depth=2)
     with dr.suspend_grad():
         ray = mi.Ray3f(rays().o, mi.Vector3f(0, 0, -1))
         start = CameraStart(ray, sampler(), mi.Bool(True))
-        path = PathState.begin(walk, start, sustained=True)
-        layout = Layout.of(walk, path_moves(walk, start, path.at))
-        records = dr.alloc_local(record_type(layout), room_for(walk))
-        lost, first = LostPaths(), mi.UInt32(0)
-        records, count, _, _, _ = first_walk(walk, start.sampler, path, layout, records, first, lost)
+        path = PathState.begin(trace, start, sustained=True)
+        layout = Layout.of(trace, path_moves(trace, start, path.at))
+        records = dr.alloc_local(record_type(layout), room_for(trace))
+        lost, first = NonFiniteCounter(), mi.UInt32(0)
+        records, count, _, _, _ = first_walk(trace, start.sampler, path, layout, records, first, lost)
         given = mi.Spectrum(δL), mi.Spectrum(L), q
-        L, _ = walk_back(walk, layout, records, first, mi.UInt32(1), count - 1, dr.detach(ray), *given, lost)
+        L, _ = walk_back(trace, layout, records, first, mi.UInt32(1), count - 1, dr.detach(ray), *given, lost)
         dr.eval(L)
     return L
 

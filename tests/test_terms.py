@@ -15,11 +15,11 @@ import pytest
 
 from media_scenes import cloud, heterogeneous, smooth
 from pathreplay import PathreplayError
-from pathreplay.gradient.baseline import Baseline, Seen
+from pathreplay.gradient.baseline import BaselineState, BaselineStats
 from pathreplay.render.boundary import Boundary
 from pathreplay.render.camera_pass import Pass
 from pathreplay.render.facts import SceneFacts, facts_of
-from pathreplay.render.term import Found, Term
+from pathreplay.render.term import Term, TermResult
 from truth import lit_room, rgb
 
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}
@@ -63,7 +63,7 @@ def test_a_term_has_the_methods_of_the_protocol_and_gives_what_it_says(plugin: s
     view = Pass.of(scene, 0, 1, SPP)
     adjoint = dr.ones(mi.TensorXf, (16, 16, 3))
     with dr.suspend_grad():
-        view, walk, terms = integrator._planned(view)
+        view, trace, terms = integrator._planned(view)
     for term in terms:
         for name in METHODS:
             promised = list(inspect.signature(getattr(Term, name)).parameters)[1:]
@@ -71,16 +71,16 @@ def test_a_term_has_the_methods_of_the_protocol_and_gives_what_it_says(plugin: s
             assert [p.name for p in given[: len(promised)]] == promised
             assert all(p.default is not p.empty for p in given[len(promised) :])
         with dr.suspend_grad(), dr.isolate_grad():
-            found = term.backward(view, walk, adjoint, None)
-        assert isinstance(found, Found) and found.image is None and found.seen is None
+            found = term.backward(view, trace, adjoint, None)
+        assert isinstance(found, TermResult) and found.image is None and found.seen is None
         assert np.abs(np.array(dr.grad(params[DENSITY]))).max() > 0
         dr.set_grad(params[DENSITY], 1)
         with dr.suspend_grad():
             if plugin == "pathreplay_rb":
                 with pytest.raises(PathreplayError, match="no forward mode"):
-                    term.forward(view, walk, None)
+                    term.forward(view, trace, None)
             else:
-                assert term.forward(view, walk, None).image.shape == (16, 16, 3)
+                assert term.forward(view, trace, None).image.shape == (16, 16, 3)
 
 
 def test_another_term_may_stand_for_the_interior(load) -> None:
@@ -142,13 +142,13 @@ def test_what_was_learned_outlives_another_scene_between(load) -> None:
 def test_what_shards_have_seen_can_be_added(load) -> None:
     scene, _ = load(foggy(), DENSITY)
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "branch": True})
-    walk = integrator._walk(scene, scene.sensors()[0])
-    nothing = Baseline.fresh(scene.bbox())
+    trace = integrator._walk(scene, scene.sensors()[0])
+    nothing = BaselineState.fresh(scene.bbox())
 
-    def seen(seed: int) -> Seen:
+    def seen(seed: int) -> BaselineStats:
         with dr.suspend_grad(), dr.isolate_grad():
             term, view = integrator.interior, Pass.of(scene, 0, seed, SPP)
-            return term.backward(view, walk, dr.ones(mi.TensorXf, (16, 16, 3)), nothing.guess).seen
+            return term.backward(view, trace, dr.ones(mi.TensorXf, (16, 16, 3)), nothing.guess).seen
 
     one, other = seen(1), seen(2)
     both = one + other
@@ -161,7 +161,7 @@ def test_what_shards_have_seen_can_be_added(load) -> None:
     assert after.passes == again.passes and len(after.passes) == 2
     for name, value in after.learned().items():
         np.testing.assert_allclose(again.learned()[name], value, rtol=1e-5)
-    restored = Baseline.restored(scene.bbox(), after.learned())
+    restored = BaselineState.restored(scene.bbox(), after.learned())
     np.testing.assert_allclose(np.array(restored.guess.known), np.array(after.guess.known))
 
 

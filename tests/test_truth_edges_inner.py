@@ -13,7 +13,7 @@ from edge_scenes import BY_NAME, INDIRECT, SHADOWS, VEILED
 from edge_truth import backwards, hold_forward, hold_gradients, hold_need, loaded, reference, some
 from pathreplay.check.statistics import gap
 from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
-from pathreplay.gradient import inner_edges, seer
+from pathreplay.gradient import observer, secondary_boundary
 from pathreplay.render import boundary
 from pathreplay.render import integrator as integrators
 from pathreplay.transport import velocity
@@ -58,11 +58,11 @@ def test_nor_do_they_where_edges_ignore_what_the_interior_follows(name: str, mon
     So emitters are looked for by arcs alone, with all of their light, and directions at both sides stand still. Nor
     does the film follow what is seen: where that moves with it, there is nothing to be counted twice.
     """
-    monkeypatch.setattr(integrators, "can_follow", lambda walk, sensor: False)
-    arrival, kept = seer.Arrival, (mi.Bool(True), mi.Bool(False))
-    monkeypatch.setattr(inner_edges, "moved_direction", lambda lengths, origin, d, hit, active: (d, mi.Float(1)))
-    monkeypatch.setattr(seer, "Arrival", lambda ray, hit, pdf, *_: arrival(ray, hit, pdf, *kept))
-    monkeypatch.setattr(inner_edges, "shadow_weight", lambda x, shaded: mi.Spectrum(0))
+    monkeypatch.setattr(integrators, "can_follow", lambda trace, sensor: False)
+    arrival, kept = observer.Arrival, (mi.Bool(True), mi.Bool(False))
+    monkeypatch.setattr(secondary_boundary, "moved_direction", lambda lengths, origin, d, hit, active: (d, mi.Float(1)))
+    monkeypatch.setattr(observer, "Arrival", lambda ray, hit, pdf, *_: arrival(ray, hit, pdf, *kept))
+    monkeypatch.setattr(secondary_boundary, "shadow_weight", lambda x, shaded: mi.Spectrum(0))
     differences = reference(name)
     with loaded(BY_NAME[name]) as bench:
         found = gap(backwards(bench, COUNTED_TWICE[name]), differences)

@@ -17,7 +17,7 @@ from pathreplay.check.stencil import CENTRAL
 from pathreplay.inverse.losses import l2
 from pathreplay.inverse.recorded import Recordings, differentiate
 from pathreplay.render.boundary import Boundary
-from pathreplay.render.term import Found
+from pathreplay.render.term import TermResult
 
 from ..scenes import SCENES
 from ..scenes.movers import MOVERS
@@ -39,11 +39,11 @@ PICTURES = {"type": "path"}
 class Nothing:
     """A term that is zero."""
 
-    def forward(self, *_: Any) -> Found:
-        return Found()
+    def forward(self, *_: Any) -> TermResult:
+        return TermResult()
 
-    def backward(self, *_: Any) -> Found:
-        return Found()
+    def backward(self, *_: Any) -> TermResult:
+        return TermResult()
 
     def note(self, *_: Any) -> str:
         return ""

@@ -31,7 +31,7 @@ DEPTH = 4
 WAVES = 6
 
 
-class Found(NamedTuple):
+class TermResult(NamedTuple):
     start: float
     error: float
     """Root mean square errors of the texture, before and after."""
@@ -45,7 +45,9 @@ def waves(size: int) -> torch.Tensor:
     return torch.cat([angles.sin(), angles.cos()], -1).flatten(1)
 
 
-def recover(resolution: int = 96, texture: int = 64, steps: int = 300, picture: Path = Path("network.png")) -> Found:
+def recover(
+    resolution: int = 96, texture: int = 64, steps: int = 300, picture: Path = Path("network.png")
+) -> TermResult:
     """Train the network on renderings of one view; ``picture`` shows what was found, and the truth."""
     torch.manual_seed(0)
     arguments = {"resolution": resolution, "texture": texture}
@@ -80,7 +82,7 @@ def recover(resolution: int = 96, texture: int = 64, steps: int = 300, picture: 
     with torch.no_grad():
         predicted = network(places).reshape(texture, texture, 3).numpy()
     picture.write_bytes(png_bytes(np.concatenate([predicted, truth], axis=1)))
-    return Found(errors[0], float(np.sqrt(np.mean((predicted - truth) ** 2))))
+    return TermResult(errors[0], float(np.sqrt(np.mean((predicted - truth) ** 2))))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ..errors import PathreplayError
 from ..transport.step import repeat_step
-from ..transport.vertex import Arrival, Replayed, Step, Walk
+from ..transport.vertex import Arrival, Step, TraceConfig, VertexRecord
 
 
 class Unreached(PathreplayError):
@@ -37,7 +37,7 @@ class RayDerivative:
         return dr.select(ok, self, RayDerivative.zero()), ok
 
 
-class LostPaths:
+class NonFiniteCounter:
     """Counts the paths that lost a part of their gradient because it was not finite."""
 
     def __init__(self) -> None:
@@ -57,8 +57,8 @@ def _attached_arrival(at: Arrival) -> Arrival:
 
 
 def backward_step(
-    walk: Walk,
-    v: Replayed,
+    trace: TraceConfig,
+    v: VertexRecord,
     attached: bool,
     δL: mi.Spectrum,
     L: mi.Spectrum,
@@ -75,7 +75,7 @@ def backward_step(
     with dr.resume_grad():
         at = _attached_arrival(v.at) if attached else v.at
     with dr.resume_grad(*((at.ray.o, at.ray.d, at.pdf) if rays_only else ())):
-        step = repeat_step(walk, replace(v, at=at), attached, active)
+        step = repeat_step(trace, replace(v, at=at), attached, active)
         Li = step.e + step.w * (v.rr_weight * L)
         target = dr.sum(δL * v.β * Li)
         if attached:
@@ -89,7 +89,7 @@ def backward_step(
 
 
 def forward_step(
-    walk: Walk, v: Replayed, attached: bool, tangent: RayDerivative, active: mi.Bool
+    trace: TraceConfig, v: VertexRecord, attached: bool, tangent: RayDerivative, active: mi.Bool
 ) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative]:
     """The step, the tangents of e_i and w_i, and that of the next arrival."""
     with dr.resume_grad():
@@ -99,7 +99,7 @@ def forward_step(
             dr.set_grad(at.ray.o, tangent.o)
             dr.set_grad(at.ray.d, tangent.d)
             dr.set_grad(at.pdf, tangent.pdf)
-        step = repeat_step(walk, replace(v, at=at), attached, active)
+        step = repeat_step(trace, replace(v, at=at), attached, active)
         δe, δw, δo, δd, δpdf = tangents(step.e, step.w, step.ray_next.o, step.ray_next.d, step.pdf)
     return step, δe, δw, RayDerivative(δo, δd, δpdf)
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .counted import Counted
-from .seer import Seer
+from .counter_sampler import CounterSampler
+from .observer import ObserverVertex
 
 EVENLY = 0.25
 """Share of the arcs that are thrown evenly: those that begin below the horizon, or where lobes are weak, count, too."""
@@ -50,20 +50,20 @@ class Arc:
     def at(self, t: mi.Float) -> mi.Vector3f:
         return self.c * dr.cos(t) + self.w * dr.sin(t)
 
-    def weight(self, seer: Seer, p: mi.Float, active: mi.Bool) -> mi.Float:
+    def weight(self, observer: ObserverVertex, p: mi.Float, active: mi.Bool) -> mi.Float:
         """What a crossing counts at a direction with so much of the samples' density."""
         l = self.end - self.begin
         if self.j is None:
             return dr.rcp(l * self.p)
         share = _length(self.j) * probability(p, self.j) * _suits(p, self.j) / _sum(p)
-        return share / (l * self._density(seer, active))
+        return share / (l * self._density(observer, active))
 
     @dr.syntax
-    def _density(self, seer: Seer, active: mi.Bool) -> mi.Float:
+    def _density(self, observer: ObserverVertex, active: mi.Bool) -> mi.Float:
         """The mean of p P_j over all places where the sample might lie."""
         arc, i, total = self, mi.UInt32(0), mi.Float(0)
-        while dr.hint(i < PLACES, exclude=[arc, seer, active], label="pathreplay: density of an arc"):
-            p = density_of_samples(seer.towards(arc.at(_place(i) * (arc.end - arc.begin)), active)[1])
+        while dr.hint(i < PLACES, exclude=[arc, observer, active], label="pathreplay: density of an arc"):
+            p = density_of_samples(observer.towards(arc.at(_place(i) * (arc.end - arc.begin)), active)[1])
             total += p * probability(p, arc.j) / PLACES
             i += 1
         return total
@@ -73,18 +73,18 @@ class Arc:
         return mi.Float(1) if self.j is None else _suits(self.p, self.j) / _sum(self.p)
 
 
-def arc(seer: Seer, l: float, narrow: bool, key: mi.UInt32, active: mi.Bool) -> tuple[Arc, mi.Bool]:
+def arc(observer: ObserverVertex, l: float, narrow: bool, key: mi.UInt32, active: mi.Bool) -> tuple[Arc, mi.Bool]:
     """An arc through a direction in which a vertex scatters, and whether there is one.
 
     The longest ones are ``l`` radians long; all are where no lobe may be ``narrow``.
     """
-    numbers = Counted(key, mi.UInt32(0x100))
+    numbers = CounterSampler(key, mi.UInt32(0x100))
     (lobe, way), turn = numbers.next_2d(), dr.two_pi * numbers.next_1d()
-    d, smooth = seer.sample(lobe, numbers.next_2d())
+    d, smooth = observer.sample(lobe, numbers.next_2d())
     evenly = way < EVENLY
     d = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), d)
     ok = active & (evenly | smooth)
-    f, pdf = seer.towards(d, ok)
+    f, pdf = observer.towards(d, ok)
     p = dr.select(ok, density_of_samples(pdf), 1)
     d = dr.select(ok, d, mi.Vector3f(0, 0, 1))
     sin, cos = dr.sincos(turn)
@@ -103,7 +103,7 @@ def density_of_samples(pdf: mi.Float) -> mi.Float:
     return dr.lerp(pdf, dr.inv_four_pi, EVENLY)
 
 
-def length_drawn(p: mi.Float, numbers: Counted) -> mi.UInt32:
+def length_drawn(p: mi.Float, numbers: CounterSampler) -> mi.UInt32:
     """j, with `probability`."""
     u, v = numbers.next_1d(), numbers.next_1d()
     j = dr.select(u < ANY, mi.UInt32(u * (LENGTHS / ANY)), mi.UInt32(_level(p) + v))

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import PathreplayError
 from ..transport.media import interaction, majorant, span
-from ..transport.vertex import Replayed
+from ..transport.vertex import VertexRecord
 
 # Cells along each axis of space, and along each side of the octahedron of directions. 8³ x 4² cells of two averages
 # with four numbers each are 256 KiB, three times: what is known, its sums, and what the present pass sees. More cells
@@ -64,7 +64,7 @@ class BaselineCells:
 
 
 @dataclass
-class Seen:
+class BaselineStats:
     """What gradient passes saw of the media: sums, so that those of several passes or shards can be added."""
 
     cells: BaselineCells
@@ -74,17 +74,17 @@ class Seen:
     passes: frozenset[Hashable]  # keys of the passes
 
     @staticmethod
-    def none(cells: BaselineCells, *keys: Hashable) -> Seen:
+    def none(cells: BaselineCells, *keys: Hashable) -> BaselineStats:
         """For the pass with that key to begin with; recorded ones have none."""
         sums, nulls = dr.zeros(mi.Float, 4 * AVERAGES), dr.zeros(mi.Float, SLOTS)
         dr.make_opaque(sums, nulls)
-        return Seen(cells, sums, nulls, 0, frozenset(keys))
+        return BaselineStats(cells, sums, nulls, 0, frozenset(keys))
 
-    def __add__(self, other: Seen) -> Seen:
+    def __add__(self, other: BaselineStats) -> BaselineStats:
         sums, nulls, paths = self.sums + other.sums, self.nulls + other.nulls, self.paths + other.paths
-        return Seen(self.cells, sums, nulls, paths, self.passes | other.passes)
+        return BaselineStats(self.cells, sums, nulls, paths, self.passes | other.passes)
 
-    def learn(self, replayed: Replayed, L: mi.Spectrum) -> None:
+    def learn(self, replayed: VertexRecord, L: mi.Spectrum) -> None:
         """Collect the radiance ``L`` that came back along the ray of a replayed vertex; in the loop of a pass."""
         at, flight = replayed.at, replayed.kept.media.flight
         in_medium = at.medium != None  # noqa: E711 (an array of pointers)
@@ -113,7 +113,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Guess:
+class Baseline:
     """What a pass asks of a baseline, which a frozen function can be handed.
 
     ``branching`` is what a null collision is to count.
@@ -134,36 +134,36 @@ class Guess:
 
 
 @dataclass(frozen=True)
-class Baseline:
+class BaselineState:
     """What is known of the media of a scene. ``after`` is what is known when more has been seen."""
 
     cells: BaselineCells
-    sums: mi.Float  # those of `Seen`, of which older passes count less
+    sums: mi.Float  # those of `BaselineStats`, of which older passes count less
     branching: mi.Float
     passes: frozenset[Hashable] = frozenset()  # keys of the passes that were learned from: none is its own judge
-    guess: Guess = field(init=False)
+    guess: Baseline = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "guess", Guess(self.cells, _averages(self.sums), self.branching))
+        object.__setattr__(self, "guess", Baseline(self.cells, _averages(self.sums), self.branching))
         dr.make_opaque(self.guess.known, self.sums, self.branching)
 
     @staticmethod
-    def fresh(box: mi.ScalarBoundingBox3f) -> Baseline:
+    def fresh(box: mi.ScalarBoundingBox3f) -> BaselineState:
         """Nothing is known yet of what is in the box."""
-        return Baseline(BaselineCells.of(box), dr.zeros(mi.Float, 4 * AVERAGES), mi.Float(FIRST_BRANCHING))
+        return BaselineState(BaselineCells.of(box), dr.zeros(mi.Float, 4 * AVERAGES), mi.Float(FIRST_BRANCHING))
 
-    def after(self, seen: Seen) -> Baseline:
+    def after(self, seen: BaselineStats) -> BaselineState:
         """What is known when passes have seen that, too. Ask when their kernels have been launched."""
         branching = seen.paths / (seen.paths + dr.sum(seen.nulls)) if seen.paths else self.branching
         sums, passes = MEMORY * self.sums + seen.sums, self.passes | seen.passes
-        return Baseline(self.cells, sums, branching, passes)
+        return BaselineState(self.cells, sums, branching, passes)
 
     def learned(self) -> dict[str, np.ndarray]:
         """All that it knows, as float32 arrays by name, from which `restored` makes the same again."""
         return {"sums": self.sums.numpy(), "branching": self.branching.numpy()}
 
     @staticmethod
-    def restored(box: mi.ScalarBoundingBox3f, learned: Mapping[str, np.ndarray]) -> Baseline:
+    def restored(box: mi.ScalarBoundingBox3f, learned: Mapping[str, np.ndarray]) -> BaselineState:
         """One that knows what `learned` told of another. Raises PathreplayError if that cannot be."""
         shapes = {name: np.shape(value) for name, value in learned.items()}
         wanted = {"sums": (4 * AVERAGES,), "branching": (1,)}
@@ -175,7 +175,7 @@ class Baseline:
         # In memory of Dr.Jit's own: recorded passes want it aligned as it was.
         one = dr.opaque(mi.Float, 1)
         sums, branching = (mi.Float(np.array(learned[name], np.float32)) * one for name in ("sums", "branching"))
-        return Baseline(BaselineCells.of(box), sums, branching)
+        return BaselineState(BaselineCells.of(box), sums, branching)
 
 
 def _averages(sums: mi.Float) -> mi.Float:

@@ -15,7 +15,7 @@ import mitsuba as mi
 from ..transport.media import interaction, majorant
 from ..transport.path import PathState, next_arrival
 from ..transport.step import choose_step
-from ..transport.vertex import Arrival, Chosen, Flight, Numbers, Walk
+from ..transport.vertex import Arrival, Flight, SampledStep, TraceConfig, VertexSamples
 from .adjoint import backward
 from .primal import walk_on
 
@@ -39,7 +39,7 @@ class Branch:
         o, d, black = mi.Point3f(0), mi.Vector3f(0), mi.Spectrum(0)
         return Branch(o, d, dr.zeros(mi.MediumPtr), black, black, mi.Float(0), mi.Float(0), mi.UInt32(0), mi.Float(1))
 
-    def offer(self, path: PathState, step: Chosen) -> Branch:
+    def offer(self, path: PathState, step: SampledStep) -> Branch:
         """This one, or the null collision of one more flight, by their masses."""
         ray, null = path.at.ray, step.kept.media.flight.null
         active = path.active & dr.any(path.β != 0)
@@ -52,35 +52,35 @@ class Branch:
         return replace(dr.select(taken, offered, self), mass=mass, number=number)
 
 
-def branch_backward(walk: Walk, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum) -> None:
+def branch_backward(trace: TraceConfig, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum) -> None:
     """Back-propagate ``δL`` through the branch's part of the radiance, if any parameter reaches it."""
     with dr.resume_grad():
-        term = branch_term(walk, branch, sampler, ray)
+        term = branch_term(trace, branch, sampler, ray)
         if dr.grad_enabled(term):
             backward(dr.sum(δL * term))
 
 
-def branch_term(walk: Walk, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f) -> mi.Spectrum:
+def branch_term(trace: TraceConfig, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f) -> mi.Spectrum:
     """What has the branch's part of the radiance's derivative for derivative; its value means nothing.
 
     Walks the extra path, detached; time and wavelengths are those of the camera ``ray``. Differentiable in the
     coefficients of the medium. Call it under `dr.resume_grad`.
     """
-    onward = replace(walk, branching=None)
+    onward = replace(trace, branching=None)
     active = branch.mass > 0
     with dr.suspend_grad():
         ray, hit = mi.Ray3f(branch.p, branch.d, ray.time, ray.wavelengths), dr.zeros(mi.PreliminaryIntersection3f)
         at = Arrival(ray, hit, mi.Float(1), mi.Bool(True), mi.Bool(False), branch.medium, mi.Float(0))
         one = mi.Spectrum(1)
         flight = Flight(event=active, t=mi.Float(0), density=mi.Float(1), W=one, along=mi.Float(0), σ_s=one)
-        u = Numbers.draw(sampler)
-        step = choose_step(onward, at, u, sampler, one, branch.depth + 1 < walk.max_depth, active, flight)
+        u = VertexSamples.draw(sampler)
+        step = choose_step(onward, at, u, sampler, one, branch.depth + 1 < trace.max_depth, active, flight)
         at_next = next_arrival(onward, at, step, step.active)
         L, _ = walk_on(onward, sampler, PathState(at_next, one, None, branch.η, branch.depth + 1, step.active))
         L_s = step.e + step.w * L
     mei = interaction(branch.medium, at.ray, mi.Float(0))
     σ_s, _, σ_t = branch.medium.get_scattering_coefficients(mei, active)
     term = branch.weight * σ_s * L_s
-    if walk.baseline is not None:
-        term -= branch.bare * σ_t * walk.baseline(mei, σ_t, majorant(branch.medium, at.ray, active), active)
+    if trace.baseline is not None:
+        term -= branch.bare * σ_t * trace.baseline(mei, σ_t, majorant(branch.medium, at.ray, active), active)
     return dr.select(active, branch.mass * term, 0)

@@ -11,9 +11,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.meet import meet
-from ..transport.vertex import Walk
-from .counted import Counted, key_of
-from .edges import Places
+from ..transport.vertex import TraceConfig
+from .counter_sampler import CounterSampler, key_of
+from .edges import FilmDomain
 
 SAMPLED = frozenset(map(int, (mi.ShapeType.Sphere, mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Cylinder)))
 RAYS = 1024
@@ -21,15 +21,17 @@ THROUGH = 4
 """Surfaces of the shape itself that a ray passes at most."""
 
 
-def casters(walk: Walk) -> list[mi.Shape]:
+def casters(trace: TraceConfig) -> list[mi.Shape]:
     """The shapes that are known to move, and of which points can be drawn."""
-    return [shape for shape in walk.traits.moving or () if shape.is_mesh() or int(shape.shape_type()) in SAMPLED]
+    return [shape for shape in trace.traits.moving or () if shape.is_mesh() or int(shape.shape_type()) in SAMPLED]
 
 
 @dr.syntax
-def cast_shadows(walk: Walk, shapes: list[mi.Shape], places: Places, seed: mi.UInt32) -> tuple[mi.Point2f, mi.Bool]:
+def cast_shadows(
+    trace: TraceConfig, shapes: list[mi.Shape], places: FilmDomain, seed: mi.UInt32
+) -> tuple[mi.Point2f, mi.Bool]:
     """Places of the film, and whether a shadow of one of the shapes may fall there."""
-    numbers = Counted.of(key_of(dr.arange(mi.UInt32, RAYS), seed))
+    numbers = CounterSampler.of(key_of(dr.arange(mi.UInt32, RAYS), seed))
     number, u = dr.minimum(mi.UInt32(numbers.next_1d() * len(shapes)), len(shapes) - 1), numbers.next_2d()
     which = numbers.next_1d()
     shape, at = mi.ShapePtr(shapes[0]), dr.zeros(mi.Interaction3f)
@@ -37,14 +39,14 @@ def cast_shadows(walk: Walk, shapes: list[mi.Shape], places: Places, seed: mi.UI
         there = number == k
         shape = dr.select(there, mi.ShapePtr(shapes[k]), shape)
         at.p = dr.select(there, _point(shapes[k], which, u), at.p)
-    light, _ = walk.scene.sample_emitter_direction(at, numbers.next_2d(), False, True)
+    light, _ = trace.scene.sample_emitter_direction(at, numbers.next_2d(), False, True)
     active = light.pdf > 0
     ray = mi.Ray3f(at.p, -light.d)
-    hit = meet(walk, ray, active)
+    hit = meet(trace, ray, active)
     n = mi.UInt32(0)
-    while dr.hint(active & (hit.shape == shape) & (n < THROUGH), exclude=[walk], label="pathreplay: cast a shadow"):
+    while dr.hint(active & (hit.shape == shape) & (n < THROUGH), exclude=[trace], label="pathreplay: cast a shadow"):
         ray = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, mi.Bool(True)).spawn_ray(ray.d)
-        hit = meet(walk, ray, mi.Bool(True))
+        hit = meet(trace, ray, mi.Bool(True))
         n += 1
     s, inside = places.of_point(ray.o + hit.t * ray.d)
     return s, active & hit.is_valid() & inside

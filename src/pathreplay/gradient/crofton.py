@@ -20,7 +20,7 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from .counted import ROUNDS
+from .counter_sampler import ROUNDS
 
 BISECTIONS = 12
 """How often a line is halved: what is left of it is 2^-12 as long."""
@@ -43,7 +43,7 @@ BEYOND = 1.5
 
 
 @dataclass
-class Sight:
+class VisibilityProbe:
     """What is seen at a place of a line: two of them tell whether there is an edge between."""
 
     signature: mi.UInt32
@@ -59,20 +59,20 @@ class Sight:
     lobe: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # its plane may hide what is there
 
     @staticmethod
-    def nothing() -> Sight:
-        return Sight(mi.UInt32(0), mi.Point3f(0), mi.Normal3f(0))
+    def nothing() -> VisibilityProbe:
+        return VisibilityProbe(mi.UInt32(0), mi.Point3f(0), mi.Normal3f(0))
 
-    def differs(self, other: Sight) -> mi.Bool:
+    def differs(self, other: VisibilityProbe) -> mi.Bool:
         """Whether it is another shape, or another sheet of the same: see `hides_itself`."""
         return self.hint(other) > 0
 
-    def hint(self, other: Sight) -> mi.Float:
+    def hint(self, other: VisibilityProbe) -> mi.Float:
         """How likely it is that there is an edge between, as an importance: 0 where there is none for certain."""
         same = dr.select(hides_itself(self.p, self.n, other.p, other.n), bend_or_edge(self, other), 0)
         hint = dr.select((self.signature != other.signature) | self._crease(other), 1, same)
         return dr.select(self.moves | other.moves, hint, 0)
 
-    def _crease(self, other: Sight) -> mi.Bool:
+    def _crease(self, other: VisibilityProbe) -> mi.Bool:
         """Whether another triangle is seen, and a direction is between their planes, or close: it jumps what they hide.
 
         Directions turn with the shading normal on the way to the crease, by no more than triangles do.
@@ -100,7 +100,7 @@ def hides_itself(p: mi.Point3f, n: mi.Normal3f, p_other: mi.Point3f, n_other: mi
     return off > OFF_PLANE * dr.norm(across) + rounding
 
 
-def bend_or_edge(a: Sight, b: Sight) -> mi.Float:
+def bend_or_edge(a: VisibilityProbe, b: VisibilityProbe) -> mi.Float:
     """How likely one sheet hides the other: on a bend each point is on the same side of the other's tangent plane."""
     across = b.p - a.p
     return dr.select(dr.dot(a.n, across) * dr.dot(b.n, across) < 0, BENDS, HIDES)
@@ -143,7 +143,7 @@ class Crossed:
     weight: mi.Float  # number of crossings that it stands for; 0: none
 
 
-Look = Callable[..., Sight]
+Probe = Callable[..., VisibilityProbe]
 """(line, place on it, active) -> what is seen there."""
 
 
@@ -156,9 +156,9 @@ class Survey:
     bright: mi.Float
 
 
-def glance(look: Look, line: Any, active: mi.Bool) -> mi.Float:
+def detect(probe: Probe, line: Any, active: mi.Bool) -> mi.Float:
     """How much a line counts, whose places are from ``line.begin`` to ``line.end``: 0 where it finds nothing."""
-    return survey([look(line, t, active) for t in looked_at(line)], active).found
+    return survey([probe(line, t, active) for t in looked_at(line)], active).found
 
 
 def looked_at(line: Any) -> tuple[mi.Float, mi.Float, mi.Float]:
@@ -166,7 +166,7 @@ def looked_at(line: Any) -> tuple[mi.Float, mi.Float, mi.Float]:
     return line.begin, line.end, 0.5 * (line.begin + line.end)
 
 
-def survey(sights: list[Sight], active: mi.Bool) -> Survey:
+def survey(sights: list[VisibilityProbe], active: mi.Bool) -> Survey:
     """What a line tells, with so much seen at its places: see `looked_at`."""
     at_a, at_b, at_c = sights
     ends, halves = at_a.hint(at_b), dr.maximum(at_c.hint(at_a), at_c.hint(at_b))
@@ -178,14 +178,14 @@ def survey(sights: list[Sight], active: mi.Bool) -> Survey:
 
 
 @dataclass
-class Picked:
+class Resampled:
     """A line for each lane, by its index among many, and what the lane stands for."""
 
     index: mi.UInt32
     weight: mi.Float  # 1 / expected number of lanes with that line; 0: no line finds anything
 
     @staticmethod
-    def of(mass: mi.Float, lanes: int, seed: mi.UInt32) -> Picked:
+    def of(mass: mi.Float, lanes: int, seed: mi.UInt32) -> Resampled:
         """As often as ``mass`` says, which is that of each line."""
         dr.eval(mass)  # before it is used twice
         n = dr.width(mass)
@@ -196,7 +196,7 @@ class Picked:
         found = dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float64, until, i) <= x)
         index = mi.UInt32(dr.minimum(found, n - 1))  # a number where there is one line
         own = dr.gather(mi.Float, mass, index)
-        return Picked(index, dr.select(own > 0, mi.Float(total / lanes) / own, 0))
+        return Resampled(index, dr.select(own > 0, mi.Float(total / lanes) / own, 0))
 
 
 def alone(m: mi.Float) -> mi.Float:
@@ -210,17 +210,17 @@ def alone(m: mi.Float) -> mi.Float:
 
 
 @dr.syntax
-def part_seen(look: Look, line: Line, at_a: Sight, at_b: Sight, active: mi.Bool) -> mi.Float:
+def part_seen(probe: Probe, line: Line, at_a: VisibilityProbe, at_b: VisibilityProbe, active: mi.Bool) -> mi.Float:
     """The share of a line around its middle in which it looks as at neither end, within a sixteenth on each side.
 
     There may be edges within: what counts is that a line with its middle there finds something.
     """
     middle, half = 0.5 * (line.begin + line.end), 0.5 * (line.end - line.begin)
     n, share, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)
-    while dr.hint(active & (n < 2 * PARTS), exclude=[look, line], label="pathreplay: part of a line"):
+    while dr.hint(active & (n < 2 * PARTS), exclude=[probe, line], label="pathreplay: part of a line"):
         side = dr.select(n < PARTS, mi.Float(-1), 1)
         further = reach + step
-        there = look(line, middle + side * half * further, mi.Bool(True))
+        there = probe(line, middle + side * half * further, mi.Bool(True))
         within = there.differs(at_a) | there.differs(at_b)
         reach, step = dr.select(within, further, reach), 0.5 * step
         n += 1
@@ -231,7 +231,7 @@ def part_seen(look: Look, line: Line, at_a: Sight, at_b: Sight, active: mi.Bool)
 
 
 @dr.syntax
-def bisect(look: Look, line: Any, weight: mi.Float, pick: mi.PCG32) -> Crossed:
+def bisect(probe: Probe, line: Any, weight: mi.Float, pick: mi.PCG32) -> Crossed:
     """A piece of each line with an edge, 2^-12 as long as the line, where ``weight`` is not zero.
 
     Of several crossings one is chosen, by how likely they are edges; what only the middle found counts as `alone` says.
@@ -239,18 +239,18 @@ def bisect(look: Look, line: Any, weight: mi.Float, pick: mi.PCG32) -> Crossed:
     very few rays slip: an end in a crack never moves, and beyond it all is as at the other end.
     """
     a, b, weight = mi.Float(line.begin), mi.Float(line.end), mi.Float(weight)
-    at_a, at_b = look(line, a, weight > 0), look(line, b, weight > 0)
+    at_a, at_b = probe(line, a, weight > 0), probe(line, b, weight > 0)
     only_middle = (weight > 0) & ~at_a.differs(at_b)
-    weight = dr.select(only_middle, alone(part_seen(look, line, at_a, at_b, only_middle)) * weight, weight)
+    weight = dr.select(only_middle, alone(part_seen(probe, line, at_a, at_b, only_middle)) * weight, weight)
     n, still, was_left = mi.UInt32(0), mi.UInt32(0), mi.Bool(False)
     while dr.hint(
         (weight > 0) & ((n < BISECTIONS) | ((n == BISECTIONS) & (still >= STILL))),
-        exclude=[look, line],
+        exclude=[probe, line],
         label="pathreplay: bisection",
     ):
         halve, beyond = n < BISECTIONS, BEYOND * (b - a)
         c = dr.select(halve, 0.5 * (a + b), dr.select(was_left, a - beyond, b + beyond))
-        at_c = look(line, c, mi.Bool(True))
+        at_c = probe(line, c, mi.Bool(True))
         to_a, to_b = at_c.hint(at_a), at_c.hint(at_b)
         both = to_a + to_b
         left = (to_b == 0) | (pick.next_float32() * both < to_a)

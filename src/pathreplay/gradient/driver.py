@@ -7,8 +7,8 @@ from typing import Protocol
 import mitsuba as mi
 
 from ..transport.start import CameraStart
-from ..transport.vertex import Walk
-from .adjoint import LostPaths
+from ..transport.vertex import TraceConfig
+from .adjoint import NonFiniteCounter
 
 
 class Driver(Protocol):
@@ -18,7 +18,7 @@ class Driver(Protocol):
     under `dr.suspend_grad`. Its docstring says what it does not differentiate.
     """
 
-    def __call__(self, walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -> bool: ...
+    def __call__(self, trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool: ...
 
 
 class ForwardDriver(Protocol):
@@ -27,4 +27,6 @@ class ForwardDriver(Protocol):
     The parameters carry their tangents already.
     """
 
-    def __call__(self, walk: Walk, start: CameraStart, lost: LostPaths) -> tuple[mi.Spectrum, mi.Bool, bool]: ...
+    def __call__(
+        self, trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter
+    ) -> tuple[mi.Spectrum, mi.Bool, bool]: ...

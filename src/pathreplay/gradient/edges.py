@@ -1,9 +1,9 @@
 """Edges: what their motion adds to a gradient, carried from where they were found back to parameters and camera.
 
-Two searches find edges along camera paths: `film_edges` those that a path slides over, `inner_edges` those that a
-scattering vertex sees. Both tell how the edge moves at their vertex, as a function of the ray that arrives there. The
-rest is the same for both: reverse mode takes the adjoint of that ray back along the records of the path, forward mode
-brings its tangent from the camera.
+Two searches find edges along camera paths: `primary_boundary` those that a path slides over, `secondary_boundary` those
+that a scattering vertex sees. Both tell how the edge moves at their vertex, as a function of the ray that arrives
+there. The rest is the same for both: reverse mode takes the adjoint of that ray back along the records of the path,
+forward mode brings its tangent from the camera.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.vertex import Walk
-from .adjoint import LostPaths, RayDerivative, backward, backward_ray, forward_ray, forward_step, tangents
+from ..transport.vertex import TraceConfig
+from .adjoint import NonFiniteCounter, RayDerivative, backward, backward_ray, forward_ray, forward_step, tangents
 from .record import Layout, read_back
 from .two_walks import walk_back
 
 
-class Places(Protocol):
+class FilmDomain(Protocol):
     """Where on a film paths may begin: places (Point2f, in pixels) from its corner to ``size``."""
 
     @property
@@ -53,10 +53,12 @@ class Edges:
     motion: Callable[[mi.Ray3f], mi.Spectrum]  # zero where nothing was found
 
 
-def edges_backward(walk: Walk, places: Places, found: Edges, W: mi.Spectrum, lost: LostPaths) -> None:
+def edges_backward(
+    trace: TraceConfig, places: FilmDomain, found: Edges, W: mi.Spectrum, lost: NonFiniteCounter
+) -> None:
     """Back-propagate W·motion into the parameters; ``W`` is the adjoint of radiance that arrives at the places."""
     q = backward_ray(found.ray, lambda ray: dr.sum(W * found.motion(ray)))
-    q = ray_to_camera(walk, places, found, q, lost)
+    q = ray_to_camera(trace, places, found, q, lost)
     with dr.resume_grad():
         ray, _ = places.ray(found.s, found.key)
         if dr.grad_enabled(ray.o, ray.d):
@@ -66,7 +68,7 @@ def edges_backward(walk: Walk, places: Places, found: Edges, W: mi.Spectrum, los
 
 
 @dr.syntax
-def edges_forward(walk: Walk, places: Places, found: Edges) -> mi.Spectrum:
+def edges_forward(trace: TraceConfig, places: FilmDomain, found: Edges) -> mi.Spectrum:
     """The tangent of the motion, which is that of the radiance at the places. Parameters carry their tangents."""
     with dr.resume_grad():
         ray = places.ray(found.s, found.key)[0]
@@ -74,20 +76,25 @@ def edges_forward(walk: Walk, places: Places, found: Edges) -> mi.Spectrum:
     δ = RayDerivative(mi.Point3f(δo), mi.Vector3f(δd), mi.Float(0))
     layout, records, k, ray0 = found.layout, found.records, found.k, dr.detach(ray)
     i = mi.UInt32(0)
-    while dr.hint(i < k, exclude=[walk, layout, ray0], label="pathreplay: towards an edge"):
+    while dr.hint(i < k, exclude=[trace, layout, ray0], label="pathreplay: towards an edge"):
         v = read_back(layout, records, i, k, ray0)
-        δ = forward_step(walk, v, True, δ, mi.Bool(True))[3].finite_part()[0]
+        δ = forward_step(trace, v, True, δ, mi.Bool(True))[3].finite_part()[0]
         i += 1
     return forward_ray(found.ray, δ, found.motion)
 
 
 def ray_to_camera(
-    walk: Walk, places: Places, found: Edges, q: RayDerivative, lost: LostPaths, rays_only: bool = False
+    trace: TraceConfig,
+    places: FilmDomain,
+    found: Edges,
+    q: RayDerivative,
+    lost: NonFiniteCounter,
+    rays_only: bool = False,
 ) -> RayDerivative:
     """The adjoint of the camera ray, from that of the ray that sees the edge; ``rays_only``: reaching no parameter."""
     none, k = mi.Spectrum(0), found.k
     ray0 = dr.detach(places.ray(found.s, found.key)[0])
     first, count, last = mi.UInt32(0), mi.UInt32(k), mi.UInt32(k)
     return walk_back(
-        walk, found.layout, found.records, first, count, last, ray0, none, none, q, lost, rays_only=rays_only
+        trace, found.layout, found.records, first, count, last, ray0, none, none, q, lost, rays_only=rays_only
     )[1]

@@ -8,13 +8,13 @@ import mitsuba as mi
 from ..transport.motion import path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
-from ..transport.vertex import Walk
-from .adjoint import LostPaths, RayDerivative, forward_step, tangents
+from ..transport.vertex import TraceConfig
+from .adjoint import NonFiniteCounter, RayDerivative, forward_step, tangents
 from .branch import Branch, branch_term
 
 
 @dr.syntax
-def forward(walk: Walk, start: CameraStart, lost: LostPaths) -> tuple[mi.Spectrum, mi.Bool, bool]:
+def forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
     """Tangent of the radiance along the rays of a ``start``: ``(δL, valid, moves)``, the first two per ray.
 
     The parameters must carry their tangents already (propagate to them before the call). Nothing is divided, so a
@@ -30,19 +30,19 @@ def forward(walk: Walk, start: CameraStart, lost: LostPaths) -> tuple[mi.Spectru
     δβ = mi.Spectrum(0)  # tangent of the throughput
     broken = mi.Bool(False)  # a tangent was not finite
     sampler = start.sampler
-    path = PathState.begin(walk, start, sustained=True)
+    path = PathState.begin(trace, start, sustained=True)
     ray0 = path.at.ray
-    valid = mi.Bool(walk.background_is_opaque) & path.active
-    moves = path_moves(walk, start, path.at)
+    valid = mi.Bool(trace.background_is_opaque) & path.active
+    moves = path_moves(trace, start, path.at)
     branch = Branch.none()
 
-    while dr.hint(path.active, exclude=[walk, moves, lost], label="pathreplay: forward"):
-        u, step = path.choose(walk, sampler)
+    while dr.hint(path.active, exclude=[trace, moves, lost], label="pathreplay: forward"):
+        u, step = path.choose(trace, sampler)
         valid |= path.active & step.seen
-        if dr.hint(walk.branch, mode="scalar"):
+        if dr.hint(trace.branch, mode="scalar"):
             branch = branch.offer(path, step)
-        onward, v = path.advance(walk, u, step)
-        again, δe, δw, δ = forward_step(walk, v, moves, δ, path.active)
+        onward, v = path.advance(trace, u, step)
+        again, δe, δw, δ = forward_step(trace, v, moves, δ, path.active)
         if dr.hint(moves, mode="scalar"):
             δ, finite = δ.finite_part()
             lost.add(path.active & ~finite & ~broken)
@@ -51,7 +51,7 @@ def forward(walk: Walk, start: CameraStart, lost: LostPaths) -> tuple[mi.Spectru
         δβ = (δβ * dr.detach(again.w) + path.β * δw) * v.rr_weight
         path = onward
 
-    if dr.hint(walk.branch, mode="scalar"):
+    if dr.hint(trace.branch, mode="scalar"):
         with dr.resume_grad():
-            δL += tangents(branch_term(walk, branch, sampler, ray0))[0]
+            δL += tangents(branch_term(trace, branch, sampler, ray0))[0]
     return δL, valid, moves

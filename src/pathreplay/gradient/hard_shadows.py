@@ -12,13 +12,13 @@ import mitsuba as mi
 
 from ..transport.emitters import draw_emitter
 from ..transport.meet import meet
-from ..transport.passage import beyond_null
+from ..transport.passage import skip_null
 from ..transport.signature import edge_normal, outline_gap
-from ..transport.vertex import Arrival, Walk, is_smooth
+from ..transport.vertex import Arrival, TraceConfig, is_smooth
 
 
 @dataclass
-class Shade:
+class ShadowTest:
     """What keeps a light from a point: something between, or that it is outside of a projector's picture or a cone."""
 
     u: mi.Point2f  # which light
@@ -28,22 +28,22 @@ class Shade:
     uv: mi.Point2f  # place in it
 
     @staticmethod
-    def of(walk: Walk, at: Arrival, u: mi.Point2f, k: mi.UInt32, active: mi.Bool) -> Shade:
+    def of(trace: TraceConfig, at: Arrival, u: mi.Point2f, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
         """That of the light which ``u`` samples where a path arrives as its k-th vertex, if that has no extent."""
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
-        scatters = _scatters(walk, si, k, active)
-        light, Le = draw_emitter(walk.scene, si, u, scatters, visible=False)
+        scatters = _scatters(trace, si, k, active)
+        light, Le = draw_emitter(trace.scene, si, u, scatters, visible=False)
         lit = scatters & (light.pdf != 0)
         ray = si.spawn_ray_to(light.p)
-        hit = meet(walk, ray, lit & light.delta)
-        if walk.clear:
-            hit = beyond_null(walk, ray, hit, lit)
+        hit = meet(trace, ray, lit & light.delta)
+        if trace.clear:
+            hit = skip_null(trace, ray, hit, lit)
         outside = mi.Bool(False)
-        for projector in walk.traits.projectors:
+        for projector in trace.traits.projectors:
             outside |= (light.pdf == 0) & (light.emitter == mi.EmitterPtr(projector))
-        for spot in walk.traits.spots:
+        for spot in trace.traits.spots:
             outside |= (light.emitter == mi.EmitterPtr(spot)) & _ends_at_once(spot) & dr.all(Le == 0)
-        return Shade(u, ray, hit, outside & scatters, light.uv)
+        return ShadowTest(u, ray, hit, outside & scatters, light.uv)
 
     @property
     def dark(self) -> mi.Bool:
@@ -54,21 +54,21 @@ class Shade:
         return edge_normal(self.hit, self.ray, active & ~self.outside)
 
     def gap(
-        self, walk: Walk, n: mi.Vector3f, met: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
+        self, trace: TraceConfig, n: mi.Vector3f, met: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
     ) -> mi.Float:
         """B: zero where the shadow on the surface that was ``met`` ends; ``n`` is the `normal`.
 
         Differentiable in the ray, which slides over that surface, in the surfaces and in the light.
         """
         si = met.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        light, _ = walk.scene.sample_emitter_direction(si, self.u, False, active)
+        light, _ = trace.scene.sample_emitter_direction(si, self.u, False, active)
         shadow = outline_gap(n, si.p, light.d, self.hit, self.ray, active & ~self.outside)
-        if not walk.traits.projectors and not walk.traits.spots:
+        if not trace.traits.projectors and not trace.traits.spots:
             return shadow
         beside = (self.uv.x < 0) | (self.uv.x > 1)
         border = dr.select(dr.select(beside, self.uv.x, self.uv.y) > 0.5, mi.Float(1), 0)
         gap = dr.select(beside, light.uv.x, light.uv.y) - border
-        for spot in walk.traits.spots:
+        for spot in trace.traits.spots:
             gap = dr.select(light.emitter == mi.EmitterPtr(spot), _inside_cone(spot, light), gap)
         return dr.select(active & self.outside, gap, shadow)
 
@@ -86,14 +86,14 @@ def _inside_cone(spot: mi.Emitter, light: mi.DirectionSample3f) -> mi.Float:
 
 
 def light_of(
-    walk: Walk, si: mi.SurfaceInteraction3f, u: mi.Point2f, k: mi.UInt32, active: mi.Bool
+    trace: TraceConfig, si: mi.SurfaceInteraction3f, u: mi.Point2f, k: mi.UInt32, active: mi.Bool
 ) -> tuple[mi.DirectionSample3f, mi.Bool]:
     """The emitter sample of the k-th vertex, and whether there is any."""
-    lit = _scatters(walk, si, k, active)
-    light, _ = draw_emitter(walk.scene, si, u, lit, visible=False)
+    lit = _scatters(trace, si, k, active)
+    light, _ = draw_emitter(trace.scene, si, u, lit, visible=False)
     return light, lit & (light.pdf != 0)
 
 
-def _scatters(walk: Walk, si: mi.SurfaceInteraction3f, k: mi.UInt32, active: mi.Bool) -> mi.Bool:
+def _scatters(trace: TraceConfig, si: mi.SurfaceInteraction3f, k: mi.UInt32, active: mi.Bool) -> mi.Bool:
     """Whether the k-th vertex scatters light of emitters."""
-    return active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < walk.max_depth)
+    return active & si.is_valid() & is_smooth(si.bsdf()) & (k + 1 < trace.max_depth)

@@ -15,8 +15,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.surface import held_point
-from ..transport.vertex import Walk
-from .seer import Seer
+from ..transport.vertex import TraceConfig
+from .observer import ObserverVertex
 
 
 @dataclass
@@ -29,15 +29,15 @@ class Lamp:
     around: mi.Bool  # its samples go around: see `sample_at`
 
     @staticmethod
-    def of(walk: Walk, index: mi.UInt32, active: mi.Bool) -> Lamp:
+    def of(trace: TraceConfig, index: mi.UInt32, active: mi.Bool) -> Lamp:
         """The emitter of an index."""
-        emitter = dr.gather(mi.EmitterPtr, walk.scene.emitters_dr(), index, active)
+        emitter = dr.gather(mi.EmitterPtr, trace.scene.emitters_dr(), index, active)
         around = mi.Bool(False)
-        if walk.traits.ball_lights:
+        if trace.traits.ball_lights:
             around = emitter.get_shape().shape_type() == int(mi.ShapeType.Sphere)
-        if not walk.traits.mesh_lights:
+        if not trace.traits.mesh_lights:
             return Lamp(emitter, mi.Point3f(0), mi.Float(0), around)
-        ball = dr.gather(mi.Vector4f, walk.traits.tables.lamp_balls, index, active)
+        ball = dr.gather(mi.Vector4f, trace.traits.tables.lamp_balls, index, active)
         return Lamp(emitter, mi.Point3f(ball.x, ball.y, ball.z), ball.w, around)
 
 
@@ -53,30 +53,30 @@ class Glimpse:
     hidden: mi.Bool
 
 
-def glimpse(walk: Walk, seer: Seer, lamp: Lamp, u: mi.Point2f, active: mi.Bool) -> Glimpse:
+def glimpse(trace: TraceConfig, observer: ObserverVertex, lamp: Lamp, u: mi.Point2f, active: mi.Bool) -> Glimpse:
     """Look at a place of a lamp's square. Detached."""
     in_cone = active & (lamp.radius > 0)
-    light, Le = lamp.emitter.sample_direction(seer.origin, sample_at(walk, lamp, u), active & ~in_cone)
-    ray = seer.origin.spawn_ray_to(light.p)
+    light, Le = lamp.emitter.sample_direction(observer.origin, sample_at(trace, lamp, u), active & ~in_cone)
+    ray = observer.origin.spawn_ray_to(light.p)
     looks = active & (light.pdf != 0)
-    if not walk.traits.mesh_lights:
-        hit = seer.behind(ray, seer.hit(ray, looks), looks)
+    if not trace.traits.mesh_lights:
+        hit = observer.behind(ray, observer.hit(ray, looks), looks)
         return Glimpse(light, Le, light.pdf, ray, hit, _hides(hit, light.emitter, looks))
-    d, Ω = direction(lamp, seer.origin.p, u)
-    ray = dr.select(in_cone, seer.origin.spawn_ray(d), ray)
+    d, Ω = direction(lamp, observer.origin.p, u)
+    ray = dr.select(in_cone, observer.origin.spawn_ray(d), ray)
     looks |= in_cone
-    first = seer.hit(ray, looks)
+    first = observer.hit(ray, looks)
     at_lamp = in_cone & first.is_valid() & (first.shape.emitter() == lamp.emitter)  # also if light goes through it
-    hit = dr.select(at_lamp, first, seer.behind(ray, first, looks & ~at_lamp))
+    hit = dr.select(at_lamp, first, observer.behind(ray, first, looks & ~at_lamp))
     seen = in_cone & hit.is_valid() & (hit.shape.emitter() == lamp.emitter)
     si = hit.compute_surface_interaction(ray, mi.RayFlags.All, seen)
-    there = mi.DirectionSample3f(walk.scene, si=si, ref=seer.origin)
+    there = mi.DirectionSample3f(trace.scene, si=si, ref=observer.origin)
     there.d = d
     light, density = dr.select(in_cone, there, light), dr.select(in_cone, 0, light.pdf)
     Le = dr.select(in_cone, dr.select(seen, lamp.emitter.eval(si, seen) * Ω, 0), Le)
-    density = dr.select(seen, lamp.emitter.pdf_direction(seer.origin, there, seen), density)
+    density = dr.select(seen, lamp.emitter.pdf_direction(observer.origin, there, seen), density)
     # What is behind the ball does not hide it.
-    near = ~in_cone | (hit.t < dr.norm(lamp.centre - seer.origin.p) + lamp.radius)
+    near = ~in_cone | (hit.t < dr.norm(lamp.centre - observer.origin.p) + lamp.radius)
     return Glimpse(light, Le, density, ray, hit, _hides(hit, lamp.emitter, looks) & near)
 
 
@@ -85,9 +85,9 @@ def _hides(hit: mi.PreliminaryIntersection3f, emitter: mi.EmitterPtr, active: mi
     return active & hit.is_valid() & (hit.shape.emitter() != emitter)
 
 
-def sample_at(walk: Walk, lamp: Lamp, u: mi.Point2f) -> mi.Point2f:
+def sample_at(trace: TraceConfig, lamp: Lamp, u: mi.Point2f) -> mi.Point2f:
     """The sample of an emitter at a place; of a ball that at the place's distance and angle on the disk, as evenly."""
-    if not walk.traits.ball_lights:
+    if not trace.traits.ball_lights:
         return u
     p = mi.warp.square_to_uniform_disk_concentric(u)
     turn = dr.inv_two_pi * dr.atan2(p.y, p.x)
@@ -111,15 +111,15 @@ def direction(lamp: Lamp, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi
 
 
 def followed(
-    walk: Walk, lamp: Lamp, origin: mi.Interaction3f, u: mi.Point2f, glue: Glimpse, active: mi.Bool
+    trace: TraceConfig, lamp: Lamp, origin: mi.Interaction3f, u: mi.Point2f, glue: Glimpse, active: mi.Bool
 ) -> mi.Vector3f:
     """The direction to a place of a lamp, differentiable in it, and in the origin and the lamp.
 
     On a mesh the point that follows it is that which ``glue`` sees.
     """
     in_cone = active & (lamp.radius > 0)
-    light, _ = lamp.emitter.sample_direction(origin, sample_at(walk, lamp, u), active & ~in_cone)
-    if not walk.traits.mesh_lights:
+    light, _ = lamp.emitter.sample_direction(origin, sample_at(trace, lamp, u), active & ~in_cone)
+    if not trace.traits.mesh_lights:
         return light.d
     d, _ = direction(lamp, origin.p, u)
     y = held_point(glue.hit, dr.detach(glue.ray), in_cone & glue.hit.is_valid()).p

@@ -25,8 +25,8 @@ import mitsuba as mi
 from ..transport.motion import path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
-from ..transport.vertex import Walk
-from .adjoint import LostPaths, RayDerivative
+from ..transport.vertex import TraceConfig
+from .adjoint import NonFiniteCounter, RayDerivative
 from .pixel_numbers import PixelNumbers
 from .record import Layout, record_type, room_for
 from .two_walks import first_walk, walk_back
@@ -42,7 +42,12 @@ class PixelLoss:
 
 @dr.syntax
 def pixel_sweep(
-    walk: Walk, numbers: PixelNumbers, camera: Callable[..., Any], paths: int, loss: PixelLoss, lost: LostPaths
+    trace: TraceConfig,
+    numbers: PixelNumbers,
+    camera: Callable[..., Any],
+    paths: int,
+    loss: PixelLoss,
+    lost: NonFiniteCounter,
 ) -> tuple[bool, mi.Spectrum]:
     """Walk ``paths`` paths (two or more) in every lane and back-propagate the loss.
 
@@ -50,13 +55,13 @@ def pixel_sweep(
     detached, and their weights: (sampler, active) -> (Ray3f, Spectrum). For scenes without media. What is not
     differentiated, what is counted as ``lost`` and what is raised: see `sweep`.
     """
-    room, size = room_for(walk), numbers.together(paths)
+    room, size = room_for(trace), numbers.together(paths)
     total = mi.Spectrum(0)  # radiance of all paths
     with dr.suspend_grad():
         sampler = numbers.first()
         ray0, _ = camera(sampler.clone(), mi.Bool(True))
         start = CameraStart(ray0, sampler, mi.Bool(True))
-        layout = Layout.of(walk, path_moves(walk, start, PathState.begin(walk, start).at))
+        layout = Layout.of(trace, path_moves(trace, start, PathState.begin(trace, start).at))
     records = dr.alloc_local(record_type(layout), paths * room)
     counts = dr.alloc_local(mi.UInt32, paths)  # of each path the number of its records
     ends = dr.alloc_local(mi.Spectrum, paths)  # what comes from beyond them
@@ -64,23 +69,23 @@ def pixel_sweep(
     s = mi.UInt32(0)  # number of the path
 
     while dr.hint(
-        s < paths, exclude=[walk, numbers, camera, layout, start, lost], label="pathreplay: paths of a pixel"
+        s < paths, exclude=[trace, numbers, camera, layout, start, lost], label="pathreplay: paths of a pixel"
     ):
         sampler = numbers.of(sampler, s % size, size, s // size)
-        ray, β = camera(sampler, mi.Bool(walk.max_depth > 0))
-        path = PathState.begin(walk, CameraStart(ray, sampler, mi.Bool(True)), sustained=True)
+        ray, β = camera(sampler, mi.Bool(trace.max_depth > 0))
+        path = PathState.begin(trace, CameraStart(ray, sampler, mi.Bool(True)), sustained=True)
         path.β, path.β_alive = mi.Spectrum(β), mi.Spectrum(β)
-        records, count, L, beyond, _branch = first_walk(walk, sampler, path, layout, records, s * room, lost)
+        records, count, L, beyond, _branch = first_walk(trace, sampler, path, layout, records, s * room, lost)
         counts[s], ends[s] = count, beyond
         sets[s // size] += L
         total += L
         s += 1
 
-    while dr.hint(s > 0, exclude=[walk, ray0, lost, loss, layout, start], label="pathreplay: pixel, backwards"):
+    while dr.hint(s > 0, exclude=[trace, ray0, lost, loss, layout, start], label="pathreplay: pixel, backwards"):
         s -= 1
         others = mi.Float(paths - dr.minimum(size, paths - s // size * size))
         δL = (loss.offset + loss.slope * ((total - sets[s // size]) / others)) / paths
         first, count, still = s * room, mi.UInt32(counts[s]), RayDerivative.zero()
-        walk_back(walk, layout, records, first, count, first + count - 1, ray0, δL, mi.Spectrum(ends[s]), still, lost)
+        walk_back(trace, layout, records, first, count, first + count - 1, ray0, δL, mi.Spectrum(ends[s]), still, lost)
 
     return layout.moves, total / paths

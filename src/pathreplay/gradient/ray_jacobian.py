@@ -17,7 +17,7 @@ import mitsuba as mi
 from ..transport.emitters import emission
 from ..transport.path import PathState
 from ..transport.step import repeat_step
-from ..transport.vertex import Arrival, Numbers, Replayed, Walk, reciprocal
+from ..transport.vertex import Arrival, TraceConfig, VertexRecord, VertexSamples, reciprocal
 from .adjoint import tangents
 
 # Noise is needed where `independence` is below this. At held smooth lobes it would be zero but for float32 rounding,
@@ -89,9 +89,9 @@ class Linearised:
     frame_next: RayFrame  # of the next ray
 
 
-def has_smooth_lobes(walk: Walk) -> bool:
+def has_smooth_lobes(trace: TraceConfig) -> bool:
     """Whether any BSDF of the scene has a lobe other than delta lobes."""
-    return bool(walk.traits.detached_names or walk.traits.attachables)
+    return bool(trace.traits.detached_names or trace.traits.attachables)
 
 
 def length_scale(scene: mi.Scene) -> float:
@@ -101,9 +101,9 @@ def length_scale(scene: mi.Scene) -> float:
     return diagonal / 2 if 0 < diagonal < float("inf") else 1.0
 
 
-def emission_slope(walk: Walk, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
+def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
     """How weight·e (detached weight) changes with the density of an arrival and the distance it came."""
-    if not has_smooth_lobes(walk):
+    if not has_smooth_lobes(trace):
         return Slope(mi.Float(0), mi.Float(0))
     slopes = []
     for k in range(2):
@@ -115,20 +115,26 @@ def emission_slope(walk: Walk, at: Arrival, weight: mi.Spectrum, active: mi.Bool
             si = at.hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
             ray.o = ray.o + ray.d * slide
             slid = Arrival(ray=ray, hit=at.hit, pdf=pdf, delta=at.delta, camera=at.camera)
-            e = dr.sum(weight * emission(walk.scene, slid, si, True, active))
+            e = dr.sum(weight * emission(trace.scene, slid, si, True, active))
             slopes.append(dr.select(active, tangents(e)[0], 0))
     return Slope(*slopes)
 
 
 def local_terms(
-    walk: Walk, v: Replayed, at: Arrival, weight: mi.Spectrum, slope: Slope, frame_next: RayFrame, active: mi.Bool
+    trace: TraceConfig,
+    v: VertexRecord,
+    at: Arrival,
+    weight: mi.Spectrum,
+    slope: Slope,
+    frame_next: RayFrame,
+    active: mi.Bool,
 ) -> tuple[mi.Float, mi.Spectrum, list[mi.Float]]:
     """The step at ``v`` with a differentiable arrival: what its adjoint is made of.
 
     δL·β_i e_i + (slope of e_{i+1})·(pdf, slide), w_i/detach(w_i) (0 where w_i is 0) and the four coordinates of
     the next ray. ``weight`` is δL β_i, ``slope`` that of the next vertex.
     """
-    step = repeat_step(walk, replace(v, at=at), True, active)
+    step = repeat_step(trace, replace(v, at=at), True, active)
     o, d = step.ray_next.o, step.ray_next.d
     e = dr.sum(weight * step.e)
     e += dr.select(v.go_on, slope.pdf * step.pdf + slope.slide * dr.dot(dr.detach(d), o), 0)
@@ -136,13 +142,15 @@ def local_terms(
     return e, w, frame_next.coordinates(o, d)
 
 
-def linearise(walk: Walk, v: Replayed, onward: PathState, δL: mi.Spectrum, scale: float, active: mi.Bool) -> Linearised:
+def linearise(
+    trace: TraceConfig, v: VertexRecord, onward: PathState, δL: mi.Spectrum, scale: float, active: mi.Bool
+) -> Linearised:
     """Differentiate `local_terms` by the four coordinates of the ray, and by nothing else.
 
     ``onward`` is the path at the next vertex, ``scale`` the unit of length. Both passes call this very function, so
     that they see the same numbers to the last bit.
     """
-    slope = emission_slope(walk, onward.at, δL * onward.β, v.go_on)
+    slope = emission_slope(trace, onward.at, δL * onward.β, v.go_on)
     frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
     columns = []
     for k in range(4):
@@ -153,7 +161,7 @@ def linearise(walk: Walk, v: Replayed, onward: PathState, δL: mi.Spectrum, scal
             ray = mi.Ray3f(v.at.ray)
             ray.o, ray.d = frame.point(ray.o, x), frame.direction(ray.d, x)
             at = Arrival(ray=ray, hit=v.at.hit, pdf=v.at.pdf, delta=v.at.delta, camera=v.at.camera)
-            e, w, x_next = local_terms(walk, v, at, δL * v.β, slope, frame_next, active)
+            e, w, x_next = local_terms(trace, v, at, δL * v.β, slope, frame_next, active)
             columns.append(tangents(e, w, *x_next))
     A = [columns[k][2 + j] for j in range(4) for k in range(4)]
     e, log_w = mi.Vector4f(*[c[0] for c in columns]), [c[1] for c in columns]
@@ -173,7 +181,7 @@ def _unit_tangent(value: mi.Float) -> mi.Float:
     return variable
 
 
-def random_sign(u: Numbers) -> mi.Float:
+def random_sign(u: VertexSamples) -> mi.Float:
     """+1 or -1 with even odds: a hash of a vertex's numbers, so it repeats and takes none from the sampler."""
     bits = [dr.reinterpret_array(mi.UInt32, x) for x in (u.light.x, u.roulette)]
     return dr.select((mi.sample_tea_32(bits[0], bits[1], 4)[0] & 1) == 0, mi.Float(1), mi.Float(-1))

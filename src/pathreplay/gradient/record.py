@@ -13,7 +13,17 @@ import drjit as dr
 import mitsuba as mi
 
 from ..device import Device, device_of
-from ..transport.vertex import Arrival, Flight, Kept, KeptInMedia, KnownLight, Numbers, Replayed, Shadow, Walk
+from ..transport.vertex import (
+    Arrival,
+    Flight,
+    KnownLight,
+    SampledContinuation,
+    SampledInMedia,
+    Shadow,
+    TraceConfig,
+    VertexRecord,
+    VertexSamples,
+)
 
 # Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x up to 136 bytes are 4.5 MB, and a
 # thread's stack is 8 MB. Beyond the stack the process would die without a word.
@@ -25,22 +35,22 @@ MAX_DEPTH_MEDIA = 1024
 MAX_RECORDS_MEDIA = 2000
 
 
-def deepest(walk: Walk, device: Device | None = None) -> int:
+def deepest(trace: TraceConfig, device: Device | None = None) -> int:
     """The largest ``max_depth`` that the sweep driver can hold in this scene, on the device of the active variant.
 
     On a GPU that is a share of its memory: see `pathreplay.device`.
     """
     device = device_of(mi.variant()) if device is None else device
     if not device.is_gpu:
-        return MAX_DEPTH if walk.media is None else MAX_DEPTH_MEDIA
-    if walk.media is None:
-        return device.most_records(largest_record(walk), MAX_DEPTH)
-    return min(MAX_DEPTH_MEDIA, max((device.most_records(largest_record(walk), 2**30) - 8) // 3, 0))
+        return MAX_DEPTH if trace.media is None else MAX_DEPTH_MEDIA
+    if trace.media is None:
+        return device.most_records(largest_record(trace), MAX_DEPTH)
+    return min(MAX_DEPTH_MEDIA, max((device.most_records(largest_record(trace), 2**30) - 8) // 3, 0))
 
 
-def largest_record(walk: Walk) -> int:
+def largest_record(trace: TraceConfig) -> int:
     """Bytes of a vertex, whether the path moves or not: in the one case light is remembered, in the other numbers."""
-    return max(_bytes(Layout.of(walk, moves)) for moves in (False, True))
+    return max(_bytes(Layout.of(trace, moves)) for moves in (False, True))
 
 
 def _bytes(layout: Layout) -> int:
@@ -48,11 +58,11 @@ def _bytes(layout: Layout) -> int:
     return 4 * sum(dr.size_v(kind) if dr.depth_v(kind) > 1 else 1 for kind in kinds) + 4  # and the word
 
 
-def room_for(walk: Walk) -> int:
+def room_for(trace: TraceConfig) -> int:
     """How many vertices the record has room for: with media also two null boundaries at each, as convex ones need."""
-    if walk.media is None:
-        return device_of(mi.variant()).room(max(walk.max_depth, 1))
-    return min(3 * walk.max_depth + 8, MAX_RECORDS_MEDIA)
+    if trace.media is None:
+        return device_of(mi.variant()).room(max(trace.max_depth, 1))
+    return min(3 * trace.max_depth + 8, MAX_RECORDS_MEDIA)
 
 
 @dataclass(frozen=True)
@@ -77,13 +87,13 @@ class Layout:
         return not self.fixed
 
     @staticmethod
-    def of(walk: Walk, moves: bool) -> Layout:
+    def of(trace: TraceConfig, moves: bool) -> Layout:
         """The layout for a walk."""
-        media = walk.media is not None
-        fixed = not media and not moves and not walk.traits.lights_vary
-        kinds = {name: media and getattr(walk.media, name) for name in ("chromatic", "emissive", "passes")}
-        glows, resamples = fixed and walk.traits.area_lights, walk.resamples or media
-        return Layout(mi.variant(), moves, resamples, fixed, glows, media=media, branch=walk.branch, **kinds)
+        media = trace.media is not None
+        fixed = not media and not moves and not trace.traits.lights_vary
+        kinds = {name: media and getattr(trace.media, name) for name in ("chromatic", "emissive", "passes")}
+        glows, resamples = fixed and trace.traits.area_lights, trace.resamples or media
+        return Layout(mi.variant(), moves, resamples, fixed, glows, media=media, branch=trace.branch, **kinds)
 
 
 # Where it stands in a Replayed, its type in Mitsuba, and what of the layout has it remembered.
@@ -146,7 +156,7 @@ def record_type(layout: Layout) -> type:
     return make_dataclass("Record", [*fields.items(), ("word", mi.UInt32)])
 
 
-def record(layout: Layout, v: Replayed) -> Any:
+def record(layout: Layout, v: VertexRecord) -> Any:
     """A vertex, to be written."""
     fields = {}
     for place, kind, remembered in FIELDS:
@@ -160,7 +170,7 @@ def record(layout: Layout, v: Replayed) -> Any:
     return record_type(layout)(**fields, word=word)
 
 
-def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, ray0: mi.Ray3f) -> Replayed:
+def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, ray0: mi.Ray3f) -> VertexRecord:
     """The vertex recorded at ``index``.
 
     ``last`` is the index of the path's last vertex; time and wavelengths are those of the ray ``ray0``.
@@ -178,7 +188,7 @@ def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, r
     return replace(v, kept=kept, go_on=index < last, hit_next=onward.hit)
 
 
-def _read(layout: Layout, read: Any, ray0: mi.Ray3f) -> Replayed:
+def _read(layout: Layout, read: Any, ray0: mi.Ray3f) -> VertexRecord:
     v = _blank(layout, ray0)
     for place, kind, remembered in FIELDS:
         if getattr(layout, remembered):
@@ -191,22 +201,22 @@ def _read(layout: Layout, read: Any, ray0: mi.Ray3f) -> Replayed:
     return v
 
 
-def _blank(layout: Layout, ray0: mi.Ray3f) -> Replayed:
+def _blank(layout: Layout, ray0: mi.Ray3f) -> VertexRecord:
     """A vertex of which nothing is known yet; what is not remembered stays what it is here."""
     zero, no = mi.Float(0), mi.Bool(False)
     ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0), ray0.time, ray0.wavelengths)
     at = Arrival(ray, dr.zeros(mi.PreliminaryIntersection3f), zero, no, no)
-    kept = Kept(mi.Vector3f(0), zero, no, no, mi.UInt32(0), no)
+    kept = SampledContinuation(mi.Vector3f(0), zero, no, no, mi.UInt32(0), no)
     if layout.fixed:
         kept.known = KnownLight(mi.Spectrum(0), mi.Vector3f(0), mi.Spectrum(0))
     if layout.media:
         flight = Flight(no, zero, zero, mi.Spectrum(1), zero)
-        kept.media = KeptInMedia(no, flight, Shadow(mi.Spectrum(0), zero, dr.zeros(mi.MediumPtr), zero))
-    u = Numbers(mi.Point2f(0), zero, mi.Point2f(0), zero)
-    return Replayed(at, u, kept, no, at.hit, zero, mi.Spectrum(0))
+        kept.media = SampledInMedia(no, flight, Shadow(mi.Spectrum(0), zero, dr.zeros(mi.MediumPtr), zero))
+    u = VertexSamples(mi.Point2f(0), zero, mi.Point2f(0), zero)
+    return VertexRecord(at, u, kept, no, at.hit, zero, mi.Spectrum(0))
 
 
-def _put(v: Replayed, place: str, value: Any) -> None:
+def _put(v: VertexRecord, place: str, value: Any) -> None:
     *way, name = place.split(".")
     setattr(reduce(getattr, way, v), name, value)
 

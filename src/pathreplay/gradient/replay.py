@@ -17,8 +17,8 @@ from ..transport.motion import path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.step import repeat_step
-from ..transport.vertex import Walk, reciprocal
-from .adjoint import LostPaths, backward
+from ..transport.vertex import TraceConfig, reciprocal
+from .adjoint import NonFiniteCounter, backward
 from .branch import Branch, branch_backward
 from .primal import walk_on
 from .ray_jacobian import Recovery, has_smooth_lobes
@@ -27,10 +27,10 @@ from .replay_attached import replay_attached
 
 
 def replay(
-    walk: Walk,
+    trace: TraceConfig,
     start: CameraStart,
     δL: mi.Spectrum,
-    lost: LostPaths,
+    lost: NonFiniteCounter,
     recovery: Recovery = Recovery(),  # noqa: B008 (it is frozen)
 ) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
@@ -40,19 +40,19 @@ def replay(
     visibility, weights that are exactly zero (the sweep driver keeps their derivatives) and, with ``attach='none'``,
     everything that moves.
     """
-    path = PathState.begin(walk, start, sustained=walk.branch)  # so that branches get the numbers of other drivers
-    moves = path_moves(walk, start, path.at)
+    path = PathState.begin(trace, start, sustained=trace.branch)  # so that branches get the numbers of other drivers
+    moves = path_moves(trace, start, path.at)
     if not moves:
-        _replay_still(walk, start, path, δL)
-    elif walk.media is not None:
+        _replay_still(trace, start, path, δL)
+    elif trace.media is not None:
         raise PathreplayError(
             "driver = 'replay' cannot follow paths that move through media: use driver = 'sweep', "
             f"with max_depth of at most {MAX_DEPTH_MEDIA}"
         )
     else:
-        if has_smooth_lobes(walk):
+        if has_smooth_lobes(trace):
             _warn_of_smooth_lobes()
-        replay_attached(walk, start, path, δL, lost, recovery)
+        replay_attached(trace, start, path, δL, lost, recovery)
     return moves
 
 
@@ -68,28 +68,28 @@ def _warn_of_smooth_lobes() -> None:
 
 
 @dr.syntax
-def _replay_still(walk: Walk, start: CameraStart, path: PathState, δL: mi.Spectrum) -> None:
+def _replay_still(trace: TraceConfig, start: CameraStart, path: PathState, δL: mi.Spectrum) -> None:
     """Replay a path that does not move.
 
     Peels β_{i+1} L_{i+1} = β_i L_i - β_i e_i and differentiates it as (β_i L_{i+1}) w_i through the relative
     derivative of w_i.
     """
     sampler, ray0 = start.sampler, path.at.ray
-    L = walk_on(walk, sampler.clone(), dr.copy(path))[0]  # β_i L_i, peeled on the way
+    L = walk_on(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, peeled on the way
     branch = Branch.none()
 
-    while dr.hint(path.active, exclude=[walk], label="pathreplay: replay"):
-        u, step = path.choose(walk, sampler)
+    while dr.hint(path.active, exclude=[trace], label="pathreplay: replay"):
+        u, step = path.choose(trace, sampler)
         L -= path.β * step.e
-        if dr.hint(walk.branch, mode="scalar"):
+        if dr.hint(trace.branch, mode="scalar"):
             branch = branch.offer(path, step)
 
-        onward, v = path.advance(walk, u, step)
+        onward, v = path.advance(trace, u, step)
         with dr.resume_grad():
-            again = repeat_step(walk, v, False, path.active)
+            again = repeat_step(trace, v, False, path.active)
             Lo = path.β * again.e + L * again.w * dr.detach(reciprocal(again.w))
             backward(dr.sum(δL * Lo))
         path = onward
 
-    if dr.hint(walk.branch, mode="scalar"):
-        branch_backward(walk, branch, sampler, ray0, δL)
+    if dr.hint(trace.branch, mode="scalar"):
+        branch_backward(trace, branch, sampler, ray0, δL)

@@ -16,13 +16,13 @@ import mitsuba as mi
 
 from ..transport.path import PathState
 from ..transport.start import CameraStart
-from ..transport.vertex import Walk
-from .adjoint import LostPaths, backward
+from ..transport.vertex import TraceConfig
+from .adjoint import NonFiniteCounter, backward
 from .ray_jacobian import RayFrame, Recovery, length_scale, linearise, local_terms, random_sign
 
 
 def replay_attached(
-    walk: Walk, start: CameraStart, path: PathState, δL: mi.Spectrum, lost: LostPaths, recovery: Recovery
+    trace: TraceConfig, start: CameraStart, path: PathState, δL: mi.Spectrum, lost: NonFiniteCounter, recovery: Recovery
 ) -> None:
     """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start`` of a ``path``.
 
@@ -30,9 +30,9 @@ def replay_attached(
     delta lobes. Behind smooth lobes A_i has rank two: without noise q is lost there, with noise the result is unbiased
     as long as rounding is not magnified beyond it. Not differentiated: visibility, and weights that are exactly zero.
     """
-    scale = length_scale(walk.scene)
+    scale = length_scale(trace.scene)
     again = start.sampler.clone()
-    L, q = _tangents(walk, start.sampler, dr.copy(path), δL, recovery, scale)
+    L, q = _tangents(trace, start.sampler, dr.copy(path), δL, recovery, scale)
     overflow = ~dr.all(dr.isfinite(q))
     q = dr.select(overflow, 0, q)
     with dr.resume_grad():
@@ -42,12 +42,12 @@ def replay_attached(
             x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
             backward(sum(q0[k] * x[k] for k in range(4)))
-    _peel(walk, again, path, δL, L, q, overflow, lost, recovery, scale)
+    _peel(trace, again, path, δL, L, q, overflow, lost, recovery, scale)
 
 
 @dr.syntax
 def _tangents(
-    walk: Walk, sampler: mi.Sampler, path: PathState, δL: mi.Spectrum, recovery: Recovery, scale: float
+    trace: TraceConfig, sampler: mi.Sampler, path: PathState, δL: mi.Spectrum, recovery: Recovery, scale: float
 ) -> tuple[mi.Spectrum, mi.Vector4f]:
     """First pass: L_0 and δL·∂L_0/∂r_0."""
     Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
@@ -56,10 +56,10 @@ def _tangents(
     J = Matrix(1)  # ∂r_i/∂r_0
     κ = [Spectrum(0) for _ in range(4)]  # ∂ log β_i / ∂r_0, by each coordinate
 
-    while dr.hint(path.active, exclude=[walk, recovery, scale], label="pathreplay: tangents"):
-        u, step = path.choose(walk, sampler)
-        onward, v = path.advance(walk, u, step)
-        local = linearise(walk, v, onward, δL, scale, path.active)
+    while dr.hint(path.active, exclude=[trace, recovery, scale], label="pathreplay: tangents"):
+        u, step = path.choose(trace, sampler)
+        onward, v = path.advance(trace, u, step)
+        local = linearise(trace, v, onward, δL, scale, path.active)
 
         L += Spectrum(v.β * step.e)
         lit = Spectrum(δL) * Spectrum(v.β * step.e)
@@ -73,14 +73,14 @@ def _tangents(
 
 @dr.syntax
 def _peel(
-    walk: Walk,
+    trace: TraceConfig,
     sampler: mi.Sampler,
     path: PathState,
     δL: mi.Spectrum,
     L: mi.Spectrum,
     q: mi.Vector4f,
     overflow: mi.Bool,
-    lost: LostPaths,
+    lost: NonFiniteCounter,
     recovery: Recovery,
     scale: float,
 ) -> None:
@@ -88,11 +88,11 @@ def _peel(
     Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
     broken = mi.Bool(False)  # this path has been counted as lost
 
-    while dr.hint(path.active, exclude=[walk, recovery, scale, lost], label="pathreplay: replay"):
-        u, step = path.choose(walk, sampler)
-        onward, v = path.advance(walk, u, step)
+    while dr.hint(path.active, exclude=[trace, recovery, scale, lost], label="pathreplay: replay"):
+        u, step = path.choose(trace, sampler)
+        onward, v = path.advance(trace, u, step)
         L = dr.select(v.go_on, L - Spectrum(v.β * step.e), 0)
-        local = linearise(walk, v, onward, δL, scale, path.active)
+        local = linearise(trace, v, onward, δL, scale, path.active)
 
         p = Vector(local.e) + Vector(*[dr.sum(Spectrum(δL) * L * Spectrum(k)) for k in local.log_w])
         A = recovery.regularised(Matrix(local.A), random_sign(u), ~v.kept.delta)
@@ -103,7 +103,7 @@ def _peel(
         broken |= breaks
 
         with dr.resume_grad():
-            e, w, x_next = local_terms(walk, v, v.at, δL * v.β, local.slope, local.frame_next, path.active)
+            e, w, x_next = local_terms(trace, v, v.at, δL * v.β, local.slope, local.frame_next, path.active)
             q_next = mi.Vector4f(q)
             target = e + dr.sum(δL * mi.Spectrum(L) * w) + sum(q_next[k] * x_next[k] for k in range(4))
             if dr.hint(dr.grad_enabled(target), mode="scalar"):  # not so where the camera alone moves

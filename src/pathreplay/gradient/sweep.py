@@ -13,15 +13,17 @@ from ..errors import PathreplayError
 from ..transport.motion import path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
-from ..transport.vertex import Walk
-from .adjoint import LostPaths, RayDerivative, backward
-from .baseline import Seen
+from ..transport.vertex import TraceConfig
+from .adjoint import NonFiniteCounter, RayDerivative, backward
+from .baseline import BaselineStats
 from .branch import branch_backward
 from .record import Layout, deepest, record_type, room_for
 from .two_walks import first_walk, walk_back
 
 
-def sweep(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths, seen: Seen | None = None) -> bool:
+def sweep(
+    trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter, seen: BaselineStats | None = None
+) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
 
     Returns whether the path moves with the parameters; if so, ``lost`` counts paths with an adjoint that was not
@@ -30,24 +32,24 @@ def sweep(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths, see
     visibility and, with ``attach='none'``, everything that moves.
     Raises PathreplayError when ``max_depth`` is above `deepest`, or when no parameter reaches the paths.
     """
-    if walk.max_depth > deepest(walk):
+    if trace.max_depth > deepest(trace):
         raise PathreplayError(
-            f"max_depth = {walk.max_depth} is more than the sweep driver can hold ({deepest(walk)}): "
+            f"max_depth = {trace.max_depth} is more than the sweep driver can hold ({deepest(trace)}): "
             "use driver = 'replay', which has no limit"
         )
-    path = PathState.begin(walk, start, sustained=True)
+    path = PathState.begin(trace, start, sustained=True)
     ray0 = path.at.ray
-    moves = path_moves(walk, start, path.at)
-    layout = Layout.of(walk, moves)
-    records = dr.alloc_local(record_type(layout), room_for(walk))
-    records, count, _, L, branch = first_walk(walk, start.sampler, path, layout, records, mi.UInt32(0), lost)
+    moves = path_moves(trace, start, path.at)
+    layout = Layout.of(trace, moves)
+    records = dr.alloc_local(record_type(layout), room_for(trace))
+    records, count, _, L, branch = first_walk(trace, start.sampler, path, layout, records, mi.UInt32(0), lost)
 
     first, q = mi.UInt32(0), RayDerivative.zero()
-    _, q = walk_back(walk, layout, records, first, count, count - 1, ray0, δL, L, q, lost, seen)
-    if walk.branch:
+    _, q = walk_back(trace, layout, records, first, count, count - 1, ray0, δL, L, q, lost, seen)
+    if trace.branch:
         if seen is not None:
             seen.tally(branch.number)
-        branch_backward(walk, branch, start.sampler, ray0, δL)
+        branch_backward(trace, branch, start.sampler, ray0, δL)
     with dr.resume_grad():
         o, d = start.repeat()
         if moves and dr.grad_enabled(o, d):

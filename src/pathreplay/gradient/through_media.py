@@ -16,34 +16,34 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport.meet import meet
-from ..transport.passage import SHORT_OF, further, passage
+from ..transport.passage import SHORT_OF, further, transmittance_up_to
 from ..transport.path import PathState
 from ..transport.start import CameraStart, behind_emitters
-from ..transport.vertex import Arrival, Walk
-from .counted import Counted
+from ..transport.vertex import Arrival, TraceConfig
+from .counter_sampler import CounterSampler
 
 
-def clear(walk: Walk) -> Walk:
+def clear(trace: TraceConfig) -> TraceConfig:
     """The walk as if there were no media, nor null boundaries."""
-    return walk if walk.media is None else replace(walk, media=None, clear=True)  # type: ignore[arg-type]
+    return trace if trace.media is None else replace(trace, media=None, clear=True)  # type: ignore[arg-type]
 
 
 @dr.syntax
-def left_of_light(
-    walk: Walk, ray: mi.Ray3f, key: mi.UInt32, k: mi.UInt32, reach: mi.Float, active: mi.Bool
+def transmittance_to_split(
+    trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, k: mi.UInt32, reach: mi.Float, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.MediumPtr]:
     """Transmittance of a chain up to ``reach`` after its k-th vertex, and the medium there."""
-    thin = clear(walk)
-    numbers, others = Counted.of(key), Counted(mi.UInt32(key), mi.UInt32(0x50000))
+    thin = clear(trace)
+    numbers, others = CounterSampler.of(key), CounterSampler(mi.UInt32(key), mi.UInt32(0x50000))
     path = PathState.begin(thin, CameraStart(ray, numbers, active))
     T = mi.Spectrum(1)
-    around = walk.media.around
+    around = trace.media.around
     medium = dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)
     count = mi.UInt32(0)
-    while dr.hint(path.active & (count <= k), exclude=[walk, thin], label="pathreplay: left of light"):
+    while dr.hint(path.active & (count <= k), exclude=[trace, thin], label="pathreplay: left of light"):
         last = count == k
         length = dr.select(last, reach, SHORT_OF * path.at.hit.t)
-        part, medium = passage(walk, path.at.ray, length, medium, others, path.active)
+        part, medium = transmittance_up_to(trace, path.at.ray, length, medium, others, path.active)
         T *= part
         u, step = path.choose(thin, numbers)
         si = path.at.hit.compute_surface_interaction(path.at.ray, mi.RayFlags.All, path.active & ~last)
@@ -54,10 +54,10 @@ def left_of_light(
     return T, medium
 
 
-def going_on(walk: Walk, at: Arrival, t: mi.Float, medium: mi.MediumPtr, active: mi.Bool) -> Arrival:
+def going_on(trace: TraceConfig, at: Arrival, t: mi.Float, medium: mi.MediumPtr, active: mi.Bool) -> Arrival:
     """The same arrival, as it is seen from distance ``t`` on its ray, where there is ``medium``."""
     ray = further(at.ray, t)
-    hit = meet(walk, ray, active)
-    if walk.hide_emitters:
-        hit = behind_emitters(walk, ray, hit, active & at.camera)
+    hit = meet(trace, ray, active)
+    if trace.hide_emitters:
+        hit = behind_emitters(trace, ray, hit, active & at.camera)
     return Arrival(ray, hit, at.pdf, at.delta, at.camera, medium, t)

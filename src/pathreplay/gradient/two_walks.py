@@ -10,55 +10,61 @@ import mitsuba as mi
 
 from ..transport.arrive import background
 from ..transport.path import PathState
-from ..transport.vertex import Walk
-from .adjoint import LostPaths, RayDerivative, backward_step
-from .baseline import Seen
+from ..transport.vertex import TraceConfig
+from .adjoint import NonFiniteCounter, RayDerivative, backward_step
+from .baseline import BaselineStats
 from .branch import Branch
 from .record import Layout, read_back, record, room_for
 
 
 @dr.syntax
 def first_walk(
-    walk: Walk, sampler: mi.Sampler, path: PathState, layout: Layout, records: Any, first: mi.UInt32, lost: LostPaths
+    trace: TraceConfig,
+    sampler: mi.Sampler,
+    path: PathState,
+    layout: Layout,
+    records: Any,
+    first: mi.UInt32,
+    lost: NonFiniteCounter,
 ) -> tuple[Any, mi.UInt32, mi.Spectrum, mi.Spectrum, Branch]:
     """Record a path from ``first`` on; gives the records, their number, the radiance, what comes of it from beyond the
     records (relative to the throughput there), and the branch.
 
     All lanes of a packet write to the same place: elsewhere writes to local memory get lost (Dr.Jit 1.5).
     """
-    walk = replace(walk, leaves=layout.fixed)
+    trace = replace(trace, leaves=layout.fixed)
     L, beyond = mi.Spectrum(0), mi.Spectrum(0)  # radiance so far
     count = mi.UInt32(0)  # vertices, and null boundaries
     branch, left = Branch.none(), mi.Bool(False)
-    if dr.hint(walk.leaves, mode="scalar"):
+    if dr.hint(trace.leaves, mode="scalar"):
         path, left = path.leave()
 
-    while dr.hint(path.active, exclude=[walk, layout, lost], label="pathreplay: record"):
-        u, step = path.choose(walk, sampler)
-        onward, v = path.advance(walk, u, step)
+    while dr.hint(path.active, exclude=[trace, layout, lost], label="pathreplay: record"):
+        u, step = path.choose(trace, sampler)
+        onward, v = path.advance(trace, u, step)
         records[first + count] = record(layout, v)
-        if dr.hint(walk.branch, mode="scalar"):
+        if dr.hint(trace.branch, mode="scalar"):
             branch = branch.offer(path, step)
         L += path.β * step.e
         path = onward
         count += 1
-        if dr.hint(walk.media is not None, mode="scalar"):
-            full = path.active & (count >= room_for(walk))
+        if dr.hint(trace.media is not None, mode="scalar"):
+            full = path.active & (count >= room_for(trace))
             lost.add(full)
             path.active &= ~full
-        if dr.hint(walk.leaves, mode="scalar"):
+        if dr.hint(trace.leaves, mode="scalar"):
             path, gone = path.leave()
             left |= gone
 
-    if dr.hint(walk.leaves, mode="scalar"):
-        beyond = background(walk, path.at, left)
+    if dr.hint(trace.leaves, mode="scalar"):
+        beyond = background(trace, path.at, left)
         L += path.β * beyond
     return records, count, L, beyond, branch
 
 
 @dr.syntax
 def walk_back(
-    walk: Walk,
+    trace: TraceConfig,
     layout: Layout,
     records: Any,
     first: mi.UInt32,
@@ -68,8 +74,8 @@ def walk_back(
     δL: mi.Spectrum,
     L: mi.Spectrum,
     q: RayDerivative,
-    lost: LostPaths,
-    seen: Seen | None = None,
+    lost: NonFiniteCounter,
+    seen: BaselineStats | None = None,
     rays_only: bool = False,
 ) -> tuple[mi.Spectrum, RayDerivative]:
     """Back-propagate from the last of ``count`` records to the first; gives radiance and ray adjoint there.
@@ -79,10 +85,10 @@ def walk_back(
     """
     broken = mi.Bool(False)  # a part of the adjoint was not finite
 
-    while dr.hint(count > 0, exclude=[walk, layout, ray0, lost, seen, rays_only], label="pathreplay: sweep"):
+    while dr.hint(count > 0, exclude=[trace, layout, ray0, lost, seen, rays_only], label="pathreplay: sweep"):
         count -= 1
         v = read_back(layout, records, first + count, last, ray0)
-        L, q, breaks = backward_step(walk, v, layout.moves, δL, L, q, mi.Bool(True), rays_only)
+        L, q, breaks = backward_step(trace, v, layout.moves, δL, L, q, mi.Bool(True), rays_only)
         if dr.hint(seen is not None, mode="scalar"):
             seen.learn(v, L)  # type: ignore[union-attr]
         if dr.hint(layout.moves, mode="scalar"):

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.vertex import Walk
+from ..transport.vertex import TraceConfig
 from .crofton import Survey
-from .seer import Seer
+from .observer import ObserverVertex
 
 WITHIN = 2.0
 """`blend_length`s of what is seen: closer than these nothing counts more."""
@@ -46,16 +46,16 @@ def _finite(x: mi.Float) -> mi.Float:
     return dr.select(dr.isfinite(x), x, 0)
 
 
-def closeness(walk: Walk, hit: mi.PreliminaryIntersection3f) -> mi.Float:
+def closeness(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Float:
     """1 / r, as fast as what was hit turns when it moves on; see `WITHIN`."""
     shape = dr.reinterpret_array(mi.UInt32, hit.shape)
-    h0 = dr.gather(mi.Float, walk.traits.tables.blend_lengths, shape, hit.is_valid())
+    h0 = dr.gather(mi.Float, trace.traits.tables.blend_lengths, shape, hit.is_valid())
     return dr.select(hit.is_valid(), dr.rcp(hit.t + WITHIN * h0), 0)
 
 
-def own_plane(seer: Seer, a: mi.Vector3f, b: mi.Vector3f) -> mi.Float:
+def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Float:
     """`OWN` where the plane of the seer's own triangle lies between two directions, else 1."""
-    return dr.select(seer.parts(a, b), OWN, mi.Float(1))
+    return dr.select(observer.parts(a, b), OWN, mi.Float(1))
 
 
 def radiance_of(worths: list[Worth]) -> mi.Float:

@@ -270,10 +270,10 @@ class Evaluator:
         share = about.share / len(problem.trained())
         problem.album.rest()
         with plain_errors():
-            value, untold, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
+            value, deferred, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
                 problem.params, problem.scene, sensor, self.integrator, target, weight, number, spp,
                 problem.loss, share, self._sweeps[which], factor, batch,
             )  # fmt: skip
-        if untold is not None:
-            self.integrator.tell(untold, target.shape[0] * target.shape[1] * spp)
+        if deferred is not None:
+            self.integrator.tell(deferred, target.shape[0] * target.shape[1] * spp)
         return float(value[0]) if dr.width(value) else float("nan"), by_factor

@@ -49,7 +49,7 @@ class NonFinite:
 
 
 @dataclass(frozen=True)
-class Faint:
+class LowSNR:
     """The gradient of a variable is lost in noise: signal to noise, over the last iterations."""
 
     key: str
@@ -72,9 +72,9 @@ class Stopped:
     done: int
 
 
-Event = Started | Entered | Finished | Refined | NonFinite | Faint | Stepped | Stopped
+Event = Started | Entered | Finished | Refined | NonFinite | LowSNR | Stepped | Stopped
 
-Told = Entered | Finished | Refined | NonFinite | Faint
+Told = Entered | Finished | Refined | NonFinite | LowSNR
 
 
 def note_of(event: Told) -> str:
@@ -106,7 +106,7 @@ class Notes:
         """The line; "" where there is nothing to say, or it has been said."""
         if isinstance(event, (Started, Stepped, Stopped)):
             return ""
-        if isinstance(event, (NonFinite, Faint)):
+        if isinstance(event, (NonFinite, LowSNR)):
             if (type(event), event.key) in self._told:
                 return ""
             self._told.add((type(event), event.key))

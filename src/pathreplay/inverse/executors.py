@@ -1,7 +1,7 @@
 """Shards evaluated by actors of Ray, which hold scene and kernels: on this machine or on a cluster, with the same bits.
 
-Large values are sent once in a step. Who computes what is up to `Sharing`; an evaluation is a function of values, shard
-and what was learned, and evaluations are added up in the order of the shards, so that it does not matter.
+Large values are sent once in a step. `Scheduler` decides who computes what. It does not matter: an evaluation is a
+function of values, shard and what was learned, and evaluations are added up in the order of the shards.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config import Config
 from pathreplay.inverse.evaluate import Evaluation, Shard
 from pathreplay.inverse.problem import Problem
-from pathreplay.inverse.ray_actor import Answer, Hello, Parcel, RayActor, versions
+from pathreplay.inverse.ray_actor import Answer, RayActor, Ready, WorkerInit, versions
 from pathreplay.inverse.ray_cluster import Cluster, connected, load_ray
-from pathreplay.inverse.sharing import Sharing, Step
+from pathreplay.inverse.scheduler import Scheduler, Step
 from pathreplay.inverse.targets import Targets
 from pathreplay.inverse.values import Arrays
 from pathreplay.scenes.descriptions import one_line
@@ -71,23 +71,23 @@ class _Call:
 
 
 @dataclass
-class Crew:
+class WorkerPool:
     """The actors of a run, and what they are asked; the executors of a job and of its rival share them."""
 
     cluster: Cluster
     actors: dict[int, Any]
-    parcel: Any
+    setup: Any
     """Ray's reference to what they need to know."""
     retries: int
     tell: Tell
     status: Tell = lambda text: None
     """Told how far a step is, again and again."""
     counts: Counts = field(default_factory=Counts)
-    sharings: list[Sharing] = field(default_factory=list)
+    schedulers: list[Scheduler] = field(default_factory=list)
     """What is known of them for each who asks."""
     calls: dict[Any, _Call] = field(default_factory=dict)
     """By Ray's reference to the answer."""
-    ready: dict[int, Hello] = field(default_factory=dict)
+    ready: dict[int, Ready] = field(default_factory=dict)
     said: set[str] = field(default_factory=set)
 
     @property
@@ -142,7 +142,7 @@ class Crew:
             self.cluster.require()
             self._lost(call, error)
             return None
-        if isinstance(answer, Hello):
+        if isinstance(answer, Ready):
             self._there(call.actor, answer)
             return None
         if answer is None:
@@ -150,9 +150,9 @@ class Crew:
         return answer
 
     def _greet(self, number: int) -> None:
-        self.calls[self.actors[number].hello.remote(self.parcel)] = _Call(number)
+        self.calls[self.actors[number].hello.remote(self.setup)] = _Call(number)
 
-    def _there(self, number: int, hello: Hello) -> None:
+    def _there(self, number: int, hello: Ready) -> None:
         """An actor is ready. Raises PathreplayError if it is of other versions."""
         if hello.versions != versions():
             raise PathreplayError(
@@ -194,17 +194,17 @@ class Crew:
 class RayExecutor:
     """Evaluates shards by actors of Ray: an `Executor`. `crew_of` makes the crew; ``rival`` says whose integrator."""
 
-    def __init__(self, crew: Crew, names: Sequence[str] = (), rival: bool = False) -> None:
-        self.crew, self.names, self.rival = crew, names, rival
-        self.sharing = Sharing()
-        crew.sharings.append(self.sharing)
+    def __init__(self, pool: WorkerPool, names: Sequence[str] = (), rival: bool = False) -> None:
+        self.pool, self.names, self.rival = pool, names, rival
+        self.scheduler = Scheduler()
+        pool.schedulers.append(self.scheduler)
 
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
         """See `Executor`. Raises PathreplayError where actors are lost for good, and what evaluations raise."""
         if not shards:
             return
-        crew, step = self.crew, Step(self.sharing, shards)
-        sent = [crew.sent(dict(each)) for each in (values, learned)]
+        pool, step = self.pool, Step(self.scheduler, shards)
+        sent = [pool.sent(dict(each)) for each in (values, learned)]
         size = _bytes_of(values)
         found: dict[int, Evaluation] = {}
         losses: dict[int, int] = {}
@@ -215,15 +215,15 @@ class RayExecutor:
                 given += 1
                 continue
             self._hand_out(step, shards, size, *sent)
-            late = step.patience() if crew.idle() else None
+            late = step.patience() if pool.idle() else None
             patience = SOON_S if late is None else min(SOON_S, max(0.0, late - time.monotonic()))
-            answered = crew.answered(patience)
+            answered = pool.answered(patience)
             for call, _ in answered:
                 if call.step is not None:
                     call.step.heard(call.indices[0], call.actor)
             self._hand_out(step, shards, size, *sent)
             for call, reference in answered:
-                answers = crew.fetch(call, reference)
+                answers = pool.fetch(call, reference)
                 if call.step is None:
                     continue
                 if answers is None:
@@ -232,36 +232,36 @@ class RayExecutor:
                 for index, answer in zip(call.indices, answers, strict=True):
                     if call.step.finished(index, call.actor, answer.seconds) and call.step is step:
                         found[index] = self._taken(answer)
-                crew.status(f"{len(crew.ready)} actors, shard {len(step.done)} of {len(shards)}")
-            if not crew.ready and time.monotonic() - begin > SOON_S:
-                crew.say_once("ray: no actor is ready yet; is there room for them? 'ray status' tells")
+                pool.status(f"{len(pool.ready)} actors, shard {len(step.done)} of {len(shards)}")
+            if not pool.ready and time.monotonic() - begin > SOON_S:
+                pool.say_once("ray: no actor is ready yet; is there room for them? 'ray status' tells")
 
     def _hand_out(self, step: Step, shards: Sequence[Shard], size: int, values: Any, learned: Any) -> None:
         """Give idle actors what they have to do. Values, and so gradients, have ``size`` bytes."""
-        idle = self.crew.idle()
+        idle = self.pool.idle()
         for number in step.in_turn(idle):
             late = len(step.again)
             first = step.next(number, time.monotonic(), idle)
             if first is None:
                 break  # what is nothing for one is hardly anything for the others, of whom there may be many
-            self.crew.counts.twice += len(step.again) - late
-            indices = (first, *step.along(number, size, len(self.crew.ready)))
-            self.crew.ask(
+            self.pool.counts.twice += len(step.again) - late
+            indices = (first, *step.along(number, size, len(self.pool.ready)))
+            self.pool.ask(
                 number, _Call(number, step, indices), self.rival, values, [shards[i] for i in indices], learned
             )
 
     def _lost(self, call: _Call, step: Step, shards: Sequence[Shard], losses: dict[int, int]) -> None:
         """An actor was lost at a call, which may be one of a step before."""
         assert call.step is not None
-        for sharing in self.crew.sharings:
-            sharing.forget(call.actor)
+        for scheduler in self.pool.schedulers:
+            scheduler.forget(call.actor)
         for index in call.indices:
             call.step.lost(index, call.actor)
             if call.step is not step or index in step.done:
                 continue
-            self.crew.counts.again += 1
+            self.pool.counts.again += 1
             losses[index] = losses.get(index, 0) + 1
-            if losses[index] > self.crew.retries:
+            if losses[index] > self.pool.retries:
                 raise PathreplayError(
                     f"ray: {self._name([shards[i] for i in call.indices])} has ended {losses[index]} actors, one "
                     "after the other; give them more memory, or raise ray.max_task_retries"
@@ -269,10 +269,10 @@ class RayExecutor:
 
     def _taken(self, answer: Answer) -> Evaluation:
         """What the first answer to a shard has found."""
-        self.crew.counts.shards += 1
+        self.pool.counts.shards += 1
         for line in answer.warnings:
-            if line not in self.crew.said:
-                self.crew.said.add(line)
+            if line not in self.pool.said:
+                self.pool.said.add(line)
                 mi.Log(mi.LogLevel.Warn, line)
         return answer.evaluation
 
@@ -298,7 +298,7 @@ def require_executor(config: Config) -> None:
 
 
 @contextmanager
-def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Tell) -> Iterator[Crew | None]:
+def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Tell) -> Iterator[WorkerPool | None]:
     """The actors of a job, until the end of the block; None where it computes in this process. Raises PathreplayError.
 
     ``tell`` is given lines that stay, ``status`` what is so for a moment.
@@ -313,18 +313,18 @@ def crew_of(config: Config, base: Path, problem: Problem, tell: Tell, status: Te
         ray = cluster.ray
         count = _count(ray, config, threads, problem)
         targets = Targets.of(problem.views)
-        parcel = ray.put(Parcel(config, base.resolve(), targets, mi.variant(), threads))
+        setup = ray.put(WorkerInit(config, base.resolve(), targets, mi.variant(), threads))
         kind = ray.remote(**_needs(threads), max_restarts=config.ray.max_restarts, max_task_retries=-1)(RayActor)
         actors = {number: kind.remote() for number in range(count)}
         where = "this machine" if cluster.own else f"a cluster of {len(ray.nodes())} nodes"
         tell(f"ray: {count} actors with {threads} {'thread' if threads == 1 else 'threads'} each on {where}")
-        crew = Crew(cluster, actors, parcel, config.ray.max_task_retries, tell, status)
+        pool = WorkerPool(cluster, actors, setup, config.ray.max_task_retries, tell, status)
         try:
-            yield crew
-            tell(f"ray: {crew.counts.line()}")
+            yield pool
+            tell(f"ray: {pool.counts.line()}")
         finally:
             if cluster.has_others():  # it goes on without these actors; our own ends with all that is in it
-                for actor in crew.actors.values():
+                for actor in pool.actors.values():
                     ray.kill(actor)
 
 

@@ -17,7 +17,7 @@ from pathreplay.inverse.batches import batch
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import ITERATION, JUDGEMENT, PICTURE, Config
 from pathreplay.inverse.evaluate import Evaluate, Evaluation, Evaluator, Executor, Local, Shard, Total, release, total
-from pathreplay.inverse.events import Entered, Event, Faint, Finished, NonFinite, Refined, Started, Stepped, Stopped
+from pathreplay.inverse.events import Entered, Event, Finished, LowSNR, NonFinite, Refined, Started, Stepped, Stopped
 from pathreplay.inverse.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.grids import resampled
 from pathreplay.inverse.images import Image
@@ -72,7 +72,7 @@ def _optimiser(problem: Problem, values: Arrays, options: Optimizer) -> Optimise
     return DrJitOptimiser(values, options, uniform)
 
 
-def answer_of(problem: Problem, run: Run) -> dict[str, Array]:
+def best_values(problem: Problem, run: Run) -> dict[str, Array]:
     """The values that a run has come to: after its last step, or at the best one of a line search."""
     found = run.optimiser.answer()
     for v in problem.variables:
@@ -112,7 +112,7 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
         for key, ratio in noise.ratios(run.history).items():
             if ratio < noise.FAINT and key not in faint:
                 faint.add(key)
-                yield Faint(key, ratio, i, run.history[-1].spp)
+                yield LowSNR(key, ratio, i, run.history[-1].spp)
         yield Stepped(run.history[-1])
         _require_gradients(config, run)
         if stop.by is not None:

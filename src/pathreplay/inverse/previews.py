@@ -25,7 +25,7 @@ from pathreplay.inverse.config import Config
 from pathreplay.inverse.events import Event, Notes, Started, Stepped, Stopped
 from pathreplay.inverse.images import Image, displayed, exposure_for
 from pathreplay.inverse.likeness import Likeness
-from pathreplay.inverse.loop import answer_of, picture_of
+from pathreplay.inverse.loop import best_values, picture_of
 from pathreplay.inverse.outcome import DIFFERENCE_GAIN, Recovered, ViewPictures, number_of, resume_command
 from pathreplay.inverse.page_parts import (
     about,
@@ -170,7 +170,7 @@ class Previews:
         """Pictures of the views as they are now."""
         try:
             spp = max(self.config.most_spp, min(LEAST_SPP, self.config.picture_spp))
-            values = answer_of(self.problem, self.run)
+            values = best_values(self.problem, self.run)
             images = {v.name: picture_of(self.problem, self.config, values, v, spp) for v in self._views}
         except RuntimeError as error:
             if self.stop.aborted:

@@ -26,7 +26,7 @@ from pathreplay.threads import one_thread
 
 
 @dataclass(frozen=True)
-class Parcel:
+class WorkerInit:
     """What an actor needs to know to build the problem of a job as the process has it that sends this."""
 
     config: Config
@@ -37,7 +37,7 @@ class Parcel:
 
 
 @dataclass(frozen=True)
-class Hello:
+class Ready:
     """Who an actor is, when it is ready."""
 
     host: str
@@ -71,16 +71,16 @@ class RayActor:
         self.evaluators: dict[bool, Evaluate]
         self.log: Any = None
 
-    def hello(self, parcel: Parcel) -> Hello:
+    def hello(self, setup: WorkerInit) -> Ready:
         """Build the problem: before anything else. Raises PathreplayError for what this machine has not."""
-        backend.set_variant(parcel.variant)
-        dr.set_thread_count(parcel.threads)
+        backend.set_variant(setup.variant)
+        dr.set_thread_count(setup.threads)
         self.evaluators = {}
-        self.problem = build_problem(parcel.config, parcel.base, parcel.targets)
+        self.problem = build_problem(setup.config, setup.base, setup.targets)
         self.config = self.problem.config
         self.log = _kept_log()
         machine = f"{_processor()}, LLVM {'.'.join(map(str, backend.loaded_version()))}"
-        return Hello(platform.node(), os.getpid(), versions(), machine)
+        return Ready(platform.node(), os.getpid(), versions(), machine)
 
     def evaluate(self, rival: bool, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Answer] | None:
         """Shards by the job's integrator, or by that of its rival; None where this actor was started again since."""

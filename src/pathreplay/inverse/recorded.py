@@ -19,7 +19,7 @@ import mitsuba as mi
 from pathreplay.inverse.exposures import derivative
 from pathreplay.inverse.losses import Loss, mean_loss
 from pathreplay.inverse.pixel_batches import Batch
-from pathreplay.render.path_integrator import Handed
+from pathreplay.render.path_integrator import FrozenInputs
 from pathreplay.scenes.parameters import keep_only
 
 # Integrators of Mitsuba's that look at nothing on the host while they render; they do not say so. Ours does.
@@ -60,11 +60,11 @@ class Recordings:
         self, params: mi.SceneParameters, scene: mi.Scene, sensor: int, integrator: mi.Integrator, *args: Any
     ) -> Any:
         """As the function of that name. Raises NotRecordable; a part of the gradient may be there, then."""
-        handed = _to_hand(integrator, scene)
+        frozen_inputs = _inputs_to_freeze(integrator, scene)
         keys = list(params.keys())
         # By view, since Dr.Jit thinks that something is wrong with a function that it has to record often.
         view = (sensor, *(dr.shape(params[key]) for key in keys))
-        which = view, None if handed is None else handed.constants
+        which = view, None if frozen_inputs is None else frozen_inputs.constants
         if which not in self._frozen:
             self._made[view] += 1
             if self._made[view] > MOST_RECORDINGS:
@@ -72,7 +72,7 @@ class Recordings:
             gc.collect()  # scenes of the past would be traced, too
             self._frozen[which] = _recording(keys)
         try:
-            return self._frozen[which](scene, handed, sensor, integrator, *args)
+            return self._frozen[which](scene, frozen_inputs, sensor, integrator, *args)
         except RuntimeError as error:
             if _RECORDING not in str(error):
                 raise
@@ -94,18 +94,18 @@ def differentiate(
     params: mi.SceneParameters, scene: mi.Scene, sensor: int, integrator: mi.Integrator, *args: Any
 ) -> tuple[Any, Any, Any]:
     """The loss of a view and its gradient, traced anew: see `_differentiate`."""
-    return _differentiate(params, scene, _to_hand(integrator, scene), sensor, integrator, *args)
+    return _differentiate(params, scene, _inputs_to_freeze(integrator, scene), sensor, integrator, *args)
 
 
-def _to_hand(integrator: Any, scene: mi.Scene) -> Handed | None:
+def _inputs_to_freeze(integrator: Any, scene: mi.Scene) -> FrozenInputs | None:
     """What an integrator of ours is handed; others want nothing."""
-    return integrator.to_hand(scene) if hasattr(integrator, "to_hand") else None
+    return integrator.inputs_to_freeze(scene) if hasattr(integrator, "to_hand") else None
 
 
 def _differentiate(
     params: mi.SceneParameters,
     scene: mi.Scene,
-    handed: Handed | None,
+    frozen_inputs: FrozenInputs | None,
     sensor: int,
     integrator: mi.Integrator,
     target: mi.TensorXf,
@@ -121,11 +121,11 @@ def _differentiate(
     """``share`` times the loss of a view, whose gradient is added to the parameters; ``sweeps``: in one pass.
 
     With a ``batch``, which only sweeps take, target and weight are its rows, and so is the loss an estimate by them.
-    An integrator of ours is ``handed`` what it needs. Also what that has not told (see `Untold`; None of another), and
+    An integrator of ours takes its ``frozen_inputs``. Also returns the `DeferredDiagnostics` (None of another), and
     the derivative by the logarithm of the ``factor`` on the picture (see `exposures`) for each channel, if there is
     one.
     """
-    with _handing(integrator, handed):
+    with _with_frozen_inputs(integrator, frozen_inputs):
         if sweeps:
             share, pixels = (share, None) if batch is None else (share * batch.share, batch.pixels)
             offset, slope = (term * share for term in linear_derivative(loss, target, weight))
@@ -144,7 +144,7 @@ def _differentiate(
                 other: Any = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(_OTHER))[0]
                 again = mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=other)
             by_factor = derivative(loss, image, again, factor, target, weight) * share
-    return dr.detach(value), integrator.take_untold() if hasattr(integrator, "take_untold") else None, by_factor
+    return dr.detach(value), integrator.take_deferred() if hasattr(integrator, "take_untold") else None, by_factor
 
 
 def _times(tensor: Any, factor: Any) -> Any:
@@ -152,16 +152,16 @@ def _times(tensor: Any, factor: Any) -> Any:
 
 
 @contextmanager
-def _handing(integrator: Any, handed: Handed | None) -> Iterator[None]:
+def _with_frozen_inputs(integrator: Any, frozen_inputs: FrozenInputs | None) -> Iterator[None]:
     """Within this block an integrator of ours has what it is handed."""
-    if handed is None:
+    if frozen_inputs is None:
         yield
         return
-    integrator.handed = handed
+    integrator.frozen_inputs = frozen_inputs
     try:
         yield
     finally:
-        integrator.handed = None
+        integrator.frozen_inputs = None
 
 
 def linear_derivative(loss: Loss, target: Any, weight: Any = None) -> tuple[Any, Any]:

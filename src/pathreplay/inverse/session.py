@@ -17,10 +17,10 @@ from pathreplay.interrupts import Stop, stopping, undisturbed
 from pathreplay.inverse.checkpoint import Entry, Run
 from pathreplay.inverse.config import Config, Plugin
 from pathreplay.inverse.events import Event, Stepped
-from pathreplay.inverse.executors import Crew, RayExecutor, crew_of, require_executor
+from pathreplay.inverse.executors import RayExecutor, WorkerPool, crew_of, require_executor
 from pathreplay.inverse.images import Image
 from pathreplay.inverse.limits import require_finite_loss
-from pathreplay.inverse.loop import answer_of, iterate, new_run, picture_of, render_views, with_exposures
+from pathreplay.inverse.loop import best_values, iterate, new_run, picture_of, render_views, with_exposures
 from pathreplay.inverse.notebook import NotebookPanel, in_notebook
 from pathreplay.inverse.outcome import resume_command
 from pathreplay.inverse.previews import Previews
@@ -155,10 +155,10 @@ def _states(
             require_reached(problem, config)
         for note in problem.notes:
             bar.note(note)
-        crew = stack.enter_context(crew_of(config, job.base, problem, bar.remark, bar.status))
-        run = _run(problem, config, problem.integrator, config.integrator, crew)
+        pool = stack.enter_context(crew_of(config, job.base, problem, bar.remark, bar.status))
+        run = _run(problem, config, problem.integrator, config.integrator, pool)
         if problem.rival is not None and config.rival is not None:
-            run.rival = _run(problem, config, problem.rival, config.rival, crew, rival=True)
+            run.rival = _run(problem, config, problem.rival, config.rival, pool, rival=True)
         if resumed is None:
             folder, before = _begun(output, home, job, problem, run)
             stack.callback(folder.lock.close)
@@ -180,7 +180,7 @@ def _states(
                 problem.album.rest()
                 if isinstance(event, Stepped):
                     views = tuple(view.name for view in problem.views)
-                    yield State(event.entry, answer_of(problem, run), views, folder.path, look)
+                    yield State(event.entry, best_values(problem, run), views, folder.path, look)
         except GeneratorExit:
             saving.close()
             raise
@@ -193,7 +193,7 @@ def _states(
                 raise PathreplayError(f"{error}; {way_out}") from error
             raise
         bar.say("writing")
-        run = replace(run, values=answer_of(problem, run))
+        run = replace(run, values=best_values(problem, run))
         with computing(config):
             for each in filter(None, (run, run.rival)):
                 each.values = dict(with_exposures(problem, config, each.values))
@@ -213,12 +213,17 @@ def _progress(shown: bool) -> Progress | NotebookPanel:
 
 
 def _run(
-    problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin, crew: Crew | None, rival: bool = False
+    problem: Problem,
+    config: Config,
+    integrator: mi.Integrator,
+    plugin: Plugin,
+    pool: WorkerPool | None,
+    rival: bool = False,
 ) -> Run:
     """A run that begins, by an integrator, which is made of that plugin; in this process, if there is no crew."""
     record = not config.deterministic
-    if crew is not None:
-        executor = RayExecutor(crew, [view.name for view in problem.views], rival)
+    if pool is not None:
+        executor = RayExecutor(pool, [view.name for view in problem.views], rival)
         return new_run(problem, integrator, record, config.optimizer, executor=executor)
     staged = None if config.stages is None else Staged(problem, config, integrator, plugin, record)
     return new_run(problem, integrator, record, config.optimizer, staged)

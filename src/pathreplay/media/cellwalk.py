@@ -162,19 +162,19 @@ def free_flight(
         hit = active & (m > 0) & (t < b)
         return dr.select(hit, t, dr.inf), dr.select(hit, m, 0)
 
-    walk = begin(cells, ray, a, b)
+    trace = begin(cells, ray, a, b)
 
     def step(active: Any, cell: Any, t: Any, τ: Any, m: Any) -> tuple[Any, ...]:
         m = cells.lookup(mi.Float, cell, active)
-        crossings = walk.crossing(cell)
-        t_next = dr.minimum(dr.min(crossings), walk.end)
+        crossings = trace.crossing(cell)
+        t_next = dr.minimum(dr.min(crossings), trace.end)
         depth = m * dr.maximum(t_next - t, 0)
         hit = depth > τ
-        cell = walk.onward(cell, crossings, t_next)
-        active = ~hit & (t_next < walk.end)
+        cell = trace.onward(cell, crossings, t_next)
+        active = ~hit & (t_next < trace.end)
         return active, cell, dr.select(hit, t, t_next), dr.select(hit, τ, τ - depth), dr.select(hit, m, 0)
 
-    state = (active & (a < walk.end), walk.start, a, τ, mi.Float(0))
+    state = (active & (a < trace.end), trace.start, a, τ, mi.Float(0))
     labels = ("active", "cell", "t", "τ", "m")
     going = dr.while_loop(state, lambda active, *_: active, step, labels=labels, label="gridmedium: free flight")
     _, _, t, τ, m = going
@@ -217,26 +217,26 @@ def transmittance(cells: Cells, box: Any, ray: Any, density: Callable[..., Any],
     residual collisions, which come with rate m. ``density(t, active)`` evaluates σ.
     """
     a, b = clip(box, ray)
-    walk = begin(cells, ray, a, b)
-    active = mi.Mask(active) & (a < walk.end)
-    cell, t = mi.Vector3f(walk.start), mi.Float(a)
+    trace = begin(cells, ray, a, b)
+    active = mi.Mask(active) & (a < trace.end)
+    cell, t = mi.Vector3f(trace.start), mi.Float(a)
     τ = -dr.log(1 - sampler.next_1d(active))
     depth = mi.Float(0)
     T = mi.UnpolarizedSpectrum(1)
 
-    while dr.hint(active, exclude=[cells, box, ray, walk, density], label="gridmedium: transmittance"):
+    while dr.hint(active, exclude=[cells, box, ray, trace, density], label="gridmedium: transmittance"):
         c, m = cells.lookup(mi.Vector2f, cell, active)
-        crossings = walk.crossing(cell)
-        t_next = dr.minimum(dr.min(crossings), walk.end)
+        crossings = trace.crossing(cell)
+        t_next = dr.minimum(dr.min(crossings), trace.end)
         expected = m * dr.maximum(t_next - t, 0)
         hit = active & (expected > τ)
         stop = dr.select(hit, t + τ / m, t_next)
         depth += c * dr.maximum(stop - t, 0)
         τ -= expected
-        cell = dr.select(hit, cell, walk.onward(cell, crossings, t_next))
+        cell = dr.select(hit, cell, trace.onward(cell, crossings, t_next))
         t = stop
-        active &= hit | (t_next < walk.end)
-        if dr.hint(hit, exclude=[cells, box, ray, walk, density]):
+        active &= hit | (t_next < trace.end)
+        if dr.hint(hit, exclude=[cells, box, ray, trace, density]):
             T *= 1 - (density(t, mi.Mask(True)) - c) / m
             # Whether the estimate is worth going on with.
             kept = dr.minimum(dr.max(dr.abs(T)) * dr.exp(-depth) / FAINT, 1)

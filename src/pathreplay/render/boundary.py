@@ -10,21 +10,21 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..gradient.adjoint import LostPaths
-from ..gradient.baseline import Guess
-from ..gradient.beam_edges import beam_edges
-from ..gradient.counted import Counted
+from ..gradient.adjoint import NonFiniteCounter
+from ..gradient.baseline import Baseline
+from ..gradient.counter_sampler import CounterSampler
 from ..gradient.edges import Edges, edges_backward, edges_forward
-from ..gradient.film_edges import film_edges
-from ..gradient.inner_edges import inner_edges
+from ..gradient.primary_boundary import primary_edges
+from ..gradient.secondary_boundary import secondary_edges
+from ..gradient.volumetric_boundary import volumetric_edges
 from ..transport.motion import edges_move, moving_shapes
 from ..transport.path import PathState
 from ..transport.start import CameraStart
-from ..transport.vertex import Walk
+from ..transport.vertex import TraceConfig
 from .camera_pass import Pass
 from .film import MOST_SAMPLES
 from .places import FilmPlaces
-from .term import Found
+from .term import TermResult
 
 FILM_CLOSER, INNER_CLOSER = 5, 16
 """For so many lines one is looked at closer, of those with an edge."""
@@ -48,48 +48,48 @@ class Boundary:
     inner: bool = True  # those that surfaces see
     spp: int = 0  # lines per pixel, of each kind; 0: samples of the pass
 
-    def forward(self, view: Pass, walk: Walk, learned: Guess | None) -> Found:
+    def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         """Tangent of the image: see `Term`."""
         places = FilmPlaces.of(view)
-        if not _move(walk, places):
-            return Found()
+        if not _move(trace, places):
+            return TermResult()
         image = None
-        for edges in self._searches(view, walk, places):
-            δL = edges_forward(walk, places, edges)
+        for edges in self._searches(view, trace, places):
+            δL = edges_forward(trace, places, edges)
             part = places.image(edges.s, δL, edges.ray.wavelengths)
             image = part if image is None else image + part
-        return Found(image)
+        return TermResult(image)
 
-    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
+    def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         """Back-propagate the adjoint of the image: see `Term`."""
         places = FilmPlaces.of(view)
-        if not _move(walk, places):
-            return Found()
+        if not _move(trace, places):
+            return TermResult()
         wanted = places.undeveloped(grad_in)
 
-        lost, paths = LostPaths(), 0
-        for edges in self._searches(view, walk, places):
+        lost, paths = NonFiniteCounter(), 0
+        for edges in self._searches(view, trace, places):
             W = places.importance(wanted, edges.s, edges.ray.wavelengths)
-            edges_backward(walk, places, edges, W, lost)
+            edges_backward(trace, places, edges, W, lost)
             paths += dr.width(edges.s)
         dr.eval()
-        return Found(lost=lost.count, paths=paths, moves=True)
+        return TermResult(lost=lost.count, paths=paths, moves=True)
 
-    def note(self, walk: Walk) -> str:
+    def note(self, trace: TraceConfig) -> str:
         """Nothing: see `Term`."""
         return ""
 
     @staticmethod
-    def move(view: Pass, walk: Walk) -> bool:
+    def move(view: Pass, trace: TraceConfig) -> bool:
         """Whether edges move with the parameters that have gradients. Nothing is evaluated."""
-        return _move(walk, FilmPlaces.of(view))
+        return _move(trace, FilmPlaces.of(view))
 
     @staticmethod
-    def informed(view: Pass, walk: Walk) -> Walk:
+    def informed(view: Pass, trace: TraceConfig) -> TraceConfig:
         """The walk, knowing which shapes may move. With media all may: paths pass boundaries that move unseen."""
-        if walk.media is not None or walk.traits.moving is not None:
-            return walk
-        return replace(walk, traits=replace(walk.traits, moving=moving_shapes(walk.scene, _still_cameras(view))))
+        if trace.media is not None or trace.traits.moving is not None:
+            return trace
+        return replace(trace, traits=replace(trace.traits, moving=moving_shapes(trace.scene, _still_cameras(view))))
 
     @staticmethod
     def obstacle(view: Pass) -> str:
@@ -106,19 +106,19 @@ class Boundary:
                 )
         return ""
 
-    def _searches(self, view: Pass, walk: Walk, places: FilmPlaces) -> Iterator[Edges]:
+    def _searches(self, view: Pass, trace: TraceConfig, places: FilmPlaces) -> Iterator[Edges]:
         """The edges of each search."""
         if why := self.obstacle(view):
             raise PathreplayError(f"{why}, or use edges = 'none'")
-        walk = self.informed(view, walk)
+        trace = self.informed(view, trace)
         lines = lines_of(view, places, self.spp)
         seed = view.opaque_seed
         if self.film:
-            yield film_edges(walk, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
-            if walk.media is not None and walk.traits.hard_lights:
-                yield beam_edges(walk, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
+            yield primary_edges(trace, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
+            if trace.media is not None and trace.traits.hard_lights:
+                yield volumetric_edges(trace, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
         if self.inner:
-            yield inner_edges(walk, places, lines, max(lines // INNER_CLOSER, 1), seed ^ 0x5EED, INNER_LENGTHS)
+            yield secondary_edges(trace, places, lines, max(lines // INNER_CLOSER, 1), seed ^ 0x5EED, INNER_LENGTHS)
 
 
 def lines_of(view: Pass, places: FilmPlaces, spp: int) -> int:
@@ -138,10 +138,10 @@ def _still_cameras(view: Pass) -> list[mi.Sensor]:
     return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
 
 
-def _move(walk: Walk, places: FilmPlaces) -> bool:
+def _move(trace: TraceConfig, places: FilmPlaces) -> bool:
     """Whether edges move with the parameters: see `edges_move`."""
     key = mi.UInt32(0)
     with dr.resume_grad():
         ray, _ = places.ray(mi.Point2f(0.5), key)
-    start = CameraStart(ray, Counted.of(key), mi.Bool(True))
-    return edges_move(walk, start, PathState.begin(walk, start).at)
+    start = CameraStart(ray, CounterSampler.of(key), mi.Bool(True))
+    return edges_move(trace, start, PathState.begin(trace, start).at)

@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ..gradient.pixel_numbers import Alone, EvenSets, PixelNumbers
 from ..plugins import mitsuba_integrator
-from ..transport.even import Even, in_order, key_of
+from ..transport.owen_sobol import OwenSobolSampler, in_order, key_of
 from ..transport.start import CameraStart
 from .film_flow import FilmFlow, Sample
 from .lifetimes import is_recording
@@ -40,7 +40,7 @@ class Rays:
 class _ForCamera:
     """Numbers, as Mitsuba's integrators want them to draw camera rays."""
 
-    numbers: Even
+    numbers: OwenSobolSampler
     count: int
 
     def sample_count(self) -> int:
@@ -122,13 +122,15 @@ class Pass:
         # Not `sample_ray`, which irradiance meters do not have.
         return self.sensor.sample_ray_differential(time, wavelength, place, aperture)
 
-    def numbers(self, pixel: mi.UInt32, width: int, path: mi.UInt32, paths: int, of: int | mi.UInt32 = 0) -> Even:
+    def numbers(
+        self, pixel: mi.UInt32, width: int, path: mi.UInt32, paths: int, of: int | mi.UInt32 = 0
+    ) -> OwenSobolSampler:
         """Even numbers of a path in a pixel (row by row, of that width) that has so many; ``of`` keeps sets apart."""
         bits = (paths - 1).bit_length()
         place = in_order(pixel % width, pixel // width)
         # What does not fit into 32 bits tells sets apart, too.
         beyond = place >> (32 - bits) if bits else mi.UInt32(0)
-        return Even.of((place << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), beyond))
+        return OwenSobolSampler.of((place << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), beyond))
 
     @property
     def opaque_seed(self) -> mi.UInt32:

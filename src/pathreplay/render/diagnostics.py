@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..transport.vertex import Walk
+from ..transport.vertex import TraceConfig
 from .edge_notes import edges_note, keys_that_move_edges
 
 COST_OF_EDGES = (
@@ -32,13 +32,13 @@ def used_before_note(seed: int) -> str:
     )
 
 
-def doubts(walk: Walk) -> Iterator[str]:
+def doubts(trace: TraceConfig) -> Iterator[str]:
     """One line for each thing that makes the gradient of this scene wrong or incomplete, whatever moves.
 
     Raises PathreplayError where it would be useless.
     """
-    traits = walk.traits
-    if traits.instances_move and walk.attach != "none":
+    traits = trace.traits
+    if traits.instances_move and trace.attach != "none":
         raise PathreplayError(
             "pathreplay: an instance's to_world has a gradient, but Mitsuba does not differentiate the normals "
             "of instances: move the vertex_positions of the shapes in its group, or use a shape of its own"
@@ -48,12 +48,12 @@ def doubts(walk: Walk) -> Iterator[str]:
             "a mask lies over delta lobes, which Mitsuba cannot sample one by one there: derivatives by what "
             "decides among them (an index, or a reflectance of plastic) are wrong"
         )
-    if walk.media is not None and walk.media.passes and traits.opacity_moves:
+    if trace.media is not None and trace.media.passes and traits.opacity_moves:
         yield (
             "the opacity of a mask has gradients in a scene with media: what it does to the light of emitters "
             "that shadow rays see through it is missing from the gradient"
         )
-    if walk.attach != "all":
+    if trace.attach != "all":
         return
     if not traits.attachables:
         raise PathreplayError(
@@ -64,15 +64,15 @@ def doubts(walk: Walk) -> Iterator[str]:
         yield f"attach = 'all' keeps the directions of {', '.join(traits.detached_names)} fixed"
 
 
-def missing_edges(walk: Walk, sensor: mi.Sensor, edges: str) -> tuple[str, bool]:
+def missing_edges(trace: TraceConfig, sensor: mi.Sensor, edges: str) -> tuple[str, bool]:
     """One line that tells of the motion of edges where something moves (empty: none), and whether it names what.
 
     ``edges`` are looked at.
     """
-    moving = keys_that_move_edges(mi.traverse(walk.scene)) or keys_that_move_edges(mi.traverse(sensor))
+    moving = keys_that_move_edges(mi.traverse(trace.scene)) or keys_that_move_edges(mi.traverse(sensor))
     if moving:
         return edges_note(moving, edges), True
-    if edges == "none" and walk.traits.lobes and walk.traits.area_lights:
+    if edges == "none" and trace.traits.lobes and trace.traits.area_lights:
         return (
             "something moves in a scene with delta lobes and area lights: where the edge of a light or a "
             "silhouette is seen through glass or mirrors, its motion is missing from the gradient"

@@ -17,7 +17,7 @@ from ..transport.traits import (
     blend_lengths,
     fixed_traits,
     lamp_balls,
-    pieces_of,
+    smoothing_groups_of,
     tables_of,
 )
 from ..transport.traits import Tables as Tables
@@ -95,8 +95,8 @@ class SceneFacts:
             if not np.array_equal(np.array(balls), np.array(self._tables.lamp_balls)):
                 self._tables = replace(self._tables, lamp_balls=balls)
         if sizes != self._sizes:
-            begins, pieces = pieces_of(self._shapes)
-            self._tables = replace(self._tables, pieces_at=begins, pieces=pieces)
+            begins, groups = smoothing_groups_of(self._shapes)
+            self._tables = replace(self._tables, groups_at=begins, groups=groups)
         self._boxes, self._sizes = boxes, sizes
         return self._tables
 
@@ -104,7 +104,7 @@ class SceneFacts:
         """The tables of a pass that `dr.freeze` records.
 
         The ``known`` tables are taken as they are if they belong to this scene. Otherwise the recording writes the
-        tables of the scene as it is now, and those of pieces only if it looks for ``edges``.
+        tables of the scene as it is now, and smoothing groups only if it looks for ``edges``.
         """
         if known is not None and known is self._tables:
             return known

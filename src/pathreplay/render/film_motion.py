@@ -31,16 +31,16 @@ import drjit as dr
 import mitsuba as mi
 
 from ..gradient.adjoint import backward, tangents
-from ..gradient.baseline import Guess
+from ..gradient.baseline import Baseline
 from ..gradient.primal import primal
-from ..transport.even import Even
+from ..transport.owen_sobol import OwenSobolSampler
 from ..transport.start import CameraStart
-from ..transport.vertex import Walk
+from ..transport.vertex import TraceConfig
 from .camera_pass import Pass
 from .film_flow import FilmFlow, Sample
 from .filter_samples import FilterSamples
 from .places import FilmPlaces
-from .term import Found
+from .term import TermResult
 
 GROUP = 5
 """Paths with the same random numbers: to the right and to the left, above and below, and one for the divergence."""
@@ -70,18 +70,18 @@ class FilmMotion:
 
     flow: FilmFlow
 
-    def forward(self, view: Pass, walk: Walk, learned: Guess | None) -> Found:
+    def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         """Tangent of the image: see `Term`."""
-        places, f = FilmPlaces.of(view), self._walked(view, walk)
+        places, f = FilmPlaces.of(view), self._walked(view, trace)
         with dr.resume_grad():
             (δ,) = tangents(self._moved(view, f))
         pixels = places.pixels(f.pixel, f.L * δ, f.wavelengths)
         pixels += blurred(sum(places.pixels(i, f.L * δ * share, f.wavelengths) for i, share in self._shared(view, f)))
-        return Found(places.developed(pixels))
+        return TermResult(places.developed(pixels))
 
-    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
+    def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         """Back-propagate the adjoint of the image: see `Term`."""
-        places, f = FilmPlaces.of(view), self._walked(view, walk)
+        places, f = FilmPlaces.of(view), self._walked(view, trace)
         wanted = places.undeveloped(grad_in)
         smooth = blurred(wanted)
         W = places.importance_of_pixels(wanted, f.pixel, f.wavelengths)
@@ -92,9 +92,9 @@ class FilmMotion:
         with dr.resume_grad():
             backward(δ * self._moved(view, f))
         dr.eval()
-        return Found()
+        return TermResult()
 
-    def note(self, walk: Walk) -> str:
+    def note(self, trace: TraceConfig) -> str:
         """Nothing: see `Term`."""
         return ""
 
@@ -123,7 +123,7 @@ class FilmMotion:
         scale = dr.select(total > 0, slope.sign(f.offset) / total, 0)
         return [(f.pixel, dr.select(f.single, 0, mi.Float(-1))), *((pixel, mass * scale) for pixel, mass in masses)]
 
-    def _usual(self, view: Pass, walk: Walk) -> mi.Float:
+    def _usual(self, view: Pass, trace: TraceConfig) -> mi.Float:
         """What is usually seen, as one number, by paths of its own.
 
         A picture that is the same everywhere does not change while its places move, so that radiance counts less that.
@@ -134,10 +134,10 @@ class FilmMotion:
         place = (mi.Point2f(pixel % width, pixel // width) + numbers.next_2d()) / mi.Point2f(width, height)
         sample = Sample(view.sensor.shutter_open(), numbers.next_1d(), place, numbers.next_2d())
         there = dr.full(mi.Bool, True, width * height) & self.flow.moves_at(place)
-        L, _ = _seen(view, walk, sample, numbers, there)
+        L, _ = _seen(view, trace, sample, numbers, there)
         return dr.sum(dr.mean(L)) / dr.maximum(mi.Float(dr.count(there)), 1)
 
-    def _walked(self, view: Pass, walk: Walk) -> Flowing:
+    def _walked(self, view: Pass, trace: TraceConfig) -> Flowing:
         """Walk the paths of a pass."""
         width, height = view.size
         groups = -(-view.spp // self.flow.samples)
@@ -164,15 +164,17 @@ class FilmMotion:
 
         time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
         sample = Sample(time, numbers.next_1d(), place, numbers.next_2d())
-        L, wavelengths = _seen(view, walk, sample, numbers, self.flow.moves_at(place))
-        L = (L - self._usual(view, walk)) * weight
+        L, wavelengths = _seen(view, trace, sample, numbers, self.flow.moves_at(place))
+        L = (L - self._usual(view, trace)) * weight
         return Flowing(pixel, sample, axis, single, offset, slope, L, wavelengths)
 
 
-def _seen(view: Pass, walk: Walk, sample: Sample, numbers: Even, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
+def _seen(
+    view: Pass, trace: TraceConfig, sample: Sample, numbers: OwenSobolSampler, active: mi.Bool
+) -> tuple[mi.Spectrum, mi.Spectrum]:
     """What a path brings that begins with the camera ray of a sample, times the ray's weight; and its wavelengths."""
     ray, weight = dr.detach(sample.ray(view.sensor))
-    L, _ = primal(walk, CameraStart(mi.Ray3f(ray), numbers, active))
+    L, _ = primal(trace, CameraStart(mi.Ray3f(ray), numbers, active))
     return L * weight, ray.wavelengths
 
 

@@ -14,10 +14,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import PathreplayError
-from ..gradient.baseline import SLOTS, Baseline, Guess, Seen
+from ..gradient.baseline import SLOTS, Baseline, BaselineState, BaselineStats
 from ..gradient.ray_jacobian import Recovery
 from ..gradient.record import MAX_DEPTH
-from ..transport.vertex import Walk
+from ..transport.vertex import TraceConfig
 from .boundary import Boundary
 from .camera_pass import Pass, Seed, Which
 from .diagnostics import COST_OF_EDGES, doubts, lost_note, missing_edges, used_before_note
@@ -26,11 +26,11 @@ from .film_flow import CameraFlow
 from .film_motion import FilmMotion
 from .interior import PathReplay
 from .lifetimes import is_recording
-from .path_integrator import UNBOUNDED, Handed, PathIntegrator, reached
+from .path_integrator import UNBOUNDED, FrozenInputs, PathIntegrator, reached
 from .pixels import among, obstacle, pixel_loss
 from .properties import choice, deviation, whole_number
 from .seen_flow import SeenFlow, can_follow
-from .term import Found, Term
+from .term import Term, TermResult
 
 DRIVERS = ("auto", "sweep", "replay")
 ATTACH = ("delta", "all", "none")
@@ -64,11 +64,11 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
 
 
 @dataclass
-class Untold:
+class DeferredDiagnostics:
     """What is to be told of passes that a frozen function has made."""
 
     lost: mi.UInt32 | None = None  # how many paths lost a part of their gradient, if they were counted
-    sums: mi.Float | None = None  # those of `Seen`
+    sums: mi.Float | None = None  # those of `BaselineStats`
     nulls: mi.Float | None = None  # if they were counted
 
 
@@ -79,8 +79,8 @@ class PathReplayIntegrator(PathIntegrator):
     (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``, ``none``), ``noise``
     (0.01; of ray adjoints with the replay driver: see `Recovery`), ``branch`` (``auto``, True, False), ``edges``
     (``auto``, ``none``, ``film``, ``all``: see `Boundary`), ``edge_spp`` (0: the samples of the pass) and ``numbers``
-    (``even``: those of `Even` instead of independent ones; ``scene``: those of its sampler). ``auto`` drivers sweep
-    unless ``max_depth`` is more than the sweep can hold, or only lights have gradients (see `lights`).
+    (``even``: `OwenSobolSampler` instead of independent numbers; ``scene``: those of its sampler). ``auto`` drivers
+    sweep unless ``max_depth`` is more than the sweep can hold, or only lights have gradients (see `emission_only`).
     Forward mode is the same whatever the driver.
 
     ``auto`` edges are ``all`` where something moves that can hide light (see `edges_move`) and edges can be
@@ -119,8 +119,8 @@ class PathReplayIntegrator(PathIntegrator):
                 "attach = 'delta' only: use that, or edges = 'none'"
             )
         self.told: set[str] = set()  # what has been said in the log
-        self.untold = Found()  # of passes whose lost paths have not been told
-        self.baseline: tuple[ReferenceType[SceneFacts], Baseline] | None = None  # and the scene that it belongs to
+        self.deferred = TermResult()  # of passes whose lost paths have not been told
+        self.baseline: tuple[ReferenceType[SceneFacts], BaselineState] | None = None  # and the scene that it belongs to
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -129,35 +129,35 @@ class PathReplayIntegrator(PathIntegrator):
             return (self.interior,)
         return self.interior, Boundary(inner=self.edges != "film", spp=self.edge_spp)
 
-    def _planned(self, view: Pass, follow: bool = True) -> tuple[Pass, Walk, tuple[Term, ...]]:
+    def _planned(self, view: Pass, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
         """See `PathIntegrator`. What moves over the film has a term of its own, and the others what that leaves.
 
         Where it may, the film's flow is to ``follow`` what is seen. Edges are left out where none move, and where
         `auto` finds that they cannot be done; the interior, where the film's term is all.
         """
-        view, walk, terms = PathIntegrator._planned(self, view)
+        view, trace, terms = PathIntegrator._planned(self, view)
         if self.edges == "none":
-            return view, walk, terms
+            return view, trace, terms
         view = replace(view, flow=CameraFlow.of(view.scene, view.sensor))
-        needs_edges = self._needs_edges(view, walk)
-        if needs_edges and follow and self._may_follow(view, walk):
-            walk = Boundary.informed(view, walk)
-            view = replace(view, flow=SeenFlow.of(view.sensor, walk))
+        needs_edges = self._needs_edges(view, trace)
+        if needs_edges and follow and self._may_follow(view, trace):
+            trace = Boundary.informed(view, trace)
+            view = replace(view, flow=SeenFlow.of(view.sensor, trace))
         motion: tuple[Term, ...] = () if view.flow is None else (FilmMotion(view.flow),)
         if not needs_edges:
             terms = tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
-            return view, walk, motion if view.flow is not None and view.flow.is_all else (*terms, *motion)
+            return view, trace, motion if view.flow is not None and view.flow.is_all else (*terms, *motion)
         if is_recording():
-            walk = replace(walk, traits=replace(walk.traits, tables=self._tables(facts_of(view.scene), edges=True)))
-        return view, replace(walk, edges=self.edges != "film" and walk.media is None), (*terms, *motion)
+            trace = replace(trace, traits=replace(trace.traits, tables=self._tables(facts_of(view.scene), edges=True)))
+        return view, replace(trace, edges=self.edges != "film" and trace.media is None), (*terms, *motion)
 
-    def _may_follow(self, view: Pass, walk: Walk) -> bool:
+    def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:
         """Whether the film may follow what it sees: all edges are found of what then slides under it."""
-        return self.edges != "film" and can_follow(walk, view.sensor) and not facts_of(view.scene).has_seams
+        return self.edges != "film" and can_follow(trace, view.sensor) and not facts_of(view.scene).has_seams
 
-    def _needs_edges(self, view: Pass, walk: Walk) -> bool:
+    def _needs_edges(self, view: Pass, trace: TraceConfig) -> bool:
         """Whether edges move, and can be differentiated where that is left to ``auto``; says what they cost."""
-        if not Boundary.move(view, walk):
+        if not Boundary.move(view, trace):
             return False
         why = Boundary.obstacle(view) if self.edges == "auto" else ""
         if why:
@@ -184,8 +184,8 @@ class PathReplayIntegrator(PathIntegrator):
         if self.edges in ("none", "film"):
             return ""
         with self._passing():
-            walk = self._walk(view.scene, view.sensor)
-            follows = Boundary.move(view, walk) and not Boundary.obstacle(view) and self._may_follow(view, walk)
+            trace = self._walk(view.scene, view.sensor)
+            follows = Boundary.move(view, trace) and not Boundary.obstacle(view) and self._may_follow(view, trace)
         return "the film follows what moves; take edges = 'none'" if follows else ""
 
     def render_and_backward(
@@ -213,42 +213,42 @@ class PathReplayIntegrator(PathIntegrator):
         some = None if pixels is None else mi.UInt32(pixels)
         with reached(scene, sensor, zero_is_told=True), self._passing(), dr.isolate_grad():
             loss = pixel_loss(view, self.max_depth, offset, slope, some)
-            view, walk, (_, *edges) = self._planned(view, follow=False)
+            view, trace, (_, *edges) = self._planned(view, follow=False)
             if view.flow is not None:
                 raise PathreplayError(
                     f"pathreplay: sensor '{view.sensor.id()}' moves, and cannot be swept: hold it, or use mi.render"
                 )
-            self._learned(view, walk)
-            found = self.interior.pixels(view, walk, loss, some)
+            self._learned(view, trace)
+            found = self.interior.pixels(view, trace, loss, some)
             if edges:
                 wanted = offset + slope * found.image
                 if some is not None:
                     wanted = among(some, wanted, view.size)
-                found = reduce(add, [term.backward(view, walk, wanted, None) for term in edges], found)
-        self._told(view, walk, found)
+                found = reduce(add, [term.backward(view, trace, wanted, None) for term in edges], found)
+        self._told(view, trace, found)
         return found.image
 
-    def _learned(self, view: Pass, walk: Walk) -> Guess | None:
+    def _learned(self, view: Pass, trace: TraceConfig) -> Baseline | None:
         """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
-        for doubt in filter(None, (*doubts(walk), *(term.note(walk) for term in self.terms))):
+        for doubt in filter(None, (*doubts(trace), *(term.note(trace) for term in self.terms))):
             self._tell_once(doubt)
-        if walk.media is None:
+        if trace.media is None:
             return None
         if is_recording():
-            return None if self.handed is None else self.handed.guess
-        facts = facts_of(walk.scene)
+            return None if self.frozen_inputs is None else self.frozen_inputs.guess
+        facts = facts_of(trace.scene)
         if self.baseline is None or self.baseline[0]() is not facts:
-            self.baseline = ref(facts), Baseline.fresh(walk.scene.bbox())
+            self.baseline = ref(facts), BaselineState.fresh(trace.scene.bbox())
         baseline = self.baseline[1]
         if baseline.passes.intersection(view.keys):
             self._tell_once(used_before_note(view.keys[0][0]))
             return None
         return baseline.guess
 
-    def to_hand(self, scene: mi.Scene) -> Handed:
+    def inputs_to_freeze(self, scene: mi.Scene) -> FrozenInputs:
         """See `PathIntegrator`."""
-        handed = PathIntegrator.to_hand(self, scene)
-        return handed if self.baseline is None else replace(handed, guess=self.baseline[1].guess)
+        frozen_inputs = PathIntegrator.inputs_to_freeze(self, scene)
+        return frozen_inputs if self.baseline is None else replace(frozen_inputs, guess=self.baseline[1].guess)
 
     def learned(self) -> dict[str, np.ndarray]:
         """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
@@ -257,29 +257,29 @@ class PathReplayIntegrator(PathIntegrator):
     def restore_learned(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
         """Go on with what `learned` told of the same scene; where that is nothing, anew. Raises PathreplayError."""
         box = scene.bbox()
-        baseline = Baseline.restored(box, learned) if learned else Baseline.fresh(box)
+        baseline = BaselineState.restored(box, learned) if learned else BaselineState.fresh(box)
         self.baseline = ref(facts_of(scene)), baseline
 
-    def _told(self, view: Pass, walk: Walk, found: Found) -> None:
+    def _told(self, view: Pass, trace: TraceConfig, found: TermResult) -> None:
         """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see
-        `take_untold`, which tells of the passes before, too."""
+        `take_deferred`, which tells of the passes before, too."""
         if found.moves:
-            self._tell_edges(walk, view.sensor)
+            self._tell_edges(trace, view.sensor)
         frozen = is_recording()
-        self.untold = self.untold + replace(found, image=None) if frozen else Found()
+        self.deferred = self.deferred + replace(found, image=None) if frozen else TermResult()
         if not frozen:
             self._keep(found)
 
-    def _keep(self, found: Found) -> None:
+    def _keep(self, found: TermResult) -> None:
         if found.lost is not None and found.lost[0] > 0:
             mi.Log(mi.LogLevel.Warn, f"pathreplay: {lost_note(found.lost[0], found.paths)}")
         if found.seen is not None and self.baseline is not None:
             self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
 
-    def _tell_edges(self, walk: Walk, sensor: mi.Sensor) -> None:
+    def _tell_edges(self, trace: TraceConfig, sensor: mi.Sensor) -> None:
         if EDGES in self.told or self.edges in ("auto", "all"):
             return
-        note, named = missing_edges(walk, sensor, self.edges)
+        note, named = missing_edges(trace, sensor, self.edges)
         if named:
             self.told.add(EDGES)
         if note:
@@ -290,20 +290,20 @@ class PathReplayIntegrator(PathIntegrator):
             self.told.add(message)
             mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
 
-    def take_untold(self) -> Untold:
+    def take_deferred(self) -> DeferredDiagnostics:
         """What passes in a frozen function found out, which cannot look at it itself; nothing of others."""
-        found, self.untold = self.untold, Found()
+        found, self.deferred = self.deferred, TermResult()
         if found.seen is None:
-            return Untold(found.lost)
-        return Untold(found.lost, found.seen.sums, found.seen.nulls if found.seen.paths else None)
+            return DeferredDiagnostics(found.lost)
+        return DeferredDiagnostics(found.lost, found.seen.sums, found.seen.nulls if found.seen.paths else None)
 
-    def tell(self, untold: Untold, paths: int) -> None:
+    def tell(self, deferred: DeferredDiagnostics, paths: int) -> None:
         """Warn, and keep what was learned, as passes themselves do; there were so many ``paths``."""
-        found = Found(lost=untold.lost, paths=paths)
-        if untold.sums is not None and self.baseline is not None:
-            counted = untold.nulls is not None
-            nulls = untold.nulls if counted else dr.zeros(mi.Float, SLOTS)
-            seen = Seen(self.baseline[1].cells, untold.sums, nulls, paths if counted else 0, frozenset())
+        found = TermResult(lost=deferred.lost, paths=paths)
+        if deferred.sums is not None and self.baseline is not None:
+            counted = deferred.nulls is not None
+            nulls = deferred.nulls if counted else dr.zeros(mi.Float, SLOTS)
+            seen = BaselineStats(self.baseline[1].cells, deferred.sums, nulls, paths if counted else 0, frozenset())
             found = replace(found, seen=seen)
         self._keep(found)
 

@@ -14,14 +14,14 @@ import mitsuba as mi
 
 from ..errors import PathreplayError
 from ..gradient.adjoint import Unreached
-from ..gradient.baseline import Guess
+from ..gradient.baseline import Baseline
 from ..gradient.primal import primal
 from ..plugins import mitsuba_integrator
 from ..transport.motion import path_moves, weights_vary
 from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.traits import Tables
-from ..transport.vertex import Walk
+from ..transport.vertex import TraceConfig
 from .camera_pass import Pass, Seed, Which
 from .facts import SceneFacts, facts_of
 from .interior import image
@@ -29,7 +29,7 @@ from .lifetimes import careful, is_recording
 from .parts import Sums, parts
 from .properties import flag, whole_number
 from .reach import unreached_note
-from .term import Found, Term
+from .term import Term, TermResult
 
 UNBOUNDED = 0xFFFFFFFF
 
@@ -58,20 +58,20 @@ def reached(scene: mi.Scene, sensor: Which, zero_is_told: bool = False) -> Itera
 
 
 @dataclass
-class Handed:
+class FrozenInputs:
     """What a pass in a frozen function cannot find out, and has to be handed."""
 
     tables: Tables  # of the scene
     branches: bool  # see `Media`
     constants: tuple[object, ...]  # other passes than those with the same have to be recorded anew
-    guess: Guess | None = None  # of what is known of its media
+    guess: Baseline | None = None  # of what is known of its media
 
 
 class PathIntegrator:
     """A template of an integrator (see `on_base`), for those of ours.
 
     Properties ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5) and ``hide_emitters`` (False).
-    Classes below have a ``name`` (the plugin's), ``attach`` (as `Walk` has it) and the term ``interior``. Raises
+    Classes below have a ``name`` (the plugin's), ``attach`` (as `TraceConfig` has it) and the term ``interior``. Raises
     PathreplayError for unusable properties and in polarised variants.
     """
 
@@ -95,7 +95,7 @@ class PathIntegrator:
         hide_emitters = flag(props, self.name, "hide_emitters", False)
         mitsuba_integrator().__init__(self, props)
         self.hide_emitters = hide_emitters
-        self.handed: Handed | None = None  # in a frozen function
+        self.frozen_inputs: FrozenInputs | None = None  # in a frozen function
         self.tables: Tables | None = None  # of the scene that was rendered last: there `dr.freeze` finds them
 
     @property
@@ -132,13 +132,13 @@ class PathIntegrator:
         tangent = None
         for part in self._parts(scene, sensor, seed, spp):
             with self._passing():
-                part, walk, terms = self._planned(part)
-                learned = self._learned(part, walk)
+                part, trace, terms = self._planned(part)
+                learned = self._learned(part, trace)
                 if part.flow is not None:
                     part.flow.carry_tangents()
-                found = reduce(add, [term.forward(part, walk, learned) for term in terms])
+                found = reduce(add, [term.forward(part, trace, learned) for term in terms])
                 tangent = _sum(tangent, found.image, part.share)
-            self._told(part, walk, found)
+            self._told(part, trace, found)
         return tangent
 
     def render_backward(
@@ -159,12 +159,12 @@ class PathIntegrator:
         try:
             for part in of_parts:
                 with self._passing(), dr.isolate_grad():
-                    part, walk, terms = self._planned(part)
-                    learned = self._learned(part, walk)
+                    part, trace, terms = self._planned(part)
+                    learned = self._learned(part, trace)
                     wanted = grad_in if part.share == 1 else grad_in * part.share
                     with dr.isolate_grad():  # of terms, one by one, from the flow that they share
-                        found = reduce(add, [term.backward(part, walk, wanted, learned) for term in terms])
-                self._told(part, walk, found)
+                        found = reduce(add, [term.backward(part, trace, wanted, learned) for term in terms])
+                self._told(part, trace, found)
                 if sums is not None:
                     sums.take()
         finally:
@@ -182,15 +182,15 @@ class PathIntegrator:
             raise PathreplayError(f"{self.name}: sample() is not differentiated: use mi.render, or render_backward")
         return *primal(self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
 
-    def _planned(self, view: Pass) -> tuple[Pass, Walk, tuple[Term, ...]]:
+    def _planned(self, view: Pass) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
         """A gradient pass as terms see it, how it walks, and the terms that it adds up."""
         return view, self._walk(view.scene, view.sensor), self.terms
 
-    def _learned(self, view: Pass, walk: Walk) -> Guess | None:
+    def _learned(self, view: Pass, trace: TraceConfig) -> Baseline | None:
         """What earlier passes found out that this one may use."""
         return None
 
-    def _told(self, view: Pass, walk: Walk, found: Found) -> None:
+    def _told(self, view: Pass, trace: TraceConfig, found: TermResult) -> None:
         """What is done with what terms have found."""
 
     def _parts(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> list[Pass]:
@@ -212,11 +212,11 @@ class PathIntegrator:
         with careful(), dr.suspend_grad():
             yield
 
-    def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> Walk:
+    def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> TraceConfig:
         """How the scene is walked through; the sensor may be in a medium."""
         facts = facts_of(scene)
-        branches = None if self.handed is None else self.handed.branches
-        return Walk(
+        branches = None if self.frozen_inputs is None else self.frozen_inputs.branches
+        return TraceConfig(
             scene=scene,
             traits=facts.traits(self._tables(facts)),
             media=facts.media(sensor, branches),  # type: ignore[arg-type]
@@ -229,8 +229,8 @@ class PathIntegrator:
 
     def _tables(self, facts: SceneFacts, edges: bool = False) -> Tables:
         """Those of a pass; while `dr.freeze` records, with all that is asked for ``edges``."""
-        if self.handed is not None:
-            return self.handed.tables
+        if self.frozen_inputs is not None:
+            return self.frozen_inputs.tables
         if is_recording():
             return facts.recorded_tables(self.tables, edges)
         self.tables = facts.tables()
@@ -243,17 +243,17 @@ class PathIntegrator:
         """
         view = Pass.of(scene, sensor, 0, 1)
         with self._passing():
-            walk, start = self._walk(scene, view.sensor), view.rays().start
-            if walk.media is not None or walk.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
+            trace, start = self._walk(scene, view.sensor), view.rays().start
+            if trace.media is not None or trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
                 return True
-            at = PathState.begin(walk, start).at
-            return path_moves(walk, start, at) or weights_vary(walk, at)
+            at = PathState.begin(trace, start).at
+            return path_moves(trace, start, at) or weights_vary(trace, at)
 
-    def to_hand(self, scene: mi.Scene) -> Handed:
+    def inputs_to_freeze(self, scene: mi.Scene) -> FrozenInputs:
         """What passes over this scene are to be handed if they are recorded."""
         facts = facts_of(scene)
         self.tables = facts.tables()  # now, since a recording wants all that integrators hold to stay as it is
-        return Handed(self.tables, facts.branches(), facts.constants())
+        return FrozenInputs(self.tables, facts.branches(), facts.constants())
 
     def _described(self, **more: Any) -> str:
         depth = -1 if self.max_depth == UNBOUNDED else self.max_depth

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..gradient.counted import Counted
+from ..gradient.counter_sampler import CounterSampler
 from ..plugins import mitsuba_integrator
 from .camera_pass import Pass
 
@@ -20,7 +20,7 @@ QUADRATURE = 128
 
 @dataclass(frozen=True)
 class FilmPlaces:
-    """The part of a film that paths begin in: its crop window, and its border where it samples one. See `Places`."""
+    """The part of a film where paths begin: its crop window, and its border if it samples one. See `FilmDomain`."""
 
     view: Pass
     corner: mi.ScalarPoint2f  # in the film's pixels
@@ -34,20 +34,20 @@ class FilmPlaces:
         return FilmPlaces(view, corner, mi.ScalarVector2f(film.crop_size()) + 2 * border)
 
     def ray(self, s: mi.Point2f, key: mi.UInt32) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """The camera ray through a place, and its weight: see `Places`."""
-        sensor, numbers, place = self.view.sensor, Counted(key, mi.UInt32(0x40000)), self.in_sensor(s)
+        """The camera ray through a place, and its weight: see `FilmDomain`."""
+        sensor, numbers, place = self.view.sensor, CounterSampler(key, mi.UInt32(0x40000)), self.in_sensor(s)
         time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
         wavelength, aperture = numbers.next_1d(), numbers.next_2d()
         ray, weight = self.view.camera_ray(time, wavelength, place, aperture)
         return mi.Ray3f(ray), dr.detach(weight)
 
     def flows(self, s: mi.Point2f) -> mi.Bool:
-        """Whether what stands still may slide under a place: see `Places`."""
+        """Whether what stands still may slide under a place: see `FilmDomain`."""
         flow = self.view.flow
         return mi.Bool(False) if flow is None else flow.leaves_rest_at(self.in_sensor(s))
 
     def of_point(self, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
-        """The place where a point of space would be seen: see `Places`."""
+        """The place where a point of space would be seen: see `FilmDomain`."""
         sensor = self.view.sensor
         if sensor.class_name() not in PROJECTING:
             return mi.Point2f(0), mi.Bool(False)

@@ -28,7 +28,7 @@ from ..gradient.adjoint import tangents
 from ..transport.meet import meet
 from ..transport.motion import may_move
 from ..transport.nodes import with_gradients
-from ..transport.vertex import Walk
+from ..transport.vertex import TraceConfig
 from .film_flow import CAMERAS, Sample, followed, glanced_at, glances_of, move_with_place, slopes_of
 
 GLANCES, CELLS = 32, 16
@@ -53,11 +53,11 @@ class SeenFlow:
     samples: int = 5
 
     @staticmethod
-    def of(sensor: mi.Sensor, walk: Walk) -> SeenFlow | None:
-        """The flow of a sensor, in a ``walk`` that knows what moves; None where nothing that it might see does."""
+    def of(sensor: mi.Sensor, trace: TraceConfig) -> SeenFlow | None:
+        """The flow of a sensor, in a ``trace`` that knows what moves; None where nothing that it might see does."""
         sample = glances_of(sensor, GLANCES)
         ray = mi.Ray3f(sample.ray(sensor)[0])
-        hit = meet(walk, ray, mi.Bool(True), coherent=True)
+        hit = meet(trace, ray, mi.Bool(True), coherent=True)
         seen, t = hit.is_valid(), dr.select(hit.is_valid(), hit.t, 1)
         with dr.resume_grad():
             flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
@@ -69,7 +69,7 @@ class SeenFlow:
             aslant, S = dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / wide
             W = dr.select(seen, aslant + S, 0)
             u = followed(si.p - dr.detach(si.p), slopes, t) * aslant / (aslant + S)
-            moves = seen & may_move(walk, hit)
+            moves = seen & may_move(trace, hit)
             dr.eval(u, W, moves)  # before all nodes read them
 
             pair = dr.arange(mi.UInt32, NODES * NODES * GLANCES * GLANCES)
@@ -122,15 +122,15 @@ class SeenFlow:
         return [dr.gather(mi.Vector2f, self.nodes, _node(cell, x, y)) for y in (0, 1) for x in (0, 1)], f
 
 
-def can_follow(walk: Walk, sensor: mi.Sensor) -> bool:
+def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
     """Whether places may follow what is seen: then all else slides under them, and all of its edges have to be found.
 
     Those behind mirrors, glass and sheets and on bent curves are not, and media are not asked. (Nor are those in
     textures: see `has_seams`.)
     """
-    traits = walk.traits
+    traits = trace.traits
     hidden = traits.mirrors or traits.veils or traits.splines
-    return walk.media is None and not hidden and sensor.class_name() in CAMERAS and not with_gradients(sensor)
+    return trace.media is None and not hidden and sensor.class_name() in CAMERAS and not with_gradients(sensor)
 
 
 def _sums(values: mi.Float) -> mi.Float:

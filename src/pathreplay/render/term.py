@@ -7,24 +7,24 @@ from typing import Any, Protocol
 
 import mitsuba as mi
 
-from ..gradient.baseline import Guess, Seen
-from ..transport.vertex import Walk
+from ..gradient.baseline import Baseline, BaselineStats
+from ..transport.vertex import TraceConfig
 from .camera_pass import Pass
 
 
 @dataclass(frozen=True)
-class Found:
+class TermResult:
     """What terms give back of their passes, beside the gradients of parameters: it can be added up."""
 
     image: mi.TensorXf | None = None  # tangent of the image (forward mode), or the image itself (pixel sweep)
-    seen: Seen | None = None  # of media, for later passes
+    seen: BaselineStats | None = None  # of media, for later passes
     lost: mi.UInt32 | None = None  # how many paths lost a part of their gradient, if they were counted
     paths: int = 0  # how many they were counted out of
     moves: bool = False  # hit points, directions or emitter samples depend on parameters with gradients
 
-    def __add__(self, other: Found) -> Found:
+    def __add__(self, other: TermResult) -> TermResult:
         image, seen, lost = (_sum(getattr(self, name), getattr(other, name)) for name in ("image", "seen", "lost"))
-        return Found(image, seen, lost, self.paths + other.paths, self.moves or other.moves)
+        return TermResult(image, seen, lost, self.paths + other.paths, self.moves or other.moves)
 
 
 def _sum(a: Any, b: Any) -> Any:
@@ -38,11 +38,11 @@ class Term(Protocol):
     a pass; ``learned`` is what earlier passes found out, or None.
     """
 
-    def forward(self, view: Pass, walk: Walk, learned: Guess | None) -> Found:
+    def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         """Its part of the tangent of the image. The parameters carry their tangents already."""
 
-    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
+    def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         """Back-propagate the adjoint of the image into the parameters. Everything has been launched on return."""
 
-    def note(self, walk: Walk) -> str:
+    def note(self, trace: TraceConfig) -> str:
         """What is to be said of how it goes about it; "" if it is nothing."""

@@ -11,7 +11,7 @@ import mitsuba as mi
 from ..gradient.adjoint import backward
 from ..transport.media import interaction, majorant, span
 from ..transport.shadow import Stretch
-from ..transport.vertex import Arrival, Flight, Walk, reciprocal
+from ..transport.vertex import Arrival, Flight, TraceConfig, reciprocal
 
 
 @dr.syntax
@@ -36,15 +36,15 @@ def differentiate_flight(at: Arrival, flight: Flight, past: mi.Sampler, active: 
 
 @dr.syntax
 def differentiate_shadow(
-    walk: Walk, ray: mi.Ray3f, medium: mi.MediumPtr, past: mi.Sampler, active: mi.Bool, weight: mi.Spectrum
+    trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, past: mi.Sampler, active: mi.Bool, weight: mi.Spectrum
 ) -> None:
     """Differentiate the tentative collisions of a shadow ray that arrived. In homogeneous media there are none."""
     stretch = Stretch.begin(ray, medium, active)
-    while dr.hint(stretch.active, exclude=[walk], label="pathreplay: listing, shadow"):
-        hit, a, b, inside = stretch.part(walk)
+    while dr.hint(stretch.active, exclude=[trace], label="pathreplay: listing, shadow"):
+        hit, a, b, inside = stretch.part(trace)
         σ_bar = majorant(stretch.medium, stretch.ray, inside)
         tracked = inside & (σ_bar > 0)
-        if dr.hint(walk.media.homogeneous, mode="scalar"):
+        if dr.hint(trace.media.homogeneous, mode="scalar"):
             tracked &= ~stretch.medium.is_homogeneous()  # known without tracking
         t = mi.Float(a)
         while dr.hint(tracked, label="pathreplay: listing, ratio tracking"):

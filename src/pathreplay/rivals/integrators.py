@@ -11,15 +11,15 @@ from functools import partial
 
 import mitsuba as mi
 
-from ..gradient.baseline import Guess
+from ..gradient.baseline import Baseline
 from ..gradient.driver import Driver, ForwardDriver
 from ..gradient.forward import forward
 from ..render.camera_pass import Pass
 from ..render.interior import back_propagate, tangent
 from ..render.path_integrator import PathIntegrator
 from ..render.properties import choice, flag
-from ..render.term import Found
-from ..transport.vertex import Walk
+from ..render.term import TermResult
+from ..transport.vertex import TraceConfig
 from .listing import listing
 from .radiative import no_forward, radiative
 from .tape import tape_backward, tape_forward
@@ -37,15 +37,15 @@ class OtherInterior:
     backwards: Driver
     forwards: ForwardDriver
 
-    def forward(self, view: Pass, walk: Walk, learned: Guess | None) -> Found:
+    def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         """Tangent of the image: see `Term`."""
-        return tangent(view, walk, self.forwards)
+        return tangent(view, trace, self.forwards)
 
-    def backward(self, view: Pass, walk: Walk, grad_in: mi.TensorXf, learned: Guess | None) -> Found:
+    def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         """Back-propagate the adjoint of the image: see `Term`."""
-        return back_propagate(view, walk, grad_in, self.backwards)
+        return back_propagate(view, trace, grad_in, self.backwards)
 
-    def note(self, walk: Walk) -> str:
+    def note(self, trace: TraceConfig) -> str:
         """Nothing: see `Term`."""
         return ""
 

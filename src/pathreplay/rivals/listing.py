@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..gradient.adjoint import LostPaths, backward
+from ..gradient.adjoint import NonFiniteCounter, backward
 from ..gradient.primal import walk_on
 from ..transport import arrive, scatter
 from ..transport.connect import Connection, shadow_start
@@ -22,46 +22,46 @@ from ..transport.emitters import redraw_emitter
 from ..transport.motion import path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
-from ..transport.vertex import Numbers, Walk, reciprocal
+from ..transport.vertex import TraceConfig, VertexSamples, reciprocal
 from .collisions import differentiate_flight, differentiate_shadow
 
 
 @dr.syntax
-def listing(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -> bool:
+def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters.
 
     Uses one majorant for each medium. Not differentiated: what the listings miss (above), visibility, emission of
     media, and everything that moves: a path that moves with the parameters raises PathreplayError, and so does a scene
     without media.
     """
-    if dr.hint(walk.media is None, mode="scalar"):
+    if dr.hint(trace.media is None, mode="scalar"):
         raise PathreplayError("pathreplay_listing differentiates media, and the scene has none: use 'pathreplay'")
     # Nobody else's tracking is used, so that every collision is one that can be differentiated.
-    walk = replace(walk, media=replace(walk.media, grids=(), plain=True))
-    sampler, path = start.sampler, PathState.begin(walk, start)
-    if dr.hint(path_moves(walk, start, path.at), mode="scalar"):
+    trace = replace(trace, media=replace(trace.media, grids=(), plain=True))
+    sampler, path = start.sampler, PathState.begin(trace, start)
+    if dr.hint(path_moves(trace, start, path.at), mode="scalar"):
         raise PathreplayError("pathreplay_listing cannot follow what moves: use 'pathreplay'")
-    L = walk_on(walk, sampler.clone(), dr.copy(path))[0]  # β_i L_i, peeled on the way
+    L = walk_on(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, peeled on the way
     ctx = mi.BSDFContext()
 
-    while dr.hint(path.active, exclude=[walk, ctx], label="pathreplay: listing"):
+    while dr.hint(path.active, exclude=[trace, ctx], label="pathreplay: listing"):
         past = sampler.clone()
-        Numbers.draw(past)
-        u, step = path.choose(walk, sampler)
+        VertexSamples.draw(past)
+        u, step = path.choose(trace, sampler)
         kept = step.kept
 
         # All that comes along the ray has passed the null collisions of its flight, or was scattered at the real one.
         differentiate_flight(path.at, kept.media.flight, past, path.active, δL * L)
         L -= path.β * step.e
 
-        onward, again = path.advance(walk, u, step)
+        onward, again = path.advance(trace, u, step)
         with dr.resume_grad():
-            v = arrive.choose(walk, path.at, past, path.β, path.active, kept.media.flight)
-            light, Le = redraw_emitter(walk, v.origin, u.light, kept.light, False, kept.lit)
+            v = arrive.choose(trace, path.at, past, path.β, path.active, kept.media.flight)
+            light, Le = redraw_emitter(trace, v.origin, u.light, kept.light, False, kept.lit)
             f, pdf = scatter.towards(v, ctx, light.d, kept.lit)
             reached = Connection(light, Le * kept.media.shadow.T, kept.lit).reaches(pdf, False)
             lighting = v.inside.w * dr.select(kept.lit, f * reached, 0)
-            w = scatter.repeat(walk, v, again, ctx, False)[0]
+            w = scatter.repeat(trace, v, again, ctx, False)[0]
             w *= v.inside.w
             Lo = path.β * (v.inside.e + v.inside.w * v.glow + lighting) + L * w * dr.detach(reciprocal(w))
             if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
@@ -69,6 +69,6 @@ def listing(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -
 
         # The same for the light of the emitter sample, along its shadow ray.
         ray, begins = v.origin.spawn_ray_to(light.p), shadow_start(v, light, path.at.medium)
-        differentiate_shadow(walk, ray, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
+        differentiate_shadow(trace, ray, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
         path = onward
     return False

@@ -13,21 +13,23 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import PathreplayError
-from ..gradient.adjoint import LostPaths, backward
+from ..gradient.adjoint import NonFiniteCounter, backward
 from ..gradient.primal import walk_on
 from ..transport.path import PathState, next_arrival
 from ..transport.start import CameraStart
 from ..transport.step import repeat_step
-from ..transport.vertex import Walk
+from ..transport.vertex import TraceConfig
 
 
-def no_forward(walk: Walk, start: CameraStart, lost: LostPaths) -> tuple[mi.Spectrum, mi.Bool, bool]:
+def no_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
     """There is none. Raises PathreplayError."""
     raise PathreplayError("pathreplay_rb has no forward mode: use the integrator 'pathreplay'")
 
 
 @dr.syntax
-def radiative(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths, linear: bool = False) -> bool:
+def radiative(
+    trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter, linear: bool = False
+) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters.
 
     ``linear`` is a biased variant in linear time, after those of the paper, which leave the incident radiance out: no
@@ -36,19 +38,19 @@ def radiative(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths,
     Nothing is lost. Not differentiated: everything that moves (as with ``attach='none'``), and visibility. Raises
     PathreplayError when no parameter reaches the paths.
     """
-    sampler, path = start.sampler, PathState.begin(walk, start)
+    sampler, path = start.sampler, PathState.begin(trace, start)
 
-    while dr.hint(path.active, exclude=[walk], label="pathreplay: radiative backpropagation"):
-        u, step = path.choose(walk, sampler)
-        at = next_arrival(walk, path.at, step, step.active)
+    while dr.hint(path.active, exclude=[trace], label="pathreplay: radiative backpropagation"):
+        u, step = path.choose(trace, sampler)
+        at = next_arrival(trace, path.at, step, step.active)
         if dr.hint(linear, mode="scalar"):
             L = mi.Spectrum(dr.select(step.active, 1, 0))
         else:
-            depth, η = path.passed(walk, step), path.η * step.eta
-            L, _ = walk_on(walk, sampler, PathState(at, mi.Spectrum(1), None, η, depth, step.active))
-        onward, v = path.advance(walk, u, step, at)
+            depth, η = path.passed(trace, step), path.η * step.eta
+            L, _ = walk_on(trace, sampler, PathState(at, mi.Spectrum(1), None, η, depth, step.active))
+        onward, v = path.advance(trace, u, step, at)
         with dr.resume_grad():
-            again = repeat_step(walk, replace(v, go_on=step.active), False, path.active)
+            again = repeat_step(trace, replace(v, go_on=step.active), False, path.active)
             backward(dr.sum(δL * path.β * (again.e + again.w * L)))
         path = onward
     return False

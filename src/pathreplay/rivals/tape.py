@@ -12,33 +12,33 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..gradient.adjoint import LostPaths, backward, tangents
+from ..gradient.adjoint import NonFiniteCounter, backward, tangents
 from ..transport.motion import path_moves
 from ..transport.path import PathState
 from ..transport.start import CameraStart
 from ..transport.step import repeat_step
-from ..transport.vertex import Walk
+from ..transport.vertex import TraceConfig
 
 
-def tape_backward(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -> bool:
+def tape_backward(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
 
     The estimator is that of the sweep driver, and with the same random numbers so is the gradient. Not differentiated:
     see `tape`. Raises PathreplayError when no parameter reaches the paths.
     """
     with dr.resume_grad(), dr.isolate_grad():
-        L, _, moves = tape(walk, start)
+        L, _, moves = tape(trace, start)
         backward(dr.sum(δL * L))
     return moves
 
 
-def tape_forward(walk: Walk, start: CameraStart, lost: LostPaths) -> tuple[mi.Spectrum, mi.Bool, bool]:
+def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
     """Tangent of the radiance along the rays of a ``start``, ``(δL, valid, moves)``: see `forward`.
 
     The parameters must carry their tangents already. Not differentiated: see `tape`.
     """
     with dr.resume_grad():
-        L, valid, moves = tape(walk, start)
+        L, valid, moves = tape(trace, start)
         return tangents(L)[0], valid, moves
 
 
@@ -66,7 +66,7 @@ def _cut(state: tuple[Any, ...]) -> Any:
 
 
 @dr.syntax
-def tape(walk: Walk, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, bool]:
+def tape(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, bool]:
     """Radiance along the rays of a ``start`` as an AD variable, ``(L, valid, moves)``: L = Σ β_i e_i.
 
     Every step is taken detached, to make its choices, and once more attached. Not differentiated: visibility, Russian
@@ -75,26 +75,26 @@ def tape(walk: Walk, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, bool]:
     """
     sampler = start.sampler
     with dr.suspend_grad():
-        path = PathState.begin(walk, start, sustained=True)
+        path = PathState.begin(trace, start, sustained=True)
         at = path.at
-        valid = mi.Bool(walk.background_is_opaque) & path.active
-    moves = path_moves(walk, start, at)
+        valid = mi.Bool(trace.background_is_opaque) & path.active
+    moves = path_moves(trace, start, at)
     L = mi.Spectrum(0)  # radiance so far
     β = mi.Spectrum(1)  # throughput, differentiable, and so the arrival: where, whence, density
     first = start.ray if moves else at.ray
     o, d, pdf = mi.Point3f(first.o), mi.Vector3f(first.d), mi.Float(at.pdf)
 
-    while dr.hint(path.active, mode="evaluated", exclude=[walk, moves], label="pathreplay: tape"):
+    while dr.hint(path.active, mode="evaluated", exclude=[trace, moves], label="pathreplay: tape"):
         with dr.suspend_grad():
-            u, step = path.choose(walk, sampler)
+            u, step = path.choose(trace, sampler)
             valid |= path.active & step.seen
-            onward, v = path.advance(walk, u, step)
+            onward, v = path.advance(trace, u, step)
 
         L, β, o, d, pdf = _cut((L, β, o, d, pdf))
         ray = mi.Ray3f(path.at.ray)
         ray.o, ray.d = o, d
         at = replace(path.at, ray=ray, pdf=pdf)
-        again = repeat_step(walk, replace(v, at=at), moves, path.active)
+        again = repeat_step(trace, replace(v, at=at), moves, path.active)
         L += β * again.e
         β *= again.w * v.rr_weight
         ray, pdf = (again.ray_next, again.pdf) if moves else (onward.at.ray, onward.at.pdf)

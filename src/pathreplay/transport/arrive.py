@@ -16,7 +16,7 @@ from .flight import Flown, fly, fly_again
 from .media import interaction
 from .surface import met, steady
 from .traits import is_null
-from .vertex import Arrival, Flight, Replayed, Walk
+from .vertex import Arrival, Flight, TraceConfig, VertexRecord
 
 
 @dataclass
@@ -45,26 +45,26 @@ class InMedium:
 
 
 def choose(
-    walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: mi.Bool, flight: Flight | None = None
+    trace: TraceConfig, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: mi.Bool, flight: Flight | None = None
 ) -> Vertex:
     """Arrive in a first walk; with media, draw the flight from ``sampler``, unless it is given. Detached.
 
     Real collisions are chosen by the throughput ``β``, see `fly`.
     """
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
-    if walk.steady:
+    if trace.steady:
         si = steady(si, at.ray, active)
-    if walk.media is None:
-        return _on_surface(walk, at, si, False, active)
-    flight = fly(walk, at, sampler, β, active) if flight is None else flight
+    if trace.media is None:
+        return _on_surface(trace, at, si, False, active)
+    flight = fly(trace, at, sampler, β, active) if flight is None else flight
     event = active & flight.event
     mei = interaction(at.medium, dr.detach(at.ray), flight.t)
     w = dr.select(event, flight.σ_s * dr.rcp(flight.density), 1) * flight.W
     e = mi.Spectrum(0 if flight.E is None else flight.E)
-    return _in_medium(walk, at, si, flight, Flown(mei, w, e), False, active)
+    return _in_medium(trace, at, si, flight, Flown(mei, w, e), False, active)
 
 
-def repeat(walk: Walk, again: Replayed, attached: bool, active: mi.Bool) -> Vertex:
+def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool) -> Vertex:
     """Arrive once more, differentiably in emission and the coefficients of media.
 
     If ``attached`` the hit point follows the ray and the shape, and the emission's MIS weight the ray's density.
@@ -78,47 +78,58 @@ def repeat(walk: Walk, again: Replayed, attached: bool, active: mi.Bool) -> Vert
         )
     if kept.media is None:
         known = None if kept.known is None or attached else kept.known.glow
-        return _on_surface(walk, at, si, attached, active, known)
+        return _on_surface(trace, at, si, attached, active, known)
     reach = dr.select(si.is_valid(), si.t, dr.inf)
-    flown = fly_again(walk, at, kept.media.flight, reach, attached, active)
-    return _in_medium(walk, at, si, kept.media.flight, flown, attached, active)
+    flown = fly_again(trace, at, kept.media.flight, reach, attached, active)
+    return _in_medium(trace, at, si, kept.media.flight, flown, attached, active)
 
 
-def background(walk: Walk, at: Arrival, left: mi.Bool) -> mi.Spectrum:
+def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
     """Radiance along rays that ``left`` the scene, MIS weighted; differentiable in the environment's radiance."""
-    if walk.scene.environment() is None:
+    if trace.scene.environment() is None:
         return mi.Spectrum(0)
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.t, si.wi, si.time, si.wavelengths = dr.inf, -at.ray.d, at.ray.time, at.ray.wavelengths
-    return emission(walk.scene, at, si, False, sees_lights(walk, at, si, left))
+    return emission(trace.scene, at, si, False, sees_lights(trace, at, si, left))
 
 
-def sees_lights(walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+def sees_lights(trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
     """Where what is emitted at the end of a ray counts: with ``hide_emitters`` no camera ray sees the environment."""
-    return active & (~at.camera | si.is_valid()) if walk.hide_emitters else active
+    return active & (~at.camera | si.is_valid()) if trace.hide_emitters else active
 
 
 def _on_surface(
-    walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool, known: mi.Spectrum = None
+    trace: TraceConfig,
+    at: Arrival,
+    si: mi.SurfaceInteraction3f,
+    attached: bool,
+    active: mi.Bool,
+    known: mi.Spectrum = None,
 ) -> Vertex:
     if known is None:
-        known = vertex_glow(walk, at, si, attached, sees_lights(walk, at, si, active))
+        known = vertex_glow(trace, at, si, attached, sees_lights(trace, at, si, active))
     return Vertex(si, si.bsdf(at.ray), active & si.is_valid(), si, known)
 
 
 def _in_medium(
-    walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, flight: Flight, flown: Flown, attached: bool, active: mi.Bool
+    trace: TraceConfig,
+    at: Arrival,
+    si: mi.SurfaceInteraction3f,
+    flight: Flight,
+    flown: Flown,
+    attached: bool,
+    active: mi.Bool,
 ) -> Vertex:
     event = active & flight.event
     bsdf, phase = si.bsdf(at.ray), at.medium.phase_function()
     surface = active & ~event & si.is_valid()
     through = surface & is_null(bsdf)
     seen = active & ~event
-    if walk.hide_emitters:
+    if trace.hide_emitters:
         seen &= ~at.camera | si.is_valid()
     origin = dr.zeros(mi.Interaction3f)
     origin.t, origin.time, origin.wavelengths = mi.Float(0), at.ray.time, at.ray.wavelengths
     origin.p = dr.select(event, flown.mei.p, si.p)
     origin.n = dr.select(event, 0, si.n)
     inside = InMedium(event, through, flown.mei, phase, flight, flown.w, flown.e)
-    return Vertex(si, bsdf, surface & ~through, origin, emission(walk.scene, at, si, attached, seen), inside)
+    return Vertex(si, bsdf, surface & ~through, origin, emission(trace.scene, at, si, attached, seen), inside)

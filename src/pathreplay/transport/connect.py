@@ -11,7 +11,7 @@ from .arrive import Vertex
 from .emitters import draw_emitter, redraw_emitter
 from .scatter import towards
 from .shadow import shadow, shadow_again
-from .vertex import Numbers, Replayed, Shadow, Walk, is_smooth, mis_weight
+from .vertex import Shadow, TraceConfig, VertexRecord, VertexSamples, is_smooth, mis_weight
 
 
 @dataclass
@@ -34,18 +34,20 @@ class Connection:
         return self.Le * (mis if attached else dr.detach(mis))
 
 
-def choose(walk: Walk, v: Vertex, medium: mi.MediumPtr, u: Numbers, sampler: mi.Sampler, go_on: mi.Bool) -> Connection:
+def choose(
+    trace: TraceConfig, v: Vertex, medium: mi.MediumPtr, u: VertexSamples, sampler: mi.Sampler, go_on: mi.Bool
+) -> Connection:
     """Draw an emitter sample, and with media a shadow ray in ``medium``, where something can scatter it. Detached."""
     if v.inside is None:
         lit = go_on & v.surface & is_smooth(v.bsdf)
-        light, Le = draw_emitter(walk.scene, v.origin, u.light, lit)
+        light, Le = draw_emitter(trace.scene, v.origin, u.light, lit)
         return Connection(light, Le, lit & (light.pdf != 0))
     event = v.inside.event
     lit = go_on & (v.surface | event)
     lit &= dr.select(event, medium.use_emitter_sampling(), is_smooth(v.bsdf))
-    light, Le = draw_emitter(walk.scene, v.origin, u.light, lit, visible=False)
+    light, Le = draw_emitter(trace.scene, v.origin, u.light, lit, visible=False)
     lit &= light.pdf != 0
-    dark = shadow(walk, v.origin.spawn_ray_to(light.p), shadow_start(v, light, medium), sampler, lit)
+    dark = shadow(trace, v.origin.spawn_ray_to(light.p), shadow_start(v, light, medium), sampler, lit)
     return Connection(light, Le * dark.T, lit & dr.any(dark.T != 0), dark)
 
 
@@ -54,7 +56,7 @@ def shadow_start(v: Vertex, light: mi.DirectionSample3f, medium: mi.MediumPtr) -
     return dr.select(v.surface & v.si.is_medium_transition(), v.si.target_medium(light.d), medium)
 
 
-def repeat(walk: Walk, v: Vertex, again: Replayed, ctx: mi.BSDFContext, attached: bool) -> mi.Spectrum:
+def repeat(trace: TraceConfig, v: Vertex, again: VertexRecord, ctx: mi.BSDFContext, attached: bool) -> mi.Spectrum:
     """The part of e that the kept emitter sample brings (Spectrum), differentiably.
 
     If ``attached`` the point on the emitter follows the emitter. Visibility is not differentiated.
@@ -63,8 +65,8 @@ def repeat(walk: Walk, v: Vertex, again: Replayed, ctx: mi.BSDFContext, attached
     if kept.known is not None and not attached:
         f = v.bsdf.eval(ctx, v.si, v.si.to_local(kept.known.d), kept.lit)
         return dr.select(kept.lit, f * kept.known.w, 0)
-    light, Le = redraw_emitter(walk, v.origin, again.u.light, kept.light, attached, kept.lit)
+    light, Le = redraw_emitter(trace, v.origin, again.u.light, kept.light, attached, kept.lit)
     if kept.media is not None:
-        Le *= shadow_again(walk, v.origin.spawn_ray_to(light.p), kept.media.shadow, attached, kept.lit)
+        Le *= shadow_again(trace, v.origin.spawn_ray_to(light.p), kept.media.shadow, attached, kept.lit)
     f, pdf = towards(v, ctx, light.d, kept.lit)
     return dr.select(kept.lit, f * Connection(light, Le, kept.lit).reaches(pdf, attached), 0)

@@ -6,10 +6,10 @@ import drjit as dr
 import mitsuba as mi
 
 from .meet import meet
-from .passage import beyond_null
+from .passage import skip_null
 from .surface import held_point
 from .traits import is_painted
-from .vertex import Arrival, Lighting, Walk, mis_weight, reciprocal
+from .vertex import Arrival, Lighting, TraceConfig, mis_weight, reciprocal
 
 
 def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool) -> mi.Spectrum:
@@ -29,17 +29,19 @@ def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached
     return mis * ds.emitter.eval(si, active)
 
 
-def vertex_glow(walk: Walk, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool) -> mi.Spectrum:
+def vertex_glow(
+    trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool
+) -> mi.Spectrum:
     """The `emission` at a vertex: none where what is around the scene is none, and no surface emits."""
-    if walk.leaves and not walk.traits.area_lights:
+    if trace.leaves and not trace.traits.area_lights:
         return mi.Spectrum(0)
-    return emission(walk.scene, at, si, attached, active)
+    return emission(trace.scene, at, si, attached, active)
 
 
-def relight(walk: Walk, at: Arrival, lighting: Lighting) -> mi.Spectrum:
+def relight(trace: TraceConfig, at: Arrival, lighting: Lighting) -> mi.Spectrum:
     """The e of a vertex once more (Spectrum), differentiable in what emitters emit alone: all else is as it was."""
-    own = vertex_glow(walk, at, lighting.si, False, lighting.seen)
-    return own + lighting.w * walk.scene.eval_emitter_direction(lighting.si, lighting.light, lighting.lit)
+    own = vertex_glow(trace, at, lighting.si, False, lighting.seen)
+    return own + lighting.w * trace.scene.eval_emitter_direction(lighting.si, lighting.light, lighting.lit)
 
 
 def draw_emitter(
@@ -55,7 +57,12 @@ def draw_emitter(
 
 
 def redraw_emitter(
-    walk: Walk, origin: mi.Interaction3f, u: mi.Point2f, light: mi.DirectionSample3f, attached: bool, lit: mi.Bool
+    trace: TraceConfig,
+    origin: mi.Interaction3f,
+    u: mi.Point2f,
+    light: mi.DirectionSample3f,
+    attached: bool,
+    lit: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
     """The emitter sample of a first walk once more, with Le/p, differentiable.
 
@@ -63,17 +70,17 @@ def redraw_emitter(
     the same in the emitter's own coordinates, so that it moves with the emitter, and everything follows; else it is
     fixed in space and only the emitted radiance is differentiated. Visibility never is.
     """
-    scene = walk.scene
+    scene = trace.scene
     if attached:
         painted = mi.Bool(False)
-        if walk.traits.painted_meshes:
+        if trace.traits.painted_meshes:
             still, _ = draw_emitter(scene, dr.detach(origin), u, lit, visible=False)
             painted = lit & is_painted(still.emitter) & still.emitter.get_shape().is_mesh()
         light, Le = scene.sample_emitter_direction(origin, u, False, lit & ~painted)
-        if walk.traits.lights_deform:
+        if trace.traits.lights_deform:
             Le *= _mesh_growth(scene, origin, light, lit & ~painted)
-        if walk.traits.painted_meshes:
-            glued, glow = _glued(walk, origin, still, painted)
+        if trace.traits.painted_meshes:
+            glued, glow = _glued(trace, origin, still, painted)
             light, Le = dr.select(painted, glued, light), dr.select(painted, glow, Le)
         return light, Le
     if light is None:
@@ -82,7 +89,7 @@ def redraw_emitter(
 
 
 def _glued(
-    walk: Walk, origin: mi.Interaction3f, still: mi.DirectionSample3f, active: mi.Bool
+    trace: TraceConfig, origin: mi.Interaction3f, still: mi.DirectionSample3f, active: mi.Bool
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
     """A sample of a mesh with a texture, at a point that is glued to it, with Le/p; ``still`` is the same, detached.
 
@@ -90,9 +97,9 @@ def _glued(
     """
     ray = dr.detach(origin.spawn_ray_to(still.p))
     ray.maxt = dr.largest(mi.Float)
-    hit = meet(walk, ray, active)
-    if walk.media is not None:
-        hit = beyond_null(walk, ray, hit, active)
+    hit = meet(trace, ray, active)
+    if trace.media is not None:
+        hit = skip_null(trace, ray, hit, active)
     y = held_point(hit, ray, active)
     towards = y.p - origin.p
     facing = dr.abs(dr.dot(y.A, towards))
@@ -105,7 +112,7 @@ def _glued(
     light.d = dr.select(ok, dr.replace_grad(still.d, towards * dr.rsqrt(dist2)), still.d)
     light.dist = dr.select(ok, dr.replace_grad(still.dist, dr.sqrt(dist2)), still.dist)
     light.pdf = dr.select(ok, dr.replace_grad(still.pdf, -still.pdf * log_J), still.pdf)
-    Le = walk.scene.eval_emitter_direction(dr.detach(origin), still, active) * reciprocal(still.pdf)
+    Le = trace.scene.eval_emitter_direction(dr.detach(origin), still, active) * reciprocal(still.pdf)
     return light, Le * J
 
 

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .media import Media, carried, interaction, is_grid, majorant, span
-from .vertex import Arrival, Flight, NullCollision, Walk, reciprocal
+from .vertex import Arrival, Flight, NullCollision, TraceConfig, reciprocal
 
 # Points of a flight at which the derivative of its transmittance is taken. Few leave a variance of their own, many take
 # time; of the cloud of `pathreplay bench media` four make the least of both.
@@ -36,20 +36,20 @@ def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
 
 
 @dr.syntax
-def fly(walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: mi.Bool) -> Flight:
+def fly(trace: TraceConfig, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: mi.Bool) -> Flight:
     """Sample the flight along ``at.ray``, in ``at.medium``, up to the surface ``at.hit``. Detached.
 
     ``β`` is the throughput: in chromatic media a collision is real with probability p = Σ_k β_k σ_k / (σ̄ Σ_k β_k), the
     history of all channels.
     """
-    media = walk.media
+    media = trace.media
     ray, medium = dr.detach(at.ray), at.medium
     flying = active & (medium != None)  # noqa: E711 (an array of pointers)
     reach = dr.select(at.hit.is_valid(), at.hit.t, dr.inf)
     a, b = span(medium, ray, reach, flying)
     flying &= a < b
     σ_max = majorant(medium, ray, flying)
-    if dr.hint(walk.branch, mode="scalar"):  # null collisions are wanted also where the whole medium is empty
+    if dr.hint(trace.branch, mode="scalar"):  # null collisions are wanted also where the whole medium is empty
         σ_max = dr.maximum(σ_max, dr.select(dr.isfinite(b), dr.rcp(b - a), 0))
 
     t = mi.Float(a)
@@ -62,8 +62,8 @@ def fly(walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: m
     t_emit, c_emit, count = mi.Float(0), mi.Spectrum(0), mi.Float(0)
     t_null, ω_null, bare, mass, nulls = mi.Float(0), mi.Spectrum(0), mi.Float(0), mi.Float(0), mi.Float(0)
 
-    while dr.hint(flying, exclude=[walk, at, media], label="pathreplay: flight"):
-        step, σ_bar = _tentative(walk, medium, ray, t, b, sampler.next_1d(flying), σ_max, flying)
+    while dr.hint(flying, exclude=[trace, at, media], label="pathreplay: flight"):
+        step, σ_bar = _tentative(trace, medium, ray, t, b, sampler.next_1d(flying), σ_max, flying)
         t_next = t + step
         inside = flying & (t_next < b)
         mei = interaction(medium, ray, t_next)
@@ -84,8 +84,8 @@ def fly(walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: m
         p = _reality(media, dr.abs(β * W), σ_t, σ_bar)
         real = inside & (sampler.next_1d(inside) < p)
         flying = inside & ~real
-        if dr.hint(walk.branch, mode="scalar"):
-            share = walk.branching * branch_weight(p, walk.branching) / σ_bar
+        if dr.hint(trace.branch, mode="scalar"):
+            share = trace.branching * branch_weight(p, trace.branching) / σ_bar
             m = share * dr.mean(dr.abs(β) * dr.maximum(dr.abs(W), 1))
             mass += dr.select(flying, m, 0)
             nulls += dr.select(flying, 1, 0)
@@ -105,17 +105,24 @@ def fly(walk: Walk, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: m
     flight = Flight(event=event, t=t, density=density, W=W, along=along, σ_s=σ_s)
     if dr.hint(media.emissive, mode="scalar"):
         flight.t_emit, flight.c_emit, flight.E = t_emit, c_emit * count, E
-    if dr.hint(walk.branch, mode="scalar"):
+    if dr.hint(trace.branch, mode="scalar"):
         flight.p, flight.null = p_real, NullCollision(t_null, ω_null, bare, mass, nulls, sampler.next_1d(active))
     return flight
 
 
 def _tentative(
-    walk: Walk, medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float, b: mi.Float, u: mi.Float, σ: mi.Float, active: mi.Bool
+    trace: TraceConfig,
+    medium: mi.MediumPtr,
+    ray: mi.Ray3f,
+    t: mi.Float,
+    b: mi.Float,
+    u: mi.Float,
+    σ: mi.Float,
+    active: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:
     """How far it is from ``t`` to the next tentative collision, and the majorant there: σ, but in grids."""
     step = dr.select(σ > 0, -dr.log(1 - u) * dr.rcp(σ), dr.inf)
-    for grid in walk.media.grids:
+    for grid in trace.media.grids:
         mine = active & is_grid(grid, medium)
         onward = mi.Ray3f(ray.o + t * ray.d, ray.d, ray.time, ray.wavelengths)
         onward.maxt = b - t
@@ -142,12 +149,14 @@ class Flown:
     e: mi.Spectrum  # emission on the way, and a control variate: value zero, derivative of mean zero
 
 
-def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: mi.Float, attached: bool, active: mi.Bool) -> Flown:
+def fly_again(
+    trace: TraceConfig, at: Arrival, flight: Flight, reach: mi.Float, attached: bool, active: mi.Bool
+) -> Flown:
     """The kept flight, differentiable in the coefficients of the medium and, if ``attached``, in ray and ``reach``.
 
     ``reach`` is the distance to the surface (infinity if there is none). A collision keeps its place relative to the
     two ends of the medium on its ray, so that it moves with the ray and with the surface, and no derivative is lost
-    where the flight is cut off. With b any function of position and direction (`Walk.baseline`),
+    where the flight is cut off. With b any function of position and direction (`TraceConfig.baseline`),
 
         (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (the last term at a collision x only)
 
@@ -170,8 +179,8 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: mi.Float, attached
 
     σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
     σ_y = [medium.get_scattering_coefficients(y, through)[2] for y in points]
-    if walk.branch:  # The rest of the derivative of a collision, but not by its place, is left to null ones.
-        rest = 1 - flight.p * branch_weight(flight.p, walk.branching)
+    if trace.branch:  # The rest of the derivative of a collision, but not by its place, is left to null ones.
+        rest = 1 - flight.p * branch_weight(flight.p, trace.branching)
         still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
         σ_s, σ_t = (σ - rest * (σ_0 - dr.detach(σ_0)) for σ, σ_0 in ((σ_s, still[0]), (σ_t, still[2])))
     w_event = σ_s * stretch * dr.rcp(flight.density)
@@ -180,16 +189,16 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: mi.Float, attached
     if dr.grad_enabled(σ_y, length):
         log_T = dr.select(through, -length / POINTS * sum(σ_y), 0)
         w *= dr.replace_grad(mi.Spectrum(1), log_T)
-        if walk.baseline is not None:
+        if trace.baseline is not None:
             σ_bar = majorant(medium, ray, in_medium)
-            guesses = [σ * _guess(walk, y, σ, σ_bar, through) for y, σ in zip(points, σ_y, strict=True)]
+            guesses = [σ * _guess(trace, y, σ, σ_bar, through) for y, σ in zip(points, σ_y, strict=True)]
             score = dr.select(through, length / POINTS * sum(guesses), 0)
-            score -= dr.select(event, σ_t * stretch * dr.rcp(flight.density) * _guess(walk, mei, σ_t, σ_bar, event), 0)
+            score -= dr.select(event, σ_t * stretch * dr.rcp(flight.density) * _guess(trace, mei, σ_t, σ_bar, event), 0)
             e += score - dr.detach(score)
 
-    if walk.media.emissive:
+    if trace.media.emissive:
         emitted = mi.Spectrum(0)
-        for grid in walk.media.grids:
+        for grid in trace.media.grids:
             if grid.emission is not None:
                 glows = in_medium & is_grid(grid, medium) & (flight.t_emit > 0)
                 with dr.suspend_grad(when=not attached):
@@ -208,7 +217,9 @@ def fly_again(walk: Walk, at: Arrival, flight: Flight, reach: mi.Float, attached
     return Flown(mei=mei, w=w, e=e)
 
 
-def _guess(walk: Walk, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool) -> mi.Spectrum:
+def _guess(
+    trace: TraceConfig, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool
+) -> mi.Spectrum:
     """The baseline; where collisions are never real, and null ones not asked, it would be a bias, and is left out."""
-    b = walk.baseline(mei, σ_t, σ_bar, active)  # type: ignore[misc]
-    return b if walk.branch else mi.Spectrum(dr.select(dr.detach(σ_t) != 0, b, 0))
+    b = trace.baseline(mei, σ_t, σ_bar, active)  # type: ignore[misc]
+    return b if trace.branch else mi.Spectrum(dr.select(dr.detach(σ_t) != 0, b, 0))

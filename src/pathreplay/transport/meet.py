@@ -12,24 +12,24 @@ import drjit as dr
 import mitsuba as mi
 
 from .signature import shape_met
-from .vertex import Walk
+from .vertex import TraceConfig
 
 ROUNDING = 2.0**-22
 """Of v = (s + k) / n, for the k-th segment and its own s, in segments per segment before."""
 
 
-def meet(walk: Walk, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.PreliminaryIntersection3f:
+def meet(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.PreliminaryIntersection3f:
     """What a ray meets. Detached."""
-    hit = walk.scene.ray_intersect_preliminary(ray, coherent=coherent, reorder=False, active=active)
-    return short_of_end(walk, ray, hit, active)
+    hit = trace.scene.ray_intersect_preliminary(ray, coherent=coherent, reorder=False, active=active)
+    return short_of_end(trace, ray, hit, active)
 
 
 def short_of_end(
-    walk: Walk, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
     """The same hit; on a B-spline not at the end of a segment."""
-    if walk.traits.splines:
-        kind = shape_met(walk, hit, ray, active).shape_type()
+    if trace.traits.splines:
+        kind = shape_met(trace, hit, ray, active).shape_type()
         on_spline = active & hit.is_valid() & (kind == int(mi.ShapeType.BSplineCurve))
         end = 1 - ROUNDING * (mi.Float(hit.prim_index) + 1)
         hit.prim_uv.x = dr.select(on_spline, dr.minimum(hit.prim_uv.x, end), hit.prim_uv.x)

@@ -11,7 +11,7 @@ import mitsuba as mi
 from .meet import meet
 from .shadow import Stretch, shadow, transmittance
 from .traits import is_null
-from .vertex import Walk
+from .vertex import TraceConfig
 
 SHORT_OF = 1 - 1e-3
 """Of the way to an edge, the part that its sides share: a little less than all, so that both still meet something."""
@@ -20,17 +20,17 @@ STEP = 1e-5
 
 
 @dr.syntax
-def beyond_null(
-    walk: Walk, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+def skip_null(
+    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
     """The hit, or the first one behind null boundaries; distances are told along ``ray``."""
     here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
     passing = active & _is_boundary(here)
-    while dr.hint(passing, exclude=[walk, ray], label="pathreplay: beyond null boundaries"):
+    while dr.hint(passing, exclude=[trace, ray], label="pathreplay: beyond null boundaries"):
         # On the same line, from which `spawn_ray` would depart.
         gone = t + STEP * (1 + dr.max(dr.abs(ray.o)) + t)
         onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
-        here = meet(walk, onward, passing)
+        here = meet(trace, onward, passing)
         t = gone + here.t
         passing &= _is_boundary(here)
     here.t = t
@@ -42,31 +42,31 @@ def _is_boundary(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
 
 
 @dr.syntax
-def passage(
-    walk: Walk, ray: mi.Ray3f, reach: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
+def transmittance_up_to(
+    trace: TraceConfig, ray: mi.Ray3f, reach: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.MediumPtr]:
     """The transmittance of the first ``reach`` of a ray that starts in ``medium``, and the medium there. Detached."""
     ray = mi.Ray3f(ray)
     ray.maxt = reach
     stretch = Stretch.begin(ray, medium, active)
     T = mi.Spectrum(1)
-    while dr.hint(stretch.active, exclude=[walk], label="pathreplay: passage"):
-        hit, a, b, inside = stretch.part(walk)
-        T = dr.select(inside, T * transmittance(walk, stretch.medium, stretch.ray, a, b, sampler, inside), T)
+    while dr.hint(stretch.active, exclude=[trace], label="pathreplay: passage"):
+        hit, a, b, inside = stretch.part(trace)
+        T = dr.select(inside, T * transmittance(trace, stretch.medium, stretch.ray, a, b, sampler, inside), T)
         stretch, T = stretch.beyond(hit, T)
     return T, stretch.medium
 
 
-def past(
-    walk: Walk, ray: mi.Ray3f, t: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
+def transmittance_past_edge(
+    trace: TraceConfig, ray: mi.Ray3f, t: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
 ) -> mi.Spectrum:
     """The transmittance of a shadow ray that passes an edge at distance ``t``. Detached.
 
     In two parts, so that it passes on its side: null boundaries push rays aside by more than they are off the edge.
     """
     t = SHORT_OF * t
-    T, medium = passage(walk, ray, t, medium, sampler, active)
-    return T * shadow(walk, further(ray, t), medium, sampler, active & dr.any(T != 0)).T
+    T, medium = transmittance_up_to(trace, ray, t, medium, sampler, active)
+    return T * shadow(trace, further(ray, t), medium, sampler, active & dr.any(T != 0)).T
 
 
 def further(ray: mi.Ray3f, t: mi.Float) -> mi.Ray3f:

@@ -8,10 +8,10 @@ import drjit as dr
 import mitsuba as mi
 
 from .meet import meet
-from .passage import beyond_null
+from .passage import skip_null
 from .start import CameraStart, behind_emitters
 from .step import choose_step
-from .vertex import Arrival, Chosen, Numbers, Replayed, Walk, reciprocal
+from .vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples, reciprocal
 
 # Russian roulette ends at least one path in twenty, so that a path between mirrors comes to an end.
 MAX_SURVIVAL = 0.95
@@ -30,28 +30,30 @@ class PathState:
     active: mi.Bool
 
     @staticmethod
-    def begin(walk: Walk, start: CameraStart, sustained: bool = False) -> PathState:
+    def begin(trace: TraceConfig, start: CameraStart, sustained: bool = False) -> PathState:
         """Paths at their first vertices; ``sustained`` says that weights of zero are to keep their derivatives."""
-        active = mi.Bool(start.active) & (walk.max_depth > 0)
+        active = mi.Bool(start.active) & (trace.max_depth > 0)
         β_alive = mi.Spectrum(1) if sustained else None
-        return PathState(start.choose(walk, active), mi.Spectrum(1), β_alive, mi.Float(1), mi.UInt32(0), active)
+        return PathState(start.choose(trace, active), mi.Spectrum(1), β_alive, mi.Float(1), mi.UInt32(0), active)
 
-    def choose(self, walk: Walk, sampler: mi.Sampler) -> tuple[Numbers, Chosen]:
+    def choose(self, trace: TraceConfig, sampler: mi.Sampler) -> tuple[VertexSamples, SampledStep]:
         """The random numbers of this vertex, and the step that they choose."""
-        u = Numbers.draw(sampler)
+        u = VertexSamples.draw(sampler)
         β = self.β if self.β_alive is None else self.β_alive
-        return u, choose_step(walk, self.at, u, sampler, β, self.depth + 1 < walk.max_depth, self.active)
+        return u, choose_step(trace, self.at, u, sampler, β, self.depth + 1 < trace.max_depth, self.active)
 
     def leave(self) -> tuple[PathState, mi.Bool]:
         """The path, ended where the ray that arrives has hit nothing, and where that is so. ``at`` stays what it is."""
         left = self.active & ~self.at.hit.is_valid()
         return replace(self, active=self.active & ~left), left
 
-    def passed(self, walk: Walk, step: Chosen) -> mi.UInt32:
+    def passed(self, trace: TraceConfig, step: SampledStep) -> mi.UInt32:
         """Vertices before the next: one more, but with media not so at null boundaries."""
-        return self.depth + (1 if walk.media is None else dr.select(step.null, mi.UInt32(0), 1))
+        return self.depth + (1 if trace.media is None else dr.select(step.null, mi.UInt32(0), 1))
 
-    def advance(self, walk: Walk, u: Numbers, step: Chosen, at: Arrival | None = None) -> tuple[PathState, Replayed]:
+    def advance(
+        self, trace: TraceConfig, u: VertexSamples, step: SampledStep, at: Arrival | None = None
+    ) -> tuple[PathState, VertexRecord]:
         """The path at its next vertex, and what later passes are to know of the one that it has left.
 
         ``at`` is the next arrival, if somebody has followed the step already.
@@ -60,16 +62,16 @@ class PathState:
         β_alive = None if self.β_alive is None else sustain(self.β_alive, self.β, step)
         lasting = β if β_alive is None else β_alive
         η = self.η * step.eta
-        rr_weight, survives = survival(lasting, η, self.depth, u.roulette, walk, step)
+        rr_weight, survives = survival(lasting, η, self.depth, u.roulette, trace, step)
         active = step.active & survives & (dr.max(lasting) != 0)
-        at = next_arrival(walk, self.at, step, active) if at is None else at
+        at = next_arrival(trace, self.at, step, active) if at is None else at
         β_alive = None if β_alive is None else β_alive * rr_weight
-        onward = PathState(at, β * rr_weight, β_alive, η, self.passed(walk, step), active)
-        return onward, Replayed(self.at, u, step.kept, active, at.hit, rr_weight, self.β)
+        onward = PathState(at, β * rr_weight, β_alive, η, self.passed(trace, step), active)
+        return onward, VertexRecord(self.at, u, step.kept, active, at.hit, rr_weight, self.β)
 
 
 def survival(
-    β: mi.Spectrum, η: mi.Float, depth: mi.UInt32, u: mi.Float, walk: Walk, step: Chosen
+    β: mi.Spectrum, η: mi.Float, depth: mi.UInt32, u: mi.Float, trace: TraceConfig, step: SampledStep
 ) -> tuple[mi.Float, mi.Bool]:
     """Russian roulette: 1 / (survival probability), and whether the path survives. Detached.
 
@@ -77,13 +79,13 @@ def survival(
     angle out of the radiance throughput. Null boundaries between media let all paths pass.
     """
     probability = dr.minimum(dr.max(β) * dr.square(η), MAX_SURVIVAL)
-    plays = depth >= walk.rr_depth
-    if walk.media is not None:
+    plays = depth >= trace.rr_depth
+    if trace.media is not None:
         plays &= ~step.null
     return dr.select(plays, reciprocal(probability), 1), ~plays | (u < probability)
 
 
-def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: Chosen) -> mi.Spectrum:
+def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spectrum:
     """Throughput that decides how long a path is worth differentiating: one zero weight per channel is left out.
 
     A weight that is zero now still has a derivative, times the light beyond it; so the path goes on as if that weight
@@ -98,20 +100,20 @@ def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: Chosen) -> mi.Spectrum
     return β_alive * mi.Spectrum(dr.select((w == 0) & (β != 0), stand_in, w))
 
 
-def next_arrival(walk: Walk, at: Arrival, step: Chosen, active: mi.Bool) -> Arrival:
+def next_arrival(trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.Bool) -> Arrival:
     """Follow the continuation of a step, which was taken from ``at``, to the next vertex.
 
     With media a null boundary is no vertex for multiple importance sampling: what was sampled before it still counts.
     """
     kept, null, ray = step.kept, step.null, step.ray_next
-    hit = meet(walk, ray, active)
-    if walk.clear:
-        hit = beyond_null(walk, ray, hit, active)
-    if walk.media is None:
+    hit = meet(trace, ray, active)
+    if trace.clear:
+        hit = skip_null(trace, ray, hit, active)
+    if trace.media is None:
         return Arrival(ray=ray, hit=hit, pdf=kept.pdf, delta=kept.delta, camera=mi.Bool(False))
     camera = null & at.camera
-    if walk.hide_emitters:
-        hit = behind_emitters(walk, ray, hit, active & camera)
+    if trace.hide_emitters:
+        hit = behind_emitters(trace, ray, hit, active & camera)
     pdf, delta = dr.select(null, at.pdf, kept.pdf), dr.select(null, at.delta, kept.delta)
     behind = dr.select(null, at.behind + dr.norm(ray.o - at.ray.o), 0)
     return Arrival(ray, hit, pdf, delta, camera, step.medium, behind)

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from .arrive import Vertex
 from .velocity import moved_direction
-from .vertex import Arrival, Kept, Numbers, Replayed, Walk, is_smooth, reciprocal
+from .vertex import Arrival, SampledContinuation, TraceConfig, VertexRecord, VertexSamples, is_smooth, reciprocal
 
 # Share by which the weight of a lobe sampled alone may differ from the weight that was drawn (and squared distance of
 # their directions) and still belong to the same lobe: float32 rounding is far below it, BSDFs without support for
@@ -34,31 +34,40 @@ class Sampled:
     f: mi.Spectrum  # value for the direction of the emitter sample
     pdf_light: mi.Float  # density of sampling that direction
     w: mi.Spectrum  # weight of the continuation
-    kept: Kept
+    kept: SampledContinuation
     null: mi.Bool  # the continuation passes straight through
     eta: mi.Float
     active: mi.Bool  # there is a continuation
 
 
 def choose(
-    walk: Walk, v: Vertex, at: Arrival, u: Numbers, ctx: mi.BSDFContext, d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool
+    trace: TraceConfig,
+    v: Vertex,
+    at: Arrival,
+    u: VertexSamples,
+    ctx: mi.BSDFContext,
+    d: mi.Vector3f,
+    lit: mi.Bool,
+    go_on: mi.Bool,
 ) -> Sampled:
     """Sample the continuation, and evaluate the vertex for the direction ``d`` of the emitter sample. Detached.
 
     ``ctx`` has the transport mode, and the lobe where it is to be a given one.
     """
     at_surface = go_on & v.surface
-    if v.inside is not None and walk.media.passes:
+    if v.inside is not None and trace.media.passes:
         at_surface |= v.surface & mi.has_flag(v.bsdf.flags(), mi.BSDFFlags.Null)
     f, pdf_light, sample, w = v.bsdf.eval_pdf_sample(ctx, v.si, v.si.to_local(d), u.lobe, u.direction, at_surface)
     delta, null = (mi.has_flag(sample.sampled_type, kind) for kind in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
-    kept = Kept(v.si.to_world(sample.wo), sample.pdf, delta, dr.all(w == 0), sample.sampled_component, lit)
+    kept = SampledContinuation(
+        v.si.to_world(sample.wo), sample.pdf, delta, dr.all(w == 0), sample.sampled_component, lit
+    )
     sampled = Sampled(f, pdf_light, w, kept, null, sample.eta, at_surface)
     return sampled if v.inside is None else _in_medium(v, at, u, d, lit, go_on, sampled)
 
 
 def _in_medium(
-    v: Vertex, at: Arrival, u: Numbers, d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool, surface: Sampled
+    v: Vertex, at: Arrival, u: VertexSamples, d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool, surface: Sampled
 ) -> Sampled:
     """The same where the vertex may be a particle or a null boundary instead of a ``surface``."""
     event, through, phase, ctx = v.inside.event, v.inside.through, v.inside.phase, mi.PhaseFunctionContext(None)
@@ -90,36 +99,36 @@ def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> 
 
 
 def repeat(
-    walk: Walk, v: Vertex, again: Replayed, ctx: mi.BSDFContext, attached: bool
+    trace: TraceConfig, v: Vertex, again: VertexRecord, ctx: mi.BSDFContext, attached: bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
     """Weight w, world direction and density of the kept continuation, differentiably.
 
     Not differentiated: the choice among lobes and, unless ``attached``, direction and density.
     """
-    w, d, pdf = _at_surface(walk, v, again, ctx, attached, again.go_on & v.surface)
+    w, d, pdf = _at_surface(trace, v, again, ctx, attached, again.go_on & v.surface)
     if v.inside is None:
         return w, d, pdf
     event, through = v.inside.event, v.inside.through
-    w_medium, d_medium, pdf_medium = _at_particle(walk, v, again, attached, again.go_on & event)
+    w_medium, d_medium, pdf_medium = _at_particle(trace, v, again, attached, again.go_on & event)
     d = dr.select(event, d_medium, dr.select(through, again.at.ray.d, d))
     pdf = dr.select(event, pdf_medium, dr.select(again.kept.media.null, again.at.pdf, pdf))
     return dr.select(event, w_medium, dr.select(through, 1, w)), d, pdf
 
 
 def _at_surface(
-    walk: Walk, v: Vertex, again: Replayed, ctx: mi.BSDFContext, attached: bool, active: mi.Bool
+    trace: TraceConfig, v: Vertex, again: VertexRecord, ctx: mi.BSDFContext, attached: bool, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
     bsdf, si, kept, u = v.bsdf, v.si, again.kept, again.u
     smooth = active & ~kept.delta
     d, J = kept.d, mi.Float(1)
     if attached:
-        holds = smooth & ~keeps_direction(walk, si, smooth) & ~is_seen_through(walk, again.hit_next)
-        d, J = moved_direction(walk.traits.tables.blend_lengths, si, kept.d, again.hit_next, holds)
+        holds = smooth & ~keeps_direction(trace, si, smooth) & ~is_seen_through(trace, again.hit_next)
+        d, J = moved_direction(trace.traits.tables.blend_lengths, si, kept.d, again.hit_next, holds)
 
-    if walk.resamples:
+    if trace.resamples:
         sample, w_sample = bsdf.sample(ctx, si, u.lobe, u.direction, active)
         if attached:
-            free = _followed(walk, v, u, ctx, smooth)
+            free = _followed(trace, v, u, ctx, smooth)
             follows = free | (active & kept.delta)
             d = dr.select(follows, dr.replace_grad(kept.d, si.to_world(sample.wo)), d)
             J = dr.select(follows, 1, J)
@@ -135,52 +144,58 @@ def _at_surface(
     # BSDF has weight zero because f is, and keeps its derivative.
     w = dr.select(kept.black & dr.any(dr.detach(f) != 0), 0, w)
 
-    if attached and walk.resamples:
+    if attached and trace.resamples:
         w = dr.select(free, w_sample, w)
-    if walk.traits.lobes > 0:
+    if trace.traits.lobes > 0:
         delta = active & kept.delta
-        w = dr.select(delta, _delta_weight(walk, v, u, ctx, kept, w_sample, delta), w)
+        w = dr.select(delta, _delta_weight(trace, v, u, ctx, kept, w_sample, delta), w)
     return w, d, pdf
 
 
-def keeps_direction(walk: Walk, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
     """Where smooth continuations keep their direction rather than the point that they hit: where lobes are narrow.
 
     Those would turn the motion of what they hit into noise. Only where edges are looked for, which they slide over.
     Decided by the vertex and the ray that arrives there, so that all its directions move alike.
     """
-    if not (walk.edges and walk.traits.glossy):
+    if not (trace.edges and trace.traits.glossy):
         return mi.Bool(False)
     centre, _ = si.bsdf().sample(mi.BSDFContext(), dr.detach(si), 0.5, mi.Point2f(0.5), active)
     return active & ~mi.has_flag(centre.sampled_type, mi.BSDFFlags.Delta) & (dr.detach(centre.pdf) > NARROW)
 
 
-def is_seen_through(walk: Walk, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
     """Where a hit lets a part of the light straight through. A continuation keeps its direction there.
 
     If it held the point of a sheet that moves, it would slide over what is behind, and over the borders of that. Only
     where edges are looked for, which see the outline of the sheet.
     """
-    if not (walk.edges and walk.traits.veils):
+    if not (trace.edges and trace.traits.veils):
         return mi.Bool(False)
     return mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Null)
 
 
-def _followed(walk: Walk, v: Vertex, u: Numbers, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:
+def _followed(trace: TraceConfig, v: Vertex, u: VertexSamples, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:
     """Which smooth lobes are sampled attached: decided by what the lobe is, never by the direction drawn."""
-    if not walk.follows:
+    if not trace.follows:
         return mi.Bool(False)
     index = dr.reinterpret_array(mi.UInt32, v.bsdf)
-    table = walk.traits.tables.attachable
+    table = trace.traits.tables.attachable
     free = active & dr.gather(mi.Bool, table, index, active & (index < dr.width(table)))
-    if walk.attach == "all":
+    if trace.attach == "all":
         return free
     centre, _ = v.bsdf.sample(ctx, dr.detach(v.si), u.lobe, mi.Point2f(0.5), free)
     return free & (dr.detach(centre.pdf) > NARROW)
 
 
 def _delta_weight(
-    walk: Walk, v: Vertex, u: Numbers, ctx: mi.BSDFContext, kept: Kept, w: mi.Spectrum, active: mi.Bool
+    trace: TraceConfig,
+    v: Vertex,
+    u: VertexSamples,
+    ctx: mi.BSDFContext,
+    kept: SampledContinuation,
+    w: mi.Spectrum,
+    active: mi.Bool,
 ) -> mi.Spectrum:
     """Weight of a sampled delta lobe, with the derivative of (weight of the lobe alone) / (probability of its choice).
 
@@ -191,11 +206,11 @@ def _delta_weight(
     """
     drawn = dr.detach(w)
     missing = mi.Bool(active)
-    for k in range(walk.traits.lobes):
+    for k in range(trace.traits.lobes):
         alone = mi.BSDFContext(ctx.mode)
         alone.component = k
         # The lobes of a surface's back are counted from zero, too, but asked for after those of the front.
-        picked = missing if walk.traits.two_sides else missing & (kept.lobe == k)
+        picked = missing if trace.traits.two_sides else missing & (kept.lobe == k)
         sample, w_k = v.bsdf.sample(alone, v.si, u.lobe, u.direction, picked)
         w_k *= dr.detach(reciprocal(kept.pdf))
         same = picked & (dr.squared_norm(dr.detach(sample.wo) - v.si.to_local(kept.d)) < SAME_LOBE)
@@ -206,7 +221,7 @@ def _delta_weight(
 
 
 def _at_particle(
-    walk: Walk, v: Vertex, again: Replayed, attached: bool, active: mi.Bool
+    trace: TraceConfig, v: Vertex, again: VertexRecord, attached: bool, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
     """The direction is held as on surfaces, towards the next surface point, but only where that matters: where the
     surface scatters or emits, and so may have seams and edges. Otherwise it is fixed in space, which is less noisy.
@@ -216,8 +231,8 @@ def _at_particle(
     if attached:
         shape = hit_next.shape
         seen = is_smooth(shape.bsdf()) | (shape.emitter() != None)  # noqa: E711 (an array of pointers)
-        found = active & hit_next.is_valid() & seen & ~is_seen_through(walk, hit_next)
-        d, J = moved_direction(walk.traits.tables.blend_lengths, v.origin, kept.d, hit_next, found)
+        found = active & hit_next.is_valid() & seen & ~is_seen_through(trace, hit_next)
+        d, J = moved_direction(trace.traits.tables.blend_lengths, v.origin, kept.d, hit_next, found)
     f, pdf = v.inside.phase.eval_pdf(mi.PhaseFunctionContext(None), v.inside.mei, d, active)
     pdf = dr.replace_grad(kept.pdf, dr.select(active, pdf, 0)) if attached else kept.pdf
     return f * J * dr.detach(reciprocal(kept.pdf)), d, pdf

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from .media import carried, interaction, is_grid, majorant, span
 from .meet import meet
-from .vertex import Shadow, Walk
+from .vertex import Shadow, TraceConfig
 
 
 @dataclass
@@ -32,10 +32,10 @@ class Stretch:
         ray = mi.Ray3f(dr.detach(ray))
         return Stretch(ray, mi.Float(ray.maxt), mi.Float(0), mi.MediumPtr(medium), mi.Bool(active))
 
-    def part(self, walk: Walk) -> tuple[mi.PreliminaryIntersection3f, mi.Float, mi.Float, mi.Bool]:
+    def part(self, trace: TraceConfig) -> tuple[mi.PreliminaryIntersection3f, mi.Float, mi.Float, mi.Bool]:
         """The surface at its end, the part [a, b] of the ray that a medium fills, and whether there is one."""
         self.ray.maxt = self.far - self.gone
-        hit = meet(walk, self.ray, self.active)
+        hit = meet(trace, self.ray, self.active)
         inside = self.active & (self.medium != None)  # noqa: E711 (an array of pointers)
         a, b = span(self.medium, self.ray, dr.select(self.active & hit.is_valid(), hit.t, self.ray.maxt), inside)
         return hit, a, b, inside & (a < b)
@@ -53,15 +53,15 @@ class Stretch:
 
 
 @dr.syntax
-def shadow(walk: Walk, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool) -> Shadow:
+def shadow(trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool) -> Shadow:
     """Estimate the transmittance along a shadow ray, which starts in ``medium``. Detached."""
     stretch = Stretch.begin(ray, medium, active)
     T = mi.Spectrum(1)
     y, y_medium, length = mi.Float(0), dr.zeros(mi.MediumPtr), mi.Float(0)
 
-    while dr.hint(stretch.active, exclude=[walk], label="pathreplay: shadow"):
-        hit, a, b, inside = stretch.part(walk)
-        T = dr.select(inside, T * transmittance(walk, stretch.medium, stretch.ray, a, b, sampler, inside), T)
+    while dr.hint(stretch.active, exclude=[trace], label="pathreplay: shadow"):
+        hit, a, b, inside = stretch.part(trace)
+        T = dr.select(inside, T * transmittance(trace, stretch.medium, stretch.ray, a, b, sampler, inside), T)
         length += b - a
         u = sampler.next_1d(inside) * length
         picked = inside & (u < b - a)
@@ -73,10 +73,16 @@ def shadow(walk: Walk, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler,
 
 
 def transmittance(
-    walk: Walk, medium: mi.MediumPtr, ray: mi.Ray3f, a: mi.Float, b: mi.Float, sampler: mi.Sampler, active: mi.Bool
+    trace: TraceConfig,
+    medium: mi.MediumPtr,
+    ray: mi.Ray3f,
+    a: mi.Float,
+    b: mi.Float,
+    sampler: mi.Sampler,
+    active: mi.Bool,
 ) -> mi.Spectrum:
     """An unbiased estimate of the transmittance of one medium between the distances a and b."""
-    media = walk.media
+    media = trace.media
     T = mi.Spectrum(1)
     rest = mi.Bool(active)
     for grid in media.grids:
@@ -113,7 +119,7 @@ def ratio_tracking(
     return T
 
 
-def shadow_again(walk: Walk, ray: mi.Ray3f, kept: Shadow, attached: bool, active: mi.Bool) -> mi.Spectrum:
+def shadow_again(trace: TraceConfig, ray: mi.Ray3f, kept: Shadow, attached: bool, active: mi.Bool) -> mi.Spectrum:
     """The kept transmittance, differentiable in σ_t and, if ``attached``, in the two ends of the ray.
 
     The point y keeps its place between the two surfaces (or ends of the ray) next to it.
@@ -122,7 +128,7 @@ def shadow_again(walk: Walk, ray: mi.Ray3f, kept: Shadow, attached: bool, active
     y, growth = kept.y, mi.Float(1)
     if attached:
         still = dr.detach(ray)
-        near, reach = _boundary(walk, ray, still, kept.y, -1, walked), _boundary(walk, ray, still, kept.y, 1, walked)
+        near, reach = _boundary(trace, ray, still, kept.y, -1, walked), _boundary(trace, ray, still, kept.y, 1, walked)
         a, b = span(kept.medium, ray, reach, walked)
         a = dr.maximum(a, near)
         y, growth = carried(y, a, b, walked)
@@ -135,14 +141,14 @@ def shadow_again(walk: Walk, ray: mi.Ray3f, kept: Shadow, attached: bool, active
     return kept.T * dr.replace_grad(mi.Spectrum(1), log_T)
 
 
-def _boundary(walk: Walk, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int, active: mi.Bool) -> mi.Float:
+def _boundary(trace: TraceConfig, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int, active: mi.Bool) -> mi.Float:
     """Distance along ``ray`` of the first surface that is met from y on towards its end (sign 1) or origin (sign -1).
 
     Where none is met it is the end of the ray, or its origin (0). Differentiable in the ray and in the surface.
     """
     probe = mi.Ray3f(still.o + y * still.d, sign * still.d, still.time, still.wavelengths)
     probe.maxt = still.maxt - y if sign > 0 else y
-    hit = meet(walk, probe, active)
+    hit = meet(trace, probe, active)
     met = active & hit.is_valid()
     # The same surface, as the attached ray meets it from y on: a sphere answers for what a ray meets first.
     probe.o, probe.d = ray.o + y * ray.d, sign * ray.d

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from .surface import held_point
 from .traits import FACETS, WHOLE, Tables
-from .vertex import Walk
+from .vertex import TraceConfig
 
 TUBES = mi.ShapeType.Cylinder, mi.ShapeType.BSplineCurve, mi.ShapeType.LinearCurve
 """Open at both ends: an edge is a limb or a rim."""
@@ -16,31 +16,31 @@ GRAZING = 0.05
 
 
 def place_met(
-    walk: Walk, hit: mi.PreliminaryIntersection3f, active: mi.Bool, shape: mi.ShapePtr, facets: bool = True
+    trace: TraceConfig, hit: mi.PreliminaryIntersection3f, active: mi.Bool, shape: mi.ShapePtr, facets: bool = True
 ) -> mi.UInt32:
-    """What a ray met, as a number: 0 for nothing, else one for each shape, copy of a shape, and piece of a mesh.
+    """What a ray met, as a number: 0 for nothing, else one for each shape, copy of a shape, and smoothing group.
 
-    ``shape`` is what `shape_met` says. Pieces are shaded as if they were smooth; of a flat mesh they are its triangles.
+    ``shape`` is what `shape_met` says. Triangles of a flat mesh are groups of their own.
     Only if ``facets``.
     """
     met = active & hit.is_valid()
     shape = dr.reinterpret_array(mi.UInt32, shape)
     place = mixed(shape, dr.reinterpret_array(mi.UInt32, hit.instance))
     if facets:
-        place = mixed(place, _piece(walk.traits.tables, shape, hit.prim_index, met))
+        place = mixed(place, _group(trace.traits.tables, shape, hit.prim_index, met))
     return dr.select(met, place | 1, 0)
 
 
-def _piece(tables: Tables, shape: mi.UInt32, triangle: mi.UInt32, met: mi.Bool) -> mi.UInt32:
-    begin = dr.gather(mi.UInt32, tables.pieces_at, shape, met)
+def _group(tables: Tables, shape: mi.UInt32, triangle: mi.UInt32, met: mi.Bool) -> mi.UInt32:
+    begin = dr.gather(mi.UInt32, tables.groups_at, shape, met)
     flat = begin == FACETS
-    piece = dr.gather(mi.UInt32, tables.pieces, begin + triangle, met & ~flat & (begin != WHOLE))
-    return dr.select(flat, triangle + 1, piece)
+    group = dr.gather(mi.UInt32, tables.groups, begin + triangle, met & ~flat & (begin != WHOLE))
+    return dr.select(flat, triangle + 1, group)
 
 
-def shape_met(walk: Walk, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.ShapePtr:
+def shape_met(trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.ShapePtr:
     """The shape that a ray met; of a copy that which is copied, which a hit does not tell by itself."""
-    if not walk.traits.copies:
+    if not trace.traits.copies:
         return hit.shape
     return hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active & hit.is_valid()).shape
 

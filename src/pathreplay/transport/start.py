@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 
 from .meet import meet, short_of_end
-from .passage import beyond_null
-from .vertex import Arrival, Walk
+from .passage import skip_null
+from .vertex import Arrival, TraceConfig
 
 
 @dataclass
@@ -20,17 +20,17 @@ class CameraStart:
     sampler: mi.Sampler  # of the numbers that choose the paths
     active: mi.Bool
 
-    def choose(self, walk: Walk, active: mi.Bool) -> Arrival:
+    def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
         """The first arrival along the rays, detached; ``hide_emitters`` makes area emitters transparent."""
         ray = mi.Ray3f(dr.detach(self.ray))
-        hit = meet(walk, ray, active, coherent=True)
-        if walk.clear:
-            hit = beyond_null(walk, ray, hit, active)
-        if walk.hide_emitters:
-            hit = behind_emitters(walk, ray, hit, active)
+        hit = meet(trace, ray, active, coherent=True)
+        if trace.clear:
+            hit = skip_null(trace, ray, hit, active)
+        if trace.hide_emitters:
+            hit = behind_emitters(trace, ray, hit, active)
         at = Arrival(ray=ray, hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
-        if walk.media is not None:
-            around = walk.media.around
+        if trace.media is not None:
+            around = trace.media.around
             at.medium = dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)
             at.behind = mi.Float(0)
         return at
@@ -41,13 +41,13 @@ class CameraStart:
 
 
 def behind_emitters(
-    walk: Walk, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
     """The hit, or what lies behind the area emitters that were hit; distances are told along ``ray``."""
     passed = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
     si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, passed)
     onward = si.spawn_ray(ray.d)
-    behind = short_of_end(walk, onward, walk.skip_area_emitters(walk.scene, onward, True, passed), passed)
+    behind = short_of_end(trace, onward, trace.skip_area_emitters(trace.scene, onward, True, passed), passed)
     behind.t += dr.norm(onward.o - ray.o)
     hit[passed] = behind
     return hit

@@ -12,31 +12,31 @@ import mitsuba as mi
 from . import arrive, connect, scatter
 from .vertex import (
     Arrival,
-    Chosen,
     Flight,
-    KeptInMedia,
     KnownLight,
     Lighting,
-    Numbers,
-    Replayed,
+    SampledInMedia,
+    SampledStep,
     Signature,
     Step,
-    Walk,
+    TraceConfig,
+    VertexRecord,
+    VertexSamples,
     reciprocal,
 )
 
 
 def choose_step(
-    walk: Walk,
+    trace: TraceConfig,
     at: Arrival,
-    u: Numbers,
+    u: VertexSamples,
     sampler: mi.Sampler,
     β: mi.Spectrum,
     go_on: mi.Bool,
     active: mi.Bool,
     flight: Flight | None = None,
     ctx: mi.BSDFContext | None = None,
-) -> Chosen:
+) -> SampledStep:
     """The step of a first walk, which draws emitter sample and continuation from the numbers ``u``.
 
     With media also the flight, choosing real collisions by the throughput ``β``, unless ``flight`` is given, and the
@@ -45,30 +45,30 @@ def choose_step(
     Mitsuba's number of a lobe where surfaces are to scatter by that one alone.
     """
     ctx = mi.BSDFContext() if ctx is None else ctx
-    v = arrive.choose(walk, at, sampler, β, active, flight)
-    link = connect.choose(walk, v, at.medium, u, sampler, go_on)
-    to = scatter.choose(walk, v, at, u, ctx, link.light.d, link.lit, go_on)
+    v = arrive.choose(trace, at, sampler, β, active, flight)
+    link = connect.choose(trace, v, at.medium, u, sampler, go_on)
+    to = scatter.choose(trace, v, at, u, ctx, link.light.d, link.lit, go_on)
     reached = link.reaches(to.pdf_light, False)
     kept, e, w, medium = to.kept, v.glow + dr.select(link.lit, to.f * reached, 0), to.w, at.medium
     kept.light = link.light
     lighting: Lighting = None  # type: ignore[assignment]
     if v.inside is not None:
-        kept.media = KeptInMedia(to.null, v.inside.flight, link.shadow)
+        kept.media = SampledInMedia(to.null, v.inside.flight, link.shadow)
         e, w = v.inside.e + v.inside.w * e, v.inside.w * w
         crossed = (v.surface | v.inside.through) & v.si.is_medium_transition()
         medium = dr.select(crossed, v.si.target_medium(kept.d), medium)
-    elif not walk.traits.lights_vary:
+    elif not trace.traits.lights_vary:
         kept.known = KnownLight(v.glow, link.light.d, reached)
     else:
         w_light = to.f * (link.mis(to.pdf_light) * reciprocal(link.light.pdf))
-        seen = arrive.sees_lights(walk, at, v.si, active)
+        seen = arrive.sees_lights(trace, at, v.si, active)
         lighting = Lighting(v.si, seen, link.light, dr.select(link.lit, w_light, 0), link.lit)
     signature, ray_next = _signature(v, at, kept.lobe, go_on), v.origin.spawn_ray(kept.d)
-    return Chosen(e, w, ray_next, kept.pdf, signature, kept, to.eta, to.null, to.active, medium, lighting)
+    return SampledStep(e, w, ray_next, kept.pdf, signature, kept, to.eta, to.null, to.active, medium, lighting)
 
 
 def repeat_step(
-    walk: Walk, again: Replayed, attached: bool, active: mi.Bool, ctx: mi.BSDFContext | None = None
+    trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool, ctx: mi.BSDFContext | None = None
 ) -> Step:
     """The same step once more, differentiable in emission, BSDFs, textures and media.
 
@@ -77,9 +77,9 @@ def repeat_step(
     Russian roulette are never differentiated. ``ctx`` is that of the first walk.
     """
     ctx = mi.BSDFContext() if ctx is None else ctx
-    v = arrive.repeat(walk, again, attached, active)
-    e = v.glow + connect.repeat(walk, v, again, ctx, attached)
-    w, d, pdf = scatter.repeat(walk, v, again, ctx, attached)
+    v = arrive.repeat(trace, again, attached, active)
+    e = v.glow + connect.repeat(trace, v, again, ctx, attached)
+    w, d, pdf = scatter.repeat(trace, v, again, ctx, attached)
     if v.inside is not None:
         e, w = v.inside.e + v.inside.w * e, v.inside.w * w
     return Step(e, w, v.origin.spawn_ray(d), pdf, _signature(v, again.at, again.kept.lobe, again.go_on))

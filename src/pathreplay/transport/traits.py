@@ -13,8 +13,8 @@ import numpy as np
 
 from ..errors import PathreplayError
 from .nodes import nodes_of
-from .pieces import mesh_pieces
 from .seams import CHECKERBOARD
+from .smoothing_groups import mesh_smoothing_groups
 from .velocity import blend_length
 
 # Classes by name: Mitsuba's objects do not tell these things of themselves.
@@ -27,7 +27,7 @@ FRAMES = RELIEFS | {TWO_SIDED}
 DULL = FRAMES | {MASK, "SmoothDiffuse"}
 INSTANCE, PROJECTOR, SPOT = "Instance", "Projector", "SpotLight"
 WHOLE, FACETS = 0, 0xFFFFFFFF
-"""Shapes without edges but their outlines, and meshes that are shaded flat, in the table of pieces."""
+"""Shapes without edges but their outlines, and meshes that are shaded flat, in the table of smoothing groups."""
 COARSE = 1.0
 """Degrees between triangles and shading normals from which on it matters that they are not the same."""
 
@@ -47,8 +47,8 @@ class Tables:
 
     attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: nowhere)
     blend_lengths: mi.Float  # those of `velocity`, by shape
-    pieces_at: mi.UInt32  # by shape: where the pieces of its triangles begin, if not `WHOLE` or `FACETS`
-    pieces: mi.UInt32  # of all such meshes (see `pieces`), in a row; the first is no triangle's
+    groups_at: mi.UInt32  # by shape: offset of its triangles, or `WHOLE` or `FACETS`
+    groups: mi.UInt32  # of all such meshes (see `smoothing_groups`), in a row; the first is no triangle's
     lamp_balls: mi.Float  # of emitters that are meshes: see `lamp_balls`
 
 
@@ -126,12 +126,12 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
 def tables_of(
     attachables: Iterable[mi.BSDF], shapes: list[mi.Shape], emitters: list[mi.Emitter], edges: bool = True
 ) -> Tables:
-    """The tables of a scene, as it is now; without ``edges`` those of pieces, which may be long, are left out."""
+    """The tables of a scene, as it is now; without ``edges`` smoothing groups, which may be long, are left out."""
     attachable = _by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)
     return Tables(
         _array(mi.Bool, attachable) if attachables else None,
         blend_lengths(shapes),
-        *(pieces_of(shapes) if edges else (mi.UInt32(WHOLE), mi.UInt32(0))),
+        *(smoothing_groups_of(shapes) if edges else (mi.UInt32(WHOLE), mi.UInt32(0))),
         lamp_balls(emitters, shapes),
     )
 
@@ -163,8 +163,8 @@ def blend_lengths(shapes: list[mi.Shape]) -> mi.Float:
     return _array(mi.Float, _by_index(mi.ShapePtr, shapes, blend_length, 0.0))
 
 
-def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
-    """The tables of pieces: where those of each shape begin, and what they are."""
+def smoothing_groups_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
+    """The tables of smoothing groups: the offset of each shape, and the group of each triangle."""
     found: list[np.ndarray] = [np.zeros(1, np.uint32)]
 
     def begin(shape: mi.Shape) -> int:
@@ -172,10 +172,10 @@ def pieces_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
             return WHOLE
         if shape.has_face_normals() or not shape.has_vertex_normals():
             return FACETS
-        pieces = mesh_pieces(shape)
-        if not pieces.any():
+        groups = mesh_smoothing_groups(shape)
+        if not groups.any():
             return WHOLE
-        found.append(pieces)
+        found.append(groups)
         return sum(map(len, found[:-1]))
 
     begins = _by_index(mi.ShapePtr, shapes, begin, WHOLE)

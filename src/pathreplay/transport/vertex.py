@@ -13,8 +13,8 @@ from .traits import Traits
 
 
 @dataclass(frozen=True)
-class Walk:
-    """The scene that is walked through and how: Python values, fixed when the kernel is traced.
+class TraceConfig:
+    """The scene and the options of a trace: Python values, fixed when the kernel is recorded.
 
     ``attach`` says what the path follows when parameters move: ``none`` nothing, ``delta`` hit points and directions
     sampled from delta lobes, ``all`` also directions from the BSDFs in ``traits.attachables``. ``hide_emitters``
@@ -69,7 +69,7 @@ class Walk:
 
 
 @dataclass
-class Numbers:
+class VertexSamples:
     """The random numbers of one vertex: an input of the step, so that a second walk repeats the first exactly."""
 
     light: mi.Point2f  # which emitter, and where on it
@@ -78,9 +78,9 @@ class Numbers:
     roulette: mi.Float  # whether the path goes on
 
     @staticmethod
-    def draw(sampler: mi.Sampler) -> Numbers:
+    def draw(sampler: mi.Sampler) -> VertexSamples:
         """Draw the numbers of one vertex, in the order that all drivers share."""
-        return Numbers(sampler.next_2d(), sampler.next_1d(), sampler.next_2d(), sampler.next_1d())
+        return VertexSamples(sampler.next_2d(), sampler.next_1d(), sampler.next_2d(), sampler.next_1d())
 
 
 @dataclass
@@ -98,7 +98,7 @@ class Arrival:
 
 
 @dataclass
-class Kept:
+class SampledContinuation:
     """What a first walk chose at a vertex. Later passes hold these values while derivatives flow around them."""
 
     d: mi.Vector3f  # sampled direction, world space
@@ -107,13 +107,13 @@ class Kept:
     black: mi.Bool  # the weight of the continuation was zero in all channels
     lobe: mi.UInt32  # the BSDF component that was sampled
     lit: mi.Bool  # an emitter sample was taken, and nothing is in its way
-    media: KeptInMedia = None  # type: ignore[assignment]  # not in scenes without media
+    media: SampledInMedia = None  # type: ignore[assignment]  # not in scenes without media
     known: KnownLight | None = None  # on surfaces, if nothing about emitters is differentiated, else None
     light: mi.DirectionSample3f = None  # the emitter sample, where it is still at hand
 
 
 @dataclass
-class KeptInMedia:
+class SampledInMedia:
     """What was chosen besides in a scene with media."""
 
     null: mi.Bool  # the lobe passes straight through
@@ -197,12 +197,12 @@ class Lighting:
 
 
 @dataclass
-class Replayed:
+class VertexRecord:
     """What later passes know about a vertex and its continuation."""
 
     at: Arrival
-    u: Numbers
-    kept: Kept
+    u: VertexSamples
+    kept: SampledContinuation
     go_on: mi.Bool  # there is a next vertex
     hit_next: mi.PreliminaryIntersection3f  # of the next vertex
     rr_weight: mi.Float  # 1 / survival probability
@@ -230,10 +230,10 @@ class Step:
 
 
 @dataclass
-class Chosen(Step):
+class SampledStep(Step):
     """A step of a first walk, with what it chose and what the walk needs to go on."""
 
-    kept: Kept
+    kept: SampledContinuation
     eta: mi.Float  # relative index of refraction that the continuation crosses
     null: mi.Bool  # the continuation passes straight through
     active: mi.Bool  # there is a continuation

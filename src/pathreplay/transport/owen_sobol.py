@@ -19,7 +19,7 @@ _GOLDEN = 0x9E3779B9
 
 
 @dataclass
-class Even:
+class OwenSobolSampler:
     """Takes a sampler's place, for paths side by side."""
 
     reversed: mi.UInt32  # the number of the path, its bits from last to first
@@ -27,13 +27,13 @@ class Even:
     drawn: mi.UInt32  # how often numbers were drawn
 
     @staticmethod
-    def of(path: mi.UInt32, key: mi.UInt32) -> Even:
+    def of(path: mi.UInt32, key: mi.UInt32) -> OwenSobolSampler:
         """Those of the path of that number among all with the same key."""
-        return Even(dr.brev(path), mi.UInt32(key), mi.UInt32(0))
+        return OwenSobolSampler(dr.brev(path), mi.UInt32(key), mi.UInt32(0))
 
-    def clone(self) -> Even:
+    def clone(self) -> OwenSobolSampler:
         """One that gives the same numbers from here on."""
-        return Even(mi.UInt32(self.reversed), mi.UInt32(self.key), mi.UInt32(self.drawn))
+        return OwenSobolSampler(mi.UInt32(self.reversed), mi.UInt32(self.key), mi.UInt32(self.drawn))
 
     def next_1d(self, active: bool | mi.Bool = True) -> mi.Float:
         """Uniform in [0, 1)."""

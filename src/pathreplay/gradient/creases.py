@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from ..transport.meet import meet
 from ..transport.signature import place_met, shape_met, turned_away
-from ..transport.vertex import Arrival, Walk
+from ..transport.vertex import Arrival, TraceConfig
 from .crofton import at_an_angle, hides_itself
 
 MEETS = 1e-3
@@ -24,7 +24,7 @@ STEEPEST = 8.0
 
 
 @dataclass
-class Bend:
+class CreaseOrContour:
     """What two rays met, at the two sides of an edge."""
 
     a: mi.PreliminaryIntersection3f
@@ -34,20 +34,20 @@ class Bend:
 
     @staticmethod
     def of(
-        walk: Walk,
+        trace: TraceConfig,
         sides: tuple[tuple[mi.PreliminaryIntersection3f, mi.Ray3f], tuple[mi.PreliminaryIntersection3f, mi.Ray3f]],
         active: mi.Bool,
-    ) -> Bend:
+    ) -> CreaseOrContour:
         """Detached."""
         (a, _), (b, _) = sides
         both = active & a.is_valid() & b.is_valid()
         flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
         si_a, si_b = (x.compute_surface_interaction(ray, flags, both) for x, ray in sides)
         meets = both & at_an_angle(si_a.n, si_b.n) & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
-        same = both & (place_met(walk, a, both, si_a.shape) == place_met(walk, b, both, si_b.shape))
+        same = both & (place_met(trace, a, both, si_a.shape) == place_met(trace, b, both, si_b.shape))
         dark = [turned_away(si, ray.d) for si, (_, ray) in zip((si_a, si_b), sides, strict=True)]
         turns = same & (dark[0] != dark[1]) & ~hides_itself(si_a.p, si_a.n, si_b.p, si_b.n)
-        return Bend(a, b, meets, turns)
+        return CreaseOrContour(a, b, meets, turns)
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
         """B: zero on the edge, and wherever there is none; differentiable in the ray and in the shapes."""
@@ -57,7 +57,7 @@ class Bend:
         return dr.select(meets, t[0] - t[1], dr.select(turns, dr.dot(si.sh_frame.n, ray.d), 0))
 
 
-def off_contact(walk: Walk, a: Arrival, b: Arrival, active: mi.Bool) -> list[Arrival]:
+def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> list[Arrival]:
     """The arrivals at two sides of an edge; where two surfaces meet in a hollow, a little further from each other.
 
     Rays begin beside their surface. Closer to a line of contact than that they begin behind the other surface, and see
@@ -75,19 +75,19 @@ def off_contact(walk: Walk, a: Arrival, b: Arrival, active: mi.Bool) -> list[Arr
     moved = []
     for (at, si), n, other, side in zip(sides, normals, reversed(normals), (parts, -parts), strict=True):
         away = dr.normalize(other - dr.dot(other, n) * n)  # along the surface, to the front of the other one
-        moved.append(_towards(walk, at, si.p + x * away, 4 * x, ok & (dr.dot(across, away) * side > 0)))
+        moved.append(_towards(trace, at, si.p + x * away, 4 * x, ok & (dr.dot(across, away) * side > 0)))
     return moved
 
 
-def _towards(walk: Walk, at: Arrival, p: mi.Point3f, short: mi.Float, active: mi.Bool) -> Arrival:
+def _towards(trace: TraceConfig, at: Arrival, p: mi.Point3f, short: mi.Float, active: mi.Bool) -> Arrival:
     """The arrival at another point close by: looked for from ``short`` of it on, and the same where it is elsewhere."""
     ray, line = mi.Ray3f(at.ray), p - at.ray.o
     ray.d = dr.normalize(line)
     gone = dr.maximum(dr.norm(line) - short, 0)
     rest = mi.Ray3f(ray)
     rest.o, rest.maxt = ray.o + gone * ray.d, dr.inf
-    hit = meet(walk, rest, active)
+    hit = meet(trace, rest, active)
     hit.t += gone
-    places = [place_met(walk, h, active, shape_met(walk, h, r, active)) for h, r in ((hit, ray), (at.hit, at.ray))]
+    places = [place_met(trace, h, active, shape_met(trace, h, r, active)) for h, r in ((hit, ray), (at.hit, at.ray))]
     same = active & (places[0] == places[1])
     return dr.select(same, replace(at, ray=ray, hit=hit), at)

@@ -1,7 +1,7 @@
-"""Smooth pieces of meshes: which triangles are shaded as one surface, so that an edge is where two pieces meet.
+"""Smoothing groups of meshes: sets of triangles that are shaded as one surface. Edges lie where two groups meet.
 
-Triangles share a normal at a vertex that they share. At an edge that is to be seen, as at a seam of texture
-coordinates, programs write vertices twice: then triangles have two places in common, and no vertex.
+Triangles share the normal of a vertex that they share. At a visible edge, and at a seam of texture coordinates,
+programs write vertices twice: the triangles on both sides then have two positions in common and no vertex.
 """
 
 from __future__ import annotations
@@ -16,36 +16,36 @@ WELD, ULPS = 1e-5, 4
 """Largest distance of two vertices in one place: a share of the mesh's diagonal, and units in the last place."""
 
 
-def mesh_pieces(mesh: mi.Mesh) -> np.ndarray:
-    """The `smooth_pieces` of a mesh that has vertex normals; Mitsuba's rectangle, which hides its mesh, is one."""
+def mesh_smoothing_groups(mesh: mi.Mesh) -> np.ndarray:
+    """The `smoothing_groups` of a mesh that has vertex normals; Mitsuba's rectangle, which hides its mesh, is one."""
     params = mi.traverse(mesh)
     if "faces" not in params:
         return np.zeros(mesh.face_count(), int)
     faces, positions = (np.array(params[key]).reshape(-1, 3) for key in ("faces", "vertex_positions"))
     # What a lamp emits has no seam: lines that find one would be lost for its outline.
-    return smooth_pieces(faces, positions, 0 if mesh.is_emitter() else WELD)
+    return smoothing_groups(faces, positions, 0 if mesh.is_emitter() else WELD)
 
 
-def smooth_pieces(faces: np.ndarray, positions: np.ndarray, weld: float = WELD) -> np.ndarray:
-    """A number for each triangle, other ones on both sides of an edge; all zero where there is none.
+def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WELD) -> np.ndarray:
+    """The index of each triangle's group; it differs on the two sides of an edge and is zero in a mesh without edges.
 
-    What hangs together by vertices is one piece. Where a piece meets itself without sharing vertices, as where an edge
-    runs out, each triangle there is a piece of its own. Vertices meet up to the share ``weld`` of the mesh's diagonal,
-    and rounding; with 0 exactly.
+    Triangles that are connected by vertices form a group. Where a group meets itself without sharing vertices, as at
+    the end of an edge, each triangle is a group of its own. Vertices coincide if their distance is at most ``weld``
+    times the mesh's diagonal, plus rounding; with 0 only if they are equal.
     """
     count = len(positions)
     links = coo_matrix((np.ones(faces.size, bool), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), (count, count))
-    pieces = connected_components(links, directed=False)[1][faces[:, 0]]
+    groups = connected_components(links, directed=False)[1][faces[:, 0]]
     sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2).astype(np.int64), axis=1)
     _, side, shared = np.unique(sides[:, 0] * count + sides[:, 1], return_inverse=True, return_counts=True)
     alone = np.flatnonzero(shared[side] == 1)
     places = _places(positions, sides[alone].ravel(), weld)
     of = alone // 3  # triangles
-    meeting = np.column_stack([np.sort(places.reshape(-1, 2), axis=1), pieces[of]])
+    meeting = np.column_stack([np.sort(places.reshape(-1, 2), axis=1), groups[of]])
     _, where, together = np.unique(meeting, axis=0, return_inverse=True, return_counts=True)
     torn = of[together[where.ravel()] > 1]
-    pieces[torn] = count + torn
-    return np.unique(pieces, return_inverse=True)[1].reshape(-1)
+    groups[torn] = count + torn
+    return np.unique(groups, return_inverse=True)[1].reshape(-1)
 
 
 def _places(positions: np.ndarray, vertices: np.ndarray, weld: float) -> np.ndarray:

@@ -46,7 +46,7 @@ def kind_of(shard: Shard) -> Kind:
 
 
 @dataclass
-class Sharing:
+class Scheduler:
     """What is known of shards and actors from step to step."""
 
     seconds: dict[Kind, float] = field(default_factory=dict)
@@ -122,9 +122,9 @@ class Question:
 class Step:
     """The shards of one step: which wait, who is at which, which are done. Costs little for each, however many."""
 
-    def __init__(self, sharing: Sharing, shards: Sequence[Shard]) -> None:
-        self.sharing = sharing
-        sharing.begin()
+    def __init__(self, scheduler: Scheduler, shards: Sequence[Shard]) -> None:
+        self.scheduler = scheduler
+        scheduler.begin()
         self.kinds = [kind_of(shard) for shard in shards]
         self.waiting: dict[Actor | None, list[int]] = {}
         """By who had them last, if that is known: the longest comes last, of some that are alike the first."""
@@ -141,7 +141,7 @@ class Step:
 
     def in_turn(self, idle: Iterable[Actor]) -> list[Actor]:
         """Idle actors in the order in which they are asked: those that go on by themselves, who has waited longest."""
-        return sorted(idle, key=lambda actor: (not self.waiting.get(actor), -self.sharing.waited.get(actor, 0.0)))
+        return sorted(idle, key=lambda actor: (not self.waiting.get(actor), -self.scheduler.waited.get(actor, 0.0)))
 
     def next(self, actor: Actor, now: float, idle: Collection[Actor]) -> int | None:
         """The shard that an idle actor begins; None if it has nothing to do for now. ``idle`` are all that are so."""
@@ -156,12 +156,12 @@ class Step:
             other, left = most
             # It goes without help where it would be ready sooner by itself. But who has waited longer for others than
             # it takes to make kernels may do so, or one that comes late would never have any.
-            worth = left + self.sharing.waited.get(actor, 0.0)
+            worth = left + self.scheduler.waited.get(actor, 0.0)
             for place in reversed(range(len(self.waiting[other]))):
-                if (self.sharing.expected(actor, self.kinds[self.waiting[other][place]]) or 0.0) < worth:
-                    self.sharing.waited.pop(actor, None)
+                if (self.scheduler.expected(actor, self.kinds[self.waiting[other][place]]) or 0.0) < worth:
+                    self.scheduler.waited.pop(actor, None)
                     return self._begin(actor, other, place, now)
-            self.sharing.refused.setdefault(actor, left)
+            self.scheduler.refused.setdefault(actor, left)
         late = self._latest()
         if late is None or late[0] > now:
             return None
@@ -176,12 +176,12 @@ class Step:
         become shorter and actors still end together. A gradient has ``size`` bytes.
         """
         waiting, question = self.waiting.get(actor, []), self.running[actor]
-        if not self.sharing.holds(actor, self.kinds[question.shards[0]]):
+        if not self.scheduler.holds(actor, self.kinds[question.shards[0]]):
             return []
         room, first = TOGETHER // max(1, size), self._seconds(actor, question.shards[0])
         even = self.all / actors * (1 + 1e-6)  # of shards that are alike all have as many, in spite of rounding
         limit = min(LONGEST_S, even, max(SHORTEST_S, AHEAD * (first + self.left.get(actor, 0.0))))
-        while waiting and len(question.shards) < room and self.sharing.holds(actor, self.kinds[waiting[-1]]):
+        while waiting and len(question.shards) < room and self.scheduler.holds(actor, self.kinds[waiting[-1]]):
             more = question.more + self.cost[waiting[-1]]
             if first + more > limit:
                 break
@@ -201,7 +201,7 @@ class Step:
     def finished(self, index: int, actor: Actor, seconds: float) -> bool:
         """A result is there; whether it is the first of its shard. The actor may be at its next one already."""
         self.heard(index, actor)
-        self.sharing.measured(actor, self.kinds[index], seconds)
+        self.scheduler.measured(actor, self.kinds[index], seconds)
         first = index not in self.done
         self.done.add(index)
         return first
@@ -223,9 +223,9 @@ class Step:
         return None if late is None else late[0]
 
     def _wait(self, indices: Iterable[int]) -> None:
-        seconds, touched = self.sharing.seconds, set()
+        seconds, touched = self.scheduler.seconds, set()
         for i in indices:
-            owner = self.sharing.owner.get(self.kinds[i])
+            owner = self.scheduler.owner.get(self.kinds[i])
             touched.add(owner)
             self.waiting.setdefault(owner, []).append(i)
             self.cost[i] = self._seconds(owner, i)
@@ -244,7 +244,7 @@ class Step:
         return index
 
     def _seconds(self, owner: Actor | None, index: int) -> float:
-        return 0.0 if owner is None else self.sharing.expected(owner, self.kinds[index]) or 0.0
+        return 0.0 if owner is None else self.scheduler.expected(owner, self.kinds[index]) or 0.0
 
     def _busiest(self, now: float) -> tuple[Actor, float] | None:
         """Who has most left to do, of those for whom shards wait, and how many seconds."""
@@ -262,7 +262,7 @@ class Step:
 
     def _latest(self) -> tuple[float, int] | None:
         """When the first of the shards that are at one actor alone is late, and which that is."""
-        late, seconds, extra = [], self.sharing.seconds, self.sharing.extra
+        late, seconds, extra = [], self.scheduler.seconds, self.scheduler.extra
         for question in self.running.values():
             known = seconds.get(self.kinds[question.shards[0]])
             if known is None:

@@ -15,20 +15,20 @@ bounces had 4 % too little shadow."""
 
 
 @dataclass
-class Counted:
+class CounterSampler:
     """Random numbers that are counted: those of a key are the same each time. Takes a sampler's place."""
 
     key: mi.UInt32
     index: mi.UInt32
 
     @staticmethod
-    def of(key: mi.UInt32) -> Counted:
-        return Counted(mi.UInt32(key), mi.UInt32(0))
+    def of(key: mi.UInt32) -> CounterSampler:
+        return CounterSampler(mi.UInt32(key), mi.UInt32(0))
 
     @staticmethod
-    def at_vertex(key: mi.UInt32, k: mi.UInt32) -> Counted:
-        """Those of the k-th vertex (see `Numbers.draw`) of a path whose first has the first."""
-        return Counted(mi.UInt32(key), mi.UInt32(6 * k))
+    def at_vertex(key: mi.UInt32, k: mi.UInt32) -> CounterSampler:
+        """Those of the k-th vertex (see `VertexSamples.draw`) of a path whose first has the first."""
+        return CounterSampler(mi.UInt32(key), mi.UInt32(6 * k))
 
     def next_1d(self, active: bool | mi.Bool = True) -> mi.Float:
         x = mi.sample_tea_float32(self.key, self.index, ROUNDS)

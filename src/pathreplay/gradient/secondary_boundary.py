@@ -29,20 +29,20 @@ from ..transport.path import PathState
 from ..transport.signature import edge_normal, mixed, outline_gap, place_met, shape_met, turned_away
 from ..transport.start import CameraStart
 from ..transport.velocity import held_direction, jumps_at_facets, moved_direction
-from ..transport.vertex import Arrival, Flight, Numbers, Walk, mis_weight
+from ..transport.vertex import Arrival, Flight, TraceConfig, VertexSamples, mis_weight
 from .adjoint import derivative_by_place, derivative_by_ray
 from .arcs import Arc, arc, density_of_samples
-from .bends import Bend, off_contact
 from .cast_shadows import cast_shadows, casters
-from .centres import Centres, looks_of
-from .counted import Counted, key_of, quasi_random
-from .crofton import ROUNDING, Crossed, Look, Picked, PlaneLine, Sight, bisect, looked_at, passed, survey
-from .edges import Edges, Places
-from .hard_shadows import Shade
+from .counter_sampler import CounterSampler, key_of, quasi_random
+from .creases import CreaseOrContour, off_contact
+from .crofton import ROUNDING, Crossed, PlaneLine, Probe, Resampled, VisibilityProbe, bisect, looked_at, passed, survey
+from .edges import Edges, FilmDomain
+from .hard_shadows import ShadowTest
 from .lamps import Glimpse, Lamp, followed, glimpse
+from .observer import ObserverVertex, may_see, surface_sees
 from .primal import walk_on
 from .record import Layout, deepest, record, record_type, room_for
-from .seer import Seer, may_see, surface_sees
+from .segment_density import SegmentDensity, looks_of
 from .worth import DIM, MOST, STEEP, UNFORESEEN, Worth, closeness, own_plane, radiance_of, weighed
 
 BORDER = 1e-4
@@ -58,7 +58,7 @@ WIDELY = 0.8
 
 
 @dataclass
-class Chosen:
+class SelectedVertex:
     """The vertex of a camera path that looks for edges."""
 
     at: Arrival
@@ -94,36 +94,36 @@ class SquareLine(PlaneLine):
 
 @dr.syntax
 def choose_vertex(
-    walk: Walk, numbers: Counted, ray: mi.Ray3f, flows: mi.Bool, layout: Layout, records: Any
-) -> tuple[Any, Chosen]:
+    trace: TraceConfig, numbers: CounterSampler, ray: mi.Ray3f, flows: mi.Bool, layout: Layout, records: Any
+) -> tuple[Any, SelectedVertex]:
     """Walk along a camera path, and choose one of the vertices that scatter smoothly, by what they count.
 
     ``flows``: all vertices may move under the place where the path begins. Vertices up to the chosen one are recorded,
-    if there are ``records``. The last vertex that ``walk`` allows scatters nothing: the walk ends before.
+    if there are ``records``. The last vertex that ``trace`` allows scatters nothing: the walk ends before.
     """
-    walk = replace(walk, max_depth=max(walk.max_depth - 1, 0))
-    path = PathState.begin(walk, CameraStart(ray, numbers, mi.Bool(True)))
-    if dr.hint(walk.max_depth == 1 and walk.media is None and records is None, mode="scalar"):
-        return None, _first_vertex(walk, path, flows)
+    trace = replace(trace, max_depth=max(trace.max_depth - 1, 0))
+    path = PathState.begin(trace, CameraStart(ray, numbers, mi.Bool(True)))
+    if dr.hint(trace.max_depth == 1 and trace.media is None and records is None, mode="scalar"):
+        return None, _first_vertex(trace, path, flows)
     none, no = mi.UInt32(0), mi.Bool(False)
-    flight = None if walk.media is None else Flight.none(walk.media)
-    chosen = Chosen(path.at, none, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), no, mi.Bool(False), flight)
+    flight = None if trace.media is None else Flight.none(trace.media)
+    chosen = SelectedVertex(path.at, none, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), no, mi.Bool(False), flight)
     mass = mi.Float(0)
     count = mi.UInt32(0)
     moves = mi.Bool(flows)
-    while dr.hint(path.active, exclude=[walk, layout], label="pathreplay: choose a vertex"):
+    while dr.hint(path.active, exclude=[trace, layout], label="pathreplay: choose a vertex"):
         choice = numbers.next_1d()
-        u, step = path.choose(walk, numbers)
-        here, w = may_see(walk, path.at, step)
+        u, step = path.choose(trace, numbers)
+        here, w = may_see(trace, path.at, step)
         m = dr.select(path.active & here, dr.mean(dr.abs(path.β * w)), 0)
         mass += m
-        moves |= may_move(walk, path.at.hit)
+        moves |= may_move(trace, path.at.hit)
         take = (m > 0) & (choice * mass < m)
-        flight = None if walk.media is None else step.kept.media.flight
+        flight = None if trace.media is None else step.kept.media.flight
         chosen = dr.select(
-            take, Chosen(path.at, count, path.depth, path.β * w, m, moves, mi.Bool(True), flight), chosen
+            take, SelectedVertex(path.at, count, path.depth, path.β * w, m, moves, mi.Bool(True), flight), chosen
         )
-        onward, v = path.advance(walk, u, step)
+        onward, v = path.advance(trace, u, step)
         if dr.hint(records is not None, mode="scalar"):
             records[count] = record(layout, v)
         path = onward
@@ -132,11 +132,13 @@ def choose_vertex(
     return records, chosen
 
 
-def _first_vertex(walk: Walk, path: PathState, flows: mi.Bool) -> Chosen:
+def _first_vertex(trace: TraceConfig, path: PathState, flows: mi.Bool) -> SelectedVertex:
     """The first vertex, which is the only candidate; nothing is traced beyond it."""
     at, none = path.at, mi.UInt32(0)
-    active = path.active & surface_sees(walk, at)
-    return Chosen(at, none, none, dr.select(active, path.β, 0), mi.Float(1), flows | may_move(walk, at.hit), active)
+    active = path.active & surface_sees(trace, at)
+    return SelectedVertex(
+        at, none, none, dr.select(active, path.β, 0), mi.Float(1), flows | may_move(trace, at.hit), active
+    )
 
 
 @dataclass
@@ -146,12 +148,12 @@ class Search:
     chosen: mi.Float | None = None  # what the line of each lane stands for, or None: glance
     pick: mi.PCG32 | None = None
 
-    def closer(self, look: Look, line: Any, active: mi.Bool) -> Crossed:
-        return bisect(look, line, dr.select(active, self.chosen, 0), self.pick)
+    def closer(self, probe: Probe, line: Any, active: mi.Bool) -> Crossed:
+        return bisect(probe, line, dr.select(active, self.chosen, 0), self.pick)
 
 
 @dataclass
-class Shaded:
+class ShadowEdge:
     """A crossing in the square of an emitter: where the lit side ends."""
 
     lamp: Lamp
@@ -167,80 +169,82 @@ class Shaded:
     active: mi.Bool
 
 
-def emitter_line(walk: Walk, x: Chosen, l: float, key: mi.UInt32) -> SquareLine:
+def emitter_line(trace: TraceConfig, x: SelectedVertex, l: float, key: mi.UInt32) -> SquareLine:
     """A line among the samples of an emitter."""
-    numbers, scene = Counted(key, mi.UInt32(0)), walk.scene
+    numbers, scene = CounterSampler(key, mi.UInt32(0)), trace.scene
     which, turn = numbers.next_2d()
     index, share, _ = scene.sample_emitter(which)
     sin, cos = dr.sincos(dr.two_pi * turn)
     c = BORDER + INSIDE * numbers.next_2d()
-    lamp = Lamp.of(walk, index, x.active)
+    lamp = Lamp.of(trace, index, x.active)
     return SquareLine(mi.Point2f(c), mi.Vector2f(cos, sin), mi.Float(-0.5 * l), mi.Float(0.5 * l), lamp, share)
 
 
-def emitter_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
+def emitter_edges(
+    trace: TraceConfig, x: SelectedVertex, observer: ObserverVertex, l: float, key: mi.UInt32, search: Search
+) -> Any:
     """Find the edge of a shadow among the samples of an emitter, and weigh it: see `Search`. Detached."""
-    line = emitter_line(walk, x, l, key)
+    line = emitter_line(trace, x, l, key)
 
-    def sight(seen: Glimpse) -> Sight:
-        moves = x.moves | _lamp_moves(walk, line.lamp.emitter) | may_move(walk, seen.hit)
-        return Sight(mi.UInt32(seen.hidden & moves), mi.Point3f(0), mi.Normal3f(0))
+    def sight(seen: Glimpse) -> VisibilityProbe:
+        moves = x.moves | _lamp_moves(trace, line.lamp.emitter) | may_move(trace, seen.hit)
+        return VisibilityProbe(mi.UInt32(seen.hidden & moves), mi.Point3f(0), mi.Normal3f(0))
 
-    def look(line: SquareLine, t: mi.Float, active: mi.Bool) -> Sight:
-        return sight(glimpse(walk, seer, line.lamp, line.at(t), active))
+    def probe(line: SquareLine, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
+        return sight(glimpse(trace, observer, line.lamp, line.at(t), active))
 
     if search.chosen is None:
-        glimpses = [glimpse(walk, seer, line.lamp, line.at(t), x.active) for t in looked_at(line)]
-        return _square_worth(walk, x, seer, line, l, [(seen, sight(seen)) for seen in glimpses], x.active)
-    found = search.closer(look, line, x.active)
+        glimpses = [glimpse(trace, observer, line.lamp, line.at(t), x.active) for t in looked_at(line)]
+        return _square_worth(trace, x, observer, line, l, [(seen, sight(seen)) for seen in glimpses], x.active)
+    found = search.closer(probe, line, x.active)
     active = found.weight > 0
-    a, b = (glimpse(walk, seer, line.lamp, line.at(t), active) for t in (found.a, found.b))
+    a, b = (glimpse(trace, observer, line.lamp, line.at(t), active) for t in (found.a, found.b))
     active &= a.hidden != b.hidden
     lit, dark = dr.select(a.hidden, b, a), dr.select(a.hidden, a, b)
     active &= (line.lamp.radius == 0) | (dark.hit.t < lit.hit.t)  # or it is the mesh that ends there
     light, hit = lit.light, dark.hit
-    active &= seer.is_off(hit.t)
-    f, pdf = seer.towards(light.d, active)
-    F = x.β * f * lit.Le * seer.past(light, hit.t, key, active) * line.share
+    active &= observer.is_off(hit.t)
+    f, pdf = observer.towards(light.d, active)
+    F = x.β * f * lit.Le * observer.transmittance_past_edge(light, hit.t, key, active) * line.share
     F *= dr.select(light.delta, 1, mis_weight(lit.density / line.share, pdf))
     K = 0.5 * dr.pi * INSIDE**2 / l * found.weight * F * dr.select(a.hidden, -1, 1)
     active &= dr.any(K != 0) & dr.all(dr.isfinite(K))
     u, u_lit = (line.at(dr.select(a.hidden, *ends)) for ends in ((found.a, found.b), (found.b, found.a)))
-    own = active & seer.parts(light.d, dark.light.d)  # not that of the ray, which begins a little beside
-    return Shaded(
+    own = active & observer.parts(light.d, dark.light.d)  # not that of the ray, which begins a little beside
+    return ShadowEdge(
         line.lamp, line.way(found.a), u, u_lit, lit, hit, dark.ray, edge_normal(hit, dark.ray, active), own, K, active
     )
 
 
 def _square_worth(
-    walk: Walk,
-    x: Chosen,
-    seer: Seer,
+    trace: TraceConfig,
+    x: SelectedVertex,
+    observer: ObserverVertex,
     line: SquareLine,
     l: float,
-    seen: list[tuple[Glimpse, Sight]],
+    seen: list[tuple[Glimpse, VisibilityProbe]],
     active: mi.Bool,
 ) -> Worth:
     """What a line is worth where so much is seen. Where no lobe is narrow, its middle tells what x scatters."""
     glimpses, sights = zip(*seen, strict=True)
     a, b, c = (each.light.d for each in glimpses)
-    if walk.traits.narrow:
-        scattered = [seer.towards(d, active) for d in (a, b, c)]
+    if trace.traits.narrow:
+        scattered = [observer.towards(d, active) for d in (a, b, c)]
     else:
-        scattered = [seer.towards(c, active)] * 3
+        scattered = [observer.towards(c, active)] * 3
     bright = []
     for each, (f, pdf) in zip(glimpses, scattered, strict=True):
         F = dr.mean(dr.abs(x.β * f * each.Le)) * line.share
         bright.append(F * dr.select(each.light.delta, 1, mis_weight(each.density / line.share, pdf)))
     first = reduce(lambda p, q: dr.select(q.hidden & ~(p.hidden & (p.hit.t <= q.hit.t)), q, p), glimpses)
     told = survey([replace(sight, bright=F) for sight, F in zip(sights, bright, strict=True)], active)
-    told.near = dr.select(first.hidden, closeness(walk, first.hit), 0)
+    told.near = dr.select(first.hidden, closeness(trace, first.hit), 0)
     turn = dr.norm(a - c) + dr.norm(c - b)
-    return Worth.of(told, told.bright, own_plane(seer, a, b) / (turn + l * STEEP))
+    return Worth.of(told, told.bright, own_plane(observer, a, b) / (turn + l * STEEP))
 
 
-def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
-    moving = walk.traits.moving
+def _lamp_moves(trace: TraceConfig, emitter: mi.EmitterPtr) -> mi.Bool:
+    moving = trace.traits.moving
     moves = mi.Bool(moving is None)
     for shape in moving or ():
         if shape.is_emitter():
@@ -248,18 +252,18 @@ def _lamp_moves(walk: Walk, emitter: mi.EmitterPtr) -> mi.Bool:
     return moves
 
 
-def shadow_gap(seer: Seer, c: Shaded, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
+def shadow_gap(observer: ObserverVertex, c: ShadowEdge, at: mi.Ray3f, u: mi.Point2f) -> mi.Float:
     """B: distance of the line to the emitter sample from the edge; differentiable in all that moves."""
-    origin = seer.moved(at)
-    d = followed(seer.walk, c.lamp, origin, u, c.lit, c.active)
+    origin = observer.moved(at)
+    d = followed(observer.trace, c.lamp, origin, u, c.lit, c.active)
     return dr.select(c.own, dr.dot(origin.n, d), outline_gap(c.n, origin.p, d, c.hit, c.ray, c.active))
 
 
-def shadow_weight(seer: Seer, c: Shaded) -> mi.Spectrum:
+def shadow_weight(observer: ObserverVertex, c: ShadowEdge) -> mi.Spectrum:
     """K in full: with the derivative of B along the line."""
-    slope = derivative_by_place(c.u, lambda u: shadow_gap(seer, c, seer.at.ray, u))
+    slope = derivative_by_place(c.u, lambda u: shadow_gap(observer, c, observer.at.ray, u))
     # Where a sample of the emitter jumps there is no edge: its other side is far off.
-    off = dr.abs(shadow_gap(seer, c, seer.at.ray, c.u_lit) - shadow_gap(seer, c, seer.at.ray, c.u))
+    off = dr.abs(shadow_gap(observer, c, observer.at.ray, c.u_lit) - shadow_gap(observer, c, observer.at.ray, c.u))
     jumps = off > JUMP * dr.norm(slope) * dr.norm(c.u_lit - c.u) + ROUNDING * (dr.norm(c.ray.o) + c.hit.t)
     return passed(c.w, c.K, slope, c.active & ~jumps)
 
@@ -269,18 +273,20 @@ class HardShadow:
     """Of a light without extent, on the surface that is seen at both sides: its border is crossed there."""
 
     there: mi.Bool
-    shade: Shade  # at the side in the shadow, which is the near one
+    shade: ShadowTest  # at the side in the shadow, which is the near one
     n: mi.Vector3f
 
-    def gap(self, walk: Walk, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        return self.shade.gap(walk, self.n, hit, ray, active & self.there)
+    def gap(self, trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+        return self.shade.gap(trace, self.n, hit, ray, active & self.there)
 
-    def slope(self, walk: Walk, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
-        return derivative_by_ray(ray, lambda ray: self.gap(walk, hit, ray, active)).d
+    def slope(
+        self, trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
+    ) -> mi.Vector3f:
+        return derivative_by_ray(ray, lambda ray: self.gap(trace, hit, ray, active)).d
 
 
 @dataclass
-class Hiding:
+class OcclusionEdge:
     """A crossing on an arc: one surface hides another, or bends, or a hard shadow ends on it."""
 
     edge: mi.PreliminaryIntersection3f  # of the one that hides
@@ -289,7 +295,7 @@ class Hiding:
     d_near: mi.Vector3f
     d_far: mi.Vector3f
     n: mi.Vector3f  # from near to far
-    bend: Bend
+    bend: CreaseOrContour
     hard: HardShadow | None
     own: mi.Bool  # it is the plane of the seer's own triangle
     slope: mi.Float  # of its B, along n
@@ -299,120 +305,126 @@ class Hiding:
 
 
 def _views(
-    walk: Walk, x: Chosen, seer: Seer, key: mi.UInt32, hard: bool
-) -> tuple[Callable[..., Sight], Callable[..., Shade]]:
+    trace: TraceConfig, x: SelectedVertex, observer: ObserverVertex, key: mi.UInt32, hard: bool
+) -> tuple[Callable[..., VisibilityProbe], Callable[..., ShadowTest]]:
     """What x sees along an arc, and what of it lies in the shadow of a light without extent, if any is ``hard``."""
 
-    def shade(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> Shade:
-        u = Numbers.draw(Counted(key, mi.UInt32(BEYOND))).light  # as `walk_on` draws it
-        return Shade.of(walk, seer.arrival(ray, hit, mi.Float(1)), u, x.depth + 1, active)
+    def shade(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> ShadowTest:
+        u = VertexSamples.draw(CounterSampler(key, mi.UInt32(BEYOND))).light  # as `walk_on` draws it
+        return ShadowTest.of(trace, observer.arrival(ray, hit, mi.Float(1)), u, x.depth + 1, active)
 
-    def look(line: Arc, t: mi.Float, active: mi.Bool, shaded: bool = hard) -> Sight:
-        ray = seer.origin.spawn_ray(line.at(t))
-        first = seer.hit(ray, active & seer.may_scatter(ray.d))
-        seen = seer.behind(ray, first, active)
-        counts, moves = _counts(walk, x, seen), x.moves | may_move(walk, seen)
+    def probe(line: Arc, t: mi.Float, active: mi.Bool, shaded: bool = hard) -> VisibilityProbe:
+        ray = observer.origin.spawn_ray(line.at(t))
+        first = observer.hit(ray, active & observer.may_scatter(ray.d))
+        seen = observer.behind(ray, first, active)
+        counts, moves = _counts(trace, x, seen), x.moves | may_move(trace, seen)
         close = active & counts  # nothing else is looked at closely
-        if walk.media is None:
+        if trace.media is None:
             close &= moves
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, close)
-        if not walk.traits.copies:
+        if not trace.traits.copies:
             at.shape = seen.shape
         turned = dr.select(turned_away(at, ray.d), mi.UInt32(1), 0)
-        places = [place_met(walk, seen, active, at.shape, facets) for facets in (True, False)]
-        place = dr.select(seer.keeps, *places)
-        facets = close & ~seer.keeps & jumps_at_facets(walk.traits.tables.blend_lengths, seer.origin, seen, at.p, at.n)
+        places = [place_met(trace, seen, active, at.shape, facets) for facets in (True, False)]
+        place = dr.select(observer.keeps, *places)
+        facets = (
+            close
+            & ~observer.keeps
+            & jumps_at_facets(trace.traits.tables.blend_lengths, observer.origin, seen, at.p, at.n)
+        )
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
-        if walk.media is not None:  # directions follow null boundaries, too
-            boundary = place_met(walk, first, active, shape_met(walk, first, ray, active), facets=False)
-            place, moves = mixed(place, boundary), moves | may_move(walk, first)
+        if trace.media is not None:  # directions follow null boundaries, too
+            boundary = place_met(trace, first, active, shape_met(trace, first, ray, active), facets=False)
+            place, moves = mixed(place, boundary), moves | may_move(trace, first)
         if shaded:
             dimmed = shade(ray, seen, active)
-            place, moves = mixed(place, dr.select(dimmed.dark, mi.UInt32(1), 0)), moves | may_move(walk, dimmed.hit)
-        near = closeness(walk, seen)
-        if walk.media is not None:
-            near = dr.maximum(near, closeness(walk, first))
-        bright = dr.select(seen.is_valid(), DIM, mi.Float(walk.scene.environment() is not None))
-        sight = Sight(mixed(place, turned), at.p, at.n, moves, near, bright)
+            place, moves = mixed(place, dr.select(dimmed.dark, mi.UInt32(1), 0)), moves | may_move(trace, dimmed.hit)
+        near = closeness(trace, seen)
+        if trace.media is not None:
+            near = dr.maximum(near, closeness(trace, first))
+        bright = dr.select(seen.is_valid(), DIM, mi.Float(trace.scene.environment() is not None))
+        sight = VisibilityProbe(mixed(place, turned), at.p, at.n, moves, near, bright)
         # As nothing, a sky would be.
-        dark = replace(Sight.nothing(), signature=mi.UInt32(1), moves=moves, near=near, bright=bright)
+        dark = replace(VisibilityProbe.nothing(), signature=mi.UInt32(1), moves=moves, near=near, bright=bright)
         return dr.select(counts, sight, dark)
 
-    return look, shade
+    return probe, shade
 
 
-def arc_edges(walk: Walk, x: Chosen, seer: Seer, l: float, key: mi.UInt32, search: Search) -> Any:
+def arc_edges(
+    trace: TraceConfig, x: SelectedVertex, observer: ObserverVertex, l: float, key: mi.UInt32, search: Search
+) -> Any:
     """Find an edge between two surfaces among the directions in which x scatters, and weigh both sides: see `Search`.
 
     Detached.
     """
-    line, ok = arc(seer, l, walk.traits.narrow or walk.media is not None, key, x.active)
-    hard = walk.traits.hard_lights and walk.media is None
-    look, shade = _views(walk, x, seer, key, hard)
+    line, ok = arc(observer, l, trace.traits.narrow or trace.media is not None, key, x.active)
+    hard = trace.traits.hard_lights and trace.media is None
+    probe, shade = _views(trace, x, observer, key, hard)
     if search.chosen is None:
         light = dr.select(ok, dr.mean(dr.abs(x.β * line.f)) / line.p, 0)
-        own = own_plane(seer, line.at(line.begin), line.at(line.end))
-        seen = survey([look(line, t, ok) for t in looked_at(line)], ok)
+        own = own_plane(observer, line.at(line.begin), line.at(line.end))
+        seen = survey([probe(line, t, ok) for t in looked_at(line)], ok)
         return Worth.of(replace(seen, found=seen.found * line.importance()), light, light * own / l)
-    found = search.closer(look, line, ok)
+    found = search.closer(probe, line, ok)
     active = found.weight > 0
-    rays = [seer.origin.spawn_ray(line.at(t)) for t in (found.a, found.b)]
-    firsts = [seer.hit(ray, active) for ray in rays]
-    edges, through = seer.edges(rays, firsts, active)
+    rays = [observer.origin.spawn_ray(line.at(t)) for t in (found.a, found.b)]
+    firsts = [observer.hit(ray, active) for ray in rays]
+    edges, through = observer.edges(rays, firsts, active)
     near_a, shadow, shades = edges[0].t <= edges[1].t, mi.Bool(False), None
     if hard:
         shades = [shade(ray, first, active) for ray, first in zip(rays, firsts, strict=True)]
-        a, b = (look(line, t, active, shaded=False) for t in (found.a, found.b))
+        a, b = (probe(line, t, active, shaded=False) for t in (found.a, found.b))
         shadow = active & ~a.differs(b) & (shades[0].dark != shades[1].dark)
         near_a = dr.select(shadow, shades[0].dark, near_a)
     edge, near, far = dr.select(near_a, *edges), dr.select(near_a, *firsts), dr.select(near_a, *firsts[::-1])
     ray_near, ray_far = dr.select(near_a, *rays), dr.select(near_a, *rays[::-1])
-    active &= edge.is_valid() & seer.is_off(edge.t)
+    active &= edge.is_valid() & observer.is_off(edge.t)
 
-    bend = Bend.of(walk, ((edge, ray_near), (dr.select(near_a, *edges[::-1]), ray_far)), active & ~shadow)
+    bend = CreaseOrContour.of(trace, ((edge, ray_near), (dr.select(near_a, *edges[::-1]), ray_far)), active & ~shadow)
     slope = derivative_by_ray(ray_near, lambda ray: bend.gap(ray, active)).d
-    own = active & ~shadow & seer.parts(ray_near.d, ray_far.d)
+    own = active & ~shadow & observer.parts(ray_near.d, ray_far.d)
     border = None
     if shades is not None:
         dark = dr.select(near_a, *shades)
         border = HardShadow(shadow, dark, dark.normal(shadow))
-        slope = dr.select(shadow, border.slope(walk, edge, ray_near, active), slope)
-    slope = dr.select(own, seer.si.n, slope)
+        slope = dr.select(shadow, border.slope(trace, edge, ray_near, active), slope)
+    slope = dr.select(own, observer.si.n, slope)
     slope -= dr.dot(slope, ray_near.d) * ray_near.d
     bent = (own | bend.meets | bend.turns | shadow) & (dr.squared_norm(slope) > 0)
     active &= bent | ~shadow
     n = dr.select(bent, dr.normalize(slope), edge_normal(edge, ray_near, active))
     n = dr.select(dr.dot(n, ray_far.d - ray_near.d) < 0, -n, n)
     steep = dr.select(bent, dr.dot(slope, n), 1)
-    f, pdf = seer.towards(ray_far.d, active)
-    common = x.β * f * (0.5 * dr.pi * found.weight * line.weight(seer, density_of_samples(pdf), active))
+    f, pdf = observer.towards(ray_far.d, active)
+    common = x.β * f * (0.5 * dr.pi * found.weight * line.weight(observer, density_of_samples(pdf), active))
     active &= dr.any(common != 0)
-    arrivals = off_contact(walk, seer.arrival(ray_near, near, pdf), seer.arrival(ray_far, far, pdf), active)
+    arrivals = off_contact(trace, observer.arrival(ray_near, near, pdf), observer.arrival(ray_far, far, pdf), active)
     depth = x.depth + 1
-    T, arrivals = seer.onward(arrivals, SHORT_OF * edge.t, key, active & through)
+    T, arrivals = observer.onward(arrivals, SHORT_OF * edge.t, key, active & through)
     K = []
     for arrival in arrivals:
-        path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < walk.max_depth))
-        L, _ = walk_on(walk, Counted(key, mi.UInt32(BEYOND)), path)
+        path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < trace.max_depth))
+        L, _ = walk_on(trace, CounterSampler(key, mi.UInt32(BEYOND)), path)
         K.append(dr.select(active, common * T * L, 0))
-    return Hiding(edge, near, far, ray_near.d, ray_far.d, n, bend, border, own, steep, K[0], K[1], active)
+    return OcclusionEdge(edge, near, far, ray_near.d, ray_far.d, n, bend, border, own, steep, K[0], K[1], active)
 
 
-def _counts(walk: Walk, x: Chosen, seen: mi.PreliminaryIntersection3f) -> mi.Bool:
+def _counts(trace: TraceConfig, x: SelectedVertex, seen: mi.PreliminaryIntersection3f) -> mi.Bool:
     """Whether light may come from what x sees: at the end of a path only what glows has any."""
-    if walk.media is not None:
+    if trace.media is not None:
         return mi.Bool(True)
-    glows = dr.select(seen.is_valid(), seen.shape.emitter() != None, walk.scene.environment() is not None)  # noqa: E711
-    return glows | (x.depth + 2 < walk.max_depth)
+    glows = dr.select(seen.is_valid(), seen.shape.emitter() != None, trace.scene.environment() is not None)  # noqa: E711
+    return glows | (x.depth + 2 < trace.max_depth)
 
 
-def hiding_motion(walk: Walk, seer: Seer, c: Hiding, at: mi.Ray3f) -> mi.Spectrum:
+def hiding_motion(trace: TraceConfig, observer: ObserverVertex, c: OcclusionEdge, at: mi.Ray3f) -> mi.Spectrum:
     """What the edge sweeps that the directions at its sides do not follow; differentiable in all that moves."""
-    origin = seer.moved(at)
-    lengths = walk.traits.tables.blend_lengths
+    origin = observer.moved(at)
+    lengths = trace.traits.tables.blend_lengths
     edge = held_direction(origin, c.d_near, c.edge, c.active)
-    d_near, _ = moved_direction(lengths, origin, c.d_near, c.near, seer.holds(c.near, c.active))
-    d_far, _ = moved_direction(lengths, origin, c.d_far, c.far, seer.holds(c.far, c.active))
+    d_near, _ = moved_direction(lengths, origin, c.d_near, c.near, observer.holds(c.near, c.active))
+    d_far, _ = moved_direction(lengths, origin, c.d_far, c.far, observer.holds(c.far, c.active))
     shadow = mi.Bool(False) if c.hard is None else c.hard.there
     bends = c.own | c.bend.meets | c.bend.turns | shadow
 
@@ -421,16 +433,16 @@ def hiding_motion(walk: Walk, seer: Seer, c: Hiding, at: mi.Ray3f) -> mi.Spectru
         ray = mi.Ray3f(origin.spawn_ray(dr.detach(d)).o, d)
         B = dr.select(c.own, dr.dot(origin.n, d), c.bend.gap(ray, c.active & ~c.own))
         if c.hard is not None:
-            B = dr.select(shadow, c.hard.gap(walk, c.edge, ray, c.active), B)
+            B = dr.select(shadow, c.hard.gap(trace, c.edge, ray, c.active), B)
         return dr.select(bends, -B / c.slope, dr.dot(c.n, edge - d))
 
     swept = c.K_near * gap(d_near) - c.K_far * gap(d_far)
     return dr.select(c.active, swept, 0)
 
 
-def inner_edges(
-    walk: Walk,
-    places: Places,
+def secondary_edges(
+    trace: TraceConfig,
+    places: FilmDomain,
     lines: int,
     closer: int,
     seed: mi.UInt32,
@@ -441,32 +453,32 @@ def inner_edges(
     ``lengths`` are those in the square and on the sphere (radians). What light counts that arrives at the film decides
     nothing here, since forward mode would not know it and choose otherwise.
     """
-    walk = replace(walk, max_depth=min(walk.max_depth, deepest(walk)))
-    layout = Layout.of(walk, True)
+    trace = replace(trace, max_depth=min(trace.max_depth, deepest(trace)))
+    layout = Layout.of(trace, True)
     square, arc = lengths
 
-    def path(centres: Centres, i: mi.UInt32, n: int, seed: mi.UInt32, records: Any) -> tuple[Any, ...]:
+    def path(centres: SegmentDensity, i: mi.UInt32, n: int, seed: mi.UInt32, records: Any) -> tuple[Any, ...]:
         key = key_of(i, seed ^ 0x2545F491)
         s, density = centres.draw(mi.Point2f(quasi_random(i, n, seed)))
         ray, weight = dr.detach(places.ray(s, key))
-        records, x = choose_vertex(walk, Counted.of(key), ray, places.flows(s), layout, records)
+        records, x = choose_vertex(trace, CounterSampler.of(key), ray, places.flows(s), layout, records)
         x.β *= weight / (density * dr.opaque(mi.Float, n))
         return s, density, key, records, x
 
-    def glances(centres: Centres, n: int, seed: mi.UInt32) -> tuple[mi.Point2f, mi.Float, list[Worth]]:
+    def glances(centres: SegmentDensity, n: int, seed: mi.UInt32) -> tuple[mi.Point2f, mi.Float, list[Worth]]:
         s, density, key, _, x = path(centres, dr.arange(mi.UInt32, n), n, seed, None)
-        seer = Seer(walk, x.at, x.flight, x.active)
-        in_squares = emitter_edges(walk, x, seer, square, key ^ 0x1B873593, Search())
-        on_arcs = arc_edges(walk, x, seer, arc, key ^ 0x38B34AE5, Search())
+        observer = ObserverVertex(trace, x.at, x.flight, x.active)
+        in_squares = emitter_edges(trace, x, observer, square, key ^ 0x1B873593, Search())
+        on_arcs = arc_edges(trace, x, observer, arc, key ^ 0x38B34AE5, Search())
         none = dr.zeros(mi.Float, n)
         density += none  # as many as lines, as all of these
         worths = [replace(w, found=w.found / density, edges=w.edges + none) for w in (in_squares, on_arcs)]
         dr.eval(s, density, worths)
         return s, density, worths
 
-    centres = Centres(int(places.size.x), int(places.size.y), 0.0)
-    if shapes := casters(walk):
-        s, falls = cast_shadows(walk, shapes, places, seed ^ 0x2C1B3C6D)
+    centres = SegmentDensity(int(places.size.x), int(places.size.y), 0.0)
+    if shapes := casters(trace):
+        s, falls = cast_shadows(trace, shapes, places, seed ^ 0x2C1B3C6D)
         centres = centres.refined(s, dr.select(falls, mi.Float(1), 0), WIDELY)
     s, density, first = glances(centres, looks_of(lines, places.size), seed ^ 0x7F4A7C15)
     radiance = radiance_of(first)
@@ -477,21 +489,21 @@ def inner_edges(
     relative = dr.minimum(worth * often / (MOST * usual), 1)
     centres = centres.refined(of_both, dr.square(relative) / often, WIDELY)
     found, worth = weighed(glances(centres, lines, seed)[2], radiance)
-    chosen = Picked.of(worth + UNFORESEEN * found, closer, seed)
+    chosen = Resampled.of(worth + UNFORESEEN * found, closer, seed)
 
     on_arc = chosen.index >= lines
     i = dr.select(on_arc, chosen.index - lines, chosen.index)
     pick = mi.PCG32(closer, initstate=seed + 1, initseq=dr.arange(mi.UInt32, closer))
-    s, _, key, records, x = path(centres, i, lines, seed, dr.alloc_local(record_type(layout), room_for(walk)))
+    s, _, key, records, x = path(centres, i, lines, seed, dr.alloc_local(record_type(layout), room_for(trace)))
     x.active &= chosen.weight > 0
     of_square, of_arc = dr.select(on_arc, 0, chosen.weight), dr.select(on_arc, chosen.weight, 0)
-    seer = Seer(walk, x.at, x.flight, x.active)
-    shaded = emitter_edges(walk, x, seer, square, key ^ 0x1B873593, Search(of_square, pick))
-    K = shadow_weight(seer, shaded)
-    hiding = arc_edges(walk, x, seer, arc, key ^ 0x38B34AE5, Search(of_arc, pick))
+    observer = ObserverVertex(trace, x.at, x.flight, x.active)
+    shaded = emitter_edges(trace, x, observer, square, key ^ 0x1B873593, Search(of_square, pick))
+    K = shadow_weight(observer, shaded)
+    hiding = arc_edges(trace, x, observer, arc, key ^ 0x38B34AE5, Search(of_arc, pick))
 
     def motion(ray: mi.Ray3f) -> mi.Spectrum:
-        return hiding_motion(walk, seer, hiding, ray) - K * shadow_gap(seer, shaded, ray, shaded.u)
+        return hiding_motion(trace, observer, hiding, ray) - K * shadow_gap(observer, shaded, ray, shaded.u)
 
     k = dr.select(x.active, x.k, 0)
     return Edges(s, key, k, x.at.ray, layout, records, motion)

@@ -22,7 +22,7 @@ def looks_of(lines: int, size: mi.ScalarVector2f) -> int:
 
 
 @dataclass(frozen=True)
-class Centres:
+class SegmentDensity:
     """A distribution of places: constant in each pixel of a grid that covers the film, and l beyond."""
 
     width: int
@@ -31,11 +31,11 @@ class Centres:
     until: mi.Float | None = None  # of each pixel, the probability of those up to it; None: all alike
 
     @staticmethod
-    def even(size: mi.ScalarVector2f, l: float) -> Centres:
+    def even(size: mi.ScalarVector2f, l: float) -> SegmentDensity:
         """All places alike, of a film of so many pixels and lines of length l."""
-        return Centres(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
+        return SegmentDensity(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
 
-    def refined(self, c: mi.Point2f, found: mi.Float, evenly: float = EVENLY) -> Centres:
+    def refined(self, c: mi.Point2f, found: mi.Float, evenly: float = EVENLY) -> SegmentDensity:
         """More often where there was something, at places ``c`` so much, and around: edges go on.
 
         By the root of how much: variance is a sum of (what lines find, squared) / density, which is then least.
@@ -53,7 +53,7 @@ class Centres:
         before = self._share(dr.arange(mi.UInt32, n))
         share = dr.select(total > 0, dr.fma(counts, (1 - evenly) / total, evenly * before), before)
         until = dr.cumsum(share)
-        return Centres(self.width, self.height, self.margin, until / dr.gather(mi.Float, until, n - 1))
+        return SegmentDensity(self.width, self.height, self.margin, until / dr.gather(mi.Float, until, n - 1))
 
     def _share(self, i: mi.UInt32) -> mi.Float:
         """The probability of a pixel."""

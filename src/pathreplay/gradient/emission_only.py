@@ -14,55 +14,55 @@ from ..transport.emitters import relight
 from ..transport.motion import path_moves, weights_vary
 from ..transport.path import PathState
 from ..transport.start import CameraStart
-from ..transport.vertex import Walk
-from .adjoint import LostPaths, backward
+from ..transport.vertex import TraceConfig
+from .adjoint import NonFiniteCounter, backward
 from .driver import Driver
 
 
-def lights_alone(walk: Walk, start: CameraStart) -> bool:
+def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
     """Whether nothing has gradients but what lights emit: no weight, and nothing that moves. For scenes without media.
 
     Found out by tracing, so never where Dr.Jit evaluates what is called as it goes: there some may not be met.
     """
-    if walk.media is not None or not walk.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
+    if trace.media is not None or not trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
         return False
-    if not walk.scene.shapes():  # nothing that could be lit is traced, and so nothing met
+    if not trace.scene.shapes():  # nothing that could be lit is traced, and so nothing met
         return False
-    at = PathState.begin(walk, start).at
-    return not path_moves(walk, start, at) and not weights_vary(walk, at)
+    at = PathState.begin(trace, start).at
+    return not path_moves(trace, start, at) and not weights_vary(trace, at)
 
 
 def lights_or(other: Driver) -> Driver:
     """A driver: `lights` where that will do, and the ``other`` elsewhere."""
 
-    def driver(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -> bool:
-        return (lights if lights_alone(walk, start) else other)(walk, start, δL, lost)
+    def driver(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
+        return (emission_only if only_emission_varies(trace, start) else other)(trace, start, δL, lost)
 
     return driver
 
 
 @dr.syntax
-def lights(walk: Walk, start: CameraStart, δL: mi.Spectrum, lost: LostPaths) -> bool:
+def emission_only(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into what lights emit. Of any depth; for `lights_alone`.
 
     At each vertex what was hit, and an emitter sample, by the weights of the picture; in the end what is around the
     scene, which each path meets once. Returns that paths do not move.
     Not differentiated: all but what lights emit. Raises PathreplayError when no parameter reaches the paths.
     """
-    walk = replace(walk, leaves=True)
-    sampler, path = start.sampler, PathState.begin(walk, start)
+    trace = replace(trace, leaves=True)
+    sampler, path = start.sampler, PathState.begin(trace, start)
     path, left = path.leave()
 
-    while dr.hint(path.active, exclude=[walk], label="pathreplay: lights"):
-        u, step = path.choose(walk, sampler)
+    while dr.hint(path.active, exclude=[trace], label="pathreplay: lights"):
+        u, step = path.choose(trace, sampler)
         with dr.resume_grad():
-            backward(dr.sum(δL * path.β * relight(walk, path.at, step.lighting)))
-        path = path.advance(walk, u, step)[0]
+            backward(dr.sum(δL * path.β * relight(trace, path.at, step.lighting)))
+        path = path.advance(trace, u, step)[0]
         path, gone = path.leave()
         left |= gone
 
     with dr.resume_grad():
-        beyond = background(walk, path.at, left)
+        beyond = background(trace, path.at, left)
         if dr.grad_enabled(beyond):
             backward(dr.sum(δL * path.β * beyond))
     return False
