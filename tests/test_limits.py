@@ -10,7 +10,7 @@ import pytest
 
 from pathreplay import memory
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.limits import require_grid, require_learning_rate
+from pathreplay.inverse.parameter_limits import require_grid, require_learning_rate
 from pathreplay.render.film import MOST_SAMPLES, require_film
 
 

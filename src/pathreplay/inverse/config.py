@@ -20,7 +20,6 @@ from pathreplay.inverse.executor_options import ExecutorName, RayOptions
 from pathreplay.inverse.memory_options import Memory, bytes_of
 from pathreplay.inverse.noise_options import AUTO, AutoSpp, Spp
 from pathreplay.inverse.optimizer_options import Optimizer
-from pathreplay.inverse.pose import PARTS, PoseKind
 from pathreplay.inverse.preview_options import Preview
 from pathreplay.inverse.schedules import Schedule
 from pathreplay.inverse.stage_options import Stage, begins
@@ -56,6 +55,10 @@ ImportPath = Annotated[str, AfterValidator(_import_path)]
 
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
+
+PoseKind = Literal["translation", "rotation", "rigid"]
+PARTS = {"translation": ("translation",), "rotation": ("rotation",), "rigid": ("translation", "rotation")}
+"""Variables of each kind of pose."""
 
 TransformKind = Literal["log", "softplus", "logit"]
 

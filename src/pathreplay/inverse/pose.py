@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config import PARTS, PoseKind
 from pathreplay.scenes.parameters import get_array, is_transform
 
-PoseKind = Literal["translation", "rotation", "rigid"]
 PART_NAMES = (":translation", ":rotation")
 """How names of the variables of a pose end."""
-PARTS = {"translation": ("translation",), "rotation": ("rotation",), "rigid": ("translation", "rotation")}
 
 # θ² below which series stand in for a and b: their next terms, θ⁴ / 120 and θ⁴ / 720, are below float32 rounding there.
 _SMALL = 1e-3

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import limits
+from pathreplay.inverse import limits, parameter_limits
 from pathreplay.inverse.album import Album
 from pathreplay.inverse.background import require_known
 from pathreplay.inverse.capture import Shot, fingerprint, read_capture
@@ -35,6 +35,7 @@ from pathreplay.inverse.targets import (
     read_masks,
     read_targets,
     rendered_targets,
+    require_films,
     require_weights,
     target_scene,
     truth_of,
@@ -196,10 +197,10 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     limits.require_visible(scene, params, keys)
     if config.target.alpha == "scene":
         require_known(scene, params, keys)
-    limits.require_films(scene, sensors, {"spp": config.most_spp, "picture_spp": config.picture_spp})
+    require_films(scene, sensors, {"spp": config.most_spp, "picture_spp": config.picture_spp})
     unsolved, moved = make_variables(scene, params, named | free, config, base, modules)
     derived = make_derived(params, made, unsolved, modules)
-    limits.require_values({variable.key: variable.start.size for variable in unsolved})
+    parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
     truth: dict[str, Array] = {}
     first = targets is None

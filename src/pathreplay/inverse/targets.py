@@ -12,8 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import limits
-from pathreplay.inverse.album import Album
+from pathreplay.inverse.album import ROOM, Album
 from pathreplay.inverse.background import background
 from pathreplay.inverse.config import TARGET, Config
 from pathreplay.inverse.grids import comparable
@@ -33,13 +32,16 @@ from pathreplay.inverse.lens import Lens
 from pathreplay.inverse.patterns import matching
 from pathreplay.inverse.values import Array, adapted_image, make_value, require_finite_array, seen
 from pathreplay.inverse.views import View
-from pathreplay.render.film import picture_shape
+from pathreplay.render.film import film_size, picture_shape, require_film
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator, told
 from pathreplay.scenes.loading import load_scene_with_floats
 from pathreplay.scenes.picture_files import MOST_PIXELS
 from pathreplay.scenes.stored import form_of
 from pathreplay.traversal import traversed
+
+# Bytes for each pixel of each view: its target, start and result stay, but go to the disk where they are many.
+_A_VIEW = 36
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], a
         raise PathreplayError(
             f"The target scene has {len(scene.sensors())} sensors, the job uses number {max(sensors.values())} (from 0)"
         )
-    limits.require_films(scene, sensors, {"target.spp": config.target.spp})
+    require_films(scene, sensors, {"target.spp": config.target.spp})
     targets: dict[str, Image] = {}
     for name, index in sensors.items():
         seed, _ = config.seeds(TARGET, index)
@@ -257,3 +259,11 @@ def _weight(what: str, mask: Image, name: str) -> Image:
         wrong = "is black" if not mask.any() else f"has the value {mask.min():g}"
         raise PathreplayError(f"Of sensor '{name}' {what} {wrong}; paint white what counts, or leave the sensor out")
     return (mask / mask.mean(dtype=np.float64)).astype(np.float32)
+
+
+def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str, int]) -> None:
+    """Raise PathreplayError unless memory and a kernel hold every sensor (name -> index) at each ``spp`` (by key)."""
+    pixels = 0
+    for name, index in sensors.items():
+        pixels += prod(film_size(scene.sensors()[index]))
+        require_film(scene.sensors()[index], f"sensor '{name}'", spp, min(pixels * _A_VIEW, ROOM))

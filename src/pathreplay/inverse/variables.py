@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import limits
+from pathreplay.inverse import parameter_limits
 from pathreplay.inverse.config import Config, Derivation, Parameter
 from pathreplay.inverse.exposures import EXPOSURE
 from pathreplay.inverse.grids import Levels, make_levels, resampled
@@ -117,7 +117,7 @@ def make_variables(
     for key, entry in keys.items():
         rate = entry.learning_rate or config.learning_rate
         # A step of SGD is the rate times the gradient, which may be anything.
-        bounded = limits.require_learning_rate if config.optimizer.type != "sgd" else lambda *_: None
+        bounded = parameter_limits.require_learning_rate if config.optimizer.type != "sgd" else lambda *_: None
         if entry.pose is None:
             form = AS_STORED if entry.shape else form_of(params, key)
             like = seen(params, key) if entry.shape is None else _numbers(key, entry.shape)
@@ -136,7 +136,7 @@ def make_variables(
             penalty = _penalty(params, key, entry, start, levels, modules)
             variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
             continue
-        limits.require_near(scene, key, parameters.get_array(params[key]), entry)
+        parameter_limits.require_near(scene, key, parameters.get_array(params[key]), entry)
         pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
         poses.append(pose)
         for part, name in pose.parts().items():
@@ -195,7 +195,7 @@ def _penalty(
 
 def _numbers(key: str, shape: list[int]) -> Any:
     """Zeros that nobody has written down. Raises PathreplayError where memory has no room for them."""
-    limits.require_values({key: prod(shape)})
+    parameter_limits.require_values({key: prod(shape)})
     return dr.zeros(mi.TensorXf, shape)
 
 
@@ -206,7 +206,7 @@ def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> L
         raise PathreplayError(
             f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'resolutions' out"
         )
-    limits.require_grid(key, start.shape, entry.resolutions)
+    parameter_limits.require_grid(key, start.shape, entry.resolutions)
     return make_levels(start.shape, entry.resolutions, refine_at)
 
 
