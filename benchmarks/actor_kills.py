@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import psutil
 import typer
 
-from pathreplay.inverse import make_config, optimize
+from pathreplay.jobs import make_config, optimize
 
 from .kills import JOB, outcome
 

@@ -1,4 +1,4 @@
-"""What the care around a pass costs in a process with a million objects: see `pathreplay.render.lifetimes`.
+"""What the care around a pass costs in a process with a million objects: see `pathreplay.integrators.lifetimes`.
 
     python -m benchmarks.collector
 
@@ -12,7 +12,7 @@ import gc
 import statistics
 import time
 
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 
 OBJECTS, ROUNDS, PASSES = 10**6, 1000, 20
 
@@ -23,7 +23,7 @@ def main() -> None:
     import drjit as dr
     import mitsuba as mi
 
-    from pathreplay.render.lifetimes import careful
+    from pathreplay.integrators.lifetimes import careful
 
     scene = mi.load_dict(mi.cornell_box())
     integrator = mi.load_dict({"type": "pathreplay", "max_depth": 4})

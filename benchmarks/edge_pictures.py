@@ -21,9 +21,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Polygon, Rectangle
 
-from pathreplay.backend import set_variant
-from pathreplay.check.objective import Objective
-from pathreplay.check.stencil import CENTRAL
+from pathreplay.platform.backend import set_variant
+from pathreplay.testing.objective import Objective
+from pathreplay.testing.stencil import CENTRAL
 
 from .plots import BLUE, GREY, IMAGES, ORANGE, RED
 

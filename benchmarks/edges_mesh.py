@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pathreplay.inverse import load_config, optimize
+from pathreplay.jobs import load_config, optimize
 from pathreplay.scenes.bodies import ball, knobs
 
 EXAMPLE = Path(__file__).parent.parent / "examples/mesh-by-shadows/config.toml"

@@ -19,11 +19,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.backend import set_variant
-from pathreplay.check.objective import Objective
-from pathreplay.check.statistics import gap, mean_and_error
-from pathreplay.check.stencil import CENTRAL
-from pathreplay.check.verdict import Z_LIMIT
+from pathreplay.platform.backend import set_variant
+from pathreplay.testing.objective import Objective
+from pathreplay.testing.statistics import gap, mean_and_error
+from pathreplay.testing.stencil import CENTRAL
+from pathreplay.testing.verdict import Z_LIMIT
 
 SceneDict = dict[str, Any]
 

@@ -13,9 +13,9 @@ import json
 import sys
 from pathlib import Path
 
-from pathreplay.inverse import load_config, optimize
-from pathreplay.inverse.config import Config
-from pathreplay.inverse.images import read_image
+from pathreplay.inverse.config.schema import Config
+from pathreplay.inverse.images.io import read_image
+from pathreplay.jobs import load_config, optimize
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 RUNS = Path("runs/edges-pose")

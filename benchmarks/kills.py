@@ -24,8 +24,8 @@ from typing import Annotated, Any
 import safetensors.numpy
 import typer
 
-from pathreplay.inverse.checksums import SEAL
-from pathreplay.inverse.run_folder import CHECKPOINT
+from pathreplay.inverse.loop.checksums import SEAL
+from pathreplay.runs.run_folder import CHECKPOINT
 
 WALLS = [f"{wall}.reflectance.value" for wall in ("red", "green", "white")]
 JOB: dict[str, Any] = {

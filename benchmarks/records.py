@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from pathreplay.errors import PathreplayError
-from pathreplay.files import file_problem
+from pathreplay.platform.files import file_problem
 
 from .drafts import ROOT, Draft
 from .measures.job import Record

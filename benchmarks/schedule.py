@@ -3,9 +3,9 @@
     python -m benchmarks.schedule [--measure]
 
 prints seconds of a step for 1 to 1000 devices and 10^6 to 10^9 parameters, for three ways to bring gradients together,
-and then what the schedule that jobs use (`pathreplay.inverse.scheduler`) makes of the first of them: devices that are
-slower and faster, shards that get stuck, devices that are lost. With `--measure` the costs of this machine are measured
-first and used; without it, those below, which were measured so. Takes a minute.
+and then what the schedule that jobs use (`pathreplay.distributed.scheduler`) makes of the first of them: devices that
+are slower and faster, shards that get stuck, devices that are lost. With `--measure` the costs of this machine are
+measured first and used; without it, those below, which were measured so. Takes a minute.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from pathreplay.inverse.evaluate import Shard
-from pathreplay.inverse.scheduler import Scheduler, Step
+from pathreplay.distributed.scheduler import Scheduler, Step
+from pathreplay.inverse.objective.evaluate import Shard
 
 DEVICES, PARAMETERS = (1, 10, 100, 1000), (10**6, 10**7, 10**8, 10**9)
 BYTES = 4
@@ -162,10 +162,10 @@ class _Devices:
 
 def measured(costs: Costs, size: int = 2 * 10**7) -> Costs:
     """The costs of this machine, in one thread; the optimiser's with its values in memory of Dr.Jit's."""
-    from pathreplay import backend
+    from pathreplay.platform import backend
 
     backend.set_variant("llvm_ad_rgb")
-    from pathreplay.inverse.optimiser import DrJitOptimiser
+    from pathreplay.inverse.optim.adaptive import DrJitOptimiser
 
     a, b = np.ones(size, np.float32), np.ones(size, np.float32)
     optimiser = DrJitOptimiser({"a": a})
@@ -176,8 +176,8 @@ def measured(costs: Costs, size: int = 2 * 10**7) -> Costs:
 
 def measured_ray(costs: Costs, size: int = 10**7) -> Costs:
     """The latency of a call of an actor here; prints how fast gradients come back from one on this machine, too."""
-    from pathreplay.inverse.executor_options import RayOptions
-    from pathreplay.inverse.ray_cluster import connected
+    from pathreplay.distributed.cluster import connected
+    from pathreplay.inverse.config.executor_options import RayOptions
 
     class Echo:
         def gradient(self, size: int) -> np.ndarray:

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 
 set_variant("llvm_ad_rgb")
 
@@ -32,10 +32,10 @@ import drjit as dr  # noqa: E402
 import mitsuba as mi  # noqa: E402
 from scipy.spatial import cKDTree  # noqa: E402
 
-from pathreplay.inverse import load_config, make_config, optimize  # noqa: E402
-from pathreplay.inverse.config import Config  # noqa: E402
-from pathreplay.inverse.grids import rmse  # noqa: E402
-from pathreplay.inverse.pose import make_pose  # noqa: E402
+from pathreplay.inverse.config.schema import Config  # noqa: E402
+from pathreplay.inverse.parameters.grids import rmse  # noqa: E402
+from pathreplay.inverse.parameters.pose import make_pose  # noqa: E402
+from pathreplay.jobs import load_config, make_config, optimize  # noqa: E402
 from pathreplay.scenes.loading import load_scene  # noqa: E402
 from pathreplay.scenes.parameters import get_array, to_value  # noqa: E402
 

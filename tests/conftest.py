@@ -21,14 +21,14 @@ import unoptimised
 
 if unoptimised.is_asked_for():
     unoptimised.keep_apart()
-from pathreplay.backend import set_variant  # before mitsuba: points Dr.Jit at a libLLVM
+from pathreplay.platform.backend import set_variant  # before mitsuba: points Dr.Jit at a libLLVM
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
 
-from pathreplay.inverse import report  # isort: skip
-from pathreplay.inverse.images import png_bytes  # isort: skip
+from pathreplay.report import report  # isort: skip
+from pathreplay.inverse.images.io import png_bytes  # isort: skip
 from variant import VARIANT  # isort: skip
 
 #: Files that compute and neither read nor write pictures, which a pool of one thread would wait for for ever.

@@ -18,8 +18,8 @@ import numpy as np
 
 import ordinary_scenes
 from ordinary_files import Patch, write_obj, write_ply
-from pathreplay.check.objective import Move, Objective
-from pathreplay.check.stencil import CENTRAL, WIDE
+from pathreplay.testing.objective import Move, Objective
+from pathreplay.testing.stencil import CENTRAL, WIDE
 from truth import add, bitmap, noise, rgb, rotate, translate, translate_vertices, turn_vertices
 
 T = mi.ScalarTransform4f

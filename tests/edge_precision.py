@@ -18,9 +18,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pathreplay import backend
-from pathreplay.check.statistics import gap
-from pathreplay.render import boundary
+from pathreplay.integrators import boundary_term as boundary
+from pathreplay.platform import backend
+from pathreplay.testing.statistics import gap
 from variant import VARIANT
 
 backend.set_variant(VARIANT)

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from edge_scenes import BY_NAME, weights
-from pathreplay.check.statistics import gap
-from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 from truth import ROWS, TRANSPOSE_MAX, Bench, Case, Row
 
 QUICK = ("shadow_all",)

@@ -22,7 +22,7 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from pathreplay.backend import set_variant  # before drjit and mitsuba
+from pathreplay.platform.backend import set_variant  # before drjit and mitsuba
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip

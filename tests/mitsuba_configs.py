@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.check.objective import Move
+from pathreplay.testing.objective import Move
 from truth import add, bitmap, noise, rgb, translate, translate_vertices
 
 

@@ -23,11 +23,11 @@ import mitsuba as mi
 import numpy as np
 
 from mitsuba_configs import CONFIGS, Config, Limits
-from pathreplay.backend import set_variant
-from pathreplay.check.objective import Objective
-from pathreplay.check.statistics import gap
-from pathreplay.check.stencil import CENTRAL
+from pathreplay.platform.backend import set_variant
 from pathreplay.scenes.parameters import get_array
+from pathreplay.testing.objective import Objective
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.stencil import CENTRAL
 
 SMALL = 32
 """Pixels in a row of the film, at most, unless in full."""

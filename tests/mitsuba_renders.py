@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.stats import norm
 
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 from variant import VARIANT
 
 SCENES = "resources/data/tests/scenes"

@@ -24,7 +24,7 @@ import numpy as np
 
 from mitsuba_configs import Limits
 from mitsuba_errors import ADJOINT, FLOOR_FORWARD, FLOOR_PRIMAL, FLOOR_REVERSE, LANES, relative
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 from variant import VARIANT
 
 TESTS = "src/integrators/tests/test_ad_integrators.py"

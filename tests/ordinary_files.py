@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from PIL import Image
 
-from pathreplay.inverse.images import exr_bytes
+from pathreplay.inverse.images.io import exr_bytes
 
 
 @dataclass(frozen=True)

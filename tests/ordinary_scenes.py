@@ -19,7 +19,7 @@ from ordinary_files import (
     write_png,
     write_serialized,
 )
-from pathreplay.media.volume_files import save_vol
+from pathreplay.scenes.volume_files import save_vol
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import io
 import numpy as np
 import PIL.Image
 
-from pathreplay.inverse.page_parts import uri
-from pathreplay.pages.page import (
+from pathreplay.report.page_parts import uri
+from pathreplay.report.pages.page import (
     Comparison,
     Head,
     Mesh,

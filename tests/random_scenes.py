@@ -20,7 +20,7 @@ from unoptimised import keep_apart, leave_unoptimised
 if __name__ == "__main__":
     keep_apart()
 import pathreplay
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_rgb", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral")
 BLOCK = 10

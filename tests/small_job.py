@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from pathreplay import interrupts
-from pathreplay.inverse import make_config
-from pathreplay.inverse.checksums import SEAL
+from pathreplay.inverse.loop.checksums import SEAL
+from pathreplay.jobs import make_config
+from pathreplay.platform import interrupts
 from test_inverse_run import JOB, SCENE
 
 #: Far above what a small job takes on a loaded machine.
@@ -26,7 +26,7 @@ ERROR = "pathreplay: error: "
 
 def write_job(folder: Path, **changes: Any) -> Path:
     """Scene and job in ``folder``; returns the config."""
-    from pathreplay.inverse.images import exr_bytes
+    from pathreplay.inverse.images.io import exr_bytes
 
     (folder / "room.xml").write_text(SCENE)
     texels = np.array([[0.1, 0.4], [0.6, 0.9]], np.float32)[:, :, None] * np.array([1, 0.8, 0.6], np.float32)

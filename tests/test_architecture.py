@@ -16,19 +16,20 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.gradient.adjoint import NonFiniteCounter
-from pathreplay.gradient.driver import Driver, ForwardDriver
-from pathreplay.gradient.forward import forward
-from pathreplay.gradient.sweep import sweep
-from pathreplay.inverse import losses, make_config, optimize
-from pathreplay.inverse.evaluate import Evaluator, Executor, Local, Shard
-from pathreplay.inverse.loop import new_run
-from pathreplay.inverse.problem import build_problem
-from pathreplay.render.camera_pass import Pass
-from pathreplay.render.lifetimes import careful
-from pathreplay.render.term import Term
+from pathreplay.adjoint.autodiff import NonFiniteCounter
+from pathreplay.adjoint.driver import Driver, ForwardDriver
+from pathreplay.adjoint.forward import forward
+from pathreplay.adjoint.sweep import sweep
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.lifetimes import careful
+from pathreplay.integrators.term import Term
+from pathreplay.inverse.loop.loop import new_run
+from pathreplay.inverse.losses import pixelwise as losses
+from pathreplay.inverse.objective.evaluate import Evaluator, Executor, Local, Shard
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import make_config, optimize
+from pathreplay.platform.threads import one_thread
 from pathreplay.scenes.parameters import get_array
-from pathreplay.threads import one_thread
 from test_inverse_run import JOB, room  # noqa: F401 (room: its folder, for the tests that ask for it)
 
 PAGE = Path(__file__).parents[1] / "docs/architecture.md"

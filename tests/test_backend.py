@@ -11,9 +11,11 @@ import mitsuba as mi
 import pytest
 
 import pathreplay
-from pathreplay import backend, doctor, libllvm, plugins
+from pathreplay import doctor
 from pathreplay.errors import PathreplayError
-from pathreplay.libllvm import LlvmLibrary
+from pathreplay.platform import backend, llvm
+from pathreplay.platform import registration as plugins
+from pathreplay.platform.llvm import LlvmLibrary
 
 GOOD = os.environ.get("DRJIT_LIBLLVM_PATH", "")
 #: A Python of its own says which plugins load in it and which libLLVM it has.
@@ -46,14 +48,14 @@ def bogus(tmp_path: Path) -> str:
     ],
 )
 def test_version_in_path(path: str, version: tuple[int, ...]) -> None:
-    assert libllvm.version_in_path(path) == version
+    assert llvm.version_in_path(path) == version
 
 
 def test_candidates_come_in_the_promised_order_each_file_once(monkeypatch: pytest.MonkeyPatch, bogus: str) -> None:
-    monkeypatch.setattr(libllvm, "ASKED_FOR", bogus)
-    monkeypatch.setattr(libllvm, "pip_library", lambda: "/venv/lib/libLLVM.so.23.1")
-    monkeypatch.setattr(libllvm, "system_libraries", lambda: ["/usr/lib/libLLVM.so.20.1", "/venv/lib/libLLVM.so.23.1"])
-    assert list(libllvm.candidates()) == [
+    monkeypatch.setattr(llvm, "ASKED_FOR", bogus)
+    monkeypatch.setattr(llvm, "pip_library", lambda: "/venv/lib/libLLVM.so.23.1")
+    monkeypatch.setattr(llvm, "system_libraries", lambda: ["/usr/lib/libLLVM.so.20.1", "/venv/lib/libLLVM.so.23.1"])
+    assert list(llvm.candidates()) == [
         (bogus, "DRJIT_LIBLLVM_PATH"),
         ("/venv/lib/libLLVM.so.23.1", "pip"),
         ("/usr/lib/libLLVM.so.20.1", "system"),
@@ -64,9 +66,9 @@ def test_system_libraries_run_from_new_to_old(monkeypatch: pytest.MonkeyPatch, t
     for name in ("libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-9.so.1"):
         (tmp_path / name).touch()
     (tmp_path / "libLLVM.so").symlink_to(tmp_path / "libLLVM.so.19.1")
-    monkeypatch.setattr(libllvm, "_SYSTEM_PATTERNS", {libllvm.sys.platform: (str(tmp_path / "libLLVM*.so*"),)})
-    monkeypatch.setattr(libllvm, "_known_to_linker", list)
-    names = [Path(path).name for path in libllvm.system_libraries()]
+    monkeypatch.setattr(llvm, "_SYSTEM_PATTERNS", {llvm.sys.platform: (str(tmp_path / "libLLVM*.so*"),)})
+    monkeypatch.setattr(llvm, "_known_to_linker", list)
+    names = [Path(path).name for path in llvm.system_libraries()]
     assert names == ["libLLVM.so.19.1", "libLLVM-15.so.1", "libLLVM-9.so.1"]
 
 
@@ -74,29 +76,29 @@ def test_system_libraries_run_from_new_to_old(monkeypatch: pytest.MonkeyPatch, t
 
 
 def test_the_library_in_use_passes_its_trial() -> None:
-    library = libllvm.probe(GOOD)
+    library = llvm.probe(GOOD)
     assert library.works, library.message
     assert library.version == ".".join(str(number) for number in backend.loaded_version())
 
 
 def test_a_file_that_is_no_library_fails_its_trial_with_a_reason(bogus: str) -> None:
-    library = libllvm.probe(bogus)
+    library = llvm.probe(bogus)
     assert not library.works
     assert bogus in library.message and "\n" not in library.message
 
 
-@pytest.mark.parametrize("path", libllvm.system_libraries())
+@pytest.mark.parametrize("path", llvm.system_libraries())
 def test_a_library_of_the_system_is_the_version_that_its_name_says_or_fails_with_a_reason(path: str) -> None:
-    library = libllvm.probe(path)
-    said = libllvm.version_in_path(os.path.realpath(path))
+    library = llvm.probe(path)
+    said = llvm.version_in_path(os.path.realpath(path))
     if not library.works:
         assert "\n" not in library.message
     elif said:
-        assert int(library.version.split(".")[0]) == said[0] >= libllvm.OLDEST_USABLE_MAJOR
+        assert int(library.version.split(".")[0]) == said[0] >= llvm.OLDEST_USABLE_MAJOR
 
 
 def test_a_crash_is_told_in_one_line() -> None:
-    _, message = libllvm.run_trial(
+    _, message = llvm.run_trial(
         "import os, sys; print('LLVM ERROR: Cannot select: 0x55d7: f32 = fminimum 0x1', file=sys.stderr); os.abort()",
         {},
         os.environ,
@@ -105,14 +107,14 @@ def test_a_crash_is_told_in_one_line() -> None:
 
 
 def test_find_llvm_passes_over_what_fails(monkeypatch: pytest.MonkeyPatch, bogus: str) -> None:
-    monkeypatch.setattr(libllvm, "candidates", lambda: iter([(bogus, "DRJIT_LIBLLVM_PATH"), (GOOD, "pip")]))
-    assert libllvm.find_llvm().path == GOOD
+    monkeypatch.setattr(llvm, "candidates", lambda: iter([(bogus, "DRJIT_LIBLLVM_PATH"), (GOOD, "pip")]))
+    assert llvm.find_llvm().path == GOOD
 
 
 def test_find_llvm_names_what_it_tried_and_the_way_out(monkeypatch: pytest.MonkeyPatch, bogus: str) -> None:
-    monkeypatch.setattr(libllvm, "candidates", lambda: iter([(bogus, "system")]))
+    monkeypatch.setattr(llvm, "candidates", lambda: iter([(bogus, "system")]))
     with pytest.raises(PathreplayError, match=r"no libLLVM .*libLLVM\.so\.99\.1.*pip install karellen-llvm-core"):
-        libllvm.find_llvm()
+        llvm.find_llvm()
 
 
 # ---------------------------------------------------------------------------------------------------------- variants
@@ -126,7 +128,7 @@ def test_find_llvm_names_what_it_tried_and_the_way_out(monkeypatch: pytest.Monke
 def test_set_variant_keeps_what_can_differentiate_and_replaces_what_cannot(run_python, active, expected) -> None:
     code = f"""
 import pathreplay, drjit as dr, mitsuba as mi
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 if {active!r}:
     mi.set_variant({active!r})
 default = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
@@ -161,7 +163,7 @@ def test_reload_is_refused_while_there_are_variables_to_lose(bogus: str) -> None
 
 # ----------------------------------------------------------------------------------------------- importing pathreplay
 
-needs_pip_llvm = pytest.mark.skipif(libllvm.pip_library() is None, reason="karellen-llvm-core is not installed")
+needs_pip_llvm = pytest.mark.skipif(llvm.pip_library() is None, reason="karellen-llvm-core is not installed")
 
 
 @needs_pip_llvm
@@ -210,7 +212,7 @@ class Broken:
             raise {failure}
 sys.meta_path.insert(0, Broken())
 import pathreplay
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 from pathreplay.doctor import examine
 report = examine()
 report.print()
@@ -243,7 +245,7 @@ def test_a_known_abort_is_announced_before_it_happens(
     assert "libLLVM 15.0.6" in caplog.text and "DRJIT_LIBLLVM_PATH" in caplog.text
 
 
-OLD = next((path for path in libllvm.system_libraries() if libllvm.version_in_path(path)[:1] in ((15,), (16,))), None)
+OLD = next((path for path in llvm.system_libraries() if llvm.version_in_path(path)[:1] in ((15,), (16,))), None)
 
 
 @needs_pip_llvm
@@ -261,7 +263,7 @@ assert 0.05 < dr.mean(image.array)[0] < 0.5
 {LOAD}"""
     done = run_python(code, env={"DRJIT_LIBLLVM_PATH": OLD})
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split("\n")[0] == f"{libllvm.version_in_path(str(OLD))[0]} [1, 2, 1]"
+    assert done.stdout.split("\n")[0] == f"{llvm.version_in_path(str(OLD))[0]} [1, 2, 1]"
     assert done.stdout.split()[-1] == "23"
 
 
@@ -288,8 +290,8 @@ def test_every_back_end_that_fails_has_a_way_out(report: doctor.DoctorReport) ->
 
 
 def test_the_doctor_without_any_libllvm_says_how_to_get_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(libllvm, "candidates", lambda: iter([]))
-    monkeypatch.setattr(libllvm, "run_trial", lambda *_: ("", "no GPU"))
+    monkeypatch.setattr(llvm, "candidates", lambda: iter([]))
+    monkeypatch.setattr(llvm, "run_trial", lambda *_: ("", "no GPU"))
     report = doctor.examine()
     assert not report.works
     assert any("pip install karellen-llvm-core" in way_out for way_out in report.ways_out)

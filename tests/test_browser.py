@@ -19,11 +19,11 @@ import PIL.Image
 import pytest
 
 from page_samples import HOSTILE, png, sample
-from pathreplay.inverse.page_parts import uri
-from pathreplay.inverse.previews import FOLDER, PAGE, PAGES, STOP
-from pathreplay.pages.document import document
-from pathreplay.pages.page import Page
-from pathreplay.watch.server import RunServer
+from pathreplay.report.live_page import FOLDER, PAGE, PAGES, STOP
+from pathreplay.report.page_parts import uri
+from pathreplay.report.pages.document import document
+from pathreplay.report.pages.page import Page
+from pathreplay.report.watch.server import RunServer
 from small_job import TIMEOUT_S, ended, start, wait_for, write_job
 
 playwright = pytest.importorskip("playwright.sync_api")

@@ -26,14 +26,15 @@ from edge_ordinary import (
     sensor,
 )
 from edge_truth import hold_agreement
-from pathreplay.check.objective import smooth_weights
-from pathreplay.check.statistics import gap
-from pathreplay.check.stencil import CENTRAL
-from pathreplay.check.verdict import Z_LIMIT
-from pathreplay.render import film_flow, film_motion
-from pathreplay.render.camera_pass import Pass
-from pathreplay.render.film_motion import FilmMotion
-from pathreplay.render.term import TermResult
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.film import camera_flow as film_flow
+from pathreplay.integrators.film import motion as film_motion
+from pathreplay.integrators.film.motion import FilmMotion
+from pathreplay.integrators.term import TermResult
+from pathreplay.testing.objective import smooth_weights
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.stencil import CENTRAL
+from pathreplay.testing.verdict import Z_LIMIT
 from pathreplay.transport.meet import meet
 from truth import add, rotate
 

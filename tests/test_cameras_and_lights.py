@@ -8,10 +8,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.check import check_gradient
-from pathreplay.check.command import check_all
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.parameters import carries_derivative, require_differentiable, resolve_differentiable
+from pathreplay.testing import check_gradient
+from pathreplay.testing.command import check_all
 
 
 @pytest.fixture(scope="module")

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.capture import read_capture
-from pathreplay.inverse.config import Capture
-from pathreplay.inverse.exposures import exposed
-from pathreplay.inverse.images import exr_bytes, picture_size, png_bytes, read_image
-from pathreplay.inverse.problem import build_problem
+from pathreplay.inverse.config.schema import Capture
+from pathreplay.inverse.dataset.capture import read_capture
+from pathreplay.inverse.images.io import exr_bytes, picture_size, png_bytes, read_image
+from pathreplay.inverse.parameters.exposures import exposed
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import make_config, optimize
 from pathreplay.output.export import export_run
 from pathreplay.scenes.loading import load_scene_for
 

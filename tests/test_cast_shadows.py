@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from edge_ordinary import T, film, sensor
-from pathreplay.gradient.cast_shadows import cast_shadows, casters
-from pathreplay.gradient.lamps import Lamp
-from pathreplay.gradient.secondary_boundary import BORDER, SquareLine
-from pathreplay.render.boundary import Boundary
-from pathreplay.render.camera_pass import Pass
-from pathreplay.render.places import FilmPlaces
+from pathreplay.boundary.cast_shadows import cast_shadows, casters
+from pathreplay.boundary.emitters import Lamp
+from pathreplay.boundary.secondary import BORDER, SquareLine
+from pathreplay.integrators.boundary_term import Boundary
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.film.domain import FilmPlaces
 from pathreplay.transport.vertex import TraceConfig
 
 SIDE = 48

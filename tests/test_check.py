@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 
 from pathreplay import cli
-from pathreplay.check import check_gradient, command
-from pathreplay.check.direction import choose_line
-from pathreplay.check.objective import smooth_weights
-from pathreplay.check.reference import integrator_under_test, read_limits, reference_integrator
-from pathreplay.check.statistics import gap, normal
-from pathreplay.check.stencil import BACKWARD, CENTRAL, FORWARD, UPWARD, WIDE, Stencil
-from pathreplay.check.verdict import Judgement, judge
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.parameters import get_array
+from pathreplay.testing import check_gradient, command
+from pathreplay.testing.direction import choose_line
+from pathreplay.testing.objective import smooth_weights
+from pathreplay.testing.reference import integrator_under_test, read_limits, reference_integrator
+from pathreplay.testing.statistics import gap, normal
+from pathreplay.testing.stencil import BACKWARD, CENTRAL, FORWARD, UPWARD, WIDE, Stencil
+from pathreplay.testing.verdict import Judgement, judge
 
 # ------------------------------------------------------------------------------
 #  Verdict

@@ -189,7 +189,7 @@ sys.argv = ["pathreplay", "--help"]
 try:
     cli.main()
 except SystemExit:
-    ours = {"pathreplay.inverse", "pathreplay.check", "pathreplay.render.integrator"}
+    ours = {"pathreplay.jobs", "pathreplay.testing", "pathreplay.integrators.integrator"}
     heavy = ours | {"matplotlib", "scipy", "pydantic"}
     print("imported:", sorted(heavy & set(sys.modules)))
 """
@@ -199,7 +199,7 @@ except SystemExit:
 def test_importing_pathreplay_is_light_and_offers_its_public_names(run_python) -> None:
     code = """
 import sys, pathreplay
-assert "matplotlib" not in sys.modules and "pathreplay.inverse" not in sys.modules
+assert "matplotlib" not in sys.modules and "pathreplay.jobs" not in sys.modules
 print(*[name for name in pathreplay.__all__ if name not in dir(pathreplay)])
 try:
     pathreplay.no_such_name

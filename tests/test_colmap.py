@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config
-from pathreplay.inverse.capture import Shot, read_capture
-from pathreplay.inverse.capture_options import Capture
-from pathreplay.inverse.images import exr_bytes, picture_size, png_bytes
-from pathreplay.inverse.lens import Lens
-from pathreplay.inverse.problem import build_problem
+from pathreplay.inverse.config.capture_options import Capture
+from pathreplay.inverse.dataset.capture import Shot, read_capture
+from pathreplay.inverse.dataset.undistortion import Lens
+from pathreplay.inverse.images.io import exr_bytes, picture_size, png_bytes
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import make_config
 from pathreplay.scenes.loading import load_scene_for
 
 DATA = Path(__file__).parent / "data" / "colmap"

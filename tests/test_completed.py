@@ -9,10 +9,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.inverse import make_config
-from pathreplay.inverse.problem import Problem, build_problem
+from pathreplay.integrators.path_limits import Limits, read_limits
+from pathreplay.inverse.problem.problem import Problem, build_problem
+from pathreplay.jobs import make_config
 from pathreplay.output.export import export_run
-from pathreplay.render.path_limits import Limits, read_limits
 
 # A lamp in view, between two walls that light each other: depth and hidden emitters both show.
 SCENE = """<scene version="3.0.0">
@@ -101,7 +101,7 @@ def test_targets_of_a_scene_with_media_are_rendered_with_them() -> None:
 
 
 def test_a_run_is_exported_with_the_depth_that_it_had() -> None:
-    from pathreplay.inverse import optimize
+    from pathreplay.jobs import optimize
 
     problem()
     folder = optimize(make_config(JOB), progress=False).folder

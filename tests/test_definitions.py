@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from pathreplay.cli import app
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import load_config, optimize
-from pathreplay.inverse.definitions import defined
+from pathreplay.inverse.config.definitions import defined
+from pathreplay.jobs import load_config, optimize
 from test_steps import JOB, SCENE
 
 TABLE: dict[str, Any] = {"scene": "a.xml", "spp": 16, "parameters": [{"key": "a"}, {"key": "b", "lower": 0.0}]}

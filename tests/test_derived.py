@@ -16,11 +16,11 @@ import pytest
 import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import RunResult, make_config, optimize
-from pathreplay.inverse.evaluate import Evaluator, Shard
-from pathreplay.inverse.images import exr_bytes
-from pathreplay.inverse.penalties import Laplacian
-from pathreplay.inverse.problem import Problem, build_problem, put_values
+from pathreplay.inverse.images.io import exr_bytes
+from pathreplay.inverse.objective.evaluate import Evaluator, Shard
+from pathreplay.inverse.parameters.regularizers import Laplacian
+from pathreplay.inverse.problem.problem import Problem, build_problem, put_values
+from pathreplay.jobs import RunResult, make_config, optimize
 from pathreplay.output.export import export_run
 from pathreplay.scenes.bodies import ball, mesh
 

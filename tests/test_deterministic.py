@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from pathreplay.inverse import optimize
+from pathreplay.jobs import optimize
 from small_job import checkpoint_bits, ended, kill_at_checkpoint, start, write_job
 from test_inverse_run import TEXTURE
 

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from media_scenes import cloud, heterogeneous, smooth
-from pathreplay import PathreplayError, device
-from pathreplay.device import Device
-from pathreplay.gradient import record
-from pathreplay.gradient.record import LARGEST_RECORD, Layout, deepest, largest_record, record_type, room_for
-from pathreplay.render import interior, pixels
+from pathreplay import PathreplayError
+from pathreplay.adjoint import record
+from pathreplay.adjoint.record import LARGEST_RECORD, Layout, deepest, largest_record, record_type, room_for
+from pathreplay.integrators import interior
+from pathreplay.integrators.film import pixel_passes as pixels
+from pathreplay.platform import device
+from pathreplay.platform.device import Device
 
 H100 = Device("cuda", "NVIDIA H100 80GB HBM3", 2048 * 132, 80 * 10**9)
 LAPTOP = Device("cuda", "GeForce", 1536 * 20, 4 * 10**9)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from pathreplay import PathreplayError
-from pathreplay.gradient.driver import Driver, ForwardDriver
-from pathreplay.gradient.forward import forward
-from pathreplay.gradient.replay import replay
-from pathreplay.gradient.sweep import sweep
-from pathreplay.rivals.listing import listing
-from pathreplay.rivals.radiative import radiative
-from pathreplay.rivals.tape import tape_backward, tape_forward
+from pathreplay.adjoint.driver import Driver, ForwardDriver
+from pathreplay.adjoint.forward import forward
+from pathreplay.adjoint.replay import replay
+from pathreplay.adjoint.sweep import sweep
+from pathreplay.integrators.baselines.listing import listing
+from pathreplay.integrators.baselines.naive import tape_backward, tape_forward
+from pathreplay.integrators.baselines.radiative import radiative
 from pathreplay.scenes.parameters import get_array
 from test_architecture import FLOOR, LAMP, conforms, driven, driven_forward, ray_weights, world
 

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 import edge_scenes as scenes
-from pathreplay.gradient.counter_sampler import ROUNDS, CounterSampler, key_of, quasi_random
-from pathreplay.gradient.crofton import BEYOND, BISECTIONS, PlaneLine, Resampled, VisibilityProbe, bisect, detect
-from pathreplay.gradient.lamps import sample_at
-from pathreplay.gradient.observer import ObserverVertex
-from pathreplay.gradient.secondary_boundary import BORDER
-from pathreplay.gradient.segment_density import SegmentDensity
-from pathreplay.render.boundary import INNER_LENGTHS
-from pathreplay.render.camera_pass import Pass
-from pathreplay.render.facts import SceneFacts
-from pathreplay.render.places import FilmPlaces
-from pathreplay.threads import one_thread
-from pathreplay.transport.smoothing_groups import smoothing_groups
+from pathreplay.boundary.crofton import BEYOND, BISECTIONS, PlaneLine, Resampled, VisibilityProbe, bisect, detect
+from pathreplay.boundary.emitters import sample_at
+from pathreplay.boundary.observer import ObserverVertex
+from pathreplay.boundary.secondary import BORDER
+from pathreplay.boundary.segment_density import SegmentDensity
+from pathreplay.integrators.boundary_term import INNER_LENGTHS
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.film.domain import FilmPlaces
+from pathreplay.integrators.scene_facts import SceneFacts
+from pathreplay.platform.threads import one_thread
+from pathreplay.samplers.counter_sampler import ROUNDS, CounterSampler, key_of, quasi_random
+from pathreplay.transport.facts.smoothing_groups import smoothing_groups
 
 
 def world(**film: Any) -> mi.Scene:

@@ -11,12 +11,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.check import check_gradient
-from pathreplay.render.boundary import Boundary
-from pathreplay.render.camera_pass import Pass
-from pathreplay.render.film_motion import FilmMotion
-from pathreplay.render.integrator import EDGES
-from pathreplay.threads import one_thread
+from pathreplay.integrators.boundary_term import Boundary
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.film.motion import FilmMotion
+from pathreplay.integrators.integrator import EDGES
+from pathreplay.platform.threads import one_thread
+from pathreplay.testing import check_gradient
 
 T = mi.ScalarTransform4f
 FILM = {"type": "hdrfilm", "width": 8, "height": 8, "pixel_format": "rgb", "rfilter": {"type": "box"}}

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pathreplay.check.objective import integrator_name
-from pathreplay.check.reference import integrator_under_test
 from pathreplay.cli import app
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import load_config, make_config, optimize
-from pathreplay.inverse.problem import build_problem
-from pathreplay.inverse.surface import Surface
+from pathreplay.inverse.parameters.mesh import Surface
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import load_config, make_config, optimize
 from pathreplay.scenes.bodies import ball, knobs, mesh
 from pathreplay.scenes.loading import load_scene
+from pathreplay.testing.objective import integrator_name
+from pathreplay.testing.reference import integrator_under_test
 
 
 @pytest.fixture(autouse=True)

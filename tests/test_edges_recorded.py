@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathreplay.inverse.config import make_config
-from pathreplay.inverse.problem import build_problem
+from pathreplay.inverse.config.schema import make_config
+from pathreplay.inverse.problem.problem import build_problem
 from test_pixel_sweep import steps
 
 SCENE = """<scene version="3.0.0">

@@ -11,9 +11,9 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.images import over_black, read_image, transparent_share
-from pathreplay.render.edge_notes import edges_note, moves_edges
+from pathreplay.integrators.edge_notes import edges_note, moves_edges
+from pathreplay.inverse.images.io import over_black, read_image, transparent_share
+from pathreplay.jobs import make_config, optimize
 
 SKY = mi.Bitmap(np.full((4, 8, 3), 0.5, np.float32))
 FILM = {"type": "hdrfilm", "width": 4, "height": 4}

@@ -9,14 +9,14 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from pathreplay.interrupts import Stop
-from pathreplay.inverse import make_config
-from pathreplay.inverse.evaluate import Evaluation, Evaluator, Shard, total
-from pathreplay.inverse.events import Refined, Started, Stepped, Stopped
-from pathreplay.inverse.loop import iterate, new_run, render_views, take_step
-from pathreplay.inverse.problem import Problem, build_problem
-from pathreplay.inverse.targets import Targets
-from pathreplay.threads import one_thread
+from pathreplay.inverse.dataset.targets import Targets
+from pathreplay.inverse.loop.events import Refined, Started, Stepped, Stopped
+from pathreplay.inverse.loop.loop import iterate, new_run, render_views, take_step
+from pathreplay.inverse.objective.evaluate import Evaluation, Evaluator, Shard, total
+from pathreplay.inverse.problem.problem import Problem, build_problem
+from pathreplay.jobs import make_config
+from pathreplay.platform.interrupts import Stop
+from pathreplay.platform.threads import one_thread
 from test_deterministic import CLOUD
 from test_inverse_run import JOB, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 
@@ -155,7 +155,7 @@ def test_views_are_not_recorded_where_there_are_too_many(monkeypatch: pytest.Mon
     problem = problem_of(**SWEEP)
     sensors = len(problem.scene.sensors())
     for most, records in ((sensors, True), (sensors - 1, False)):
-        monkeypatch.setattr("pathreplay.inverse.evaluate.MOST_SENSORS", most)
+        monkeypatch.setattr("pathreplay.inverse.objective.evaluate.MOST_SENSORS", most)
         assert Evaluator(problem, problem.integrator).freezes == records
 
 

@@ -11,10 +11,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.gradient.pixel_numbers import SETS
-from pathreplay.inverse import make_config, optimize
-from pathreplay.render.camera_pass import Pass
-from pathreplay.transport.owen_sobol import OwenSobolSampler, in_order, key_of
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.jobs import make_config, optimize
+from pathreplay.samplers.owen_sobol import OwenSobolSampler, in_order, key_of
+from pathreplay.samplers.pixel_samples import SETS
 
 METHODS: dict[str, dict[str, Any]] = {
     "even": {"type": "pathreplay"},

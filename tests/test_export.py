@@ -17,15 +17,15 @@ import pytest
 
 from pathreplay import cli
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.capture import read_capture
-from pathreplay.inverse.config import PICTURE, Capture
-from pathreplay.inverse.images import exr_bytes, read_image
-from pathreplay.media.volume_files import load_volume
+from pathreplay.inverse.config.schema import PICTURE, Capture
+from pathreplay.inverse.dataset.capture import read_capture
+from pathreplay.inverse.images.io import exr_bytes, read_image
+from pathreplay.jobs import make_config, optimize
 from pathreplay.output.export import export_run, write_files
 from pathreplay.output.scene_folder import Exported, Source, exported, require_same
-from pathreplay.scenes.builtin_scenes import BUILTINS
+from pathreplay.scenes.builtin import BUILTINS
 from pathreplay.scenes.parameters import get_array
+from pathreplay.scenes.volume_files import load_volume
 from test_inverse_run import JOB, SCENE
 
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.evaluate import Evaluator, Shard
-from pathreplay.inverse.exposures import EXPOSURE, Factors, fitted
-from pathreplay.inverse.images import exr_bytes
-from pathreplay.inverse.problem import Problem, build_problem
-from pathreplay.inverse.values import Arrays
+from pathreplay.inverse.images.io import exr_bytes
+from pathreplay.inverse.objective.evaluate import Evaluator, Shard
+from pathreplay.inverse.parameters.exposures import EXPOSURE, Factors, fitted
+from pathreplay.inverse.parameters.values import Arrays
+from pathreplay.inverse.problem.problem import Problem, build_problem
+from pathreplay.jobs import make_config, optimize
 
 KEY = "wall.bsdf.reflectance.value"
 SUN = """<emitter type="directional"><vector name="direction" value="0,0,-1"/>

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import iterate, make_config, optimize
-from pathreplay.inverse.exposures import EXPOSURE, Factors
+from pathreplay.inverse.parameters.exposures import EXPOSURE, Factors
+from pathreplay.jobs import iterate, make_config, optimize
 from small_job import checkpoint_bits
 from test_exposures import JOB, KEY, LEVELS, folder  # noqa: F401 (folder: for every test)
 

@@ -10,8 +10,8 @@ import drjit as dr
 import pytest
 
 from pathreplay import PathreplayError, cli
-from pathreplay.check import gpu
-from pathreplay.check.gpu import TIMINGS, TRUTHS, Item, examine
+from pathreplay.testing import gpu
+from pathreplay.testing.gpu import TIMINGS, TRUTHS, Item, examine
 
 
 def test_without_a_gpu_one_line_says_so_and_nothing_is_written(

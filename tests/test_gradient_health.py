@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.interrupts import Stop
-from pathreplay.inverse import load_config, make_config, optimize
-from pathreplay.inverse.checkpoint import Entry
-from pathreplay.inverse.evaluate import Evaluation, Local, Shard
-from pathreplay.inverse.events import LowSNR
-from pathreplay.inverse.loop import iterate, new_run
-from pathreplay.inverse.noise import WINDOW, next_spp, ratios
-from pathreplay.inverse.noise_options import AutoSpp
-from pathreplay.inverse.problem import build_problem
-from pathreplay.inverse.progress import Progress
+from pathreplay.inverse.config.noise_options import AutoSpp
+from pathreplay.inverse.loop.checkpoint import Entry
+from pathreplay.inverse.loop.events import LowSNR
+from pathreplay.inverse.loop.loop import iterate, new_run
+from pathreplay.inverse.loop.noise import WINDOW, next_spp, ratios
+from pathreplay.inverse.objective.evaluate import Evaluation, Local, Shard
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import load_config, make_config, optimize
+from pathreplay.platform.interrupts import Stop
+from pathreplay.report.progress import Progress
 from test_steps import JOB, SCENE
 
 KEY = JOB["parameters"][0]["key"]
@@ -207,7 +207,7 @@ def test_automatic_samples_double_and_go_on_from_a_checkpoint() -> None:
     changes = {"spp": "auto", "auto_spp": {"ratio": 1e6, "lowest": 2, "highest": 8}, "iterations": 3 * WINDOW}
     whole = optimize(make_config({**JOB, **changes, "output": "whole"}), progress=False)
     assert [entry.spp for entry in whole.history] == [2] * WINDOW + [4] * WINDOW + [8] * WINDOW
-    from pathreplay.inverse import iterate as states
+    from pathreplay.jobs import iterate as states
 
     for state in states(make_config({**JOB, **changes, "output": "cut"})):
         if state.iteration == WINDOW + 2:

@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.check.statistics import gap
-from pathreplay.check.verdict import Z_LIMIT
-from pathreplay.media import cellwalk
+from pathreplay.plugins import grid_traversal
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.verdict import Z_LIMIT
 
 RAYS = 1 << 12
 T = mi.ScalarTransform4f
@@ -116,7 +116,7 @@ def test_no_density_lies_outside_of_its_cell_bounds(layout: dict[str, Any], chan
     p = points_in_box(grid, 1 << 16, 5)
     found = density(grid, mi.Point3f(p))
     for level in grid.levels:
-        cells = cellwalk.make_cells(level, [level.lowest, level.highest])
+        cells = grid_traversal.make_cells(level, [level.lowest, level.highest])
         place = mi.Vector3f(np.floor(cells.to_cell[:, :3] @ p + cells.to_cell[:, 3:]))
         low, high = np.array(cells.lookup(mi.Vector2f, place, True))
         assert (found <= high * (1 + 1e-5) + 1e-6).all()
@@ -233,7 +233,7 @@ def test_collisions_in_a_loop_are_as_likely_as_the_transmittance_says() -> None:
 
 def transmittance(grid: Any, ray: Any, points: int = 1000) -> np.ndarray:
     """exp(-∫ σ_t ds) by the midpoint rule between the ends of the bounding box (channels x rays)."""
-    a, b = cellwalk.clip(grid.box, ray)
+    a, b = grid_traversal.clip(grid.box, ray)
     h = dr.maximum(b - a, 0) / points
 
     def body(i: Any, depth: Any) -> tuple[Any, Any]:
@@ -313,7 +313,7 @@ def test_faint_transmittance_is_unbiased() -> None:
     start = np.random.default_rng(1).random((2, RAYS)).astype(np.float32)
     ray = mi.Ray3f(mi.Point3f(start[0], start[1], -1), mi.Vector3f(0, 0, 1))
     truth = transmittance(grid, ray)[0]
-    assert truth.mean() < cellwalk.FAINT / 3
+    assert truth.mean() < grid_traversal.FAINT / 3
     sampler = mi.load_dict({"type": "independent"})
     means = []
     for seed in range(16):
@@ -515,7 +515,7 @@ def test_mistakes_are_told_in_one_line(extra: dict[str, Any], message: str) -> N
 
 OTHER_VARIANT = """
 import sys
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 set_variant(sys.argv[1])
 import drjit as dr, mitsuba as mi, numpy as np
 values = np.random.default_rng(0).random((9, 9, 9, 3)).astype(np.float32)

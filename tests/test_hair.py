@@ -8,11 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from pathreplay.check.command import check_all
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
+from pathreplay.jobs import make_config, optimize
 from pathreplay.output.export import export_run
 from pathreplay.scenes.loading import load_scene
+from pathreplay.testing.command import check_all
 
 SCENE = """<scene version="3.0.0">
   <sensor type="perspective" id="eye">

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from pathreplay import PathreplayError, check_gradient
-from pathreplay.check.statistics import gap
-from pathreplay.check.verdict import Z_LIMIT
 from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.scenes.substitute import load_dict_with
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.verdict import Z_LIMIT
 from truth import bitmap, camera, lit_room, noise, random, rgb, translate, under_sky
 
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}

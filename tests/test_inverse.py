@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import images, load_config, make_config
-from pathreplay.inverse.grids import resampled
-from pathreplay.inverse.losses import RELATIVE_FLOOR, find_loss, mean_loss
-from pathreplay.inverse.values import make_value
-from pathreplay.media.volume_files import save_vol
-from pathreplay.threads import spare_thread
+from pathreplay.inverse.images import io as images
+from pathreplay.inverse.losses.pixelwise import RELATIVE_FLOOR, find_loss, mean_loss
+from pathreplay.inverse.parameters.grids import resampled
+from pathreplay.inverse.parameters.values import make_value
+from pathreplay.jobs import load_config, make_config
+from pathreplay.platform.threads import spare_thread
+from pathreplay.scenes.volume_files import save_vol
 
 # What the docstrings say, in NumPy.
 FORMULAS = {

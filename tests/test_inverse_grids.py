@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import grids, make_config, optimize
+from pathreplay.inverse.parameters import grids
+from pathreplay.jobs import make_config, optimize
 from test_inverse_run import JOB, TEXTURE, interrupt_at, room, run  # noqa: F401 (room: its folder, for every test)
 
 GRID = np.random.default_rng(3).random((3, 4, 5, 2), np.float32)

@@ -10,10 +10,10 @@ import pytest
 import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.grids import rmse
-from pathreplay.inverse.loop import judged, new_run, render_views
-from pathreplay.inverse.problem import build_problem
+from pathreplay.inverse.loop.loop import judged, new_run, render_views
+from pathreplay.inverse.parameters.grids import rmse
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import make_config, optimize
 from test_inverse_run import JOB, TEXTURE, interrupt_at, room, run  # noqa: F401 (room: its folder, for every test)
 
 # What the job itself has: its kernels are compiled when the rival's turn comes.

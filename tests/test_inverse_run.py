@@ -15,11 +15,11 @@ import pytest
 import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import RunResult, make_config, optimize, session
-from pathreplay.inverse import run_folder as folders
-from pathreplay.inverse.images import read_image
-from pathreplay.inverse.progress import Progress
-from pathreplay.whole_files import Content, chunks
+from pathreplay.inverse.images.io import read_image
+from pathreplay.jobs import RunResult, make_config, optimize, session
+from pathreplay.platform.atomic_files import Content, chunks
+from pathreplay.report.progress import Progress
+from pathreplay.runs import run_folder as folders
 
 # A textured wall and a coloured one under a light, seen by two sensors: small enough for 0.1 s per iteration.
 CAMERA = """<sensor type="perspective" id="{name}"><float name="fov" value="55"/>
@@ -56,7 +56,7 @@ JOB = {
 
 @pytest.fixture(autouse=True)
 def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    from pathreplay.inverse.images import exr_bytes
+    from pathreplay.inverse.images.io import exr_bytes
 
     monkeypatch.chdir(tmp_path)
     (tmp_path / "room.xml").write_text(SCENE)

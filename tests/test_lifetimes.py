@@ -19,9 +19,9 @@ import pytest
 
 import pathreplay
 from edge_scenes import cube8, lit_box
-from pathreplay.render.facts import facts_of
-from pathreplay.render.lifetimes import SceneMemory, careful
-from pathreplay.transport.nodes import nodes_of, with_gradients
+from pathreplay.integrators.lifetimes import SceneMemory, careful
+from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.transport.facts.nodes import nodes_of, with_gradients
 
 RED = "red.reflectance.value"
 HERE = Path(__file__).parent
@@ -244,7 +244,7 @@ def test_a_thread_that_collects_garbage_disturbs_no_pass() -> None:
 SEQUENCE = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 from variant import VARIANT
 set_variant(VARIANT)
 import drjit as dr, mitsuba as mi

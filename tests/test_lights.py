@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.gradient import emission_only as module
-from pathreplay.gradient.emission_only import emission_only, only_emission_varies
-from pathreplay.gradient.sweep import sweep
-from pathreplay.render.camera_pass import Pass
-from pathreplay.render.lifetimes import careful
+from pathreplay.adjoint import emission_only as module
+from pathreplay.adjoint.emission_only import emission_only, only_emission_varies
+from pathreplay.adjoint.sweep import sweep
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.lifetimes import careful
 from test_architecture import BALL, FLOOR, LAMP, SEED, SIZE, SPP, attached, close, driven, ours, rgb, world
 from truth import camera
 

@@ -8,10 +8,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay import memory
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.parameter_limits import require_grid, require_learning_rate
-from pathreplay.render.film import MOST_SAMPLES, require_film
+from pathreplay.integrators.film.image import MOST_SAMPLES, require_film
+from pathreplay.inverse.parameters.limits import require_grid, require_learning_rate
+from pathreplay.platform import memory
 
 
 def test_a_container_s_limit_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

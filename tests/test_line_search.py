@@ -10,10 +10,10 @@ import pytest
 import scipy.optimize
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import iterate, make_config, optimize
-from pathreplay.inverse.line_search import MOST, LineSearch
-from pathreplay.inverse.optimiser import State
-from pathreplay.inverse.optimizer_options import Optimizer
+from pathreplay.inverse.config.optimizer_options import Optimizer
+from pathreplay.inverse.optim.adaptive import State
+from pathreplay.inverse.optim.lbfgs import MOST, LineSearch
+from pathreplay.jobs import iterate, make_config, optimize
 from small_job import checkpoint_bits
 from test_protocols import bits
 from test_steps import JOB, SCENE
@@ -157,10 +157,10 @@ def test_a_job_ends_by_itself_and_at_its_best(transform: str | None, room: Path)
 def test_all_evaluations_see_the_same_random_numbers(room: Path) -> None:
     """So that the loss is a function: at the start values once more, it is the same."""
     states = list(iterate(make_config({**SEARCHED, "output": "run"})))
-    from pathreplay.inverse.evaluate import Shard
-    from pathreplay.inverse.loop import new_run
-    from pathreplay.inverse.problem import build_problem
-    from pathreplay.threads import one_thread
+    from pathreplay.inverse.loop.loop import new_run
+    from pathreplay.inverse.objective.evaluate import Shard
+    from pathreplay.inverse.problem.problem import build_problem
+    from pathreplay.platform.threads import one_thread
 
     config = make_config(SEARCHED)
     problem = build_problem(config, room)

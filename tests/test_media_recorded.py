@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from media_scenes import checkers, cloud, constant, grid, heterogeneous, homogeneous, inside, lit_floor, smooth
-from pathreplay.inverse.losses import l2
-from pathreplay.inverse.recorded import Recordings, differentiate
+from pathreplay.inverse.losses.pixelwise import l2
+from pathreplay.inverse.objective.frozen import Recordings, differentiate
 from pathreplay.scenes.parameters import keep_only
 
 # Denser than any step before, and emptier: bounds of the extinction have to follow.

@@ -13,16 +13,17 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from pathreplay import PathreplayError, memory
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse import optimiser as optimisers
-from pathreplay.inverse.album import Album
-from pathreplay.inverse.evaluate import Evaluation, Local, Shard, total
-from pathreplay.inverse.grids import LARGEST_SHOWN, rmse, shown
-from pathreplay.inverse.optimiser import DrJitOptimiser, WhenAsked
-from pathreplay.inverse.optimizer_options import Optimizer
-from pathreplay.inverse.tensor_files import safetensors_chunks
-from pathreplay.whole_files import chunks, made
+from pathreplay import PathreplayError
+from pathreplay.inverse.config.optimizer_options import Optimizer
+from pathreplay.inverse.images.disk_store import Album
+from pathreplay.inverse.objective.evaluate import Evaluation, Local, Shard, total
+from pathreplay.inverse.optim import adaptive as optimisers
+from pathreplay.inverse.optim.adaptive import DrJitOptimiser, WhenAsked
+from pathreplay.inverse.parameters.grids import LARGEST_SHOWN, rmse, shown
+from pathreplay.jobs import make_config, optimize
+from pathreplay.platform import memory
+from pathreplay.platform.atomic_files import chunks, made
+from pathreplay.platform.tensor_files import safetensors_chunks
 from test_inverse_run import JOB, room  # noqa: F401 (room: its folder, for every test)
 
 RANDOM = np.random.default_rng(7)
@@ -164,7 +165,7 @@ def test_contents_are_made_when_they_are_written() -> None:
 def test_errors_in_pieces_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     a, b = array(31, 17), array(31, 17)
     wanted = np.sqrt(np.mean(np.square(a.astype(np.float64) - b)))
-    monkeypatch.setattr("pathreplay.inverse.grids._PIECE", 10)
+    monkeypatch.setattr("pathreplay.inverse.parameters.grids._PIECE", 10)
     assert rmse(a, b) == pytest.approx(wanted, rel=1e-12)
 
 
@@ -220,9 +221,9 @@ def test_a_run_beyond_its_budget_ends_with_a_line_and_a_checkpoint(monkeypatch: 
 PEAK = """
 import sys
 sys.path.insert(0, {tests!r})
-import pathreplay.backend
-pathreplay.backend.set_variant("llvm_ad_rgb")
-from pathreplay.inverse import make_config, optimize
+import pathreplay.platform.backend
+pathreplay.platform.backend.set_variant("llvm_ad_rgb")
+from pathreplay.jobs import make_config, optimize
 result = optimize(make_config({job!r}), output={output!r}, progress=False)
 print(int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0]) // 1024)
 """

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from pathreplay.check import check_gradient
 from pathreplay.errors import PathreplayError
-from pathreplay.files import LONGEST, file_names
-from pathreplay.inverse import RunResult, make_config, optimize
-from pathreplay.inverse.images import exr_bytes
+from pathreplay.inverse.images.io import exr_bytes
+from pathreplay.jobs import RunResult, make_config, optimize
+from pathreplay.platform.files import LONGEST, file_names
 from pathreplay.scenes import parameters
 from pathreplay.scenes.loading import load_scene
+from pathreplay.testing import check_gradient
 
 OBJ = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n{}f 1 2 3\nf 1 3 4\n"
 PLY = """ply

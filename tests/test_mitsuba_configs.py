@@ -6,7 +6,7 @@ import pytest
 
 from mitsuba_configs import CONFIGS, EDGES
 from mitsuba_errors import measure, row
-from pathreplay.check.verdict import Z_LIMIT
+from pathreplay.testing.verdict import Z_LIMIT
 
 QUICK = ("part of a film",)
 # Float32 rounding of sums in another order, relative to the sum of magnitudes.

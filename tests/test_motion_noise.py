@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.render.facts import SceneFacts
+from pathreplay.integrators.scene_facts import SceneFacts
 from pathreplay.transport import velocity
 from pathreplay.transport.surface import GRAZES, met
 from truth import (

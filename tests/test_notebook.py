@@ -9,9 +9,10 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from pathreplay.inverse import iterate, make_config, notebook, optimize
-from pathreplay.pages.page import Picture, View, thinned
-from pathreplay.pages.panel import MOST_POINTS, Panel
+from pathreplay.jobs import iterate, make_config, optimize
+from pathreplay.report import notebook
+from pathreplay.report.pages.page import Picture, View, thinned
+from pathreplay.report.pages.panel import MOST_POINTS, Panel
 from test_steps import JOB, SCENE
 
 HOSTILE = "<script>alert('\"')</script>"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathreplay.inverse.images import exr_bytes
+from pathreplay.inverse.images.io import exr_bytes
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only Linux lets a process choose cores")
 

@@ -48,7 +48,7 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def write_image(path: Path, pixels: np.ndarray) -> None:
-    from pathreplay.inverse.images import exr_bytes
+    from pathreplay.inverse.images.io import exr_bytes
 
     path.write_bytes(exr_bytes(pixels.astype(np.float32)))
 
@@ -273,7 +273,9 @@ def test_bad_input_gets_one_line_and_status_2(
 ) -> None:
     change, words = BAD[case]
     change(room)
-    monkeypatch.setattr("pathreplay.memory.available", lambda: 2 * 10**9)  # what is too large does not depend on us
+    monkeypatch.setattr(
+        "pathreplay.platform.memory.available", lambda: 2 * 10**9
+    )  # what is too large does not depend on us
     files = set(room.rglob("*"))
     assert command(monkeypatch, "job.toml", "--quiet") == 2
     out, err = capsys.readouterr()

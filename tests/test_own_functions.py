@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.imported import Imported
+from pathreplay.inverse.config.user_functions import Imported
+from pathreplay.jobs import make_config, optimize
 from test_inverse_run import JOB, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 
 # In a Python of its own: Dr.Jit would never come back from some of these, deaf to signals.
 HOSTILE = """
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 set_variant("llvm_ad_rgb")
 import mitsuba as mi
 import numpy as np
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.imported import Imported
+from pathreplay.inverse.config.user_functions import Imported
 
 loop = [1.0]
 loop.append(loop)

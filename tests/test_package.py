@@ -34,7 +34,7 @@ def test_wheel_and_source_archive_hold_the_licence(tmp_path: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     (licence,) = [name for name in names if name.endswith("LICENSE")]
     assert zipfile.ZipFile(wheel).read(licence) == (ROOT / "LICENSE").read_bytes()
-    wanted = ("py.typed", *(f"pages/page.{end}" for end in ("html.j2", "css", "js")))
+    wanted = ("py.typed", *(f"report/pages/page.{end}" for end in ("html.j2", "css", "js")))
     assert {f"pathreplay/{name}" for name in wanted} <= set(names)
     metadata = next(name for name in names if name.endswith("METADATA"))
     told = zipfile.ZipFile(wheel).read(metadata).decode()

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from page_samples import HOSTILE, sample
-from pathreplay.inverse.page_parts import common_exposure
-from pathreplay.pages.document import document
-from pathreplay.pages.page import MOST_POINTS, thinned
+from pathreplay.report.page_parts import common_exposure
+from pathreplay.report.pages.document import document
+from pathreplay.report.pages.page import MOST_POINTS, thinned
 
 
 class Elements(HTMLParser):

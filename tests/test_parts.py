@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from pathreplay import PathreplayError
-from pathreplay.render import parts as module
-from pathreplay.render.boundary import lines_of
-from pathreplay.render.camera_pass import Pass
-from pathreplay.render.parts import parts
-from pathreplay.render.places import FilmPlaces
+from pathreplay.integrators import parts as module
+from pathreplay.integrators.boundary_term import lines_of
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.film.domain import FilmPlaces
+from pathreplay.integrators.parts import parts
 from pathreplay.scenes.parameters import get_array
 
 KEY, SPP, SEED = "light.radiance.value", 24, 7

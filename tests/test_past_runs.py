@@ -17,12 +17,12 @@ import safetensors.numpy
 from page_samples import HOSTILE
 from pathreplay.cli import app
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config
-from pathreplay.inverse.checkpoint import _HISTORY, Entry
-from pathreplay.inverse.previews import FOLDER
-from pathreplay.pages.document import document
-from pathreplay.watch import compare, tensorboard, timelapse
-from pathreplay.watch.past import pasts
+from pathreplay.inverse.loop.checkpoint import _HISTORY, Entry
+from pathreplay.jobs import make_config
+from pathreplay.report.live_page import FOLDER
+from pathreplay.report.pages.document import document
+from pathreplay.report.watch import compare, tensorboard, timelapse
+from pathreplay.report.watch.past import pasts
 from test_inverse_run import JOB, TEXTURE
 
 

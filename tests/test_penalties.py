@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.imported import Imported, Modules
-from pathreplay.inverse.penalties import Laplacian, Own, Penalty, Prior, Term, TotalVariation
+from pathreplay.inverse.config.user_functions import Imported, Modules
+from pathreplay.inverse.parameters.regularizers import Laplacian, Own, Penalty, Prior, Term, TotalVariation
 from pathreplay.scenes.bodies import ball
 
 H = 1e-3

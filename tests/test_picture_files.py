@@ -15,11 +15,11 @@ import pytest
 
 from hostile.picture_bytes import HUGE, claiming, exr, picture_files, radiance
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config
-from pathreplay.inverse.images import encoded, exr_bytes, read_image
-from pathreplay.inverse.problem import build_problem
+from pathreplay.inverse.images.io import encoded, exr_bytes, read_image
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import make_config
+from pathreplay.scenes.image_files import size_of_picture
 from pathreplay.scenes.loading import load_scene
-from pathreplay.scenes.picture_files import size_of_picture
 from test_inverse_run import SCENE, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 
 WIDTH, HEIGHT = 12, 10
@@ -131,7 +131,7 @@ def test_what_claims_too_much_is_refused_before_it_is_unpacked(
 ) -> None:
     (room / name).write_bytes(claiming(name, FILES[name], HUGE))
     if where == "target":
-        monkeypatch.setattr("pathreplay.inverse.targets.read_image", None)  # its size alone is wrong
+        monkeypatch.setattr("pathreplay.inverse.dataset.targets.read_image", None)  # its size alone is wrong
     with pytest.raises(PathreplayError, match=rf"{re.escape(name)}.* is 65500 x 65400") as told:
         build_problem(job(name, where), room)
     assert "\n" not in str(told.value)

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse import picture_losses as losses
-from pathreplay.inverse.images import encoded
-from pathreplay.inverse.likeness import _similarity
-from pathreplay.inverse.losses import LOSSES, find_loss, mean_loss
+from pathreplay.inverse.images.io import encoded
+from pathreplay.inverse.images.metrics import _similarity
+from pathreplay.inverse.losses import image_losses as losses
+from pathreplay.inverse.losses.pixelwise import LOSSES, find_loss, mean_loss
+from pathreplay.jobs import make_config, optimize
 from test_inverse import FORMULAS
 from test_steps import JOB, SCENE
 

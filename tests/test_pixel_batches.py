@@ -10,19 +10,19 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.check.statistics import gap
-from pathreplay.check.stencil import CENTRAL
-from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import iterate, optimize
-from pathreplay.inverse.config import PIXELWISE, make_config
-from pathreplay.inverse.evaluate import Evaluator, Shard
-from pathreplay.inverse.loop import new_run
-from pathreplay.inverse.losses import LOSSES, QUADRATIC
-from pathreplay.inverse.pixel_batches import Batch
-from pathreplay.inverse.problem import build_problem
-from pathreplay.render import integrator as integrators
-from pathreplay.render.filter_samples import FilterSamples, is_drawable
+from pathreplay.integrators import integrator as integrators
+from pathreplay.integrators.film.filter_samples import FilterSamples, is_drawable
+from pathreplay.inverse.config.schema import PIXELWISE, make_config
+from pathreplay.inverse.loop.loop import new_run
+from pathreplay.inverse.losses.pixelwise import LOSSES, QUADRATIC
+from pathreplay.inverse.objective.evaluate import Evaluator, Shard
+from pathreplay.inverse.objective.pixel_batches import Batch
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import iterate, optimize
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.stencil import CENTRAL
+from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 from truth import RES, Bench, Case, bitmap, camera, lit_room, noise, random, rgb
 
 SLOW = pytest.mark.slow

@@ -7,16 +7,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.check.statistics import gap
-from pathreplay.check.stencil import CENTRAL
-from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config import ITERATION, make_config
-from pathreplay.inverse.evaluate import Evaluator, Shard
-from pathreplay.inverse.loop import new_run, take_step
-from pathreplay.inverse.losses import QUADRATIC, RELATIVE_FLOOR, l2
-from pathreplay.inverse.problem import build_problem
-from pathreplay.inverse.recorded import linear_derivative
+from pathreplay.inverse.config.schema import ITERATION, make_config
+from pathreplay.inverse.loop.loop import new_run, take_step
+from pathreplay.inverse.losses.pixelwise import QUADRATIC, RELATIVE_FLOOR, l2
+from pathreplay.inverse.objective.evaluate import Evaluator, Shard
+from pathreplay.inverse.objective.frozen import linear_derivative
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.stencil import CENTRAL
+from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 from truth import (
     Bench,
     Case,

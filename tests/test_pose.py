@@ -15,9 +15,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize, problem, targets
-from pathreplay.inverse.config import load_config
-from pathreplay.inverse.pose import Pose, make_pose, rotation_matrix
+from pathreplay.inverse.config.schema import load_config
+from pathreplay.inverse.dataset import targets
+from pathreplay.inverse.parameters.pose import Pose, make_pose, rotation_matrix
+from pathreplay.inverse.problem import problem
+from pathreplay.jobs import make_config, optimize
 from pathreplay.scenes.parameters import get_array
 
 
@@ -139,7 +141,7 @@ JOB = {
 
 @pytest.fixture
 def sheet(tmp_path: Path, variant: None) -> None:
-    from pathreplay.inverse.images import exr_bytes
+    from pathreplay.inverse.images.io import exr_bytes
 
     (tmp_path / "sheet.xml").write_text(SCENE)
     for glass in ("dielectric", "smoothdielectric"):

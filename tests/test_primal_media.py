@@ -37,8 +37,8 @@ from media_scenes import (
     sparse,
     sunlit,
 )
-from pathreplay.check.statistics import normal
-from pathreplay.check.verdict import Z_LIMIT
+from pathreplay.testing.statistics import normal
+from pathreplay.testing.verdict import Z_LIMIT
 from truth import RES, camera, environment, rgb
 
 SEEDS = 16

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathreplay.inverse import progress
-from pathreplay.inverse.checkpoint import Entry
-from pathreplay.inverse.result import RunResult
-from pathreplay.inverse.verdict import Verdict
+from pathreplay.inverse.loop.checkpoint import Entry
+from pathreplay.inverse.loop.verdict import Verdict
+from pathreplay.report import progress
+from pathreplay.report.result import RunResult
 
 
 def lines(total: int) -> None:
@@ -48,7 +48,7 @@ builtins.get_ipython = ZMQInteractiveShell  # how rich tells a notebook; it then
 from rich.console import Console
 from pathreplay import backend
 backend.set_variant("llvm_ad_rgb")
-from pathreplay.inverse.progress import Progress
+from pathreplay.report.progress import Progress
 print(Console().is_jupyter)
 with Progress(True) as bar:
     bar.start(0, 2); bar.advance(0.5); bar.advance(0.25)

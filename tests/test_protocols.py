@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pathreplay.inverse.evaluate import Evaluate, Evaluation, Executor, Local, Shard, total
-from pathreplay.inverse.optimiser import DrJitOptimiser, Optimiser
-from pathreplay.inverse.optimizer_options import Optimizer
+from pathreplay.inverse.config.optimizer_options import Optimizer
+from pathreplay.inverse.objective.evaluate import Evaluate, Evaluation, Executor, Local, Shard, total
+from pathreplay.inverse.optim.adaptive import DrJitOptimiser, Optimiser
 
 Make = Callable[..., Optimiser]
 OPTIMISERS = {

@@ -24,11 +24,11 @@ else:
     import tomllib
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import load_config, make_config, optimize
-from pathreplay.inverse.config import AUTO
-from pathreplay.inverse.loop import new_run, take_step
-from pathreplay.inverse.problem import build_problem
-from pathreplay.threads import one_thread
+from pathreplay.inverse.config.schema import AUTO
+from pathreplay.inverse.loop.loop import new_run, take_step
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import load_config, make_config, optimize
+from pathreplay.platform.threads import one_thread
 from small_job import ERROR, TIMEOUT_S, checkpoint_bits, ended, hear_signals, start, wait_for, write_job
 from test_deterministic import CLOUD
 from test_inverse_run import JOB, room  # noqa: F401 (room: its folder, for every test)

@@ -8,11 +8,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay import memory
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.images import read_image
+from pathreplay.inverse.images.io import read_image
 from pathreplay.output import picture
 from pathreplay.output.render import render_to_file
+from pathreplay.platform import memory
 from pathreplay.scenes.loading import load_scene
 
 SIZE = {"size": "12x8", "spp": 4, "seed": 5, "progress": False}
@@ -150,7 +150,7 @@ def test_an_interrupt_leaves_the_file(tmp_path: Path, monkeypatch: pytest.Monkey
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pathreplay.whole_files.os.replace", interrupted)
+    monkeypatch.setattr("pathreplay.platform.atomic_files.os.replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         render_to_file("cornell-box", path, **SIZE)
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

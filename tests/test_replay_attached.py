@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.check.statistics import gap
-from pathreplay.gradient import replay as replay_module
-from pathreplay.gradient.ray_jacobian import Recovery, independence, random_sign
+from pathreplay.adjoint import replay as replay_module
+from pathreplay.adjoint.ray_jacobian import Recovery, independence, random_sign
+from pathreplay.testing.statistics import gap
 from pathreplay.transport.vertex import VertexSamples
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the benchmarks run from the checkout and are not installed

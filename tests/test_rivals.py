@@ -10,9 +10,9 @@ import pytest
 
 from media_scenes import FORWARD, cloud, heterogeneous, lit_floor, smooth, sunlit
 from pathreplay import PathreplayError
-from pathreplay.check.statistics import gap
-from pathreplay.check.stencil import WIDE
-from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.stencil import WIDE
+from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 from truth import (
     Case,
     add,

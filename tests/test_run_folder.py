@@ -19,14 +19,16 @@ import safetensors
 import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import RunResult, checkpoint, optimize, run_folder
-from pathreplay.inverse.checksums import SEAL, SUMS, Sums, sealed_chunks
-from pathreplay.inverse.config import load_config
-from pathreplay.inverse.folder_lock import LOCK, FolderLock
-from pathreplay.inverse.images import exr_bytes, read_image
-from pathreplay.inverse.loop import new_run
-from pathreplay.inverse.problem import build_problem
-from pathreplay.inverse.progress import Progress
+from pathreplay.inverse.config.schema import load_config
+from pathreplay.inverse.images.io import exr_bytes, read_image
+from pathreplay.inverse.loop import checkpoint
+from pathreplay.inverse.loop.checksums import SEAL, SUMS, Sums, sealed_chunks
+from pathreplay.inverse.loop.loop import new_run
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import RunResult, optimize
+from pathreplay.report.progress import Progress
+from pathreplay.runs import run_folder
+from pathreplay.runs.folder_lock import LOCK, FolderLock
 from small_job import write_job
 from test_inverse_run import TEXTURE
 

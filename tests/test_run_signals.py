@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from pathreplay import interrupts
-from pathreplay.interrupts import stopping
-from pathreplay.inverse import optimize
+from pathreplay.jobs import optimize
+from pathreplay.platform import interrupts
+from pathreplay.platform.interrupts import stopping
 from small_job import TIMEOUT_S, ended, hear_signals, kill_at_checkpoint, start, wait_for, write_job
 
 ENDLESS = {"iterations": 100_000, "checkpoint_every": 1}

@@ -13,12 +13,12 @@ import pytest
 
 from edge_ordinary import PAINT, Moving, T, film, grey, hold_quiet, loaded, measured, painted, panel, sensor
 from edge_truth import hold_agreement
-from pathreplay.check.statistics import gap
-from pathreplay.check.verdict import Z_LIMIT
-from pathreplay.render import integrator as integrators
-from pathreplay.render.camera_pass import Pass
-from pathreplay.transport.nodes import nodes_of
-from pathreplay.transport.seams import has_seams
+from pathreplay.integrators import integrator as integrators
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.verdict import Z_LIMIT
+from pathreplay.transport.facts.nodes import nodes_of
+from pathreplay.transport.facts.seams import has_seams
 from truth import bitmap, noise, translate, turn_vertices
 
 Write = Callable[[Path], Moving]

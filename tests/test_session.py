@@ -12,7 +12,7 @@ import pytest
 
 import pathreplay
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import RunResult, State, iterate, make_config, optimize
+from pathreplay.jobs import RunResult, State, iterate, make_config, optimize
 from small_job import checkpoint_bits
 from test_deterministic import CLOUD
 from test_steps import JOB, SCENE

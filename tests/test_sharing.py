@@ -7,8 +7,8 @@ import heapq
 import numpy as np
 import pytest
 
-from pathreplay.inverse.evaluate import Shard
-from pathreplay.inverse.scheduler import LATE, TOGETHER, Scheduler, Step, kind_of
+from pathreplay.distributed.scheduler import LATE, TOGETHER, Scheduler, Step, kind_of
+from pathreplay.inverse.objective.evaluate import Shard
 
 BOTH = (0, 1)
 

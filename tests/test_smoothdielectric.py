@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import pathreplay  # noqa: F401 (registers the plugin)
-from pathreplay.bsdfs.smoothdielectric import MAX_REFLECTION
-from pathreplay.threads import spare_thread
+from pathreplay.platform.threads import spare_thread
+from pathreplay.plugins.smoothdielectric import MAX_REFLECTION
 
 N = 20000
 RADIANCE, IMPORTANCE = "Radiance", "Importance"

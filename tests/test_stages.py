@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import iterate, make_config, optimize
-from pathreplay.inverse.evaluate import Evaluator, Shard
-from pathreplay.inverse.problem import build_problem
-from pathreplay.inverse.stages import Staged, part_at, scaled
-from pathreplay.inverse.views import View
+from pathreplay.inverse.dataset.views import View
+from pathreplay.inverse.objective.evaluate import Evaluator, Shard
+from pathreplay.inverse.objective.stages import Staged, part_at, scaled
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import iterate, make_config, optimize
+from pathreplay.platform.threads import one_thread
 from pathreplay.scenes.parameters import get_array
-from pathreplay.threads import one_thread
 from small_job import checkpoint_bits
 from test_deterministic import CLOUD
 from test_inverse_run import JOB, SCENE, TEXTURE, room  # noqa: F401 (room: its folder, for every test)

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from media_scenes import constant, grid
-from pathreplay.gradient.adjoint import NonFiniteCounter, RayDerivative
-from pathreplay.gradient.record import Layout, record_type, room_for
-from pathreplay.gradient.two_walks import first_walk, walk_back
-from pathreplay.render.lifetimes import careful
+from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative
+from pathreplay.adjoint.record import Layout, record_type, room_for
+from pathreplay.adjoint.two_passes import first_walk, walk_back
+from pathreplay.integrators.lifetimes import careful
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart

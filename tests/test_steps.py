@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.config import ITERATION
-from pathreplay.inverse.schedules import rate
-from pathreplay.inverse.transforms import Transform
+from pathreplay.inverse.config.schedules import rate
+from pathreplay.inverse.config.schema import ITERATION
+from pathreplay.inverse.parameters.reparameterization import Transform
+from pathreplay.jobs import make_config, optimize
 
 JOB: dict[str, Any] = {
     "scene": "room.xml",

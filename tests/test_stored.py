@@ -16,9 +16,9 @@ import PIL.Image
 import pytest
 import safetensors.numpy
 
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.grids import rmse
-from pathreplay.inverse.images import exr_bytes, read_image
+from pathreplay.inverse.images.io import exr_bytes, read_image
+from pathreplay.inverse.parameters.grids import rmse
+from pathreplay.jobs import make_config, optimize
 from pathreplay.output.export import export_run
 from pathreplay.scenes.parameters import get_array, to_value
 from pathreplay.scenes.stored import AS_STORED, form_of
@@ -180,7 +180,7 @@ def test_eight_bit_textures_become_numbers_where_they_are_asked_for(folder: Path
 
 SPECTRAL = """
 import mitsuba as mi, numpy as np, drjit as dr
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 set_variant("llvm_ad_spectral")
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.parameters import get_array
@@ -252,7 +252,7 @@ def test_spectra_are_seen_at_three_wavelengths(run_python: Callable[..., subproc
 
 MONO = """
 import mitsuba as mi, numpy as np
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 set_variant("llvm_ad_mono")
 from pathreplay.scenes.parameters import get_array
 from pathreplay.scenes.stored import form_of

@@ -10,9 +10,9 @@ import pytest
 
 import pathreplay  # noqa: F401 (registers the plugins)
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.images import exr_bytes
+from pathreplay.inverse.images.io import exr_bytes
+from pathreplay.platform.threads import one_thread, spare_thread
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
-from pathreplay.threads import one_thread, spare_thread
 
 SMOOTH = {"dielectric": "smoothdielectric"}
 SCENE = """<scene version="3.0.0">

@@ -12,8 +12,9 @@ import pytest
 
 import pathreplay
 from pathreplay import cli
-from pathreplay.inverse import drawing, make_config, optimize
-from pathreplay.watch.server import RunServer
+from pathreplay.jobs import make_config, optimize
+from pathreplay.report import drawing
+from pathreplay.report.watch.server import RunServer
 from small_job import ERROR, write_job
 from test_inverse_run import JOB
 
@@ -37,7 +38,7 @@ def drawn() -> bytes:
     with drawing.own_settings():
         figure = drawing.Figure(figsize=(2, 2))
         figure.add_subplot().plot([1, 2], label="a")
-        from pathreplay.inverse.report import _plain
+        from pathreplay.report.report import _plain
 
         _plain(figure.axes[0], "iteration")
         file = Path("drawn.png")
@@ -59,7 +60,7 @@ def test_a_report_needs_no_latex() -> None:
 
 
 def test_a_backend_that_is_none_does_not_count(room: Path) -> None:
-    code = "import pathreplay.inverse, os; print(os.environ['MPLBACKEND'], os.environ.get('MATPLOTLIBRC'))"
+    code = "import pathreplay.jobs, os; print(os.environ['MPLBACKEND'], os.environ.get('MATPLOTLIBRC'))"
     done = python(code, MPLBACKEND="nonsense")
     assert done.returncode == 0 and done.stdout == "nonsense None\n", done.stderr
 
@@ -114,7 +115,7 @@ def test_a_program_without_a_console_has_its_runs(monkeypatch: pytest.MonkeyPatc
 def test_the_address_of_a_run_needs_no_console(monkeypatch: pytest.MonkeyPatch, room: Path) -> None:
     run = optimize("job.json", output="run", progress=False).folder
     served: list[RunServer] = []
-    monkeypatch.setattr("pathreplay.watch.server.serve", served.append)
+    monkeypatch.setattr("pathreplay.report.watch.server.serve", served.append)
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", None)
         cli.watch(run, port=0, host="127.0.0.1")

@@ -19,8 +19,8 @@ import edge_media_scenes as media
 import edge_ordinary
 import edge_scenes as scenes
 from edge_truth import ours
-from pathreplay.check.objective import Objective
-from pathreplay.gradient.arcs import arc, density_of_samples
+from pathreplay.boundary.arcs import arc, density_of_samples
+from pathreplay.testing.objective import Objective
 from pathreplay.transport.signature import turned_away
 from truth import Bench, add, translate
 

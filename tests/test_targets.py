@@ -12,10 +12,10 @@ import PIL.ImageCms
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config
-from pathreplay.inverse.images import encoded, exr_bytes, png_bytes
-from pathreplay.inverse.patterns import matching
-from pathreplay.inverse.problem import Problem, build_problem
+from pathreplay.inverse.dataset.globbing import matching
+from pathreplay.inverse.images.io import encoded, exr_bytes, png_bytes
+from pathreplay.inverse.problem.problem import Problem, build_problem
+from pathreplay.jobs import make_config
 
 WIDTH, HEIGHT = 6, 4
 SKY = [0.2, 0.4, 0.6]

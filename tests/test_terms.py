@@ -15,11 +15,11 @@ import pytest
 
 from media_scenes import cloud, heterogeneous, smooth
 from pathreplay import PathreplayError
-from pathreplay.gradient.baseline import BaselineState, BaselineStats
-from pathreplay.render.boundary import Boundary
-from pathreplay.render.camera_pass import Pass
-from pathreplay.render.facts import SceneFacts, facts_of
-from pathreplay.render.term import Term, TermResult
+from pathreplay.adjoint.baseline import BaselineState, BaselineStats
+from pathreplay.integrators.boundary_term import Boundary
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.scene_facts import SceneFacts, facts_of
+from pathreplay.integrators.term import Term, TermResult
 from truth import lit_room, rgb
 
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}

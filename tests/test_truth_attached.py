@@ -12,8 +12,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.bsdfs.smoothdielectric import SmoothDielectric
-from pathreplay.plugins import on_base
+from pathreplay.platform.registration import on_base
+from pathreplay.plugins.smoothdielectric import SmoothDielectric
 from truth import (
     Bench,
     Case,

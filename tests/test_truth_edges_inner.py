@@ -11,11 +11,12 @@ import pytest
 
 from edge_scenes import BY_NAME, INDIRECT, SHADOWS, VEILED
 from edge_truth import backwards, hold_forward, hold_gradients, hold_need, loaded, reference, some
-from pathreplay.check.statistics import gap
-from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
-from pathreplay.gradient import observer, secondary_boundary
-from pathreplay.render import boundary
-from pathreplay.render import integrator as integrators
+from pathreplay.boundary import observer
+from pathreplay.boundary import secondary as secondary_boundary
+from pathreplay.integrators import boundary_term as boundary
+from pathreplay.integrators import integrator as integrators
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 from pathreplay.transport import velocity
 
 NAMES = pytest.mark.parametrize("name", some([*SHADOWS, *INDIRECT, *VEILED]))

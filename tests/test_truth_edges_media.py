@@ -12,8 +12,8 @@ import pytest
 
 from edge_media_scenes import BY_NAME
 from edge_scenes import weights
-from pathreplay.check.statistics import gap
-from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 from truth import ROWS, TRANSPOSE_MAX, Bench, Row
 
 FEW = ("fog_shadow", "by_ball_chance")

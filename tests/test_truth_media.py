@@ -29,11 +29,11 @@ from media_scenes import (
     sparse,
     sunlit,
 )
-from pathreplay.check.objective import Move
-from pathreplay.check.statistics import gap
-from pathreplay.check.stencil import UPWARD, WIDE
-from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
-from pathreplay.gradient.baseline import BaselineCells
+from pathreplay.adjoint.baseline import BaselineCells
+from pathreplay.testing.objective import Move
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.stencil import UPWARD, WIDE
+from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 from truth import Case, add, hold, random, rgb, translate
 
 MEDIUM = "object.interior_medium."
@@ -295,7 +295,7 @@ def test_one_thread_and_many_agree(channels: int) -> None:
 SPECTRAL = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 set_variant("llvm_ad_spectral")
 import test_truth_media, truth
 try:

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from pathreplay.inverse import load_config, make_config, optimize
+from pathreplay.jobs import load_config, make_config, optimize
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples/tutorials"

@@ -12,7 +12,7 @@ SEQUENCE = """
 import json, sys
 import numpy as np
 import pathreplay
-from pathreplay.backend import ensure_llvm
+from pathreplay.platform.backend import ensure_llvm
 import drjit as dr, mitsuba as mi
 
 ensure_llvm()
@@ -48,7 +48,7 @@ alive = []
 for variant in sys.argv[1:]:
     mi.set_variant(variant)
     if variant.startswith("scalar"):
-        for plugin in pathreplay.plugins.PLUGINS:
+        for plugin in pathreplay.platform.registration.PLUGINS:
             try:
                 mi.load_dict({"type": plugin})
             except Exception as error:
@@ -110,8 +110,8 @@ from pathlib import Path
 import numpy as np
 import pathreplay
 from pathreplay import check_gradient, optimize
-from pathreplay.inverse.config import PICTURE, load_config
-from pathreplay.inverse.images import exr_bytes, read_image
+from pathreplay.inverse.config.schema import PICTURE, load_config
+from pathreplay.inverse.images.io import exr_bytes, read_image
 from pathreplay.output.export import export_run
 from pathreplay.scenes.loading import load_scene
 
@@ -195,7 +195,7 @@ def test_the_main_job_runs_in_every_variant(run_python, tmp_path, name: str) -> 
 EDGES_JOB = """
 import json, sys
 import pathreplay
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 
 set_variant(sys.argv[1])
 import mitsuba as mi
@@ -236,7 +236,7 @@ def test_edges_are_right_in_every_variant(run_python, variant: str) -> None:
 def test_the_variants_here_are_all_that_there_are() -> None:
     import mitsuba as mi
 
-    from pathreplay.backend import is_usable_variant
+    from pathreplay.platform.backend import is_usable_variant
 
     usable = {name for name in mi.variants() if is_usable_variant(name) and name.startswith("llvm")}
     assert usable == {variant for sequence in JOBS.values() for variant in sequence}
@@ -245,7 +245,7 @@ def test_the_variants_here_are_all_that_there_are() -> None:
 def test_what_belongs_to_another_variant_is_told(run_python) -> None:
     done = run_python("""
 import pathreplay, mitsuba as mi
-from pathreplay.backend import ensure_llvm
+from pathreplay.platform.backend import ensure_llvm
 ensure_llvm()
 mi.set_variant("llvm_ad_rgb")
 scene, integrator = mi.load_dict(mi.cornell_box()), mi.load_dict({"type": "pathreplay"})

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.loop import new_run
-from pathreplay.inverse.movement import MOST_PARTS, SHORTEST, parts_of, still_moves
-from pathreplay.inverse.problem import build_problem
-from pathreplay.inverse.schedules import rate
-from pathreplay.inverse.trade_offs import columns_of, trade_offs
-from pathreplay.inverse.verdict import Verdict
+from pathreplay.inverse.config.schedules import rate
+from pathreplay.inverse.loop.loop import new_run
+from pathreplay.inverse.loop.movement import MOST_PARTS, SHORTEST, parts_of, still_moves
+from pathreplay.inverse.loop.trade_offs import columns_of, trade_offs
+from pathreplay.inverse.loop.verdict import Verdict
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import make_config, optimize
 
 # ------------------------------ Whether values still move ------------------------------
 
@@ -152,7 +152,7 @@ def test_what_moves_together_is_told_apart_by_what_stands_still(
     columns, unseen = columns_of(problem, values)
     pair = tuple(f"{key}:translation" for key in keys)
     assert unseen == () and trade_offs(columns) == (() if floor else (pair,))
-    monkeypatch.setattr("pathreplay.inverse.trade_offs.FREE_SAMPLES", 100)  # of 64 pixels, by 12 pictures
+    monkeypatch.setattr("pathreplay.inverse.loop.trade_offs.FREE_SAMPLES", 100)  # of 64 pixels, by 12 pictures
     assert columns_of(problem, values) == ({}, ()) and columns_of(problem, values, taken=160 * 64 * 12)[0]
 
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import iterate, make_config, optimize
-from pathreplay.inverse.evaluate import Evaluator, Shard
-from pathreplay.inverse.problem import build_problem
-from pathreplay.render import parts
+from pathreplay.integrators import parts
+from pathreplay.inverse.objective.evaluate import Evaluator, Shard
+from pathreplay.inverse.problem.problem import build_problem
+from pathreplay.jobs import iterate, make_config, optimize
 from pathreplay.scenes.parameters import get_array
 from test_inverse_run import JOB, SCENE, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathreplay.inverse import load_config, make_config, optimize
-from pathreplay.media.volume_files import load_volume
+from pathreplay.jobs import load_config, make_config, optimize
+from pathreplay.scenes.volume_files import load_volume
 
 KEY = "cloud.interior_medium.sigma_t.data"
 EXAMPLE = Path(__file__).parent.parent / "examples/cloud/config.toml"

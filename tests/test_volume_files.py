@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.media.volume_files import grid_volume, load_volume, save_vol
+from pathreplay.scenes.volume_files import grid_volume, load_volume, save_vol
 
 VALUES = np.fromfunction(lambda k, j, i: 1 + i + 10 * j + 100 * k, (5, 4, 3), dtype=np.float32)[..., None]
 

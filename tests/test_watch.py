@@ -18,13 +18,13 @@ import pytest
 
 from page_samples import sample
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.config import Config
-from pathreplay.inverse.previews import FOLDER, PAGE, PAGES, STOP, frames
-from pathreplay.inverse.progress import Progress
-from pathreplay.inverse.run_folder import RunFolder
-from pathreplay.watch import run_files
-from pathreplay.watch.server import MOST, RunServer
+from pathreplay.inverse.config.schema import Config
+from pathreplay.jobs import make_config, optimize
+from pathreplay.report.live_page import FOLDER, PAGE, PAGES, STOP, frames
+from pathreplay.report.progress import Progress
+from pathreplay.report.watch import run_files
+from pathreplay.report.watch.server import MOST, RunServer
+from pathreplay.runs.run_folder import RunFolder
 from test_inverse_run import JOB, SCENE, TEXTURE, room  # noqa: F401
 
 SECRET = b"not for others"
@@ -178,7 +178,7 @@ def test_what_is_sent_with_a_request_is_no_request(method: str, server: RunServe
 
 
 def test_a_client_that_drips_is_left(server: RunServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pathreplay.watch.server.PATIENCE", 0.3)
+    monkeypatch.setattr("pathreplay.report.watch.server.PATIENCE", 0.3)
     end = time.monotonic() + 10
     with socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=10) as client:
         client.settimeout(0.02)
@@ -275,7 +275,7 @@ def config(**changes: object) -> Config:
 
 @pytest.mark.slow
 def test_a_run_keeps_its_page_and_a_bounded_number_of_frames(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
-    monkeypatch.setattr("pathreplay.inverse.previews.time.perf_counter", iter(range(0, 10**9, 1000)).__next__)
+    monkeypatch.setattr("pathreplay.report.live_page.time.perf_counter", iter(range(0, 10**9, 1000)).__next__)
     optimize(config(iterations=12, preview={"frames": 3, "share": 0.5}), progress=False)
     page = PAGES.validate_json((room / "run" / PAGE).read_bytes(), strict=True)
     assert [view.name for view in page.views] == ["left", "right"] and page.views[1].held_out
@@ -298,7 +298,7 @@ def test_a_run_keeps_its_page_and_a_bounded_number_of_frames(room: Path, monkeyp
 def test_previews_change_no_bit_of_a_run(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: F811
     same = {"integrator": {"type": "pathreplay", "max_depth": 3}, "deterministic": True, "iterations": 4}
     without = optimize(config(**same, preview={"share": 0.0}), progress=False)
-    monkeypatch.setattr("pathreplay.inverse.previews.time.perf_counter", iter(range(0, 10**9, 1000)).__next__)
+    monkeypatch.setattr("pathreplay.report.live_page.time.perf_counter", iter(range(0, 10**9, 1000)).__next__)
     with_them = optimize(config(**same, preview={"share": 0.5}), progress=False)
     assert len({i for i, _, _ in frames(with_them.folder)}) >= 4 and not list(frames(without.folder))
     for key, value in without.parameters.items():

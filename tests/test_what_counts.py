@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import make_config, optimize
-from pathreplay.inverse.batches import batch
-from pathreplay.inverse.images import exr_bytes, read_image
-from pathreplay.inverse.imported import Modules
-from pathreplay.inverse.likeness import MOST_DB, Likeness
-from pathreplay.inverse.losses import find_loss
-from pathreplay.threads import spare_thread
+from pathreplay.inverse.config.user_functions import Modules
+from pathreplay.inverse.images.io import exr_bytes, read_image
+from pathreplay.inverse.images.metrics import MOST_DB, Likeness
+from pathreplay.inverse.loop.batches import batch
+from pathreplay.inverse.losses.pixelwise import find_loss
+from pathreplay.jobs import make_config, optimize
+from pathreplay.platform.threads import spare_thread
 
 KEY = "wall.bsdf.reflectance.data"
 SCENE = """<scene version="3.0.0">
@@ -209,7 +209,7 @@ def test_flip_is_that_of_flip_evaluator_where_the_mask_is() -> None:
 
 
 def test_flip_is_left_out_where_the_package_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pathreplay.inverse.likeness.has_flip", lambda: False)
+    monkeypatch.setattr("pathreplay.inverse.images.metrics.has_flip", lambda: False)
     assert Likeness.of(np.zeros((2, 2, 3)), np.ones((2, 2, 3)), 1.0, flip=True).flip is None
 
 

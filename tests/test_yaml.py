@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse import load_config, make_config, optimize
+from pathreplay.jobs import load_config, make_config, optimize
 from test_steps import JOB, SCENE
 
 TEXT = """

@@ -1,7 +1,7 @@
 """The cases of the truth tests (scene, parameter, direction), what is asserted of their gradients, and a table.
 
 The objective is always J = Σ W·image with fixed random weights W in [0, 1): no two pixels can cancel by symmetry.
-The parameter moves along a curve, value(t), and all gradients are dJ/dt at t = 0. What measures is pathreplay.check.
+The parameter moves along a curve, value(t), and all gradients are dJ/dt at t = 0. What measures is pathreplay.testing.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.check.objective import Move, Objective
-from pathreplay.check.statistics import gap
-from pathreplay.check.stencil import CENTRAL, Stencil
-from pathreplay.check.verdict import RESOLUTION, Z_LIMIT
+from pathreplay.testing.objective import Move, Objective
+from pathreplay.testing.statistics import gap
+from pathreplay.testing.stencil import CENTRAL, Stencil
+from pathreplay.testing.verdict import RESOLUTION, Z_LIMIT
 
 RES = 16
 

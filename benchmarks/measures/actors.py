@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pathreplay.inverse import iterate, make_config
+from pathreplay.jobs import iterate, make_config
 
 from .job import Job, Measure
 

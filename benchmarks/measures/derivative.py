@@ -10,10 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.check.direction import choose_line
-from pathreplay.check.objective import Mode, Objective, alone
-from pathreplay.check.reference import reference_integrator
 from pathreplay.scenes.parameters import get_array
+from pathreplay.testing.direction import choose_line
+from pathreplay.testing.objective import Mode, Objective, alone
+from pathreplay.testing.reference import reference_integrator
 
 from ..scenes.truth import TRUTH_SCENES
 from ..tasks.truth import CELLS, STEPS, Cell
@@ -71,7 +71,7 @@ class Derivative:
         return self.objective.dot(difference)
 
     def conclude(self, kept: dict[str, list[np.ndarray]]) -> dict[str, dict[str, Any]]:
-        """The samples of each method, and the verdict on it: see pathreplay.check.verdict."""
+        """The samples of each method, and the verdict on it: see pathreplay.testing.verdict."""
         samples = {name: np.concatenate(rows) for name, rows in kept.items() if rows}
         facts: dict[str, dict[str, Any]] = {
             name: {"values": values.tolist(), "mean": float(values.mean())} for name, values in samples.items()

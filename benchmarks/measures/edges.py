@@ -12,12 +12,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.check.objective import Objective, smooth_weights
-from pathreplay.check.stencil import CENTRAL
-from pathreplay.inverse.losses import l2
-from pathreplay.inverse.recorded import Recordings, differentiate
-from pathreplay.render.boundary import Boundary
-from pathreplay.render.term import TermResult
+from pathreplay.integrators.boundary_term import Boundary
+from pathreplay.integrators.term import TermResult
+from pathreplay.inverse.losses.pixelwise import l2
+from pathreplay.inverse.objective.frozen import Recordings, differentiate
+from pathreplay.testing.objective import Objective, smooth_weights
+from pathreplay.testing.stencil import CENTRAL
 
 from ..scenes import SCENES
 from ..scenes.movers import MOVERS

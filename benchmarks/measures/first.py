@@ -18,7 +18,7 @@ BEGIN = time.perf_counter()
 
 def _set_variant(ours: bool) -> None:
     if ours:
-        from pathreplay import backend
+        from pathreplay.platform import backend
 
         backend.set_variant(None)
     else:

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.media import cellwalk
+from pathreplay.plugins import grid_traversal
 
 from ..scenes.grids import grid_medium
 from .job import Job, Measure
@@ -85,7 +85,7 @@ def _fine(grid: Any) -> Any:
 
 def _controlled(grid: Any, bounds: Any, control: Any, denser: float) -> Any:
     low, high = bounds.lowest * grid.scale, bounds.highest * grid.scale
-    return cellwalk.make_cells(bounds, [control, denser * dr.maximum(high - control, control - low)])
+    return grid_traversal.make_cells(bounds, [control, denser * dr.maximum(high - control, control - low)])
 
 
 def _with(control: Callable[[Any, Any], Any], denser: float) -> Callable[[Any], Any]:
@@ -101,7 +101,7 @@ CANDIDATES: dict[str, Callable[[Any], Any]] = {
     "lowest, x 2": _with(lambda fine, scale: fine.lowest * scale, 2),
     "mean as control": _with(lambda fine, scale: fine.mean * scale, 1),
     "mean, x 2": _with(lambda fine, scale: fine.mean * scale, 2),
-    **{f"bounded, x {n}": _with(lambda fine, scale: cellwalk.control(fine, scale)[0], n) for n in (1, 2, 4)},
+    **{f"bounded, x {n}": _with(lambda fine, scale: grid_traversal.control(fine, scale)[0], n) for n in (1, 2, 4)},
     "gridmedium": lambda grid: grid.shadow_cells,
 }
 
@@ -154,7 +154,7 @@ def _shadow_rays(grid: Any, rays: int) -> Any:
 
 
 def _quadrature(grid: Any, ray: Any) -> np.ndarray:
-    a, b = cellwalk.clip(grid.box, ray)
+    a, b = grid_traversal.clip(grid.box, ray)
     h = dr.maximum(b - a, 0) / POINTS
 
     def body(i: Any, depth: Any) -> tuple[Any, Any]:

@@ -117,7 +117,7 @@ class Point:
     mean: float | None = None  # of what was measured, over entries and seeds
     values: tuple[float, ...] = ()  # of each seed, where what was measured is one number
     z: float | None = None  # the difference from a reference, in standard errors, where there is one
-    verdict: str | None = None  # of task `truth`: see pathreplay.check.verdict
+    verdict: str | None = None  # of task `truth`: see pathreplay.testing.verdict
 
 
 @dataclass(frozen=True)

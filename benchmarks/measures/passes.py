@@ -60,6 +60,6 @@ class Pass(SceneMeasure):
 
 def _wave(shape: tuple[int, int, int]) -> Any:
     # Imported here: it brings scipy along, 60 MiB that belong to no method's peak.
-    from pathreplay.check.objective import smooth_weights
+    from pathreplay.testing.objective import smooth_weights
 
     return mi.TensorXf(smooth_weights(shape, alpha=False).astype(np.float32))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.gradient.ray_jacobian import Recovery
+from pathreplay.adjoint.ray_jacobian import Recovery
 
 
 @dataclass(frozen=True)

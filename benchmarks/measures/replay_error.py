@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.gradient.ray_jacobian import Recovery
+from pathreplay.adjoint.ray_jacobian import Recovery
 
 from .job import Job
 from .methods import METHODS

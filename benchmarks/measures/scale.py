@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from pathreplay import memory
-from pathreplay.inverse import iterate, make_config
-from pathreplay.inverse.images import exr_bytes
+from pathreplay.inverse.images.io import exr_bytes
+from pathreplay.jobs import iterate, make_config
+from pathreplay.platform import memory
 
 from .job import Job, Measure
 from .passes import Pass

@@ -10,15 +10,15 @@ import drjit.opt
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.inverse.checkpoint import Run
-from pathreplay.inverse.config import make_config
-from pathreplay.inverse.evaluate import Evaluator, Local
-from pathreplay.inverse.loop import take_step
-from pathreplay.inverse.losses import l2
-from pathreplay.inverse.optimiser import DrJitOptimiser
-from pathreplay.inverse.problem import Problem
-from pathreplay.inverse.variables import Variable
-from pathreplay.inverse.views import View
+from pathreplay.inverse.config.schema import make_config
+from pathreplay.inverse.dataset.views import View
+from pathreplay.inverse.loop.checkpoint import Run
+from pathreplay.inverse.loop.loop import take_step
+from pathreplay.inverse.losses.pixelwise import l2
+from pathreplay.inverse.objective.evaluate import Evaluator, Local
+from pathreplay.inverse.optim.adaptive import DrJitOptimiser
+from pathreplay.inverse.parameters.variables import Variable
+from pathreplay.inverse.problem.problem import Problem
 from pathreplay.scenes.parameters import get_array
 
 from ..scenes import SCENES

@@ -19,7 +19,8 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from pathreplay import __version__, backend
+from pathreplay import __version__
+from pathreplay.platform import backend
 
 from .job import Job, Kind, Machine, Measure
 

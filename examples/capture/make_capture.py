@@ -12,8 +12,8 @@ import json
 import math
 from pathlib import Path
 
-from pathreplay.backend import set_variant  # before mitsuba: finds a libLLVM
-from pathreplay.inverse import optimize
+from pathreplay.jobs import optimize
+from pathreplay.platform.backend import set_variant  # before mitsuba: finds a libLLVM
 
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip

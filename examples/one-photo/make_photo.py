@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 
 FOLDER = Path(__file__).parent
 TRUTH = {
@@ -29,7 +29,7 @@ def main(resolution: int = 96, spp: int = 1024, into: Path = FOLDER) -> None:
     set_variant()
     import mitsuba as mi
 
-    from pathreplay.inverse.images import png_bytes
+    from pathreplay.inverse.images.io import png_bytes
     from pathreplay.scenes.loading import load_scene
     from pathreplay.scenes.parameters import to_value
 

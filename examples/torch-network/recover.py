@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 import pathreplay  # before mitsuba: it brings a libLLVM that works
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 
 set_variant()
 
@@ -23,7 +23,7 @@ import mitsuba as mi  # noqa: E402
 import torch  # noqa: E402
 
 from pathreplay.bridge.torch import Render  # noqa: E402
-from pathreplay.inverse.images import find_image, png_bytes, read_image, resized  # noqa: E402
+from pathreplay.inverse.images.io import find_image, png_bytes, read_image, resized  # noqa: E402
 from pathreplay.scenes.loading import load_scene  # noqa: E402
 
 SCENE, TEXTURE, CLOSEUP = "cornell-box-photo", "back.bsdf.reflectance.data", 1

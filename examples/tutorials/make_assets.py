@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pathreplay.backend import set_variant
+from pathreplay.platform.backend import set_variant
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -41,9 +41,9 @@ def sky(rows: int = 32) -> np.ndarray:
 def main() -> None:
     """Write all files, in the place of those that are there."""
     set_variant()
-    from pathreplay.inverse.images import exr_bytes
-    from pathreplay.media.volume_files import save_vol
+    from pathreplay.inverse.images.io import exr_bytes
     from pathreplay.scenes.bodies import ball, knobs, mesh
+    from pathreplay.scenes.volume_files import save_vol
 
     ASSETS.mkdir(exist_ok=True)
     vertices, faces = ball(5)

@@ -17,10 +17,10 @@ __all__ = ["PathreplayError", "__version__", "check_gradient", "exclusive", "ite
 
 #: Public names that live in rooms which need more time to import than `import pathreplay` should take.
 _LAZY = {
-    "check_gradient": "pathreplay.check",
-    "exclusive": "pathreplay.render.lifetimes",
-    "iterate": "pathreplay.inverse",
-    "optimize": "pathreplay.inverse",
+    "check_gradient": "pathreplay.testing",
+    "exclusive": "pathreplay.integrators.lifetimes",
+    "iterate": "pathreplay.jobs",
+    "optimize": "pathreplay.jobs",
 }
 
 
@@ -31,12 +31,12 @@ def _set_up() -> None:
         os.getcwd()
     except OSError:
         return  # the folder was removed: Mitsuba would bring Python down at its end; the command says so
-    from pathreplay import address_space
+    from pathreplay.platform import address_space
 
     if address_space.is_too_small():
         return  # Mitsuba would hang; commands and functions say so
     # Before the first import of mitsuba: Dr.Jit looks for libLLVM while it is imported.
-    from pathreplay import backend, interrupts, plugins
+    from pathreplay.platform import backend, interrupts, registration
 
     backend.point_drjit()
     try:
@@ -44,7 +44,7 @@ def _set_up() -> None:
             import mitsuba  # noqa: F401
     except Exception:
         return  # missing or broken: set_variant and the doctor say so, with the way out
-    plugins.install()
+    registration.install()
 
 
 _set_up()
@@ -55,7 +55,7 @@ def __getattr__(name: str) -> Any:
     if name in _LAZY:
         import importlib
 
-        from pathreplay import address_space
+        from pathreplay.platform import address_space
 
         address_space.require()
         return getattr(importlib.import_module(_LAZY[name]), name)

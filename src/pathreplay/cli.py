@@ -21,9 +21,9 @@ from typing import Annotated, Any, Literal, NoReturn
 import typer
 import typer.core
 
-from pathreplay import address_space, interrupts
 from pathreplay.errors import PathreplayError, plain_line
-from pathreplay.watch import commands
+from pathreplay.platform import address_space, interrupts
+from pathreplay.report.watch import commands
 
 _UsageError: Any = typer.BadParameter.__base__
 """What typer raises for a command line that is none; it exports one kind only, whose base they share."""
@@ -89,7 +89,7 @@ def doctor(
     from rich.console import Console
 
     if gpu:
-        from pathreplay.check.gpu import examine as examine_gpu
+        from pathreplay.testing.gpu import examine as examine_gpu
 
         typer.echo(examine_gpu(variant, output, tell=typer.echo))
         return
@@ -131,9 +131,9 @@ def check(
 ) -> None:
     """Compare gradients with finite differences of Mitsuba's path tracer; exit status 1 if one does not pass."""
     with interrupts.undisturbed():  # as in `optimize`
-        from pathreplay import backend
-        from pathreplay.check import command
+        from pathreplay.platform import backend
         from pathreplay.scenes.loading import load_scene_for
+        from pathreplay.testing import command
 
     if json is not None:
         command.require_writable(json)
@@ -172,7 +172,7 @@ def optimize(
 ) -> None:
     """Recover scene parameters from pictures; Ctrl-C or SIGTERM ends early with everything written."""
     with interrupts.undisturbed():  # what is half imported can bring the process down at its end
-        from pathreplay.inverse import optimize as run_job
+        from pathreplay.jobs import optimize as run_job
 
     result = run_job(config, resume=resume, output=output, progress=not quiet, define=define or (), executor=executor)
     typer.echo(result.describe())
@@ -188,8 +188,8 @@ def watch(
 ) -> None:
     """Serve a page that follows a run, with a button to stop it; Ctrl-C ends the command, and not the run."""
     with interrupts.undisturbed():
-        from pathreplay.watch.run_files import require_run
-        from pathreplay.watch.server import RunServer, serve
+        from pathreplay.report.watch.run_files import require_run
+        from pathreplay.report.watch.server import RunServer, serve
 
     require_run(run)
     server = RunServer(run, host, port)
@@ -230,8 +230,8 @@ def render(
 ) -> None:
     """Render a scene by any integrator into one file, which is there whole or not at all."""
     with interrupts.undisturbed():  # as in `optimize`
-        from pathreplay import backend
         from pathreplay.output.render import render_to_file
+        from pathreplay.platform import backend
 
         backend.set_variant(variant)
     line = render_to_file(
@@ -260,7 +260,7 @@ def schema() -> None:
     """Print the JSON schema of a job: editors complete and check configs with it."""
     import json
 
-    from pathreplay.inverse.config import Config
+    from pathreplay.inverse.config.schema import Config
 
     typer.echo(json.dumps(Config.model_json_schema(), indent=2))
 

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.text import Text
 
-from pathreplay import __version__, libllvm
-from pathreplay.backend import is_usable_variant
+from pathreplay import __version__
 from pathreplay.errors import plain_line
-from pathreplay.libllvm import ENVIRONMENT_VARIABLE, LlvmLibrary
+from pathreplay.platform import llvm
+from pathreplay.platform.backend import is_usable_variant
+from pathreplay.platform.llvm import ENVIRONMENT_VARIABLE, LlvmLibrary
 
 
 @dataclass(frozen=True)
@@ -105,14 +106,14 @@ if not 0.0 < gradient < 100.0:
 def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[VariantVerdict]:
     """Try each variant; once one of a back end fails to start, its others are not tried."""
     environment = os.environ | ({ENVIRONMENT_VARIABLE: library.path} if library else {})
-    preload = libllvm.unlinked_siblings(library.path) if library else []
+    preload = llvm.unlinked_siblings(library.path) if library else []
     verdicts = []
     dead = {} if library else {"llvm": "no libLLVM works"}
     for name in names:
         backend = name.split("_")[0]
         message = dead.get(backend)
         if message is None:
-            _, message = libllvm.run_trial(_PROBE, {"preload": preload, "variant": name}, environment)
+            _, message = llvm.run_trial(_PROBE, {"preload": preload, "variant": name}, environment)
             if message:
                 dead[backend] = f"as {name}"
         verdicts.append(VariantVerdict(name, not message, message))
@@ -130,15 +131,15 @@ def examine() -> DoctorReport:
     except Exception as error:
         versions, known = (f"cannot be imported ({plain_line(str(error))})", "unknown"), []
         ways_out.append("install Mitsuba: pip install 'mitsuba>=3.9.1,<3.10'")
-    libraries = tuple(libllvm.probe(path, origin) for path, origin in libllvm.candidates()) if known else ()
+    libraries = tuple(llvm.probe(path, origin) for path, origin in llvm.candidates()) if known else ()
     library = next((library for library in libraries if library.works), None)
     names = sorted(filter(is_usable_variant, known), key=lambda name: (name.split("_")[0] != "llvm", known.index(name)))
     variants = _try_variants(names, library)
 
     broken = {variant.name.split("_")[0] for variant in variants if not variant.works}
     if "llvm" in broken and library is None:
-        ways_out.append(f"libLLVM: {libllvm.WAY_OUT}")
-    if library is not None and any(each.path == libllvm.ASKED_FOR and not each.works for each in libraries):
+        ways_out.append(f"libLLVM: {llvm.WAY_OUT}")
+    if library is not None and any(each.path == llvm.ASKED_FOR and not each.works for each in libraries):
         ways_out.append(f"{ENVIRONMENT_VARIABLE} names a libLLVM that fails: unset it, or let it name {library.path}")
     if "cuda" in broken:
         ways_out.append(

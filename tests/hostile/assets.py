@@ -97,8 +97,8 @@ def pfm(pixels: np.ndarray) -> bytes:
 
 def make_room(room: Path, vdb: Path) -> None:
     """Write the files of a good room. Needs an active variant."""
-    from pathreplay.inverse.images import exr_bytes
-    from pathreplay.media.volume_files import save_vol
+    from pathreplay.inverse.images.io import exr_bytes
+    from pathreplay.scenes.volume_files import save_vol
 
     room.mkdir()
     (room / "ball.xml").write_text(SCENE)
@@ -116,8 +116,8 @@ def make_room(room: Path, vdb: Path) -> None:
 
 def make(folder: Path, vdb: Path) -> None:
     """Write the folders ``room`` and ``run`` into ``folder``. Runs the job once: needs a process of its own."""
-    from pathreplay import backend
-    from pathreplay.inverse import optimize
+    from pathreplay.jobs import optimize
+    from pathreplay.platform import backend
 
     backend.set_variant("llvm_ad_rgb")
     make_room(folder / "room", vdb)

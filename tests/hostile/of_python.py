@@ -120,7 +120,7 @@ _code(
 _code("check_gradient of a loss that is NaN", CHECK.format(
     key="'paint.reflectance.data'", options="{'loss': lambda image: dr.sum(image) * float('nan')}"))  # fmt: skip
 
-OPTIMIZE = "from pathreplay.inverse import make_config, optimize\n"
+OPTIMIZE = "from pathreplay.jobs import make_config, optimize\n"
 for _call in (
     "optimize()",
     "optimize(3)",
@@ -139,7 +139,7 @@ for _call in (
 ):
     _code(_call[:60], OPTIMIZE + _call)
 
-VOLUMES = "from pathreplay.media.volume_files import grid_volume, load_volume, save_vol, vol_bytes\n"
+VOLUMES = "from pathreplay.scenes.volume_files import grid_volume, load_volume, save_vol, vol_bytes\n"
 for _call in (
     "load_volume('')",
     "load_volume('texture.png')",

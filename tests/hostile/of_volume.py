@@ -15,7 +15,7 @@ KIND = "volume"
 MEDIUM = """<shape type="cube" id="box"><bsdf type="null"/><medium type="heterogeneous" name="interior">
   <volume type="gridvolume" name="sigma_t"><string name="filename" value="cloud.vol"/></volume></medium></shape>"""
 
-READ = "from pathreplay.media.volume_files import load_volume; load_volume({file!r}, {grid!r})"
+READ = "from pathreplay.scenes.volume_files import load_volume; load_volume({file!r}, {grid!r})"
 
 
 def vol(

@@ -13,7 +13,7 @@ KIND = "watch"
 ASK = """
 import socket, threading, time
 from pathlib import Path
-from pathreplay.watch import server as watch
+from pathreplay.report.watch import server as watch
 watch.PATIENCE = 2.0
 run = Path("runs/job")
 server = watch.RunServer(run, "127.0.0.1", 0, "token")

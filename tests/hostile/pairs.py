@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config import Config, make_config
+from pathreplay.inverse.config.schema import Config, make_config
 
 from .assets import png
 from .battery import Result
@@ -194,7 +194,7 @@ def missing_keys() -> set[str]:
 
 
 def _keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[str]:
-    from pathreplay.inverse.config import _TABLES
+    from pathreplay.inverse.config.schema import _TABLES
 
     for name in model.model_fields:
         table = _TABLES.get(name) if not prefix else None

@@ -26,9 +26,6 @@ def serve() -> None:
     """Answer requests until standard input ends."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever imports print does not belong among the answers
-    import pathreplay.check.command
-    import pathreplay.cli
-    import pathreplay.inverse.job  # noqa: F401
 
     for line in sys.stdin:
         request = json.loads(line)

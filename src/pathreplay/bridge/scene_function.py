@@ -16,11 +16,11 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.descriptions import load_integrator, told
 from pathreplay.scenes.loading import load_scene_for
 from pathreplay.scenes.parameters import get_array, is_transform, resolve_differentiable
 from pathreplay.scenes.stored import form_of
-from pathreplay.traversal import traversed
 
 
 class View(NamedTuple):

@@ -9,8 +9,8 @@ from typing import Any
 import mitsuba as mi
 
 from pathreplay.bridge.scene_function import SceneFunction, View
-from pathreplay.device import backend_of
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.device import backend_of
 
 try:
     import torch

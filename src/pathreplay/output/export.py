@@ -17,22 +17,22 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from pathreplay import backend
 from pathreplay.errors import PathreplayError
-from pathreplay.files import file_names
-from pathreplay.inverse.capture import FACING, read_capture
-from pathreplay.inverse.exposures import EXPOSURE
-from pathreplay.inverse.images import picture_size, png_bytes
-from pathreplay.inverse.pose import PART_NAMES
-from pathreplay.inverse.run_folder import Job, read_job, require_writable_name
-from pathreplay.inverse.values import Arrays
+from pathreplay.inverse.dataset.capture import FACING, read_capture
+from pathreplay.inverse.images.io import picture_size, png_bytes
+from pathreplay.inverse.parameters.exposures import EXPOSURE
+from pathreplay.inverse.parameters.pose import PART_NAMES
+from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.output.scene_folder import SCENE, Exported, Source, exported, require_same
-from pathreplay.scenes.builtin_scenes import BUILTINS
+from pathreplay.platform import backend
+from pathreplay.platform.atomic_files import whole_folder
+from pathreplay.platform.files import file_names
+from pathreplay.platform.traversal import traversed
+from pathreplay.runs.run_folder import Job, read_job, require_writable_name
+from pathreplay.scenes.builtin import BUILTINS
 from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.loading import as_xml_has_them, builtin_dict, coarse_pictures
 from pathreplay.scenes.parameters import get_array
-from pathreplay.traversal import traversed
-from pathreplay.whole_files import whole_folder
 
 _OPTION = "-o"
 

@@ -15,11 +15,11 @@ from typing import Any
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.threads import spare_thread
+from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.descriptions import require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
 from pathreplay.scenes.substitute import exchange
-from pathreplay.threads import spare_thread
-from pathreplay.traversal import traversed
 
 Node = Any
 """`mi.parser.SceneNode`."""

@@ -14,11 +14,11 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 
-from pathreplay import memory
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.inverse.images import Image, png_bytes
-from pathreplay.render.film import MOST_SAMPLES, require_film
-from pathreplay.render.parts import rounded, split
+from pathreplay.integrators.film.image import MOST_SAMPLES, require_film
+from pathreplay.integrators.parts import rounded, split
+from pathreplay.inverse.images.io import Image, png_bytes
+from pathreplay.platform import memory
 from pathreplay.scenes.descriptions import told
 
 # Samples of a pass: some seconds, so that a bar moves and a Ctrl-C is heard. Only where samples do not know each other.

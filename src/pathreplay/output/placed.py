@@ -9,12 +9,12 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.images import exr_bytes
-from pathreplay.media.volume_files import UNIT_CUBE, Bounds, vol_bytes
+from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.output.nodes import Described, Node, Owner
+from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.parameters import get_array
 from pathreplay.scenes.stored import form_of
-from pathreplay.traversal import traversed
+from pathreplay.scenes.volume_files import UNIT_CUBE, Bounds, vol_bytes
 
 _PICTURES = ("bitmap", "envmap")
 _OF_A_MESH = ("vertex_", "faces", "face_")

@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.inverse.definitions import defined
+from pathreplay.inverse.config.definitions import defined
 from pathreplay.output.picture import Told, file_bytes, find_sensor, render, set_size
+from pathreplay.platform.atomic_files import require_writable, write_whole
 from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.scenes.loading import load_scene
-from pathreplay.whole_files import require_writable, write_whole
 
 _OPTION = "-o"
 _SECONDS = 10.0

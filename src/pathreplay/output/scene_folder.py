@@ -15,18 +15,18 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.files import file_names
-from pathreplay.inverse.values import Arrays
+from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.output.nodes import Described, describe, require_no_objects
 from pathreplay.output.placed import Placing, copied_files, made_otherwise
 from pathreplay.output.xml import scene_xml
-from pathreplay.plugins import PLUGINS
+from pathreplay.platform.files import file_names
+from pathreplay.platform.registration import PLUGINS
+from pathreplay.platform.threads import spare_thread
+from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.parameters import get_array, is_empty, to_value
 from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
-from pathreplay.threads import spare_thread
-from pathreplay.traversal import traversed
 
 SCENE = "scene.xml"
 

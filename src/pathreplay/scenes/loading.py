@@ -13,14 +13,14 @@ from typing import Any
 
 import mitsuba as mi
 
-from pathreplay import memory
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.files import MISSING, file_problem
+from pathreplay.platform import memory
+from pathreplay.platform.files import MISSING, file_problem
+from pathreplay.platform.traversal import traversed
 from pathreplay.scenes import parameters as scene_parameters
-from pathreplay.scenes.builtin_scenes import BUILTINS, COSTS, SceneDict
+from pathreplay.scenes.builtin import BUILTINS, COSTS, SceneDict
 from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.substitute import Cameras, load_dict_with, load_file_with
-from pathreplay.traversal import traversed
 
 # What Mitsuba calls the class of a `bitmap` in 8 bits.
 _COARSE = "BitmapTextureImpl[uint8]"

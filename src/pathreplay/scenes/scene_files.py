@@ -12,10 +12,10 @@ from xml.parsers import expat
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.files import MISSING, file_problem
-from pathreplay.media.volume_files import require_whole_vol
+from pathreplay.platform.files import MISSING, file_problem
+from pathreplay.scenes.image_files import require_readable_picture
 from pathreplay.scenes.mesh_files import require_sound_ply, require_sound_serialized
-from pathreplay.scenes.picture_files import require_readable_picture
+from pathreplay.scenes.volume_files import require_whole_vol
 
 DEEPEST = 64
 """Elements inside each other in a scene file. Real ones have ten; Mitsuba's parser runs out of stack at some 10 000."""

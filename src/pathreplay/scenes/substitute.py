@@ -13,9 +13,9 @@ from typing import Any
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
+from pathreplay.platform.threads import spare_thread
 from pathreplay.scenes.descriptions import require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
-from pathreplay.threads import spare_thread
 
 Cameras = Mapping[str, Mapping[str, Any]]
 """Sensors by their ids, as dictionaries of Mitsuba's."""

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .emitters import emission, vertex_glow
-from .flight import Flown, fly, fly_again
-from .media import interaction
-from .surface import met, steady
-from .traits import is_null
-from .vertex import Arrival, Flight, TraceConfig, VertexRecord
+from pathreplay.transport.emitters import emission, vertex_glow
+from pathreplay.transport.facts.traits import is_null
+from pathreplay.transport.surface import met, steady
+from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, VertexRecord
+from pathreplay.transport.volume.flight import Flown, fly, fly_again
+from pathreplay.transport.volume.media import interaction
 
 
 @dataclass

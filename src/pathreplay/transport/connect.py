@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .arrive import Vertex
-from .emitters import draw_emitter, redraw_emitter
-from .scatter import towards
-from .shadow import shadow, shadow_again
-from .vertex import Shadow, TraceConfig, VertexRecord, VertexSamples, is_smooth, mis_weight
+from pathreplay.transport.arrive import Vertex
+from pathreplay.transport.emitters import draw_emitter, redraw_emitter
+from pathreplay.transport.scatter import towards
+from pathreplay.transport.vertex import Shadow, TraceConfig, VertexRecord, VertexSamples, is_smooth, mis_weight
+from pathreplay.transport.volume.shadow import shadow, shadow_again
 
 
 @dataclass

@@ -5,11 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .meet import meet
-from .passage import skip_null
-from .surface import held_point
-from .traits import is_painted
-from .vertex import Arrival, Lighting, TraceConfig, mis_weight, reciprocal
+from pathreplay.transport.facts.traits import is_painted
+from pathreplay.transport.meet import meet
+from pathreplay.transport.surface import held_point
+from pathreplay.transport.vertex import Arrival, Lighting, TraceConfig, mis_weight, reciprocal
+from pathreplay.transport.volume.passage import skip_null
 
 
 def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool) -> mi.Spectrum:

@@ -11,8 +11,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .signature import shape_met
-from .vertex import TraceConfig
+from pathreplay.transport.signature import shape_met
+from pathreplay.transport.vertex import TraceConfig
 
 ROUNDING = 2.0**-22
 """Of v = (s + k) / n, for the k-th segment and its own s, in segments per segment before."""

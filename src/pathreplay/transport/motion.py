@@ -7,12 +7,12 @@ from collections.abc import Collection
 import drjit as dr
 import mitsuba as mi
 
-from ..traversal import known_values
-from . import scatter
-from .arrive import Vertex
-from .nodes import nodes_of, with_gradients
-from .start import CameraStart
-from .vertex import Arrival, SampledContinuation, TraceConfig, VertexRecord, VertexSamples
+from pathreplay.platform.traversal import known_values
+from pathreplay.transport import scatter
+from pathreplay.transport.arrive import Vertex
+from pathreplay.transport.facts.nodes import nodes_of, with_gradients
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.vertex import Arrival, SampledContinuation, TraceConfig, VertexRecord, VertexSamples
 
 FEW = 8
 """Of more moving shapes than these nobody asks which they are."""

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from .meet import meet
-from .passage import skip_null
-from .start import CameraStart, behind_emitters
-from .step import choose_step
-from .vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples, reciprocal
+from pathreplay.transport.meet import meet
+from pathreplay.transport.start import CameraStart, behind_emitters
+from pathreplay.transport.step import choose_step
+from pathreplay.transport.vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples, reciprocal
+from pathreplay.transport.volume.passage import skip_null
 
 # Russian roulette ends at least one path in twenty, so that a path between mirrors comes to an end.
 MAX_SURVIVAL = 0.95

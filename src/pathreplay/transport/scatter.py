@@ -13,9 +13,17 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from .arrive import Vertex
-from .velocity import moved_direction
-from .vertex import Arrival, SampledContinuation, TraceConfig, VertexRecord, VertexSamples, is_smooth, reciprocal
+from pathreplay.transport.arrive import Vertex
+from pathreplay.transport.velocity import moved_direction
+from pathreplay.transport.vertex import (
+    Arrival,
+    SampledContinuation,
+    TraceConfig,
+    VertexRecord,
+    VertexSamples,
+    is_smooth,
+    reciprocal,
+)
 
 # Share by which the weight of a lobe sampled alone may differ from the weight that was drawn (and squared distance of
 # their directions) and still belong to the same lobe: float32 rounding is far below it, BSDFs without support for

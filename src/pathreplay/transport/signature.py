@@ -5,9 +5,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from .surface import held_point
-from .traits import FACETS, WHOLE, Tables
-from .vertex import TraceConfig
+from pathreplay.transport.facts.traits import FACETS, WHOLE, Tables
+from pathreplay.transport.surface import held_point
+from pathreplay.transport.vertex import TraceConfig
 
 TUBES = mi.ShapeType.Cylinder, mi.ShapeType.BSplineCurve, mi.ShapeType.LinearCurve
 """Open at both ends: an edge is a limb or a rim."""

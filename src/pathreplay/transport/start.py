@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .meet import meet, short_of_end
-from .passage import skip_null
-from .vertex import Arrival, TraceConfig
+from pathreplay.transport.meet import meet, short_of_end
+from pathreplay.transport.vertex import Arrival, TraceConfig
+from pathreplay.transport.volume.passage import skip_null
 
 
 @dataclass

@@ -9,8 +9,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from . import arrive, connect, scatter
-from .vertex import (
+from pathreplay.transport import arrive, connect, scatter
+from pathreplay.transport.vertex import (
     Arrival,
     Flight,
     KnownLight,

@@ -25,7 +25,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from .surface import HeldPoint, held_point
+from pathreplay.transport.surface import HeldPoint, held_point
 
 # h0 over the size of the shape that was hit. A larger one is less noisy and gives up more of the edges that are close
 # by; docs/gradients.md has both for 0.003 to 0.03.

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .media import Media
-from .traits import Traits
+from pathreplay.transport.facts.traits import Traits
+from pathreplay.transport.volume.media import Media
 
 
 @dataclass(frozen=True)

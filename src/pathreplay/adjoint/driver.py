@@ -1,0 +1,32 @@
+"""What a driver is: a way to differentiate the light paths of a start."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import NonFiniteCounter
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.vertex import TraceConfig
+
+
+class Driver(Protocol):
+    """Back-propagates the adjoint radiance ``δL`` of each path into the parameters, and into the ``start``.
+
+    Returns whether the paths move with the parameters. ``lost`` counts paths that lost a part of their gradient. Called
+    under `dr.suspend_grad`. Its docstring says what it does not differentiate.
+    """
+
+    def __call__(self, trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool: ...
+
+
+class ForwardDriver(Protocol):
+    """Gives the tangent of the radiance, whether anything was met (both per path), and whether the paths move.
+
+    The parameters carry their tangents already.
+    """
+
+    def __call__(
+        self, trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter
+    ) -> tuple[mi.Spectrum, mi.Bool, bool]: ...

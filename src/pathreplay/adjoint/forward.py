@@ -1,0 +1,57 @@
+"""The forward driver: carry tangents along the path, δL = Σ (δβ_i e_i + β_i δe_i), in a single pass."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative, forward_step, tangents
+from pathreplay.adjoint.null_branching import Branch, branch_term
+from pathreplay.transport.motion import path_moves
+from pathreplay.transport.path import PathState
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.vertex import TraceConfig
+
+
+@dr.syntax
+def forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
+    """Tangent of the radiance along the rays of a ``start``: ``(δL, valid, moves)``, the first two per ray.
+
+    The parameters must carry their tangents already (propagate to them before the call). Nothing is divided, so a
+    weight that is exactly zero keeps its derivative: δβ_{i+1} = δβ_i w_i + β_i δw_i. If the path ``moves`` with the
+    parameters, ``lost`` counts paths with a tangent that was not finite and was dropped. Visibility is not
+    differentiated and, with ``attach='none'``, nothing that moves.
+    """
+    with dr.resume_grad():
+        δo, δd = tangents(*start.repeat())
+    δ = RayDerivative(mi.Point3f(δo), mi.Vector3f(δd), mi.Float(0))  # tangent of the arrival
+
+    δL = mi.Spectrum(0)  # tangent of the radiance
+    δβ = mi.Spectrum(0)  # tangent of the throughput
+    broken = mi.Bool(False)  # a tangent was not finite
+    sampler = start.sampler
+    path = PathState.begin(trace, start, sustained=True)
+    ray0 = path.at.ray
+    valid = mi.Bool(trace.background_is_opaque) & path.active
+    moves = path_moves(trace, start, path.at)
+    branch = Branch.none()
+
+    while dr.hint(path.active, exclude=[trace, moves, lost], label="pathreplay: forward"):
+        u, step = path.choose(trace, sampler)
+        valid |= path.active & step.seen
+        if dr.hint(trace.branch, mode="scalar"):
+            branch = branch.offer(path, step)
+        onward, v = path.advance(trace, u, step)
+        again, δe, δw, δ = forward_step(trace, v, moves, δ, path.active)
+        if dr.hint(moves, mode="scalar"):
+            δ, finite = δ.finite_part()
+            lost.add(path.active & ~finite & ~broken)
+            broken |= ~finite
+        δL += δβ * dr.detach(again.e) + path.β * δe
+        δβ = (δβ * dr.detach(again.w) + path.β * δw) * v.rr_weight
+        path = onward
+
+    if dr.hint(trace.branch, mode="scalar"):
+        with dr.resume_grad():
+            δL += tangents(branch_term(trace, branch, sampler, ray0))[0]
+    return δL, valid, moves

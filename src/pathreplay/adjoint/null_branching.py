@@ -1,0 +1,86 @@
+"""The branch: one more path from a null collision, for derivatives where collisions are never real.
+
+The derivative of a collision is dσ_s L_s - dσ_t b, with L_s the radiance that it would scatter. Where σ_s is zero no
+path ever scatters, so that nobody knows L_s. One null collision of each path is kept, and an extra path from there
+estimates it; `branch_weight` shares the work with real collisions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import backward
+from pathreplay.adjoint.primal import walk_on
+from pathreplay.transport.path import PathState, next_arrival
+from pathreplay.transport.step import choose_step
+from pathreplay.transport.vertex import Arrival, Flight, SampledStep, TraceConfig, VertexSamples
+from pathreplay.transport.volume.media import interaction, majorant
+
+
+@dataclass
+class Branch:
+    """The null collision that was kept so far (loop state); zero before there is any."""
+
+    p: mi.Point3f  # where
+    d: mi.Vector3f  # direction of the path that came there
+    medium: mi.MediumPtr
+    weight: mi.Spectrum  # throughput and weight of the collision, over its share of the mass
+    bare: mi.Spectrum  # the same without the null collisions before it on its flight
+    mass: mi.Float  # of all null collisions so far
+    number: mi.Float  # of null collisions so far
+    depth: mi.UInt32  # vertices before
+    η: mi.Float  # relative index of refraction since the camera
+
+    @staticmethod
+    def none() -> Branch:
+        o, d, black = mi.Point3f(0), mi.Vector3f(0), mi.Spectrum(0)
+        return Branch(o, d, dr.zeros(mi.MediumPtr), black, black, mi.Float(0), mi.Float(0), mi.UInt32(0), mi.Float(1))
+
+    def offer(self, path: PathState, step: SampledStep) -> Branch:
+        """This one, or the null collision of one more flight, by their masses."""
+        ray, null = path.at.ray, step.kept.media.flight.null
+        active = path.active & dr.any(path.β != 0)
+        mass = self.mass + dr.select(active, null.mass, 0)
+        taken = active & (null.pick * mass < null.mass)
+        weight, bare = mi.Spectrum(path.β * null.ω), mi.Spectrum(path.β * null.bare)
+        number = self.number + dr.select(active, null.number, 0)
+        p, medium = mi.Point3f(ray.o + null.t * ray.d), path.at.medium
+        offered = Branch(p, ray.d, medium, weight, bare, mass, number, path.depth, path.η)
+        return replace(dr.select(taken, offered, self), mass=mass, number=number)
+
+
+def branch_backward(trace: TraceConfig, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum) -> None:
+    """Back-propagate ``δL`` through the branch's part of the radiance, if any parameter reaches it."""
+    with dr.resume_grad():
+        term = branch_term(trace, branch, sampler, ray)
+        if dr.grad_enabled(term):
+            backward(dr.sum(δL * term))
+
+
+def branch_term(trace: TraceConfig, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f) -> mi.Spectrum:
+    """What has the branch's part of the radiance's derivative for derivative; its value means nothing.
+
+    Walks the extra path, detached; time and wavelengths are those of the camera ``ray``. Differentiable in the
+    coefficients of the medium. Call it under `dr.resume_grad`.
+    """
+    onward = replace(trace, branching=None)
+    active = branch.mass > 0
+    with dr.suspend_grad():
+        ray, hit = mi.Ray3f(branch.p, branch.d, ray.time, ray.wavelengths), dr.zeros(mi.PreliminaryIntersection3f)
+        at = Arrival(ray, hit, mi.Float(1), mi.Bool(True), mi.Bool(False), branch.medium, mi.Float(0))
+        one = mi.Spectrum(1)
+        flight = Flight(event=active, t=mi.Float(0), density=mi.Float(1), W=one, along=mi.Float(0), σ_s=one)
+        u = VertexSamples.draw(sampler)
+        step = choose_step(onward, at, u, sampler, one, branch.depth + 1 < trace.max_depth, active, flight)
+        at_next = next_arrival(onward, at, step, step.active)
+        L, _ = walk_on(onward, sampler, PathState(at_next, one, None, branch.η, branch.depth + 1, step.active))
+        L_s = step.e + step.w * L
+    mei = interaction(branch.medium, at.ray, mi.Float(0))
+    σ_s, _, σ_t = branch.medium.get_scattering_coefficients(mei, active)
+    term = branch.weight * σ_s * L_s
+    if trace.baseline is not None:
+        term -= branch.bare * σ_t * trace.baseline(mei, σ_t, majorant(branch.medium, at.ray, active), active)
+    return dr.select(active, branch.mass * term, 0)

@@ -1,0 +1,91 @@
+"""The pixel sweep: an image and the gradient of a quadratic loss, from one set of paths that are walked once.
+
+What a loss wants of a path is known only when its pixel is. So a lane walks all N paths of a pixel and records them
+one behind the other, as `sweep` does for one path; then it goes back through all of them. With I the mean of their
+radiances L_s, a loss with derivative f'(I) must not judge a path by itself, or the gradient would be biased by the
+covariance of L_s and its derivative; nor by paths that know of it, as those do that fill the pixel evenly with it. So
+paths come in sets S whose random numbers know nothing of each other, and each is judged by those of the other sets:
+
+    δL_s = f'(I_{-S}) / N,    I_{-S} = (N I - Σ_S L) / (N - |S|),    f'(I) = offset + slope · I.
+
+The gradient's mean is that with an image of other paths. Its variance differs by the covariance of f'(I) dL_s and the
+change of f' with L_s: to the better where the loss asks for more light, to the worse where it asks for less; and, of
+second order in 1/N, by what the noise of the image and that of the derivative make together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative
+from pathreplay.adjoint.record import Layout, record_type, room_for
+from pathreplay.adjoint.two_passes import first_walk, walk_back
+from pathreplay.samplers.pixel_samples import PixelSamples
+from pathreplay.transport.motion import path_moves
+from pathreplay.transport.path import PathState
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.vertex import TraceConfig
+
+
+@dataclass(frozen=True)
+class PixelLoss:
+    """Derivative of a loss by each lane's pixel: offset + slope · I."""
+
+    offset: mi.Spectrum
+    slope: mi.Spectrum
+
+
+@dr.syntax
+def pixel_sweep(
+    trace: TraceConfig,
+    numbers: PixelSamples,
+    camera: Callable[..., Any],
+    paths: int,
+    loss: PixelLoss,
+    lost: NonFiniteCounter,
+) -> tuple[bool, mi.Spectrum]:
+    """Walk ``paths`` paths (two or more) in every lane and back-propagate the loss.
+
+    Returns whether the paths move with the parameters, and the mean of their radiances. ``camera`` gives rays,
+    detached, and their weights: (sampler, active) -> (Ray3f, Spectrum). For scenes without media. What is not
+    differentiated, what is counted as ``lost`` and what is raised: see `sweep`.
+    """
+    room, size = room_for(trace), numbers.together(paths)
+    total = mi.Spectrum(0)  # radiance of all paths
+    with dr.suspend_grad():
+        sampler = numbers.first()
+        ray0, _ = camera(sampler.clone(), mi.Bool(True))
+        start = CameraStart(ray0, sampler, mi.Bool(True))
+        layout = Layout.of(trace, path_moves(trace, start, PathState.begin(trace, start).at))
+    records = dr.alloc_local(record_type(layout), paths * room)
+    counts = dr.alloc_local(mi.UInt32, paths)  # of each path the number of its records
+    ends = dr.alloc_local(mi.Spectrum, paths)  # what comes from beyond them
+    sets = dr.alloc_local(mi.Spectrum, -(-paths // size), dr.zeros(mi.Spectrum))  # of each set the sum of its radiances
+    s = mi.UInt32(0)  # number of the path
+
+    while dr.hint(
+        s < paths, exclude=[trace, numbers, camera, layout, start, lost], label="pathreplay: paths of a pixel"
+    ):
+        sampler = numbers.of(sampler, s % size, size, s // size)
+        ray, β = camera(sampler, mi.Bool(trace.max_depth > 0))
+        path = PathState.begin(trace, CameraStart(ray, sampler, mi.Bool(True)), sustained=True)
+        path.β, path.β_alive = mi.Spectrum(β), mi.Spectrum(β)
+        records, count, L, beyond, _branch = first_walk(trace, sampler, path, layout, records, s * room, lost)
+        counts[s], ends[s] = count, beyond
+        sets[s // size] += L
+        total += L
+        s += 1
+
+    while dr.hint(s > 0, exclude=[trace, ray0, lost, loss, layout, start], label="pathreplay: pixel, backwards"):
+        s -= 1
+        others = mi.Float(paths - dr.minimum(size, paths - s // size * size))
+        δL = (loss.offset + loss.slope * ((total - sets[s // size]) / others)) / paths
+        first, count, still = s * room, mi.UInt32(counts[s]), RayDerivative.zero()
+        walk_back(trace, layout, records, first, count, first + count - 1, ray0, δL, mi.Spectrum(ends[s]), still, lost)
+
+    return layout.moves, total / paths

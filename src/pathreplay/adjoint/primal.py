@@ -1,0 +1,50 @@
+"""The primal driver: walk paths and add up radiance, L = Σ β_i e_i."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.transport.arrive import background
+from pathreplay.transport.path import PathState
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.vertex import TraceConfig
+
+
+def primal(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool]:
+    """Estimate the radiance along the rays of a ``start``: ``(L, valid)``, per ray.
+
+    ``valid`` is Mitsuba's alpha: the path met a particle, or a surface that does not merely let it pass. Nothing is
+    differentiated.
+    """
+    path = PathState.begin(trace, start)
+    L, valid = walk_on(trace, start.sampler, path)
+    return L, valid | (trace.background_is_opaque & path.active)
+
+
+@dr.syntax
+def walk_on(trace: TraceConfig, sampler: mi.Sampler, path: PathState) -> tuple[mi.Spectrum, mi.Bool]:
+    """Radiance that arrives at a path from where it is on, and whether anything was met there.
+
+    Relative to its throughput, which has to be one.
+    """
+    trace = replace(trace, leaves=trace.media is None)
+    L = mi.Spectrum(0)  # radiance so far
+    valid, left = mi.Bool(False), mi.Bool(False)
+    if dr.hint(trace.leaves, mode="scalar"):
+        path, left = path.leave()
+
+    while dr.hint(path.active, exclude=[trace], label="pathreplay: primal"):
+        u, step = path.choose(trace, sampler)
+        L += path.β * step.e
+        valid |= path.active & step.seen
+        path = path.advance(trace, u, step)[0]
+        if dr.hint(trace.leaves, mode="scalar"):
+            path, gone = path.leave()
+            left |= gone
+
+    if dr.hint(trace.leaves, mode="scalar"):
+        L += path.β * background(trace, path.at, left)
+    return L, valid

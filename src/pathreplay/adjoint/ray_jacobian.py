@@ -1,0 +1,210 @@
+"""Rays in four local coordinates, and the 4x4 Jacobian by which a step maps one ray to the next.
+
+A ray has four degrees of freedom: its origin in the plane perpendicular to it, and its direction. Sliding the origin
+along the ray changes neither what is hit nor what follows, so in the six coordinates (o, d) the Jacobian is always
+singular. Two facts about an arrival go beyond the ray and matter at the next vertex alone, through the MIS weight of
+its emission: the density of the ray and the distance it came. They are differentiated there and then
+(`emission_slope`), so that they need no place in the matrix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import tangents
+from pathreplay.transport.emitters import emission
+from pathreplay.transport.path import PathState
+from pathreplay.transport.step import repeat_step
+from pathreplay.transport.vertex import Arrival, TraceConfig, VertexRecord, VertexSamples, reciprocal
+
+# Noise is needed where `independence` is below this. At held smooth lobes it would be zero but for float32 rounding,
+# which makes it 1e-7; at mirrors, glass and attached rough metal it is above 1e-3. float64 forgives 1e-4.
+ILL_CONDITIONED = 1e-4
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """How ray adjoints are recovered: solve (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i, in float64.
+
+    ``noise`` is the standard deviation of ε_i, which is +noise or -noise with even odds: of all noise of mean zero and
+    that variance it stays furthest from zero, and so the matrix from being singular. 0 turns it off. X_i is the
+    identity on directions and zero on origins, and only where A_i is ill-conditioned.
+    """
+
+    noise: float = 0.01
+
+    def real(self, kind: type) -> type:
+        """The array type in which the books are kept that belongs to a type of the variant."""
+        return dr.float64_array_t(kind)  # type: ignore[no-any-return]
+
+    def regularised(self, A: mi.Matrix4f, sign: mi.Float, smooth: mi.Bool) -> mi.Matrix4f:
+        """A + ε X; ``smooth`` tells where a smooth lobe was sampled."""
+        ε = dr.select(independence(A) >= ILL_CONDITIONED, 0, type(A[0, 0])(self.noise * sign))
+        return A + type(A)(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, ε, 0, 0, 0, 0, ε)
+
+
+@dataclass
+class RayFrame:
+    """Two axes perpendicular to a ray: its coordinates are (s·o/ℓ, t·o/ℓ, s·d, t·d), relative to the ray itself."""
+
+    s: mi.Vector3f
+    t: mi.Vector3f
+    scale: float  # ℓ, the unit of length
+
+    @staticmethod
+    def of(ray: mi.Ray3f, scale: float) -> RayFrame:
+        s, t = mi.coordinate_system(ray.d)
+        return RayFrame(s, t, scale)
+
+    def point(self, o: mi.Point3f, x: list[mi.Float]) -> mi.Point3f:
+        return o + self.scale * (self.s * x[0] + self.t * x[1])
+
+    def direction(self, d: mi.Vector3f, x: list[mi.Float]) -> mi.Vector3f:
+        return d + self.s * x[2] + self.t * x[3]
+
+    def coordinates(self, o: mi.Point3f, d: mi.Vector3f) -> list[mi.Float]:
+        inverse = 1 / self.scale
+        return [dr.dot(self.s, o) * inverse, dr.dot(self.t, o) * inverse, dr.dot(self.s, d), dr.dot(self.t, d)]
+
+
+@dataclass
+class Slope:
+    """Derivative of δL·β e of a vertex with respect to what its ray alone does not tell."""
+
+    pdf: mi.Float  # by the density of the ray
+    slide: mi.Float  # by the length that the origin slides forward along the ray
+
+
+@dataclass
+class Linearised:
+    """A step linearised in the four coordinates of its ray."""
+
+    A: mi.Matrix4f  # coordinates of the next ray by those of this ray
+    e: mi.Vector4f  # derivative of δL·β_i e_i + (slope of e_{i+1})·(pdf, slide)
+    log_w: list[mi.Spectrum]  # four: derivative of log w_i, by each coordinate; 0 where w_i is 0
+    slope: Slope  # of the next vertex
+    frame_next: RayFrame  # of the next ray
+
+
+def has_smooth_lobes(trace: TraceConfig) -> bool:
+    """Whether any BSDF of the scene has a lobe other than delta lobes."""
+    return bool(trace.traits.detached_names or trace.traits.attachables)
+
+
+def length_scale(scene: mi.Scene) -> float:
+    """Half the diagonal of the scene: a unit of length in which offsets and angles are alike. 1 for an empty scene."""
+    extents = scene.bbox().extents()
+    diagonal = sum(float(x) ** 2 for x in extents) ** 0.5
+    return diagonal / 2 if 0 < diagonal < float("inf") else 1.0
+
+
+def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
+    """How weight·e (detached weight) changes with the density of an arrival and the distance it came."""
+    if not has_smooth_lobes(trace):
+        return Slope(mi.Float(0), mi.Float(0))
+    slopes = []
+    for k in range(2):
+        x = [at.pdf, mi.Float(0)]
+        x[k] = _unit_tangent(x[k])
+        with dr.resume_grad(x[k]):
+            pdf, slide = x
+            ray = mi.Ray3f(at.ray)
+            si = at.hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            ray.o = ray.o + ray.d * slide
+            slid = Arrival(ray=ray, hit=at.hit, pdf=pdf, delta=at.delta, camera=at.camera)
+            e = dr.sum(weight * emission(trace.scene, slid, si, True, active))
+            slopes.append(dr.select(active, tangents(e)[0], 0))
+    return Slope(*slopes)
+
+
+def local_terms(
+    trace: TraceConfig,
+    v: VertexRecord,
+    at: Arrival,
+    weight: mi.Spectrum,
+    slope: Slope,
+    frame_next: RayFrame,
+    active: mi.Bool,
+) -> tuple[mi.Float, mi.Spectrum, list[mi.Float]]:
+    """The step at ``v`` with a differentiable arrival: what its adjoint is made of.
+
+    δL·β_i e_i + (slope of e_{i+1})·(pdf, slide), w_i/detach(w_i) (0 where w_i is 0) and the four coordinates of
+    the next ray. ``weight`` is δL β_i, ``slope`` that of the next vertex.
+    """
+    step = repeat_step(trace, replace(v, at=at), True, active)
+    o, d = step.ray_next.o, step.ray_next.d
+    e = dr.sum(weight * step.e)
+    e += dr.select(v.go_on, slope.pdf * step.pdf + slope.slide * dr.dot(dr.detach(d), o), 0)
+    w = dr.select(v.go_on, step.w * dr.detach(reciprocal(step.w)), 0)
+    return e, w, frame_next.coordinates(o, d)
+
+
+def linearise(
+    trace: TraceConfig, v: VertexRecord, onward: PathState, δL: mi.Spectrum, scale: float, active: mi.Bool
+) -> Linearised:
+    """Differentiate `local_terms` by the four coordinates of the ray, and by nothing else.
+
+    ``onward`` is the path at the next vertex, ``scale`` the unit of length. Both passes call this very function, so
+    that they see the same numbers to the last bit.
+    """
+    slope = emission_slope(trace, onward.at, δL * onward.β, v.go_on)
+    frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
+    columns = []
+    for k in range(4):
+        # One graph per column: traversing one twice ends the process (Dr.Jit 1.5, virtual calls in a loop).
+        x = [mi.Float(0) for _ in range(4)]
+        x[k] = _unit_tangent(0)
+        with dr.resume_grad(x[k]):
+            ray = mi.Ray3f(v.at.ray)
+            ray.o, ray.d = frame.point(ray.o, x), frame.direction(ray.d, x)
+            at = Arrival(ray=ray, hit=v.at.hit, pdf=v.at.pdf, delta=v.at.delta, camera=v.at.camera)
+            e, w, x_next = local_terms(trace, v, at, δL * v.β, slope, frame_next, active)
+            columns.append(tangents(e, w, *x_next))
+    A = [columns[k][2 + j] for j in range(4) for k in range(4)]
+    e, log_w = mi.Vector4f(*[c[0] for c in columns]), [c[1] for c in columns]
+    return Linearised(mi.Matrix4f(*A), e, log_w, slope, frame_next)
+
+
+def _unit_tangent(value: mi.Float) -> mi.Float:
+    """An AD variable of its own with tangent 1, also where gradients are suspended.
+
+    Resume gradients for it alone: a virtual call would push tangents from parameters, too, across the border of the
+    loop.
+    """
+    variable = mi.Float(dr.detach(value))
+    with dr.resume_grad():
+        dr.enable_grad(variable)
+        dr.set_grad(variable, 1)
+    return variable
+
+
+def random_sign(u: VertexSamples) -> mi.Float:
+    """+1 or -1 with even odds: a hash of a vertex's numbers, so it repeats and takes none from the sampler."""
+    bits = [dr.reinterpret_array(mi.UInt32, x) for x in (u.light.x, u.roulette)]
+    return dr.select((mi.sample_tea_32(bits[0], bits[1], 4)[0] & 1) == 0, mi.Float(1), mi.Float(-1))
+
+
+def independence(A: mi.Matrix4f) -> mi.Float64:
+    """How far the columns of a 4x4 matrix are from linear dependence, about 1 / its condition number.
+
+    The smallest part of a column that the columns before it do not span, relative to the Frobenius norm, by modified
+    Gram-Schmidt. (Cofactors, and so `dr.rcp`, cannot tell: of a matrix of rank two they are rounding alone.)
+    """
+    real = dr.float64_array_t(mi.Float)
+    columns = [[real(A[i, k]) for i in range(4)] for k in range(4)]
+    norm2 = sum(_dot(c, c) for c in columns)
+    smallest = real(1)
+    for k, a in enumerate(columns):
+        rest2 = _dot(a, a)
+        smallest = dr.minimum(smallest, dr.sqrt(rest2 / norm2))
+        for j in range(k + 1, 4):
+            share = dr.select(rest2 > 0, _dot(a, columns[j]) / rest2, 0)
+            columns[j] = [y - share * x for x, y in zip(a, columns[j], strict=True)]
+    return smallest
+
+
+def _dot(a: list[mi.Float64], b: list[mi.Float64]) -> mi.Float64:
+    return sum(x * y for x, y in zip(a, b, strict=True))

@@ -1,0 +1,229 @@
+"""One vertex of a path as the sweep drivers remember it: plain numbers, for thread-local memory.
+
+What is remembered stands in one table, from which the type of a record, its writing and its reading follow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, make_dataclass, replace
+from functools import cache, reduce
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.platform.device import Device, device_of
+from pathreplay.transport.vertex import (
+    Arrival,
+    Flight,
+    KnownLight,
+    SampledContinuation,
+    SampledInMedia,
+    Shadow,
+    TraceConfig,
+    VertexRecord,
+    VertexSamples,
+)
+
+# Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x up to 136 bytes are 4.5 MB, and a
+# thread's stack is 8 MB. Beyond the stack the process would die without a word.
+MAX_DEPTH = 2048
+LARGEST_RECORD = 136
+"""Bytes of a vertex without media, in rgb variants."""
+# With media a vertex takes up to 210 bytes, and null boundaries have records of their own.
+MAX_DEPTH_MEDIA = 1024
+MAX_RECORDS_MEDIA = 2000
+
+
+def deepest(trace: TraceConfig, device: Device | None = None) -> int:
+    """The largest ``max_depth`` that the sweep driver can hold in this scene, on the device of the active variant.
+
+    On a GPU that is a share of its memory: see `pathreplay.platform.device`.
+    """
+    device = device_of(mi.variant()) if device is None else device
+    if not device.is_gpu:
+        return MAX_DEPTH if trace.media is None else MAX_DEPTH_MEDIA
+    if trace.media is None:
+        return device.most_records(largest_record(trace), MAX_DEPTH)
+    return min(MAX_DEPTH_MEDIA, max((device.most_records(largest_record(trace), 2**30) - 8) // 3, 0))
+
+
+def largest_record(trace: TraceConfig) -> int:
+    """Bytes of a vertex, whether the path moves or not: in the one case light is remembered, in the other numbers."""
+    return max(_bytes(Layout.of(trace, moves)) for moves in (False, True))
+
+
+def _bytes(layout: Layout) -> int:
+    kinds = [_plain(kind) for _, kind, remembered in FIELDS if getattr(layout, remembered)]
+    return 4 * sum(dr.size_v(kind) if dr.depth_v(kind) > 1 else 1 for kind in kinds) + 4  # and the word
+
+
+def room_for(trace: TraceConfig) -> int:
+    """How many vertices the record has room for: with media also two null boundaries at each, as convex ones need."""
+    if trace.media is None:
+        return device_of(mi.variant()).room(max(trace.max_depth, 1))
+    return min(3 * trace.max_depth + 8, MAX_RECORDS_MEDIA)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the walk decides about its records."""
+
+    variant: str
+    moves: bool  # the path moves with the parameters
+    resamples: bool  # BSDFs are sampled once more
+    fixed: bool  # what emitters bring to surfaces is known, and rays that leave the scene arrive at no vertex
+    glows: bool  # of these emitters some are surfaces
+    media: bool
+    chromatic: bool
+    emissive: bool
+    passes: bool
+    branch: bool
+    always: bool = True  # of what every record has
+
+    @property
+    def varies(self) -> bool:
+        """What emitters bring is to be found out again."""
+        return not self.fixed
+
+    @staticmethod
+    def of(trace: TraceConfig, moves: bool) -> Layout:
+        """The layout for a walk."""
+        media = trace.media is not None
+        fixed = not media and not moves and not trace.traits.lights_vary
+        kinds = {name: media and getattr(trace.media, name) for name in ("chromatic", "emissive", "passes")}
+        glows, resamples = fixed and trace.traits.area_lights, trace.resamples or media
+        return Layout(mi.variant(), moves, resamples, fixed, glows, media=media, branch=trace.branch, **kinds)
+
+
+# Where it stands in a Replayed, its type in Mitsuba, and what of the layout has it remembered.
+FIELDS = (
+    ("at.ray.o", "Point3f", "always"),
+    ("at.ray.d", "Vector3f", "always"),
+    ("at.hit.t", "Float", "always"),
+    ("at.hit.prim_uv", "Point2f", "always"),
+    ("at.hit.prim_index", "UInt32", "always"),
+    ("at.hit.shape_index", "UInt32", "always"),
+    ("at.hit.shape", "ShapePtr", "always"),
+    ("at.hit.instance", "ShapePtr", "always"),
+    ("at.pdf", "Float", "varies"),
+    ("at.medium", "MediumPtr", "media"),
+    ("at.behind", "Float", "media"),
+    ("β", "Spectrum", "always"),
+    ("rr_weight", "Float", "always"),
+    ("u.light", "Point2f", "varies"),
+    ("u.lobe", "Float", "resamples"),
+    ("u.direction", "Point2f", "resamples"),
+    ("kept.known.glow", "Spectrum", "glows"),
+    ("kept.known.d", "Vector3f", "fixed"),
+    ("kept.known.w", "Spectrum", "fixed"),
+    ("kept.d", "Vector3f", "fixed"),
+    ("kept.pdf", "Float", "fixed"),
+    ("kept.pdf", "Float", "passes"),
+    ("kept.media.flight.t", "Float", "media"),
+    ("kept.media.flight.density", "Float", "media"),
+    ("kept.media.flight.along", "Float", "media"),
+    ("kept.media.flight.W", "Spectrum", "chromatic"),
+    ("kept.media.flight.E", "Spectrum", "emissive"),
+    ("kept.media.flight.t_emit", "Float", "emissive"),
+    ("kept.media.flight.c_emit", "Spectrum", "emissive"),
+    ("kept.media.flight.p", "Float", "branch"),
+    ("kept.media.shadow.T", "Spectrum", "media"),
+    ("kept.media.shadow.y", "Float", "media"),
+    ("kept.media.shadow.medium", "MediumPtr", "media"),
+    ("kept.media.shadow.length", "Float", "media"),
+)
+
+# Dr.Jit's local memory cannot hold Bool: these share a word, one bit each, and the lobe takes the bits above.
+BITS = (
+    ("at.hit.valid", "always"),
+    ("at.delta", "varies"),
+    ("at.camera", "always"),
+    ("kept.lit", "always"),
+    ("kept.black", "always"),
+    ("kept.delta", "fixed"),
+    ("go_on", "fixed"),
+    ("kept.media.flight.event", "media"),
+    ("kept.media.null", "media"),
+)
+LOBE_SHIFT = 16
+
+
+@cache
+def record_type(layout: Layout) -> type:
+    """The dataclass that holds a vertex."""
+    fields = {_name(place): _plain(kind) for place, kind, remembered in FIELDS if getattr(layout, remembered)}
+    return make_dataclass("Record", [*fields.items(), ("word", mi.UInt32)])
+
+
+def record(layout: Layout, v: VertexRecord) -> Any:
+    """A vertex, to be written."""
+    fields = {}
+    for place, kind, remembered in FIELDS:
+        if getattr(layout, remembered):
+            value = reduce(getattr, place.split("."), v)
+            fields[_name(place)] = dr.reinterpret_array(mi.UInt32, value) if kind.endswith("Ptr") else value
+    word = v.kept.lobe << LOBE_SHIFT
+    for k, (place, remembered) in enumerate(BITS):
+        if getattr(layout, remembered):
+            word |= dr.select(reduce(getattr, place.split("."), v), mi.UInt32(1 << k), 0)
+    return record_type(layout)(**fields, word=word)
+
+
+def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, ray0: mi.Ray3f) -> VertexRecord:
+    """The vertex recorded at ``index``.
+
+    ``last`` is the index of the path's last vertex; time and wavelengths are those of the ray ``ray0``.
+    """
+    v = _read(layout, records[index], ray0)
+    if layout.fixed:
+        return v
+    onward = _read(layout, records[dr.minimum(index + 1, last)], ray0).at
+    # The next vertex remembers how the path came to it.
+    kept = replace(v.kept, d=onward.ray.d, delta=onward.delta)
+    if layout.passes:
+        kept.delta |= kept.media.null
+    else:
+        kept.pdf = onward.pdf
+    return replace(v, kept=kept, go_on=index < last, hit_next=onward.hit)
+
+
+def _read(layout: Layout, read: Any, ray0: mi.Ray3f) -> VertexRecord:
+    v = _blank(layout, ray0)
+    for place, kind, remembered in FIELDS:
+        if getattr(layout, remembered):
+            value = getattr(read, _name(place))
+            _put(v, place, dr.reinterpret_array(getattr(mi, kind), value) if kind.endswith("Ptr") else value)
+    for k, (place, remembered) in enumerate(BITS):
+        if getattr(layout, remembered):
+            _put(v, place, (read.word & (1 << k)) != 0)
+    v.kept.lobe = read.word >> LOBE_SHIFT
+    return v
+
+
+def _blank(layout: Layout, ray0: mi.Ray3f) -> VertexRecord:
+    """A vertex of which nothing is known yet; what is not remembered stays what it is here."""
+    zero, no = mi.Float(0), mi.Bool(False)
+    ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0), ray0.time, ray0.wavelengths)
+    at = Arrival(ray, dr.zeros(mi.PreliminaryIntersection3f), zero, no, no)
+    kept = SampledContinuation(mi.Vector3f(0), zero, no, no, mi.UInt32(0), no)
+    if layout.fixed:
+        kept.known = KnownLight(mi.Spectrum(0), mi.Vector3f(0), mi.Spectrum(0))
+    if layout.media:
+        flight = Flight(no, zero, zero, mi.Spectrum(1), zero)
+        kept.media = SampledInMedia(no, flight, Shadow(mi.Spectrum(0), zero, dr.zeros(mi.MediumPtr), zero))
+    u = VertexSamples(mi.Point2f(0), zero, mi.Point2f(0), zero)
+    return VertexRecord(at, u, kept, no, at.hit, zero, mi.Spectrum(0))
+
+
+def _put(v: VertexRecord, place: str, value: Any) -> None:
+    *way, name = place.split(".")
+    setattr(reduce(getattr, way, v), name, value)
+
+
+def _name(place: str) -> str:
+    return place.replace(".", "_")
+
+
+def _plain(kind: str) -> type:
+    return mi.UInt32 if kind.endswith("Ptr") else getattr(mi, kind)

@@ -1,0 +1,95 @@
+"""The replay driver: walk the path again with the same random numbers and peel its radiance, vertex by vertex.
+
+This is path replay backpropagation (Vicini, Speierer, Jakob 2021): the first pass keeps one number, L_0; the second
+recovers what lies beyond each vertex from what has been met so far. Memory does not depend on the depth at all.
+Where the path moves with the parameters, `replay_attached` peels the adjoint of the ray as well.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import NonFiniteCounter, backward
+from pathreplay.adjoint.null_branching import Branch, branch_backward
+from pathreplay.adjoint.primal import walk_on
+from pathreplay.adjoint.ray_jacobian import Recovery, has_smooth_lobes
+from pathreplay.adjoint.record import MAX_DEPTH_MEDIA
+from pathreplay.adjoint.replay_attached import replay_attached
+from pathreplay.errors import PathreplayError
+from pathreplay.transport.motion import path_moves
+from pathreplay.transport.path import PathState
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.step import repeat_step
+from pathreplay.transport.vertex import TraceConfig, reciprocal
+
+
+def replay(
+    trace: TraceConfig,
+    start: CameraStart,
+    δL: mi.Spectrum,
+    lost: NonFiniteCounter,
+    recovery: Recovery = Recovery(),  # noqa: B008 (it is frozen)
+) -> bool:
+    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
+
+    Returns whether the path moves with the parameters; if so, ``recovery`` says how ray adjoints are found, ``lost``
+    counts paths with one that was not finite, and a warning tells, once, of smooth lobes. Not differentiated:
+    visibility, weights that are exactly zero (the sweep driver keeps their derivatives) and, with ``attach='none'``,
+    everything that moves.
+    """
+    path = PathState.begin(trace, start, sustained=trace.branch)  # so that branches get the numbers of other drivers
+    moves = path_moves(trace, start, path.at)
+    if not moves:
+        _replay_still(trace, start, path, δL)
+    elif trace.media is not None:
+        raise PathreplayError(
+            "driver = 'replay' cannot follow paths that move through media: use driver = 'sweep', "
+            f"with max_depth of at most {MAX_DEPTH_MEDIA}"
+        )
+    else:
+        if has_smooth_lobes(trace):
+            _warn_of_smooth_lobes()
+        replay_attached(trace, start, path, δL, lost, recovery)
+    return moves
+
+
+@cache
+def _warn_of_smooth_lobes() -> None:
+    """Said once per process: the driver is at the edge of what it can do."""
+    mi.Log(
+        mi.LogLevel.Warn,
+        "pathreplay: driver = 'replay' follows moving paths over smooth BSDFs, where the Jacobian of the ray is "
+        "singular: noise makes the gradient unbiased, but it gets worse with every such bounce. "
+        "driver = 'sweep' has no such limit, and is faster",
+    )
+
+
+@dr.syntax
+def _replay_still(trace: TraceConfig, start: CameraStart, path: PathState, δL: mi.Spectrum) -> None:
+    """Replay a path that does not move.
+
+    Peels β_{i+1} L_{i+1} = β_i L_i - β_i e_i and differentiates it as (β_i L_{i+1}) w_i through the relative
+    derivative of w_i.
+    """
+    sampler, ray0 = start.sampler, path.at.ray
+    L = walk_on(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, peeled on the way
+    branch = Branch.none()
+
+    while dr.hint(path.active, exclude=[trace], label="pathreplay: replay"):
+        u, step = path.choose(trace, sampler)
+        L -= path.β * step.e
+        if dr.hint(trace.branch, mode="scalar"):
+            branch = branch.offer(path, step)
+
+        onward, v = path.advance(trace, u, step)
+        with dr.resume_grad():
+            again = repeat_step(trace, v, False, path.active)
+            Lo = path.β * again.e + L * again.w * dr.detach(reciprocal(again.w))
+            backward(dr.sum(δL * Lo))
+        path = onward
+
+    if dr.hint(trace.branch, mode="scalar"):
+        branch_backward(trace, branch, sampler, ray0, δL)

@@ -1,0 +1,58 @@
+"""The sweep driver: record a path vertex by vertex, then back-propagate from its last vertex to the first.
+
+The record lives in thread-local memory: its size depends on ``max_depth`` and on the number of running threads, not
+on the number of paths. On the way back L_i = e_i + w_i L_{i+1} is rebuilt, so nothing is divided or subtracted.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative, backward
+from pathreplay.adjoint.baseline import BaselineStats
+from pathreplay.adjoint.null_branching import branch_backward
+from pathreplay.adjoint.record import Layout, deepest, record_type, room_for
+from pathreplay.adjoint.two_passes import first_walk, walk_back
+from pathreplay.errors import PathreplayError
+from pathreplay.transport.motion import path_moves
+from pathreplay.transport.path import PathState
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.vertex import TraceConfig
+
+
+def sweep(
+    trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter, seen: BaselineStats | None = None
+) -> bool:
+    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
+
+    Returns whether the path moves with the parameters; if so, ``lost`` counts paths with an adjoint that was not
+    finite, and those that crossed so many null boundaries between media that they had to end. ``seen`` collects what
+    this pass sees of media, for later ones. A weight that is exactly zero keeps its derivative. Not differentiated:
+    visibility and, with ``attach='none'``, everything that moves.
+    Raises PathreplayError when ``max_depth`` is above `deepest`, or when no parameter reaches the paths.
+    """
+    if trace.max_depth > deepest(trace):
+        raise PathreplayError(
+            f"max_depth = {trace.max_depth} is more than the sweep driver can hold ({deepest(trace)}): "
+            "use driver = 'replay', which has no limit"
+        )
+    path = PathState.begin(trace, start, sustained=True)
+    ray0 = path.at.ray
+    moves = path_moves(trace, start, path.at)
+    layout = Layout.of(trace, moves)
+    records = dr.alloc_local(record_type(layout), room_for(trace))
+    records, count, _, L, branch = first_walk(trace, start.sampler, path, layout, records, mi.UInt32(0), lost)
+
+    first, q = mi.UInt32(0), RayDerivative.zero()
+    _, q = walk_back(trace, layout, records, first, count, count - 1, ray0, δL, L, q, lost, seen)
+    if trace.branch:
+        if seen is not None:
+            seen.tally(branch.number)
+        branch_backward(trace, branch, start.sampler, ray0, δL)
+    with dr.resume_grad():
+        o, d = start.repeat()
+        if moves and dr.grad_enabled(o, d):
+            dr.eval(q)  # every parameter of the camera sums over it apart, which would run the loops as often
+            backward(dr.dot(q.o, o) + dr.dot(q.d, d))
+    return moves

@@ -1,0 +1,98 @@
+"""The two walks of the sweep drivers: one that records a path, and one from its last vertex back to the first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative, backward_step
+from pathreplay.adjoint.baseline import BaselineStats
+from pathreplay.adjoint.null_branching import Branch
+from pathreplay.adjoint.record import Layout, read_back, record, room_for
+from pathreplay.transport.arrive import background
+from pathreplay.transport.path import PathState
+from pathreplay.transport.vertex import TraceConfig
+
+
+@dr.syntax
+def first_walk(
+    trace: TraceConfig,
+    sampler: mi.Sampler,
+    path: PathState,
+    layout: Layout,
+    records: Any,
+    first: mi.UInt32,
+    lost: NonFiniteCounter,
+) -> tuple[Any, mi.UInt32, mi.Spectrum, mi.Spectrum, Branch]:
+    """Record a path from ``first`` on; gives the records, their number, the radiance, what comes of it from beyond the
+    records (relative to the throughput there), and the branch.
+
+    All lanes of a packet write to the same place: elsewhere writes to local memory get lost (Dr.Jit 1.5).
+    """
+    trace = replace(trace, leaves=layout.fixed)
+    L, beyond = mi.Spectrum(0), mi.Spectrum(0)  # radiance so far
+    count = mi.UInt32(0)  # vertices, and null boundaries
+    branch, left = Branch.none(), mi.Bool(False)
+    if dr.hint(trace.leaves, mode="scalar"):
+        path, left = path.leave()
+
+    while dr.hint(path.active, exclude=[trace, layout, lost], label="pathreplay: record"):
+        u, step = path.choose(trace, sampler)
+        onward, v = path.advance(trace, u, step)
+        records[first + count] = record(layout, v)
+        if dr.hint(trace.branch, mode="scalar"):
+            branch = branch.offer(path, step)
+        L += path.β * step.e
+        path = onward
+        count += 1
+        if dr.hint(trace.media is not None, mode="scalar"):
+            full = path.active & (count >= room_for(trace))
+            lost.add(full)
+            path.active &= ~full
+        if dr.hint(trace.leaves, mode="scalar"):
+            path, gone = path.leave()
+            left |= gone
+
+    if dr.hint(trace.leaves, mode="scalar"):
+        beyond = background(trace, path.at, left)
+        L += path.β * beyond
+    return records, count, L, beyond, branch
+
+
+@dr.syntax
+def walk_back(
+    trace: TraceConfig,
+    layout: Layout,
+    records: Any,
+    first: mi.UInt32,
+    count: mi.UInt32,
+    last: mi.UInt32,
+    ray0: mi.Ray3f,
+    δL: mi.Spectrum,
+    L: mi.Spectrum,
+    q: RayDerivative,
+    lost: NonFiniteCounter,
+    seen: BaselineStats | None = None,
+    rays_only: bool = False,
+) -> tuple[mi.Spectrum, RayDerivative]:
+    """Back-propagate from the last of ``count`` records to the first; gives radiance and ray adjoint there.
+
+    ``L`` is the radiance along the ray that leaves those records, and ``q`` its adjoint: zero where the path ends with
+    them. ``last`` is the index of the path's last record, where that ray arrived or beyond.
+    """
+    broken = mi.Bool(False)  # a part of the adjoint was not finite
+
+    while dr.hint(count > 0, exclude=[trace, layout, ray0, lost, seen, rays_only], label="pathreplay: sweep"):
+        count -= 1
+        v = read_back(layout, records, first + count, last, ray0)
+        L, q, breaks = backward_step(trace, v, layout.moves, δL, L, q, mi.Bool(True), rays_only)
+        if dr.hint(seen is not None, mode="scalar"):
+            seen.learn(v, L)  # type: ignore[union-attr]
+        if dr.hint(layout.moves, mode="scalar"):
+            lost.add(breaks & ~broken)
+            broken |= breaks
+
+    return L, q

@@ -1,0 +1,1 @@
+"""Boundary terms: what moving edges add to a gradient."""

@@ -1,0 +1,176 @@
+"""The vertex that sees an edge: a point of a surface or, in a medium, a particle, where it is and how it scatters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.boundary.through_media import going_on
+from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.transport import arrive, scatter
+from pathreplay.transport.facts.traits import is_null
+from pathreplay.transport.meet import meet
+from pathreplay.transport.signature import place_met, shape_met
+from pathreplay.transport.surface import met
+from pathreplay.transport.vertex import Arrival, Flight, SampledStep, TraceConfig, is_smooth
+from pathreplay.transport.volume.media import carried, span
+from pathreplay.transport.volume.passage import skip_null, transmittance_past_edge, transmittance_up_to
+
+NEAR = 10.0
+"""So many times as far as rays begin beside a surface is what they see well: directions are off by a tenth at most."""
+
+
+def may_see(trace: TraceConfig, at: Arrival, step: SampledStep) -> tuple[mi.Bool, mi.Spectrum]:
+    """Whether the vertex that a path arrived at scatters smoothly, and the weight of the flight before it."""
+    if trace.media is None:
+        return surface_sees(trace, at), mi.Spectrum(1)
+    flight = step.kept.media.flight
+    return surface_sees(trace, at) | flight.event, flight.weight
+
+
+def surface_sees(trace: TraceConfig, at: Arrival) -> mi.Bool:
+    """Whether a path arrived at a surface that scatters smoothly."""
+    valid = at.hit.is_valid()
+    return valid & is_smooth(shape_met(trace, at.hit, at.ray, valid).bsdf())
+
+
+class ObserverVertex:
+    """A vertex, detached; ``moved`` is where it is while things move."""
+
+    def __init__(self, trace: TraceConfig, at: Arrival, flight: Flight | None, active: mi.Bool) -> None:
+        self.trace, self.at, self.flight, self.active = trace, at, flight, active
+        self.origin: mi.Interaction3f
+        self.si: mi.SurfaceInteraction3f
+        if trace.media is None:
+            self.origin = self.si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
+        else:
+            self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)
+            self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
+        self.keeps = scatter.keeps_direction(trace, self.si, active)  # and slides over facets, too
+
+    def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
+        """The vertex, differentiable in the ``ray`` that arrives and in what moves it: see `fly_again`."""
+        si = met(self.at.hit, ray, self.active)
+        if self.flight is None:
+            return si
+        a, b = span(self.at.medium, ray, dr.select(si.is_valid(), si.t, dr.inf), self.event)
+        t, _ = carried(self.flight.t, a, b, self.event)
+        origin = mi.Interaction3f(self.origin)
+        origin.p, origin.n = dr.select(self.event, ray.o + t * ray.d, si.p), si.n
+        return origin
+
+    def towards(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
+        """What is scattered from a direction, and the density of sampling it."""
+        ctx, si = mi.BSDFContext(), self.si
+        if self.trace.media is None:
+            return si.bsdf().eval_pdf(ctx, si, si.to_local(d), active)
+        return scatter.towards(self.vertex, ctx, d, active)
+
+    def sample(self, lobe: mi.Float, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Bool]:
+        """A direction in which it scatters, and whether there is one that is not of a delta lobe."""
+        si, active = self.si, self.active
+        surface = active if self.trace.media is None else active & self.vertex.surface
+        sample, _ = si.bsdf().sample(mi.BSDFContext(), si, lobe, u, surface)
+        d, pdf, delta = si.to_world(sample.wo), sample.pdf, mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+        if self.trace.media is not None:
+            inside, phase = self.vertex.inside, mi.PhaseFunctionContext(None)
+            wo, _, pdf_wo = inside.phase.sample(phase, inside.mei, lobe, u, active & self.event)
+            d, pdf, delta = dr.select(self.event, wo, d), dr.select(self.event, pdf_wo, pdf), delta & ~self.event
+        return d, active & (pdf > 0) & ~delta
+
+    def may_scatter(self, d: mi.Vector3f) -> mi.Bool:
+        """Whether it may scatter light from a direction: it is on the side that is looked at, or lets light through."""
+        above = mi.Frame3f.cos_theta(self.si.to_local(d)) * mi.Frame3f.cos_theta(self.si.wi) > 0
+        both = above | mi.has_flag(self.si.bsdf().flags(), mi.BSDFFlags.Transmission)
+        return both if self.trace.media is None else both | self.event
+
+    def parts(self, a: mi.Vector3f, b: mi.Vector3f) -> mi.Bool:
+        """Whether the plane of its own surface lies between two directions.
+
+        Where shading normals are interpolated, a vertex scatters light from below that plane, where its own shape
+        hides all lamps.
+        """
+        n = self.si.n
+        between = dr.dot(n, a) * dr.dot(n, b) < 0
+        return between if self.trace.media is None else between & ~self.event
+
+    def is_off(self, t: mi.Float) -> mi.Bool:
+        """Whether a distance is well beyond that by which rays begin beside their surface.
+
+        What is closer is seen where it is not, if it is there at all; and one over such distances has no bounds.
+        """
+        return t > NEAR * mi.math.RayEpsilon * (1 + dr.max(dr.abs(self.origin.p)))
+
+    def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
+        """Whether a direction follows what it hits: from particles only what scatters or emits, see `scatter`."""
+        active = active & ~self.keeps & ~scatter.is_seen_through(self.trace, hit)
+        if self.trace.media is None:
+            return active
+        seen = is_smooth(hit.shape.bsdf()) | (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
+        return active & (~self.event | seen)
+
+    def hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
+        """What a ray from here meets."""
+        return meet(self.trace, ray, active)
+
+    def behind(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
+        """The same without null boundaries."""
+        return hit if self.trace.media is None else skip_null(self.trace, ray, hit, active)
+
+    def edges(
+        self, rays: list[mi.Ray3f], firsts: list[mi.PreliminaryIntersection3f], active: mi.Bool
+    ) -> tuple[list[mi.PreliminaryIntersection3f], mi.Bool]:
+        """What has an edge between two rays: what they met first or, where that is one null boundary, what is behind.
+
+        Also, where that is.
+        """
+        if self.trace.media is None:
+            return firsts, mi.Bool(False)
+        shapes = [shape_met(self.trace, first, ray, active) for ray, first in zip(rays, firsts, strict=True)]
+        places = [
+            place_met(self.trace, *met, facets=False) for met in zip(firsts, (active, active), shapes, strict=True)
+        ]
+        through = (places[0] == places[1]) & firsts[0].is_valid() & is_null(shapes[0].bsdf())
+        pairs = zip(rays, firsts, strict=True)
+        return [dr.select(through, self.behind(ray, first, active), first) for ray, first in pairs], through
+
+    def medium(self, d: mi.Vector3f) -> mi.MediumPtr | None:
+        """What there is in a direction."""
+        if self.trace.media is None:
+            return None
+        turns = self.vertex.surface & self.si.is_medium_transition()
+        return dr.select(turns, self.si.target_medium(d), self.at.medium)
+
+    def arrival(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, pdf: mi.Float) -> Arrival:
+        """What a path comes to along a ray from here."""
+        at = Arrival(ray, hit, pdf, mi.Bool(False), mi.Bool(False))
+        if self.trace.media is None:
+            return at
+        alone = self.event & ~self.at.medium.use_emitter_sampling()
+        return replace(at, delta=alone, medium=self.medium(ray.d), behind=mi.Float(0))
+
+    def transmittance_past_edge(
+        self, light: mi.DirectionSample3f, t: mi.Float, key: mi.UInt32, active: mi.Bool
+    ) -> mi.Spectrum:
+        """What media leave of an emitter sample's light past an edge at ``t``; not all particles ask for any."""
+        if self.trace.media is None:
+            return mi.Spectrum(1)
+        asks = active & (~self.event | self.at.medium.use_emitter_sampling())
+        ray = self.origin.spawn_ray_to(light.p)
+        T = transmittance_past_edge(
+            self.trace, ray, t, self.medium(light.d), CounterSampler(key, mi.UInt32(0x60000)), asks
+        )
+        return dr.select(asks, T, 0)
+
+    def onward(
+        self, arrivals: list[Arrival], t: mi.Float, key: mi.UInt32, active: mi.Bool
+    ) -> tuple[mi.Spectrum, list[Arrival]]:
+        """Where ``active``, the arrivals as seen from ``t`` on their ray, and the transmittance up to there."""
+        if self.trace.media is None:
+            return mi.Spectrum(1), arrivals
+        others = CounterSampler(key, mi.UInt32(0x70000))
+        T, medium = transmittance_up_to(self.trace, arrivals[0].ray, t, arrivals[0].medium, others, active)
+        T = dr.select(active, T, 1)
+        return T, [dr.select(active, going_on(self.trace, at, t, medium, active), at) for at in arrivals]

@@ -1,1 +1,0 @@
-"""BSDF plugins that Mitsuba lacks."""

@@ -1,5 +1,0 @@
-"""Independent estimates of a gradient, and the verdict on one."""
-
-from pathreplay.check.gradient import GradientCheck, check_gradient
-
-__all__ = ["GradientCheck", "check_gradient"]

@@ -1,0 +1,1 @@
+"""Evaluations by actors of Ray, on this machine or on a cluster."""

@@ -1,0 +1,67 @@
+"""The tentative collisions of a first walk once more, each differentiated by itself, for the listing driver.
+
+They are found by the numbers that had drawn them, so that nothing has to be kept of them.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import backward
+from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, reciprocal
+from pathreplay.transport.volume.media import interaction, majorant, span
+from pathreplay.transport.volume.shadow import Stretch
+
+
+@dr.syntax
+def differentiate_flight(at: Arrival, flight: Flight, past: mi.Sampler, active: mi.Bool, weight: mi.Spectrum) -> None:
+    """Differentiate the collisions of a flight; ``past`` is the sampler as it was when the flight drew from it."""
+    medium, ray = at.medium, at.ray
+    flying = active & (medium != None)  # noqa: E711 (an array of pointers)
+    a, b = span(medium, ray, dr.select(at.hit.is_valid(), at.hit.t, dr.inf), flying)
+    flying &= a < b
+    σ_bar = majorant(medium, ray, flying)
+    t = mi.Float(a)
+    while dr.hint(flying, exclude=[at, flight], label="pathreplay: listing, flight"):
+        u = past.next_1d(flying)
+        t += dr.select(σ_bar > 0, -dr.log(1 - u) * dr.rcp(σ_bar), dr.inf)
+        inside = flying & (t < b)
+        past.next_1d(inside)  # had decided whether it is real
+        real = inside & flight.event & (t >= flight.t)
+        flying = inside & ~real
+        _differentiate(medium, ray, t, σ_bar, flying, real, weight)
+    past.next_1d(active)
+
+
+@dr.syntax
+def differentiate_shadow(
+    trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, past: mi.Sampler, active: mi.Bool, weight: mi.Spectrum
+) -> None:
+    """Differentiate the tentative collisions of a shadow ray that arrived. In homogeneous media there are none."""
+    stretch = Stretch.begin(ray, medium, active)
+    while dr.hint(stretch.active, exclude=[trace], label="pathreplay: listing, shadow"):
+        hit, a, b, inside = stretch.part(trace)
+        σ_bar = majorant(stretch.medium, stretch.ray, inside)
+        tracked = inside & (σ_bar > 0)
+        if dr.hint(trace.media.homogeneous, mode="scalar"):
+            tracked &= ~stretch.medium.is_homogeneous()  # known without tracking
+        t = mi.Float(a)
+        while dr.hint(tracked, label="pathreplay: listing, ratio tracking"):
+            t -= dr.log(1 - past.next_1d(tracked)) / σ_bar
+            tracked &= t < b
+            _differentiate(stretch.medium, stretch.ray, t, σ_bar, tracked, mi.Bool(False), weight)
+        past.next_1d(inside)
+        stretch = stretch.beyond(hit, mi.Spectrum(1))[0]
+
+
+def _differentiate(
+    medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float, σ_bar: mi.Float, null: mi.Bool, real: mi.Bool, weight: mi.Spectrum
+) -> None:
+    """A collision at ``t``; ``weight`` is the radiance that has passed it, times its adjoint."""
+    with dr.resume_grad():
+        σ_s, _, σ_t = medium.get_scattering_coefficients(interaction(medium, ray, t), null | real)
+        log = dr.select(null, -σ_t * dr.detach(reciprocal(σ_bar - σ_t)), 0)
+        log += dr.select(real, σ_s * dr.detach(reciprocal(σ_s)), 0)
+        if dr.grad_enabled(log):
+            backward(dr.sum(weight * log))

@@ -1,0 +1,104 @@
+"""The tape driver: plain automatic differentiation of a wavefront of paths, to compare the other drivers with.
+
+Every vertex of every path is evaluated in memory and stays there until the graph of the whole loop has been
+back-propagated: memory grows with the number of paths times their length. This is what reverse mode does by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import NonFiniteCounter, backward, tangents
+from pathreplay.transport.motion import path_moves
+from pathreplay.transport.path import PathState
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.step import repeat_step
+from pathreplay.transport.vertex import TraceConfig
+
+
+def tape_backward(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
+    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
+
+    The estimator is that of the sweep driver, and with the same random numbers so is the gradient. Not differentiated:
+    see `tape`. Raises PathreplayError when no parameter reaches the paths.
+    """
+    with dr.resume_grad(), dr.isolate_grad():
+        L, _, moves = tape(trace, start)
+        backward(dr.sum(δL * L))
+    return moves
+
+
+def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
+    """Tangent of the radiance along the rays of a ``start``, ``(δL, valid, moves)``: see `forward`.
+
+    The parameters must carry their tangents already. Not differentiated: see `tape`.
+    """
+    with dr.resume_grad():
+        L, valid, moves = tape(trace, start)
+        return tangents(L)[0], valid, moves
+
+
+def _cut(state: tuple[Any, ...]) -> Any:
+    """The same values; on the way back, all that comes from behind them is evaluated before it goes on.
+
+    Without it the way back is a single kernel, whose code grows with the depth: a minute to compile at 64 vertices.
+    """
+
+    class Cut(dr.CustomOp):  # type: ignore[misc]
+        def eval(self, state: tuple[Any, ...]) -> tuple[Any, ...]:
+            return tuple(type(value)(value) for value in state)
+
+        def backward(self) -> None:
+            gradient = self.grad_out()
+            dr.eval(gradient)
+            self.set_grad_in("state", gradient)
+
+        def forward(self) -> None:
+            gradient = self.grad_in("state")
+            dr.eval(gradient)
+            self.set_grad_out(gradient)
+
+    return dr.custom(Cut, state)
+
+
+@dr.syntax
+def tape(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, bool]:
+    """Radiance along the rays of a ``start`` as an AD variable, ``(L, valid, moves)``: L = Σ β_i e_i.
+
+    Every step is taken detached, to make its choices, and once more attached. Not differentiated: visibility, Russian
+    roulette and, with ``attach='none'``, everything that moves. Adjoints that are not finite are not looked for. Call
+    it under `dr.resume_grad`.
+    """
+    sampler = start.sampler
+    with dr.suspend_grad():
+        path = PathState.begin(trace, start, sustained=True)
+        at = path.at
+        valid = mi.Bool(trace.background_is_opaque) & path.active
+    moves = path_moves(trace, start, at)
+    L = mi.Spectrum(0)  # radiance so far
+    β = mi.Spectrum(1)  # throughput, differentiable, and so the arrival: where, whence, density
+    first = start.ray if moves else at.ray
+    o, d, pdf = mi.Point3f(first.o), mi.Vector3f(first.d), mi.Float(at.pdf)
+
+    while dr.hint(path.active, mode="evaluated", exclude=[trace, moves], label="pathreplay: tape"):
+        with dr.suspend_grad():
+            u, step = path.choose(trace, sampler)
+            valid |= path.active & step.seen
+            onward, v = path.advance(trace, u, step)
+
+        L, β, o, d, pdf = _cut((L, β, o, d, pdf))
+        ray = mi.Ray3f(path.at.ray)
+        ray.o, ray.d = o, d
+        at = replace(path.at, ray=ray, pdf=pdf)
+        again = repeat_step(trace, replace(v, at=at), moves, path.active)
+        L += β * again.e
+        β *= again.w * v.rr_weight
+        ray, pdf = (again.ray_next, again.pdf) if moves else (onward.at.ray, onward.at.pdf)
+        o, d, pdf = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(pdf)
+        path = onward
+
+    return L, valid, moves

@@ -1,0 +1,92 @@
+"""Integrators to compare `pathreplay` with, on the same steps: `pathreplay_tape`, `_rb` and `_listing`.
+
+They show what memory, time and noise the other ways of differentiating a path tracer take. Nothing else is a reason to
+use them: `pathreplay` gives the same gradients for less.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import mitsuba as mi
+
+from pathreplay.adjoint.baseline import Baseline
+from pathreplay.adjoint.driver import Driver, ForwardDriver
+from pathreplay.adjoint.forward import forward
+from pathreplay.integrators.baselines.listing import listing
+from pathreplay.integrators.baselines.naive import tape_backward, tape_forward
+from pathreplay.integrators.baselines.radiative import no_forward, radiative
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.interior import back_propagate, tangent
+from pathreplay.integrators.path_integrator import PathIntegrator
+from pathreplay.integrators.properties import choice, flag
+from pathreplay.integrators.term import TermResult
+from pathreplay.transport.vertex import TraceConfig
+
+ATTACH = ("delta", "none")
+
+
+@dataclass(frozen=True)
+class OtherInterior:
+    """The interior term in another way.
+
+    Media are differentiated by the score, without a baseline, and where they are empty not at all.
+    """
+
+    backwards: Driver
+    forwards: ForwardDriver
+
+    def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
+        """Tangent of the image: see `Term`."""
+        return tangent(view, trace, self.forwards)
+
+    def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
+        """Back-propagate the adjoint of the image: see `Term`."""
+        return back_propagate(view, trace, grad_in, self.backwards)
+
+    def note(self, trace: TraceConfig) -> str:
+        """Nothing: see `Term`."""
+        return ""
+
+
+class TapeIntegrator(PathIntegrator):
+    """Plain AD of a wavefront path tracer: for comparison only, since memory grows with the depth (see `tape`).
+
+    Properties: those of `PathIntegrator` and ``attach`` (``delta``, ``none``), which means what it does for
+    `pathreplay`.
+    """
+
+    name = "pathreplay_tape"
+    interior = OtherInterior(tape_backward, tape_forward)
+
+    def __init__(self, props: mi.Properties) -> None:
+        PathIntegrator.__init__(self, props)
+        self.attach = choice(props, self.name, "attach", "delta", ATTACH)
+
+
+class RadiativeIntegrator(PathIntegrator):
+    """Radiative backpropagation: for comparison only, since time grows with the square of the depth.
+
+    Properties: those of `PathIntegrator` and ``linear`` (False: unbiased; True: the biased variant in linear
+    time), see `radiative`. Nothing that moves is differentiated, and there is no forward mode.
+    """
+
+    name = "pathreplay_rb"
+
+    def __init__(self, props: mi.Properties) -> None:
+        PathIntegrator.__init__(self, props)
+        linear = flag(props, self.name, "linear", False)
+        self.interior = OtherInterior(partial(radiative, linear=linear), no_forward)
+
+
+class ListingIntegrator(PathIntegrator):
+    """Delta tracking as first published: for comparison only, since it misses derivatives (see `listing`).
+
+    Properties: those of `PathIntegrator`. For scenes with media; what moves raises in reverse mode. Tangents are
+    those of the forward driver, without baseline and branch.
+    """
+
+    name = "pathreplay_listing"
+    attach = "delta"  # so that it is noticed
+    interior = OtherInterior(listing, forward)

@@ -1,0 +1,56 @@
+"""Radiative backpropagation: adjoint radiance walks from the camera, to compare the other drivers with.
+
+At every vertex δL β_i is multiplied with the derivative of e_i + w_i L_{i+1}, and the radiance L_{i+1} that comes back
+along the continuation is estimated by a fresh path of all the remaining depth (Nimier-David, Speierer, Ruiz, Jakob:
+Radiative Backpropagation, 2020). Memory is constant; time grows with the square of the depth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import NonFiniteCounter, backward
+from pathreplay.adjoint.primal import walk_on
+from pathreplay.errors import PathreplayError
+from pathreplay.transport.path import PathState, next_arrival
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.step import repeat_step
+from pathreplay.transport.vertex import TraceConfig
+
+
+def no_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
+    """There is none. Raises PathreplayError."""
+    raise PathreplayError("pathreplay_rb has no forward mode: use the integrator 'pathreplay'")
+
+
+@dr.syntax
+def radiative(
+    trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter, linear: bool = False
+) -> bool:
+    """Back-propagate the adjoint radiance ``δL`` into the parameters.
+
+    ``linear`` is a biased variant in linear time, after those of the paper, which leave the incident radiance out: no
+    fresh paths, and L_{i+1} is taken to be one in all channels wherever a path goes on, while emission and next-event
+    estimation (e_i) are as they are. The size of a gradient is wrong, and where media are also dark its sign may be.
+    Nothing is lost. Not differentiated: everything that moves (as with ``attach='none'``), and visibility. Raises
+    PathreplayError when no parameter reaches the paths.
+    """
+    sampler, path = start.sampler, PathState.begin(trace, start)
+
+    while dr.hint(path.active, exclude=[trace], label="pathreplay: radiative backpropagation"):
+        u, step = path.choose(trace, sampler)
+        at = next_arrival(trace, path.at, step, step.active)
+        if dr.hint(linear, mode="scalar"):
+            L = mi.Spectrum(dr.select(step.active, 1, 0))
+        else:
+            depth, η = path.passed(trace, step), path.η * step.eta
+            L, _ = walk_on(trace, sampler, PathState(at, mi.Spectrum(1), None, η, depth, step.active))
+        onward, v = path.advance(trace, u, step, at)
+        with dr.resume_grad():
+            again = repeat_step(trace, replace(v, go_on=step.active), False, path.active)
+            backward(dr.sum(δL * path.β * (again.e + again.w * L)))
+        path = onward
+    return False

@@ -1,0 +1,147 @@
+"""The boundary term: what edges do to an image when they move, as far as one asks for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import NonFiniteCounter
+from pathreplay.adjoint.baseline import Baseline
+from pathreplay.boundary.edges import Edges, edges_backward, edges_forward
+from pathreplay.boundary.primary import primary_edges
+from pathreplay.boundary.secondary import secondary_edges
+from pathreplay.boundary.volumetric import volumetric_edges
+from pathreplay.errors import PathreplayError
+from pathreplay.integrators.camera_pass import Pass
+from pathreplay.integrators.film.domain import FilmPlaces
+from pathreplay.integrators.film.image import MOST_SAMPLES
+from pathreplay.integrators.term import TermResult
+from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.transport.motion import edges_move, moving_shapes
+from pathreplay.transport.path import PathState
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.vertex import TraceConfig
+
+FILM_CLOSER, INNER_CLOSER = 5, 16
+"""For so many lines one is looked at closer, of those with an edge."""
+GRID = "SDFGrid"
+"""By class: its surface is neither met nor held where its outline would have to be."""
+BATCH = "BatchSensor"
+"""By class: Dr.Jit ends the process where its rays are differentiated by their place."""
+FILM_LENGTH = 0.5  # pixels
+INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """A term: edges that the camera sees, directly or by mirrors and glass, and those that surfaces and particles see.
+
+    Not differentiated: hard shadows beyond the first vertex that scatters, with media; edges of textures and of masks;
+    alpha.
+    """
+
+    film: bool = True  # edges that the camera sees
+    inner: bool = True  # those that surfaces see
+    spp: int = 0  # lines per pixel, of each kind; 0: samples of the pass
+
+    def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
+        """Tangent of the image: see `Term`."""
+        places = FilmPlaces.of(view)
+        if not _move(trace, places):
+            return TermResult()
+        image = None
+        for edges in self._searches(view, trace, places):
+            δL = edges_forward(trace, places, edges)
+            part = places.image(edges.s, δL, edges.ray.wavelengths)
+            image = part if image is None else image + part
+        return TermResult(image)
+
+    def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
+        """Back-propagate the adjoint of the image: see `Term`."""
+        places = FilmPlaces.of(view)
+        if not _move(trace, places):
+            return TermResult()
+        wanted = places.undeveloped(grad_in)
+
+        lost, paths = NonFiniteCounter(), 0
+        for edges in self._searches(view, trace, places):
+            W = places.importance(wanted, edges.s, edges.ray.wavelengths)
+            edges_backward(trace, places, edges, W, lost)
+            paths += dr.width(edges.s)
+        dr.eval()
+        return TermResult(lost=lost.count, paths=paths, moves=True)
+
+    def note(self, trace: TraceConfig) -> str:
+        """Nothing: see `Term`."""
+        return ""
+
+    @staticmethod
+    def move(view: Pass, trace: TraceConfig) -> bool:
+        """Whether edges move with the parameters that have gradients. Nothing is evaluated."""
+        return _move(trace, FilmPlaces.of(view))
+
+    @staticmethod
+    def informed(view: Pass, trace: TraceConfig) -> TraceConfig:
+        """The walk, knowing which shapes may move. With media all may: paths pass boundaries that move unseen."""
+        if trace.media is not None or trace.traits.moving is not None:
+            return trace
+        return replace(trace, traits=replace(trace.traits, moving=moving_shapes(trace.scene, _still_cameras(view))))
+
+    @staticmethod
+    def obstacle(view: Pass) -> str:
+        """Why edges cannot be differentiated, with the way out; "" where they can."""
+        if view.sensor.class_name() == BATCH:
+            return (
+                f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
+                "put its sensors into the scene one by one"
+            )
+        for shape in view.scene.shapes():
+            if shape.class_name() == GRID:
+                return (
+                    f"edges of shape '{shape.id()}' of type 'sdfgrid' cannot be differentiated: put a mesh in its place"
+                )
+        return ""
+
+    def _searches(self, view: Pass, trace: TraceConfig, places: FilmPlaces) -> Iterator[Edges]:
+        """The edges of each search."""
+        if why := self.obstacle(view):
+            raise PathreplayError(f"{why}, or use edges = 'none'")
+        trace = self.informed(view, trace)
+        lines = lines_of(view, places, self.spp)
+        seed = view.opaque_seed
+        if self.film:
+            yield primary_edges(trace, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
+            if trace.media is not None and trace.traits.hard_lights:
+                yield volumetric_edges(trace, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
+        if self.inner:
+            yield secondary_edges(trace, places, lines, max(lines // INNER_CLOSER, 1), seed ^ 0x5EED, INNER_LENGTHS)
+
+
+def lines_of(view: Pass, places: FilmPlaces, spp: int) -> int:
+    """How many lines look for edges: ``spp`` per pixel in the whole pass, or as many as samples (0)."""
+    pixels = int(places.size.x) * int(places.size.y)
+    lines = pixels * (math.ceil(spp * view.share) if spp else view.spp)
+    if lines > MOST_SAMPLES:
+        raise PathreplayError(
+            f"edge_spp = {spp} with a film of {pixels} pixels are {lines} lines, beyond the {MOST_SAMPLES} that Dr.Jit "
+            f"takes at once; take edge_spp up to {MOST_SAMPLES // pixels}, or 0"
+        )
+    return max(lines, 1)
+
+
+def _still_cameras(view: Pass) -> list[mi.Sensor]:
+    """Those whose gradients do not reach the rays of a pass, but for what the flow of its film knows."""
+    return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
+
+
+def _move(trace: TraceConfig, places: FilmPlaces) -> bool:
+    """Whether edges move with the parameters: see `edges_move`."""
+    key = mi.UInt32(0)
+    with dr.resume_grad():
+        ray, _ = places.ray(mi.Point2f(0.5), key)
+    start = CameraStart(ray, CounterSampler.of(key), mi.Bool(True))
+    return edges_move(trace, start, PathState.begin(trace, start).at)

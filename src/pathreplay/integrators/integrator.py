@@ -1,0 +1,330 @@
+"""The `pathreplay` integrator plugin: reads properties, adds up terms, keeps what they learn, and tells of problems."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
+from typing import Any
+from weakref import ReferenceType, ref
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.adjoint.baseline import SLOTS, Baseline, BaselineState, BaselineStats
+from pathreplay.adjoint.ray_jacobian import Recovery
+from pathreplay.adjoint.record import MAX_DEPTH
+from pathreplay.errors import PathreplayError
+from pathreplay.integrators.boundary_term import Boundary
+from pathreplay.integrators.camera_pass import Pass, Seed, Which
+from pathreplay.integrators.diagnostics import COST_OF_EDGES, doubts, lost_note, missing_edges, used_before_note
+from pathreplay.integrators.film.camera_flow import CameraFlow
+from pathreplay.integrators.film.motion import FilmMotion
+from pathreplay.integrators.film.pixel_passes import among, obstacle, pixel_loss
+from pathreplay.integrators.film.surface_flow import SeenFlow, can_follow
+from pathreplay.integrators.interior import PathReplay
+from pathreplay.integrators.lifetimes import is_recording
+from pathreplay.integrators.path_integrator import UNBOUNDED, FrozenInputs, PathIntegrator, reached
+from pathreplay.integrators.properties import choice, deviation, whole_number
+from pathreplay.integrators.scene_facts import SceneFacts, facts_of
+from pathreplay.integrators.term import Term, TermResult
+from pathreplay.transport.vertex import TraceConfig
+
+DRIVERS = ("auto", "sweep", "replay")
+ATTACH = ("delta", "all", "none")
+BRANCH = ("auto", True, False)
+NUMBERS = ("scene", "even")
+EDGE_TERMS = ("auto", "none", "film", "all")
+EDGES = "edges"
+"""In `told`: what there is to say of edges that move has been said."""
+
+
+def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
+    """The term that the properties ask for. Raises PathreplayError for what cannot be."""
+    if "volume_gradient" in props:
+        raise PathreplayError(
+            f"{name}: there is no volume_gradient: leave it out for what was 'score', and use the integrator "
+            "'pathreplay_listing' for 'listing'"
+        )
+    driver = choice(props, name, "driver", "auto", DRIVERS)
+    if driver == "sweep" and max_depth > MAX_DEPTH:
+        depth = "-1 (unbounded)" if max_depth == UNBOUNDED else max_depth
+        raise PathreplayError(
+            f"{name}: max_depth = {depth} is more than the sweep driver can hold ({MAX_DEPTH}): "
+            "use driver = 'replay', which has no limit"
+        )
+    branch = choice(props, name, "branch", "auto", BRANCH)
+    recovery = Recovery(noise=deviation(props, name, "noise", Recovery.noise))
+    auto = driver == "auto"
+    if auto:
+        driver = "sweep" if max_depth <= MAX_DEPTH else "replay"
+    return PathReplay(driver, auto, branch, recovery)
+
+
+@dataclass
+class DeferredDiagnostics:
+    """What is to be told of passes that a frozen function has made."""
+
+    lost: mi.UInt32 | None = None  # how many paths lost a part of their gradient, if they were counted
+    sums: mi.Float | None = None  # those of `BaselineStats`
+    nulls: mi.Float | None = None  # if they were counted
+
+
+class PathReplayIntegrator(PathIntegrator):
+    """Differentiable path tracer for surfaces and media.
+
+    Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
+    (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``, ``none``), ``noise``
+    (0.01; of ray adjoints with the replay driver: see `Recovery`), ``branch`` (``auto``, True, False), ``edges``
+    (``auto``, ``none``, ``film``, ``all``: see `Boundary`), ``edge_spp`` (0: the samples of the pass) and ``numbers``
+    (``even``: `OwenSobolSampler` instead of independent numbers; ``scene``: those of its sampler). ``auto`` drivers
+    sweep unless ``max_depth`` is more than the sweep can hold, or only lights have gradients (see `emission_only`).
+    Forward mode is the same whatever the driver.
+
+    ``auto`` edges are ``all`` where something moves that can hide light (see `edges_move`) and edges can be
+    differentiated, else ``none``: with another ``attach`` than ``delta`` always, and for sensors of type ``batch``,
+    which is told. Without motion no edges are traced, whatever ``edges`` is.
+
+    Media are differentiated where paths went, less a baseline that is learned from earlier gradient passes of this
+    integrator (with other seeds). ``branch`` walks one more path from where a medium might have scattered and did
+    not, without which a gradient by extinction is wrong where it is zero; ``auto`` does so where extinction with
+    gradients varies in space or is zero, which mostly takes less time for the same noise, too.
+
+    Not differentiated: visibility, as far as ``edges`` leaves it out; with ``attach='none'`` all motion of shapes,
+    cameras and directions; by extinction where it is zero if ``branch`` is off; with the replay driver, by weights
+    that are exactly zero.
+    Raises PathreplayError for unknown or unusable properties and in polarised variants.
+    """
+
+    name = "pathreplay"
+    interior: PathReplay
+    recordable = True  # it looks at nothing on the host while it renders
+
+    def __init__(self, props: mi.Properties) -> None:
+        PathIntegrator.__init__(self, props)
+        self.attach = choice(props, self.name, "attach", "delta", ATTACH)
+        self.moves_rays = self.attach != "none"  # gradients reach cameras, and lights that move
+        self.interior = _interior(self.name, props, self.max_depth)
+        self.driver, self.branch = self.interior.driver, self.interior.branch
+        self.even = choice(props, self.name, "numbers", "even", NUMBERS) == "even"
+        self.edges = choice(props, self.name, "edges", "auto", EDGE_TERMS)
+        self.edge_spp = whole_number(props, self.name, "edge_spp", 0, lowest=0, kind="number of lines per pixel")
+        if self.edges == "auto" and self.attach != "delta":
+            self.edges = "none"
+        if self.edges != "none" and self.attach != "delta":
+            raise PathreplayError(
+                f"{self.name}: edges = '{self.edges}' with attach = '{self.attach}': edges know what moves with "
+                "attach = 'delta' only: use that, or edges = 'none'"
+            )
+        self.told: set[str] = set()  # what has been said in the log
+        self.deferred = TermResult()  # of passes whose lost paths have not been told
+        self.baseline: tuple[ReferenceType[SceneFacts], BaselineState] | None = None  # and the scene that it belongs to
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The interior, and edges unless they are switched off; `_planned` adds that of a camera that moves."""
+        if self.edges == "none":
+            return (self.interior,)
+        return self.interior, Boundary(inner=self.edges != "film", spp=self.edge_spp)
+
+    def _planned(self, view: Pass, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
+        """See `PathIntegrator`. What moves over the film has a term of its own, and the others what that leaves.
+
+        Where it may, the film's flow is to ``follow`` what is seen. Edges are left out where none move, and where
+        `auto` finds that they cannot be done; the interior, where the film's term is all.
+        """
+        view, trace, terms = PathIntegrator._planned(self, view)
+        if self.edges == "none":
+            return view, trace, terms
+        view = replace(view, flow=CameraFlow.of(view.scene, view.sensor))
+        needs_edges = self._needs_edges(view, trace)
+        if needs_edges and follow and self._may_follow(view, trace):
+            trace = Boundary.informed(view, trace)
+            view = replace(view, flow=SeenFlow.of(view.sensor, trace))
+        motion: tuple[Term, ...] = () if view.flow is None else (FilmMotion(view.flow),)
+        if not needs_edges:
+            terms = tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
+            return view, trace, motion if view.flow is not None and view.flow.is_all else (*terms, *motion)
+        if is_recording():
+            trace = replace(trace, traits=replace(trace.traits, tables=self._tables(facts_of(view.scene), edges=True)))
+        return view, replace(trace, edges=self.edges != "film" and trace.media is None), (*terms, *motion)
+
+    def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:
+        """Whether the film may follow what it sees: all edges are found of what then slides under it."""
+        return self.edges != "film" and can_follow(trace, view.sensor) and not facts_of(view.scene).has_seams
+
+    def _needs_edges(self, view: Pass, trace: TraceConfig) -> bool:
+        """Whether edges move, and can be differentiated where that is left to ``auto``; says what they cost."""
+        if not Boundary.move(view, trace):
+            return False
+        why = Boundary.obstacle(view) if self.edges == "auto" else ""
+        if why:
+            self._tell_once(f"{why}; they are left out here")
+        elif self.edges == "auto" and EDGES not in self.told:
+            self._tell_once(COST_OF_EDGES)
+        return not why
+
+    def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
+        """Whether `render_and_backward` can be used, for all pixels or for ``some``: see `pixel_obstacle`."""
+        return not self.pixel_obstacle(scene, sensor, spp, some)
+
+    def pixel_obstacle(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
+        """Why it cannot be used, with the way out: see `obstacle`. It needs the sweep driver, too, and no media."""
+        view = Pass.of(scene, sensor, 0, spp)
+        if self.driver != "sweep":
+            return f"driver = '{self.driver}' walks paths one by one; take 'sweep'"
+        if facts_of(scene).has_media:
+            return "the scene has media; leave them out"
+        return obstacle(view.sensor, self.max_depth, view.spp, some) or ("" if some else self._loss_of_sweep(view))
+
+    def _loss_of_sweep(self, view: Pass) -> str:
+        """Why whole pictures are better rendered than swept: the film follows what moves, which no sweep of it does."""
+        if self.edges in ("none", "film"):
+            return ""
+        with self._passing():
+            trace = self._walk(view.scene, view.sensor)
+            follows = Boundary.move(view, trace) and not Boundary.obstacle(view) and self._may_follow(view, trace)
+        return "the film follows what moves; take edges = 'none'" if follows else ""
+
+    def render_and_backward(
+        self,
+        scene: mi.Scene,
+        offset: mi.TensorXf,
+        slope: mi.TensorXf,
+        sensor: Which = 0,
+        seed: Seed = 0,
+        spp: int = 0,
+        pixels: mi.UInt32 | None = None,
+    ) -> mi.TensorXf:
+        """Render an image and back-propagate a loss whose derivative by it is offset + slope · image, in one pass.
+
+        ``offset`` and ``slope`` are tensors like the image (height x width x 3); the loss adds up over its values.
+        Each path is judged by the others of its pixel: see `pixel_sweep`; edges, by the image. With ``pixels`` (their
+        numbers, row by row, none twice) only these are rendered, and add to the loss: the tensors and what is returned
+        have a row for each of them (n x 1 x 3). What is not differentiated: see `sweep`.
+        Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
+        number of samples does not, a tensor has another shape, there are no such pixels, or no parameter with gradients
+        reaches the paths.
+        """
+        self._require_active(scene)
+        view = Pass.of(scene, sensor, seed, spp, self.even)
+        some = None if pixels is None else mi.UInt32(pixels)
+        with reached(scene, sensor, zero_is_told=True), self._passing(), dr.isolate_grad():
+            loss = pixel_loss(view, self.max_depth, offset, slope, some)
+            view, trace, (_, *edges) = self._planned(view, follow=False)
+            if view.flow is not None:
+                raise PathreplayError(
+                    f"pathreplay: sensor '{view.sensor.id()}' moves, and cannot be swept: hold it, or use mi.render"
+                )
+            self._learned(view, trace)
+            found = self.interior.pixels(view, trace, loss, some)
+            if edges:
+                wanted = offset + slope * found.image
+                if some is not None:
+                    wanted = among(some, wanted, view.size)
+                found = reduce(add, [term.backward(view, trace, wanted, None) for term in edges], found)
+        self._told(view, trace, found)
+        return found.image
+
+    def _learned(self, view: Pass, trace: TraceConfig) -> Baseline | None:
+        """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
+        for doubt in filter(None, (*doubts(trace), *(term.note(trace) for term in self.terms))):
+            self._tell_once(doubt)
+        if trace.media is None:
+            return None
+        if is_recording():
+            return None if self.frozen_inputs is None else self.frozen_inputs.guess
+        facts = facts_of(trace.scene)
+        if self.baseline is None or self.baseline[0]() is not facts:
+            self.baseline = ref(facts), BaselineState.fresh(trace.scene.bbox())
+        baseline = self.baseline[1]
+        if baseline.passes.intersection(view.keys):
+            self._tell_once(used_before_note(view.keys[0][0]))
+            return None
+        return baseline.guess
+
+    def inputs_to_freeze(self, scene: mi.Scene) -> FrozenInputs:
+        """See `PathIntegrator`."""
+        frozen_inputs = PathIntegrator.inputs_to_freeze(self, scene)
+        return frozen_inputs if self.baseline is None else replace(frozen_inputs, guess=self.baseline[1].guess)
+
+    def learned(self) -> dict[str, np.ndarray]:
+        """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
+        return {} if self.baseline is None else self.baseline[1].learned()
+
+    def restore_learned(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
+        """Go on with what `learned` told of the same scene; where that is nothing, anew. Raises PathreplayError."""
+        box = scene.bbox()
+        baseline = BaselineState.restored(box, learned) if learned else BaselineState.fresh(box)
+        self.baseline = ref(facts_of(scene)), baseline
+
+    def _told(self, view: Pass, trace: TraceConfig, found: TermResult) -> None:
+        """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see
+        `take_deferred`, which tells of the passes before, too."""
+        if found.moves:
+            self._tell_edges(trace, view.sensor)
+        frozen = is_recording()
+        self.deferred = self.deferred + replace(found, image=None) if frozen else TermResult()
+        if not frozen:
+            self._keep(found)
+
+    def _keep(self, found: TermResult) -> None:
+        if found.lost is not None and found.lost[0] > 0:
+            mi.Log(mi.LogLevel.Warn, f"pathreplay: {lost_note(found.lost[0], found.paths)}")
+        if found.seen is not None and self.baseline is not None:
+            self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
+
+    def _tell_edges(self, trace: TraceConfig, sensor: mi.Sensor) -> None:
+        if EDGES in self.told or self.edges in ("auto", "all"):
+            return
+        note, named = missing_edges(trace, sensor, self.edges)
+        if named:
+            self.told.add(EDGES)
+        if note:
+            self._tell_once(note)
+
+    def _tell_once(self, message: str) -> None:
+        if message not in self.told:
+            self.told.add(message)
+            mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
+
+    def take_deferred(self) -> DeferredDiagnostics:
+        """What passes in a frozen function found out, which cannot look at it itself; nothing of others."""
+        found, self.deferred = self.deferred, TermResult()
+        if found.seen is None:
+            return DeferredDiagnostics(found.lost)
+        return DeferredDiagnostics(found.lost, found.seen.sums, found.seen.nulls if found.seen.paths else None)
+
+    def tell(self, deferred: DeferredDiagnostics, paths: int) -> None:
+        """Warn, and keep what was learned, as passes themselves do; there were so many ``paths``."""
+        found = TermResult(lost=deferred.lost, paths=paths)
+        if deferred.sums is not None and self.baseline is not None:
+            counted = deferred.nulls is not None
+            nulls = deferred.nulls if counted else dr.zeros(mi.Float, SLOTS)
+            seen = BaselineStats(self.baseline[1].cells, deferred.sums, nulls, paths if counted else 0, frozenset())
+            found = replace(found, seen=seen)
+        self._keep(found)
+
+    def options(self) -> dict[str, Any]:
+        """The properties that this one was made of, beside those that all integrators of paths share."""
+        return {
+            "driver": "auto" if self.interior.auto else self.driver,
+            "attach": self.attach,
+            "noise": self.interior.recovery.noise,
+            "branch": self.branch,
+            "numbers": NUMBERS[self.even],
+            "edges": self.edges,
+            "edge_spp": self.edge_spp,
+        }
+
+    def to_string(self) -> str:
+        return self._described(
+            hide_emitters=self.hide_emitters,
+            driver=self.driver,
+            attach=self.attach,
+            branch=self.branch,
+            numbers=NUMBERS[self.even],
+            edges=self.edges,
+        )

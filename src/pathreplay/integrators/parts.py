@@ -1,0 +1,120 @@
+"""A pass of many samples in parts: passes with seeds of their own, of which it is the mean, weighted by their samples.
+
+Dr.Jit counts the samples of a kernel in 32 bits. Long before, single precision ends what sums can hold: one to which
+n equal numbers are added, one by one, is off by up to n 2^-25 of itself, and stands still at n = 2^24. Packets of 16
+samples are added up before that, and no more: neither the sum of a pixel nor the gradient of a number is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.errors import PathreplayError
+from pathreplay.integrators.camera_pass import Pass, Seed
+from pathreplay.integrators.film.image import MOST_SAMPLES, film_size
+from pathreplay.platform.traversal import known_values
+from pathreplay.scenes.parameters import is_transform
+
+# Up to so many samples a pass is one. The gradient of a number is then off by less than 1e-2 of itself, where all
+# samples add the same to it, and by far less than its noise, where they do not.
+MOST_AT_ONCE = 2**24
+# Samples of a part of a larger one: off by 1.3e-3, and some tenths of a second of work, beside which tracing it once
+# more does not count.
+A_PART = 2**22
+# Samples of a pixel, of a pass and of a part: a pixel of one colour is off by 7e-4 of it.
+MOST_A_PIXEL = 2**16
+# Of a part of many pixels: beside fewer, the work on the film would count.
+LEAST_A_PIXEL = 4
+# Samples of one call, which cannot be stopped or seen: minutes on the machines of today.
+MOST_IN_ALL = 2**36
+
+
+def parts(view: Pass) -> list[Pass]:
+    """The pass, or those that it is the mean of, weighted by their ``share``; the first has its seed.
+
+    Raises PathreplayError where one sample for each pixel is beyond what Dr.Jit can count, or all of them would take
+    hours.
+    """
+    width, height = film_size(view.sensor)
+    pixels = width * height
+    if pixels > MOST_SAMPLES:
+        raise PathreplayError(
+            f"The film of sensor '{view.sensor.id()}' has {width} x {height} pixels, beyond the {MOST_SAMPLES} samples "
+            "that Dr.Jit takes at once; make it smaller, or give it a crop window"
+        )
+    if pixels * view.spp > MOST_IN_ALL:
+        raise PathreplayError(
+            f"spp = {view.spp} with a film of {width} x {height} pixels are more samples than one call takes, "
+            f"{MOST_IN_ALL}; take spp up to {MOST_IN_ALL // pixels}, and the mean of calls with other seeds"
+        )
+    if pixels * view.spp <= MOST_AT_ONCE and view.spp <= MOST_A_PIXEL:
+        return [view]
+    sampler = view.sensor.sampler()
+    counts = split(sampler, view.spp, min(max(A_PART // pixels, LEAST_A_PIXEL), MOST_A_PIXEL, MOST_SAMPLES // pixels))
+    if len(counts) == 1:
+        return [view]
+    taken = [rounded(sampler, count) for count in counts]
+    return [
+        replace(view, seed=_seed(view.seed, k), spp=counts[k], share=taken[k] / sum(taken)) for k in range(len(counts))
+    ]
+
+
+class Sums:
+    """Gradients of a scene's parameters over parts: each begins at zero, or kernels would add to what there is."""
+
+    def __init__(self, scene: mi.Scene) -> None:
+        params = mi.traverse(scene)
+        with dr.resume_grad():
+            self._values = [
+                part for _, value in known_values(params) for part in _arrays(value) if dr.grad_enabled(part)
+            ]
+        self._sums: list[Any] = [None] * len(self._values)
+        self.take()
+
+    def take(self) -> None:
+        """Add up what there is since the last time."""
+        for n, value in enumerate(self._values):
+            found = dr.grad(value)
+            self._sums[n] = found if self._sums[n] is None else self._sums[n] + found
+            dr.set_grad(value, 0)
+        dr.eval(self._sums)
+
+    def give(self) -> None:
+        """Give the parameters what was added up."""
+        for value, total in zip(self._values, self._sums, strict=True):
+            dr.set_grad(value, total)
+
+
+def _arrays(value: Any) -> list[Any]:
+    return [value.matrix, value.inverse_transpose] if is_transform(value) else [value]
+
+
+def split(sampler: mi.Sampler, spp: int, most: int) -> list[int]:
+    """Samples per pixel of each part, about ``most``; together they are ``spp``, or more where the sampler rounds up.
+
+    Samplers other than `independent` place the samples of a pixel by each other: they get parts of a power of four,
+    which all of them take.
+    """
+    if spp <= most:
+        return [spp]
+    if sampler.class_name() == "IndependentSampler":
+        count = math.ceil(spp / most)
+        return [spp // count + (i < spp % count) for i in range(count)]
+    each = 4 ** int(math.log(most, 4))
+    return [each] * math.ceil(spp / each)
+
+
+def rounded(sampler: mi.Sampler, count: int) -> int:
+    """The samples per pixel that a sampler takes where it is asked for so many."""
+    copy = sampler.clone()  # integrators differ in whether they tell the sensor's own
+    copy.set_sample_count(count)
+    return int(copy.sample_count())
+
+
+def _seed(seed: Seed, part: int) -> Seed:
+    return seed if part == 0 else mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(part))[0]

@@ -1,0 +1,264 @@
+"""What our integrators share: their common properties, Mitsuba's interface, and care around each pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.adjoint.autodiff import Unreached
+from pathreplay.adjoint.baseline import Baseline
+from pathreplay.adjoint.primal import primal
+from pathreplay.errors import PathreplayError
+from pathreplay.integrators.camera_pass import Pass, Seed, Which
+from pathreplay.integrators.interior import image
+from pathreplay.integrators.lifetimes import careful, is_recording
+from pathreplay.integrators.parts import Sums, parts
+from pathreplay.integrators.properties import flag, whole_number
+from pathreplay.integrators.reach import unreached_note
+from pathreplay.integrators.scene_facts import SceneFacts, facts_of
+from pathreplay.integrators.term import Term, TermResult
+from pathreplay.platform.registration import mitsuba_integrator
+from pathreplay.transport.facts.traits import Tables
+from pathreplay.transport.motion import path_moves, weights_vary
+from pathreplay.transport.path import PathState
+from pathreplay.transport.start import CameraStart
+from pathreplay.transport.vertex import TraceConfig
+
+UNBOUNDED = 0xFFFFFFFF
+
+
+def _sum(total: Any, image: Any, share: float) -> Any:
+    """Images added up by the shares of their passes, each computed before the next begins; one alone as it is."""
+    if share == 1:
+        return image
+    total = image * share if total is None else total + image * share
+    dr.eval(total)
+    return total
+
+
+@contextmanager
+def reached(scene: mi.Scene, sensor: Which, zero_is_told: bool = False) -> Iterator[None]:
+    """Within this block, which differentiates, a gradient that is plainly zero is no error: see `unreached_note`.
+
+    Unless ``zero_is_told``: then it is one, too.
+    """
+    try:
+        yield
+    except Unreached as error:
+        note = unreached_note(scene, Pass.of(scene, sensor, 0, 1).sensor)
+        if note or zero_is_told:
+            raise Unreached(note or str(error)) from error
+
+
+@dataclass
+class FrozenInputs:
+    """What a pass in a frozen function cannot find out, and has to be handed."""
+
+    tables: Tables  # of the scene
+    branches: bool  # see `Media`
+    constants: tuple[object, ...]  # other passes than those with the same have to be recorded anew
+    guess: Baseline | None = None  # of what is known of its media
+
+
+class PathIntegrator:
+    """A template of an integrator (see `on_base`), for those of ours.
+
+    Properties ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5) and ``hide_emitters`` (False).
+    Classes below have a ``name`` (the plugin's), ``attach`` (as `TraceConfig` has it) and the term ``interior``. Raises
+    PathreplayError for unusable properties and in polarised variants.
+    """
+
+    name = ""
+    attach = "none"
+    even = False  # whether even numbers take the place of independent ones
+    interior: Term
+    max_depth: int  # these are Mitsuba's
+    rr_depth: int
+    skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
+
+    def __init__(self, props: mi.Properties) -> None:
+        if mi.is_polarized:
+            raise PathreplayError(
+                f"{self.name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
+                f"use {mi.variant().replace('_polarized', '')!r}"
+            )
+        # All three are Mitsuba's, too, which takes what it is given or says less.
+        whole_number(props, self.name, "max_depth", 6, lowest=0, unbounded=True)
+        whole_number(props, self.name, "rr_depth", 5, lowest=1)
+        hide_emitters = flag(props, self.name, "hide_emitters", False)
+        mitsuba_integrator().__init__(self, props)
+        self.hide_emitters = hide_emitters
+        self.frozen_inputs: FrozenInputs | None = None  # in a frozen function
+        self.tables: Tables | None = None  # of the scene that was rendered last: there `dr.freeze` finds them
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """What the gradient is a sum of."""
+        return (self.interior,)
+
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: Which = 0,
+        seed: Seed = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
+        """Render an image: see Mitsuba's ADIntegrator. Nothing is differentiated: use `mi.render` for that."""
+        if not develop:
+            raise PathreplayError(f"{self.name}: develop = False is not supported: leave it out")
+        made = None
+        for part in self._parts(scene, sensor, seed, spp):
+            with self._passing():
+                made = _sum(made, image(part, self._walk(scene, part.sensor)), part.share)
+        return made
+
+    def render_forward(
+        self, scene: mi.Scene, params: object, sensor: Which = 0, seed: Seed = 0, spp: int = 0
+    ) -> mi.TensorXf:
+        """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
+
+        The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
+        from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
+        """
+        tangent = None
+        for part in self._parts(scene, sensor, seed, spp):
+            with self._passing():
+                part, trace, terms = self._planned(part)
+                learned = self._learned(part, trace)
+                if part.flow is not None:
+                    part.flow.carry_tangents()
+                found = reduce(add, [term.forward(part, trace, learned) for term in terms])
+                tangent = _sum(tangent, found.image, part.share)
+            self._told(part, trace, found)
+        return tangent
+
+    def render_backward(
+        self, scene: mi.Scene, params: object, grad_in: mi.TensorXf, sensor: Which = 0, seed: Seed = 0, spp: int = 0
+    ) -> None:
+        """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
+
+        Warns of what terms tell: a part of the gradient was not finite and had to be left out, edges move. Raises
+        PathreplayError where no parameter with gradients reaches the paths, unless all are those of other cameras.
+        """
+        with reached(scene, sensor):
+            self._backward(scene, grad_in, sensor, seed, spp)
+
+    def _backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: Which, seed: Seed, spp: int) -> None:
+        # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
+        of_parts = self._parts(scene, sensor, seed, spp)
+        sums = Sums(scene) if len(of_parts) > 1 else None
+        try:
+            for part in of_parts:
+                with self._passing(), dr.isolate_grad():
+                    part, trace, terms = self._planned(part)
+                    learned = self._learned(part, trace)
+                    wanted = grad_in if part.share == 1 else grad_in * part.share
+                    with dr.isolate_grad():  # of terms, one by one, from the flow that they share
+                        found = reduce(add, [term.backward(part, trace, wanted, learned) for term in terms])
+                self._told(part, trace, found)
+                if sums is not None:
+                    sums.take()
+        finally:
+            if sums is not None:  # also of a view that no parameter reaches: what others gave stays
+                sums.give()
+
+    def sample(
+        self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool = True, **_: Any
+    ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], Any]:
+        """Radiance along rays, for those who have rays and no sensor, such as Mitsuba's `aov`: they start in no medium.
+
+        Derivatives are those of passes: see `render_forward` and `render_backward`. Raises PathreplayError for them.
+        """
+        if mode != dr.ADMode.Primal:
+            raise PathreplayError(f"{self.name}: sample() is not differentiated: use mi.render, or render_backward")
+        return *primal(self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
+
+    def _planned(self, view: Pass) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
+        """A gradient pass as terms see it, how it walks, and the terms that it adds up."""
+        return view, self._walk(view.scene, view.sensor), self.terms
+
+    def _learned(self, view: Pass, trace: TraceConfig) -> Baseline | None:
+        """What earlier passes found out that this one may use."""
+        return None
+
+    def _told(self, view: Pass, trace: TraceConfig, found: TermResult) -> None:
+        """What is done with what terms have found."""
+
+    def _parts(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> list[Pass]:
+        """The pass that is asked for, in parts where its samples are too many for one: see `parts`."""
+        self._require_active(scene)
+        return parts(Pass.of(scene, sensor, seed, spp, self.even))
+
+    def _require_active(self, scene: mi.Scene) -> None:
+        """Raise PathreplayError if scene or integrator are none of the active variant."""
+        if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
+            raise PathreplayError(
+                f"{self.name}: scene or integrator belongs to another variant than the active one, "
+                f"{mi.variant()!r}: load it anew, or set its variant"
+            )
+
+    @contextmanager
+    def _passing(self) -> Iterator[None]:
+        """A pass is under way, in which nothing is differentiated but what asks for it: see `careful`, too."""
+        with careful(), dr.suspend_grad():
+            yield
+
+    def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> TraceConfig:
+        """How the scene is walked through; the sensor may be in a medium."""
+        facts = facts_of(scene)
+        branches = None if self.frozen_inputs is None else self.frozen_inputs.branches
+        return TraceConfig(
+            scene=scene,
+            traits=facts.traits(self._tables(facts)),
+            media=facts.media(sensor, branches),  # type: ignore[arg-type]
+            attach=self.attach,
+            hide_emitters=self.hide_emitters,
+            max_depth=self.max_depth,
+            rr_depth=self.rr_depth,
+            skip_area_emitters=self.skip_area_emitters,
+        )
+
+    def _tables(self, facts: SceneFacts, edges: bool = False) -> Tables:
+        """Those of a pass; while `dr.freeze` records, with all that is asked for ``edges``."""
+        if self.frozen_inputs is not None:
+            return self.frozen_inputs.tables
+        if is_recording():
+            return facts.recorded_tables(self.tables, edges)
+        self.tables = facts.tables()
+        return self.tables
+
+    def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:
+        """Whether a parameter with gradients reaches the paths of a sensor; where there are media, this is assumed.
+
+        Traces one step and evaluates nothing.
+        """
+        view = Pass.of(scene, sensor, 0, 1)
+        with self._passing():
+            trace, start = self._walk(scene, view.sensor), view.rays().start
+            if trace.media is not None or trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
+                return True
+            at = PathState.begin(trace, start).at
+            return path_moves(trace, start, at) or weights_vary(trace, at)
+
+    def inputs_to_freeze(self, scene: mi.Scene) -> FrozenInputs:
+        """What passes over this scene are to be handed if they are recorded."""
+        facts = facts_of(scene)
+        self.tables = facts.tables()  # now, since a recording wants all that integrators hold to stay as it is
+        return FrozenInputs(self.tables, facts.branches(), facts.constants())
+
+    def _described(self, **more: Any) -> str:
+        depth = -1 if self.max_depth == UNBOUNDED else self.max_depth
+        values = {"max_depth": depth, "rr_depth": self.rr_depth, **more}
+        return f"{type(self).__name__}[{', '.join(f'{key} = {value}' for key, value in values.items())}]"
+
+    def to_string(self) -> str:
+        return self._described()

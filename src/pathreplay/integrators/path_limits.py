@@ -1,0 +1,32 @@
+"""What decides the image that an integrator estimates: how long paths are, and whether emitters are seen."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import mitsuba as mi
+
+from pathreplay.integrators.path_integrator import UNBOUNDED
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What decides the image that an integrator estimates. ``max_depth`` -1: no bound."""
+
+    max_depth: int
+    rr_depth: int
+    hide_emitters: bool
+
+
+def read_limits(integrator: mi.Integrator) -> Limits | None:
+    """The limits of an integrator of Mitsuba's or ours, or None where it has no path length to read."""
+    # Python integrators have attributes; C++ ones only print them.
+    printed = dict(re.findall(r"(max_depth|rr_depth) = (-?\d+)", str(integrator)))
+    max_depth = getattr(integrator, "max_depth", printed.get("max_depth"))
+    rr_depth: Any = getattr(integrator, "rr_depth", printed.get("rr_depth", 5))
+    if max_depth is None:
+        return None
+    depth = int(max_depth)  # Mitsuba's Python integrators keep -1 as UNBOUNDED
+    return Limits(-1 if depth >= UNBOUNDED else depth, int(rr_depth), bool(getattr(integrator, "hide_emitters", False)))

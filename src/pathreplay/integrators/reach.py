@@ -1,0 +1,51 @@
+"""Which sensors a parameter can reach: all of them, unless it belongs to some of them alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.platform.traversal import known_values
+from pathreplay.transport.facts.nodes import nodes_of
+
+
+def reached_sensors(
+    scene: mi.Scene, sensors: Sequence[mi.Sensor], params: mi.SceneParameters, keys: Iterable[str]
+) -> list[bool]:
+    """Of each sensor, whether its picture can depend on one of the ``keys`` of ``params``.
+
+    A parameter of a camera reaches the pictures of that camera alone. Any other parameter is taken to reach all
+    pictures, including one of a medium that a camera shares with a shape.
+    """
+    owners = {params.properties[key][2] for key in keys}
+    below = {sensor: nodes_of(sensor) | {sensor} for sensor in {*scene.sensors(), *sensors}}
+    things = (*scene.shapes(), *scene.emitters())
+    if owners.difference(*below.values()) or any(not owners.isdisjoint(nodes_of(thing)) for thing in things):
+        return [True] * len(sensors)
+    return [not owners.isdisjoint(below[sensor]) for sensor in sensors]
+
+
+def attached_keys(params: mi.SceneParameters) -> list[str]:
+    """The keys whose values have gradients."""
+    with dr.resume_grad():
+        return [key for key, value in known_values(params) if dr.grad_enabled(value)]
+
+
+def unreached_note(scene: mi.Scene, sensor: mi.Sensor) -> str:
+    """What to tell where no parameter with gradients reaches the paths of a sensor; "" where this is as it should be.
+
+    That is so where all parameters with gradients belong to other cameras: their gradient in this picture is zero.
+    """
+    params = mi.traverse(scene)
+    keys = attached_keys(params)
+    if keys and not reached_sensors(scene, [sensor], params, keys)[0]:
+        return ""
+    named = ", ".join(f"'{key}'" for key in keys[:3]) + (" ..." if len(keys) > 3 else "")
+    have = f"although {named} {'has' if len(keys) == 1 else 'have'} gradients" if keys else "and none has gradients"
+    return (
+        f"no parameter with gradients reaches the light paths of sensor '{sensor.id()}', {have}: check that the key is "
+        "differentiable (mi.traverse(scene)), that params.update() was called after dr.enable_grad, and that attach is "
+        "not 'none' if it moves something"
+    )

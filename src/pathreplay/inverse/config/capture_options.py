@@ -1,0 +1,48 @@
+"""The tables of a job about its pictures: the capture that they come from, and the exposure at which each was taken."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from pathreplay.inverse.config.tables import Count, Positive, Switch, Table, Whole
+
+
+class Capture(Table):
+    """Pictures and their cameras, by the file or model that lists them; ``width`` in pixels is that of renderings."""
+
+    transforms: str | None = None
+    colmap: str | None = None
+    images: str | None = None
+    masks: str | None = None
+    width: Count | None = None
+    hold_out_every: Annotated[Whole, Field(ge=2, le=2**31 - 1)] | None = None
+
+    @property
+    def source(self) -> str:
+        """What lists the pictures: the path that the job gives."""
+        return self.transforms or self.colmap or ""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Capture:
+        if (self.transforms is None) == (self.colmap is None):
+            raise ValueError("capture: give 'transforms' (a transforms.json) or 'colmap' (the folder of a model)")
+        if self.images is not None and self.colmap is None:
+            raise ValueError("capture: 'images' is the folder of a COLMAP model's pictures; leave it out")
+        return self
+
+
+class Exposure(Table):
+    """Factors on the rendered picture of each view, which are recovered, too."""
+
+    white_balance: Switch = False
+    reference: Whole | str | None = None
+    free: Switch = False
+    learning_rate: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_scale(self) -> Exposure:
+        if self.free and self.reference is not None:
+            raise ValueError("exposure: 'free' and 'reference' exclude each other; leave one out")
+        return self

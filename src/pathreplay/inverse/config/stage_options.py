@@ -1,0 +1,37 @@
+"""The stages of a job, as it gives them: what is otherwise for some of its iterations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from pydantic import Field
+
+from pathreplay.inverse.config.tables import Count, Positive, Table, Whole
+
+
+class Stage(Table):
+    """So many iterations, in which some things are otherwise; None: as in the rest of the job."""
+
+    iterations: Count
+    downscale: Annotated[Whole, Field(ge=1, le=2**16)] = 1
+    spp: Count | None = None
+    max_depth: Count | None = None
+    sensors: Annotated[list[Whole | str], Field(min_length=1)] | None = None
+    views_per_step: Count | None = None
+    pixels_per_step: Count | None = None
+    parameters: Annotated[list[str], Field(min_length=1)] | None = None
+    learning_rate_factor: Positive = 1.0
+
+
+def begins(stages: Sequence[Stage]) -> list[int]:
+    """The iteration with which each begins, and that after the last one."""
+    found = [0]
+    for stage in stages:
+        found.append(found[-1] + stage.iterations)
+    return found
+
+
+def place(stages: Sequence[Stage], iteration: int) -> int:
+    """Which stage an iteration belongs to; beyond the end, the last one."""
+    return min(sum(begin <= iteration for begin in begins(stages)[1:]), len(stages) - 1)

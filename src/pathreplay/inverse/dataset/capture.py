@@ -1,0 +1,126 @@
+"""A capture: pictures and the cameras that took them, from a `transforms.json` or from a model of COLMAP's.
+
+Photos have cameras that look along -z with x to the right, and lengths are pixels; Mitsuba's look along z with x to the
+left, and have a field of view.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import math
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config.capture_options import Capture
+from pathreplay.inverse.dataset.colmap import photos_of_colmap
+from pathreplay.inverse.dataset.photos import Photo
+from pathreplay.inverse.dataset.transforms_json import photos_of_json
+from pathreplay.inverse.dataset.undistortion import Lens
+from pathreplay.platform.files import file_names, file_problem
+
+STRAIGHT = 1e-3
+"""How far the axes of a camera may be from unit length and right angles."""
+FACING = np.diag([-1.0, 1.0, -1.0, 1.0])
+"""From Mitsuba's camera to OpenGL's."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture, its mask where there is one, its camera as a dictionary of Mitsuba's, and the lens to be undone."""
+
+    image: Path
+    mask: Path | None
+    camera: dict[str, Any]
+    lens: Lens | None = None
+
+
+def read_capture(
+    capture: Capture, base: Path, size_of: Callable[[Path], tuple[int, int]], pixel_format: str = "rgb"
+) -> dict[str, Shot]:
+    """The shots of a capture by name, in its order; ``size_of`` gives width and height of a picture.
+
+    Raises PathreplayError for what cannot be read, for lenses that cannot be undone, and for cameras that are no rigid
+    motions.
+    """
+    size_of = functools.cache(size_of)
+    masks = None if capture.masks is None else base / capture.masks
+    if capture.colmap is not None:
+        images = None if capture.images is None else base / capture.images
+        photos = photos_of_colmap(base / capture.colmap, images, masks, size_of)
+    else:
+        photos = photos_of_json(base / capture.source, size_of)
+        if masks is not None:
+            photos = [replace(photo, mask=_mask(photo, masks)) for photo in photos]
+    shots = {}
+    for name, photo in zip(_names([photo.name for photo in photos]), photos, strict=True):
+        camera = _camera(photo, size_of(photo.image), capture.width, pixel_format)
+        lens = None if photo.lens.is_pinhole else photo.lens
+        shots[name] = Shot(photo.image, photo.mask, {**camera, "id": name}, lens)
+    return shots
+
+
+def fingerprint(shots: Iterable[Shot]) -> str:
+    """What tells cameras, names and sizes of a capture from others: a SHA-256 in hexadecimal."""
+    known = [
+        ({**shot.camera, "to_world": np.array(shot.camera["to_world"].matrix).tolist()}, shot.lens) for shot in shots
+    ]
+    return hashlib.sha256(repr(known).encode()).hexdigest()
+
+
+def _mask(photo: Photo, masks: Path) -> Path:
+    """The mask of a photo in a folder: of its own name, whatever its ending, with .png behind it or instead of it."""
+    image = photo.image.name
+    found = next((p for n in (f"{image}.png", f"{photo.image.stem}.png") if not file_problem(p := masks / n)), None)
+    if found is None:
+        raise PathreplayError(f"{photo.where}: capture.masks {masks} has no {image}.png; correct it, or add the file")
+    return found
+
+
+def _names(files: list[str]) -> list[str]:
+    """A name for each picture, fit for a sensor and a file: that of its file, with folders where two are the same."""
+    names = [Path(file).stem for file in files]
+    if len(set(names)) < len(names):
+        names = [str(Path(file).with_suffix("")) for file in files]
+    words = [re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-") or "view" for name in names]
+    if len(set(words)) < len(words):
+        twice = next(word for word in words if words.count(word) > 1)
+        raise PathreplayError(f"The capture has two pictures that would both be called '{twice}'; remove or rename one")
+    return list(file_names(words).values())
+
+
+def _camera(photo: Photo, size: tuple[int, int], width: int | None, pixel_format: str) -> dict[str, Any]:
+    """The camera of a photo as a pinhole, as a dictionary of Mitsuba's."""
+    lens, axes = photo.lens, photo.place[:3, :3]
+    if (
+        np.abs(axes.T @ axes - np.eye(3)).max() > STRAIGHT
+        or np.linalg.det(axes) < 0
+        or (photo.place[3] != [0, 0, 0, 1]).any()
+    ):
+        raise PathreplayError(f"{photo.where} has a transform_matrix that is no rotation and translation; correct it")
+    columns = size[0] if width is None else width
+    rows = max(1, round(columns * size[1] / size[0]))
+    return {
+        "type": "perspective",
+        "fov": math.degrees(2 * math.atan(lens.w / (2 * lens.fx))),
+        "fov_axis": "x",
+        "near_clip": 1e-3,
+        "far_clip": 1e5,
+        "principal_point_offset_x": 0.5 - lens.cx / lens.w,
+        "principal_point_offset_y": 0.5 - lens.cy / lens.h,
+        "to_world": mi.ScalarTransform4f((photo.place @ FACING).tolist()),
+        "film": {
+            "type": "hdrfilm",
+            "width": columns,
+            "height": rows,
+            "pixel_format": pixel_format,
+            "rfilter": {"type": "box"},
+        },
+    }

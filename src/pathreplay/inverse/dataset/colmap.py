@@ -1,0 +1,239 @@
+"""A model of COLMAP's: cameras and images, as text or binary. Points, rigs and frames are not looked at.
+
+The formats are those of https://colmap.github.io/format.html. They are read here and not by pycolmap, which takes
+135 MB for that, does not read a model without its points, and lets a camera through whose place is NaN.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO, TypeVar
+
+import numpy as np
+
+from pathreplay.errors import PathreplayError, shown
+from pathreplay.inverse.dataset.photos import Photo
+from pathreplay.inverse.dataset.undistortion import OFF, Lens
+from pathreplay.platform.files import MISSING, file_problem
+
+MODELS: dict[str, tuple[int, str]] = {
+    "SIMPLE_PINHOLE": (0, "f cx cy"),
+    "PINHOLE": (1, "fx fy cx cy"),
+    "SIMPLE_RADIAL": (2, "f cx cy k1"),
+    "RADIAL": (3, "f cx cy k1 k2"),
+    "OPENCV": (4, "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4"),
+    "FULL_OPENCV": (6, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+}
+"""Number of each lens model in binary files, and what its parameters are."""
+NUMBERS = {number: name for name, (number, _) in MODELS.items()}
+
+MOST_BYTES = 8 * 2**30
+MOST_IMAGES = 100_000
+LONGEST_NAME = 4096
+LONGEST_LINE = 64 * 2**20
+T = TypeVar("T")
+
+UNIT = 1e-2
+"""How far a quaternion's length may be from one."""
+
+
+@dataclass(frozen=True)
+class _Posed:
+    """An image of the model: rotation (quaternion, w first) and translation from the world to the camera."""
+
+    number: int
+    quaternion: tuple[float, ...]
+    translation: tuple[float, ...]
+    camera: int
+    name: str
+
+
+def photos_of_colmap(
+    folder: Path, images: Path | None, masks: Path | None, size_of: Callable[[Path], tuple[int, int]]
+) -> list[Photo]:
+    """The photos of a model, by name; ``images`` is the folder of the pictures (default: ../../images of the model).
+
+    Of ``masks``, a folder, each photo has the file of its own name with .png behind it, as COLMAP wants them.
+    Raises PathreplayError for what cannot be read or used.
+    """
+    cameras, posed = _read(folder)
+    pictures = folder / ".." / ".." / "images" if images is None else images
+    photos = []
+    for each in sorted(posed, key=lambda each: each.name):
+        where = f"{folder}: image {shown(each.name)}"
+        image = pictures / each.name
+        if problem := file_problem(image):
+            raise PathreplayError(f"{where}: {image} {problem}; give the folder of the pictures as capture.images")
+        mask = None if masks is None else masks / f"{each.name}.png"
+        if mask is not None and (problem := file_problem(mask)):
+            raise PathreplayError(f"{where}: its mask {mask} {problem}; correct capture.masks, or add the file")
+        if each.camera not in cameras:
+            raise PathreplayError(f"{where} was taken by camera {each.camera}, which the model does not have; mend it")
+        lens, size = cameras[each.camera], size_of(image)
+        if abs(lens.w * size[1] - lens.h * size[0]) > OFF * max(lens.w, lens.h):
+            raise PathreplayError(
+                f"{where} is said to be {lens.w:g} x {lens.h:g}, and its picture is {size[0]} x {size[1]}; "
+                "give the pictures of this model"
+            )
+        photos.append(Photo(where, each.name, image, mask, lens, _place(where, each)))
+    return photos
+
+
+def _read(folder: Path) -> tuple[dict[int, Lens], list[_Posed]]:
+    ending = next((e for e in (".bin", ".txt") if not file_problem(folder / f"cameras{e}")), None)
+    if ending is None:
+        raise PathreplayError(
+            f"No COLMAP model in {folder}: it has neither cameras.bin nor cameras.txt; give the folder that has, such "
+            "as sparse/0"
+        )
+    paths = [folder / f"{name}{ending}" for name in ("cameras", "images")]
+    for path in paths:
+        if problem := file_problem(path, MOST_BYTES):
+            also = "; it belongs to every model" if problem == MISSING else "; correct it"
+            raise PathreplayError(f"{path} {problem}{also}")
+    binary = ending == ".bin"
+    cameras = dict(_parsed(paths[0], _binary_cameras if binary else _text_cameras))
+    posed = _parsed(paths[1], _binary_images if binary else _text_images)
+    if not posed:
+        raise PathreplayError(f"{paths[1]} has no image; register some first")
+    return cameras, posed
+
+
+def _parsed(path: Path, parse: Callable[[BinaryIO], Iterator[T]]) -> list[T]:
+    try:
+        with path.open("rb") as file:
+            return list(parse(file))
+    except (ValueError, OSError) as error:
+        raise PathreplayError(f"{path} is no file of a COLMAP model as we know it ({error}); mend it") from None
+
+
+def _lens(model: str, width: float, height: float, parameters: list[float]) -> Lens:
+    names = MODELS[model][1].split()
+    if len(names) != len(parameters):
+        raise ValueError(f"a {model} of {len(parameters)} parameters, which has {len(names)}")
+    given = dict(zip(names, parameters, strict=True))
+    fx, fy = (given.get(name, given.get("f", 0.0)) for name in ("fx", "fy"))
+    numbers = (width, height, *parameters)
+    if not all(map(math.isfinite, numbers)) or max(map(abs, numbers)) > 1e6 or min(width, height) < 1:
+        raise ValueError(f"a camera of {width:g} x {height:g} with parameters {parameters}")
+    if min(fx, fy) < 1e-3:
+        raise ValueError(f"a focal length of {min(fx, fy):g}")
+    fisheye = model == "OPENCV_FISHEYE"
+    radial = tuple(given.get(f"k{i}", 0.0) for i in range(1, 7))
+    tangential = given.get("p1", 0.0), given.get("p2", 0.0)
+    return Lens(width, height, fx, fy, given["cx"], given["cy"], radial, tangential, fisheye)
+
+
+def _known(model: str) -> str:
+    if model not in MODELS:
+        raise ValueError(f"the camera model {shown(model)}; undistort the pictures by COLMAP first")
+    return model
+
+
+def _place(where: str, posed: _Posed) -> np.ndarray:
+    """The camera in the world, looking along -z with y up; COLMAP's look along z with y down."""
+    q, t = np.array(posed.quaternion), np.array(posed.translation)
+    length = float(np.linalg.norm(q)) if np.isfinite(q).all() else math.nan
+    if not abs(length - 1) < UNIT or not (np.abs(t) < 1e9).all():
+        raise PathreplayError(
+            f"{where} has the quaternion {posed.quaternion} and the translation {posed.translation}, which are no "
+            "place of a camera; mend the model"
+        )
+    w, x, y, z = q / length
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    place = np.eye(4)
+    place[:3, :3], place[:3, 3] = rotation.T * [1, -1, -1], -rotation.T @ t
+    return place
+
+
+# ------------------------------------------------------------------------------
+#  Text: a line for each camera, two for each image, the second of which lists its points
+# ------------------------------------------------------------------------------
+
+
+def _lines(file: BinaryIO) -> Iterator[str]:
+    while line := file.readline(LONGEST_LINE):
+        if len(line) == LONGEST_LINE:
+            raise ValueError(f"a line of more than {LONGEST_LINE} bytes")
+        text = line.decode("utf-8").strip("\r\n")
+        if not text.lstrip().startswith("#"):
+            yield text
+
+
+def _text_cameras(file: BinaryIO) -> Iterator[tuple[int, Lens]]:
+    for line in _lines(file):
+        if words := line.split():
+            if len(words) < 4:
+                raise ValueError(f"the line {shown(line)}")
+            number, model, width, height, *parameters = words
+            yield int(number), _lens(_known(model), float(width), float(height), [float(each) for each in parameters])
+
+
+def _text_images(file: BinaryIO) -> Iterator[_Posed]:
+    lines, count = _lines(file), 0
+    for line in lines:
+        if not line.strip():
+            continue
+        words = line.split(maxsplit=9)
+        if len(words) < 10 or len(words[9]) > LONGEST_NAME:
+            raise ValueError(f"the line {shown(line)}")
+        if (count := count + 1) > MOST_IMAGES:
+            raise ValueError(f"more than {MOST_IMAGES} images")
+        q, t = tuple(map(float, words[1:5])), tuple(map(float, words[5:8]))
+        yield _Posed(int(words[0]), q, t, int(words[8]), words[9])
+        next(lines, None)  # its points
+
+
+# ------------------------------------------------------------------------------
+#  Binary: little-endian, counts first
+# ------------------------------------------------------------------------------
+
+
+def _unpacked(file: BinaryIO, layout: str) -> tuple:
+    size = struct.calcsize(layout)
+    data = file.read(size)
+    if len(data) < size:
+        raise ValueError("it is cut short")
+    return struct.unpack(layout, data)
+
+
+def _binary_cameras(file: BinaryIO) -> Iterator[tuple[int, Lens]]:
+    (count,) = _unpacked(file, "<Q")
+    if count > MOST_IMAGES:
+        raise ValueError(f"{count} cameras")
+    for _ in range(count):
+        number, model, width, height = _unpacked(file, "<IiQQ")
+        name = _known(NUMBERS.get(model, f"number {model}"))
+        parameters = _unpacked(file, f"<{len(MODELS[name][1].split())}d")
+        yield number, _lens(name, float(width), float(height), list(parameters))
+
+
+def _binary_images(file: BinaryIO) -> Iterator[_Posed]:
+    (count,) = _unpacked(file, "<Q")
+    if count > MOST_IMAGES:
+        raise ValueError(f"{count} images")
+    end = file.seek(0, 2)
+    file.seek(8)
+    for _ in range(count):
+        number, *pose, camera = _unpacked(file, "<I7dI")
+        name = bytearray()
+        while (letter := file.read(1)) not in (b"\0", b""):
+            name += letter
+            if len(name) > LONGEST_NAME:
+                raise ValueError(f"a name of more than {LONGEST_NAME} bytes")
+        (points,) = _unpacked(file, "<Q")
+        if points * 24 > end - file.tell():
+            raise ValueError(f"an image of {points} points, and it is cut short")
+        file.seek(points * 24, 1)  # x, y, number of the point
+        yield _Posed(number, tuple(pose[:4]), tuple(pose[4:]), camera, name.decode("utf-8"))

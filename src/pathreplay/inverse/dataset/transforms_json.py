@@ -1,0 +1,129 @@
+"""A `transforms.json` of NeRF, instant-ngp or Nerfstudio: its frames as photos.
+
+There, cameras look along -z with x to the right and y up, and lengths are pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from pathreplay.errors import PathreplayError, shown
+from pathreplay.inverse.dataset.photos import Photo
+from pathreplay.inverse.dataset.undistortion import OFF, Lens
+from pathreplay.platform.files import MISSING, file_problem
+
+MOST_BYTES = 64 * 2**20
+ENDINGS = (".png", ".jpg", ".jpeg", ".exr")
+"""Of pictures that are named without one, as NeRF's own scenes do it."""
+MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
+
+Row = Annotated[list[Annotated[FiniteFloat, Field(gt=-1e9, lt=1e9)]], Field(min_length=4, max_length=4)]
+Length = Annotated[FiniteFloat, Field(gt=1e-3, lt=1e6)]
+Place = Annotated[FiniteFloat, Field(gt=-1e6, lt=1e6)]
+Bend = Annotated[FiniteFloat, Field(gt=-1e6, lt=1e6)]
+
+
+class _Intrinsics(BaseModel):
+    """Those of a frame take the place of the file's."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    camera_model: str | None = None
+    camera_angle_x: Annotated[FiniteFloat, Field(gt=1e-3, lt=math.pi - 1e-3)] | None = None
+    fl_x: Length | None = None
+    fl_y: Length | None = None
+    cx: Place | None = None
+    cy: Place | None = None
+    w: Length | None = None
+    h: Length | None = None
+    is_fisheye: bool = False
+    k1: Bend = 0.0
+    k2: Bend = 0.0
+    k3: Bend = 0.0
+    k4: Bend = 0.0
+    p1: Bend = 0.0
+    p2: Bend = 0.0
+
+
+class _Frame(_Intrinsics):
+    file_path: str
+    mask_path: str | None = None
+    transform_matrix: Annotated[list[Row], Field(min_length=4, max_length=4)]
+
+
+class _Transforms(_Intrinsics):
+    frames: Annotated[list[_Frame], Field(min_length=1)]
+
+
+def photos_of_json(path: Path, size_of: Callable[[Path], tuple[int, int]]) -> list[Photo]:
+    """The photos of a transforms.json, in its order; raises PathreplayError for what cannot be read or used."""
+    found = _read(path)
+    fields, photos = set(_Intrinsics.model_fields), []
+    for frame in found.frames:
+        image = _picture(frame.file_path, path)
+        own = frame.model_dump(include=fields, exclude_unset=True)
+        table = found.model_dump(include=fields) | own
+        if own.get("camera_angle_x") is not None and own.get("fl_x") is None:
+            table |= {"fl_x": None, "fl_y": None}
+        where = f"{path}: frame {shown(frame.file_path)}"
+        mask = None if frame.mask_path is None else _picture(frame.mask_path, path)
+        lens = _lens(where, table, size_of(image))
+        photos.append(Photo(where, frame.file_path, image, mask, lens, np.array(frame.transform_matrix)))
+    return photos
+
+
+def _read(path: Path) -> _Transforms:
+    if (problem := file_problem(path, MOST_BYTES)) == MISSING:
+        raise PathreplayError(f"No capture {path}; give the path of a transforms.json")
+    if problem:
+        raise PathreplayError(f"Capture {path} {problem}; give the path of a transforms.json")
+    try:
+        return _Transforms.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        what = f"'{where}': {first['msg'].lower()}" if where else first["msg"]
+        raise PathreplayError(f"Capture {path} is no transforms.json as we know it ({what}); mend it there") from None
+
+
+def _picture(name: str, path: Path) -> Path:
+    image = path.parent / name
+    if image.name and not image.suffix:
+        named = [image.with_name(image.name + ending) for ending in ENDINGS]
+        image = next((path for path in named if not file_problem(path)), image)
+    if problem := file_problem(image):
+        raise PathreplayError(f"Capture {path}: picture {shown(name)} {problem}; correct the path or create the file")
+    return image
+
+
+def _lens(where: str, table: dict[str, Any], size: tuple[int, int]) -> Lens:
+    if (model := table["camera_model"]) is not None and model not in MODELS:
+        raise PathreplayError(f"{where} has the camera_model {shown(model)}; undistort it to a PINHOLE first")
+    fisheye = table["is_fisheye"] or model == "OPENCV_FISHEYE"
+    if table["k4"] and not fisheye:
+        raise PathreplayError(
+            f"{where} has k4 = {table['k4']:g}, which is one thing to OpenCV and another to Nerfstudio; undistort its "
+            "picture first, and set it to 0"
+        )
+    w, h = (size[i] if table[key] is None else table[key] for i, key in enumerate("wh"))
+    if abs(w * size[1] - h * size[0]) > OFF * max(w, h):
+        raise PathreplayError(
+            f"{where} is said to be {w:g} x {h:g}, and its picture is {size[0]} x {size[1]}; correct w and h"
+        )
+    if table["fl_x"] is not None:
+        fx = table["fl_x"]
+        fy = fx if table["fl_y"] is None else table["fl_y"]
+    elif table["camera_angle_x"] is not None:
+        fx = fy = w / (2 * math.tan(table["camera_angle_x"] / 2))
+    else:
+        raise PathreplayError(f"{where} has neither fl_x nor camera_angle_x; add one of them")
+    cx, cy = (half / 2 if table[key] is None else table[key] for key, half in (("cx", w), ("cy", h)))
+    ks = tuple(table[f"k{i}"] for i in (1, 2, 3, 4))
+    radial = (*ks, 0.0, 0.0) if fisheye else (*ks[:3], 0.0, 0.0, 0.0)
+    return Lens(w, h, fx, fy, cx, cy, radial, (0.0, 0.0) if fisheye else (table["p1"], table["p2"]), fisheye)

@@ -1,0 +1,1 @@
+"""The loop: steps, events, checkpoints, and whether values still move."""

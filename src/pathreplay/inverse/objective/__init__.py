@@ -1,0 +1,1 @@
+"""The objective: loss and gradients as a function of values and of a shard of the views."""

@@ -1,0 +1,58 @@
+"""Whether a job, and each of its stages, moves anything that its views depend on; told before the first iteration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.errors import PathreplayError
+from pathreplay.integrators.film.image import picture_shape
+from pathreplay.inverse.config.schema import Config
+from pathreplay.inverse.config.stage_options import begins
+from pathreplay.inverse.objective.stages import Part, part_at
+from pathreplay.inverse.parameters.exposures import EXPOSURE
+from pathreplay.inverse.problem.problem import Problem, scene_values, variables_of
+
+
+def require_reached(problem: Problem, config: Config) -> None:
+    """Raise PathreplayError where all that moves in a stage, or in the job, reaches none of its views.
+
+    An integrator of ours is asked, too, whether it differentiates what moves.
+    """
+    for first in begins(config.stages)[:-1] if config.stages else [0]:
+        part = part_at(problem, config, first)
+        where = f"stages: stage {part.number + 1}: " if config.stages else ""
+        views = part.problem.trained()
+        reached = sorted(views.keys() & part.problem.reached(part.moving))
+        if not reached and EXPOSURE not in part.moving:  # by which every picture is multiplied
+            names = _listed(view.name for view in views.values())
+            raise PathreplayError(
+                f"{where}{_listed(sorted(part.problem.moves(part.moving)))} reaches none of the views that are learned "
+                f"from ({names}): it is a part of other cameras; name the views of these, or other parameters"
+            )
+        if reached:
+            _require_differentiated(part, views[reached[0]].sensor, where)
+
+
+def _require_differentiated(part: Part, sensor: int, where: str) -> None:
+    """Raise PathreplayError where the integrator, or its rival, takes what moves for constant."""
+    problem = part.problem
+    variables = variables_of(problem, {v.key: v.start for v in problem.variables})
+    dr.enable_grad({key: value for key, value in variables.items() if key in part.moving})
+    problem.params.update(scene_values(problem, variables))
+    try:
+        for integrator in filter(None, (problem.integrator, problem.rival)):
+            if hasattr(integrator, "is_reached") and not integrator.is_reached(problem.scene, sensor):
+                nothing = dr.zeros(mi.TensorXf, picture_shape(problem.scene.sensors()[sensor]))
+                integrator.render_backward(problem.scene, problem.params, nothing, sensor, spp=1)
+    except PathreplayError as error:
+        raise PathreplayError(f"{where}{error}") from None
+    finally:
+        dr.disable_grad(variables)
+        problem.params.update(scene_values(problem, variables))
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names)

@@ -1,0 +1,196 @@
+"""What a stage makes of a job: other views, smaller films, shorter paths, parameters that are held."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.errors import PathreplayError, shown
+from pathreplay.inverse.config.schema import Config, Plugin
+from pathreplay.inverse.config.stage_options import Stage, place
+from pathreplay.inverse.dataset.views import View
+from pathreplay.inverse.images.io import Image
+from pathreplay.inverse.objective.evaluate import Evaluation, Evaluator, Shard
+from pathreplay.inverse.objective.pixel_batches import obstacle, refused
+from pathreplay.inverse.parameters.values import Arrays
+from pathreplay.inverse.problem.problem import Problem
+from pathreplay.scenes import parameters
+from pathreplay.scenes.descriptions import load_integrator
+
+
+@dataclass(frozen=True)
+class Part:
+    """The job as it is in a stage, or throughout, if it has none."""
+
+    number: int
+    config: Config
+    problem: Problem
+    """With the views that are learned from; their pictures are whole (see `scaled`)."""
+    moving: frozenset[str]
+    """Variables that are stepped, and differentiated."""
+    factor: float
+    """On all learning rates."""
+
+
+def part_at(problem: Problem, config: Config, iteration: int) -> Part:
+    """The part of an iteration."""
+    if config.stages is None:
+        return Part(0, config, problem, frozenset(v.key for v in problem.variables), 1.0)
+    number = place(config.stages, iteration)
+    return _part(problem, config, number, config.stages[number])
+
+
+def _part(problem: Problem, config: Config, number: int, stage: Stage) -> Part:
+    names = "spp", "views_per_step", "pixels_per_step"
+    given = {name: value for name in names if (value := getattr(stage, name)) is not None}
+    seen = _views(problem, stage)
+    views = tuple(replace(v, held_out=v.held_out or (seen is not None and v.name not in seen)) for v in problem.views)
+    moving = frozenset(_moving(problem, stage))
+    changed = config.model_copy(update=given)
+    return Part(number, changed, replace(problem, views=views), moving, stage.learning_rate_factor)
+
+
+def _views(problem: Problem, stage: Stage) -> set[str] | None:
+    """The names of the views that the stage asks for; None for all. Raises PathreplayError."""
+    if stage.sensors is None:
+        return None
+    ids = {view.name: problem.scene.sensors()[view.sensor].id() for view in problem.views}
+    found = set()
+    for item in stage.sensors:
+        named = [v for v in problem.views if item in (v.name, ids[v.name]) or item == v.sensor]
+        if not named or named[0].held_out:
+            why = "is held out" if named else "is none of the job's views"
+            names = ", ".join(v.name for v in problem.trained().values())
+            raise PathreplayError(f"stages: sensor {shown(item)} {why}; name some of {names}")
+        found.add(named[0].name)
+    return found
+
+
+def _moving(problem: Problem, stage: Stage) -> list[str]:
+    """The variables that are stepped in a stage. Raises PathreplayError where a key is none of the job's."""
+    keys = [v.key for v in problem.variables]
+    if stage.parameters is None:
+        return keys
+    # What makes a pose or a derived parameter is named by that, too.
+    owners: dict[str, set[str]] = {key: {key} for key in keys}
+    for each in problem.made():
+        for part in each.of:
+            owners[part].add(each.key)
+    known = dict.fromkeys(name for names in owners.values() for name in names)
+    try:
+        named = parameters.resolve_keys(known, stage.parameters)
+    except PathreplayError as error:
+        raise PathreplayError(f"stages: {error}; name parameters that the job recovers") from None
+    return [key for key in keys if not owners[key].isdisjoint(named)]
+
+
+def require_stages(problem: Problem, config: Config) -> None:
+    """Raise PathreplayError unless all stages can be done with this scene."""
+    for number, stage in enumerate(config.stages or []):
+        part = _part(problem, config, number, stage)
+        for view in part.problem.trained().values():
+            _require_divisible(problem.scene.sensors()[view.sensor], view.name, stage.downscale)
+        if stage.max_depth is not None:
+            for plugin in filter(None, (config.integrator, config.rival)):
+                _integrator(plugin, stage.max_depth)
+    for variable in problem.variables:
+        if config.stages and not any(variable.key in _moving(problem, stage) for stage in config.stages):
+            raise PathreplayError(f"stages: '{variable.key}' moves in none of them; name it in one, or leave it out")
+
+
+def require_single_pixels(problem: Problem, config: Config) -> None:
+    """Raise PathreplayError unless all views can be rendered pixel by pixel where stages, or the job, ask for that."""
+    stages: list[Stage | None] = [*config.stages] if config.stages else [None]
+    for number, stage in enumerate(stages):
+        part = part_at(problem, config, 0) if stage is None else _part(problem, config, number, stage)
+        if part.config.pixels_per_step is None:
+            continue
+        for integrator, plugin in ((problem.integrator, config.integrator), (problem.rival, config.rival)):
+            if integrator is not None and plugin is not None:
+                if stage is not None and stage.max_depth is not None:
+                    integrator = _integrator(plugin, stage.max_depth)
+                _require_single_pixels(part, integrator)
+
+
+def _require_single_pixels(part: Part, integrator: mi.Integrator) -> None:
+    problem, spp = part.problem, int(part.config.spp)  # which is not "auto" there
+    for view in problem.trained().values():
+        camera = f"{problem.scene.sensors()[view.sensor].id()}."
+        why = obstacle(problem, integrator, view.sensor, spp // part.config.parts, some=True)
+        if moves := sorted(key for key in problem.moves(part.moving) if key.startswith(camera)):
+            why = f"its camera moves; hold '{moves[0]}'"
+        if why:
+            raise refused(view.name, why)
+
+
+def _require_divisible(sensor: mi.Sensor, name: str, downscale: int) -> None:
+    film = sensor.film()
+    width, height = (int(n) for n in film.size())
+    if downscale > 1 and (tuple(film.crop_size()) != (width, height) or film.sample_border()):
+        raise PathreplayError(
+            f"stages: the film of sensor '{name}' has a crop window or samples its border; leave 'downscale' out"
+        )
+    if width % downscale or height % downscale:
+        most = np.gcd(width, height)
+        fit = [n for n in range(2, min(int(most), 64) + 1) if most % n == 0]
+        way_out = f"take one of {', '.join(map(str, fit))}" if fit else "leave it out"
+        raise PathreplayError(
+            f"stages: downscale = {downscale} does not divide the {width} x {height} pixels of sensor '{name}'; "
+            f"{way_out}"
+        )
+
+
+def _integrator(plugin: Plugin, max_depth: int) -> mi.Integrator:
+    return load_integrator({**plugin.model_dump(), "max_depth": max_depth})
+
+
+def scaled(view: View, downscale: int) -> View:
+    """The view with means of squares of pixels in place of them: those of what counts, where there is a mask."""
+    if downscale == 1:
+        return view
+    if view.weight is None:
+        return replace(view, target=_means(view.target, downscale))
+    weight = _means(view.weight, downscale)
+    plain, counted = _means(view.target, downscale), _means(view.target * view.weight, downscale)
+    target = np.where(weight > 0, counted / np.where(weight > 0, weight, 1), plain)
+    return replace(view, target=target.astype(np.float32), weight=weight)
+
+
+def _means(image: Image, n: int) -> Image:
+    height, width, channels = image.shape
+    squares = image.reshape(height // n, n, width // n, n, channels)
+    return squares.mean(axis=(1, 3), dtype=np.float64).astype(np.float32)
+
+
+class Staged:
+    """Evaluates shards as their stages want it: an `Evaluate`. It holds what it needs for one stage at a time."""
+
+    def __init__(
+        self, problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin, record: bool = True
+    ) -> None:
+        self.problem, self.config, self.integrator, self.plugin, self.record = (
+            problem, config, integrator, plugin, record,
+        )  # fmt: skip
+        self._number: int | None = None
+        self._evaluate: Callable[[Arrays, Shard, Arrays], Evaluation] | None = None
+
+    def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
+        """See `Evaluate`."""
+        if self._number != shard.stage or self._evaluate is None:
+            self._evaluate, self._number = None, shard.stage  # the old one goes before there is a new one
+            self._evaluate = self._evaluator(shard.stage)
+        return self._evaluate(values, shard, learned)
+
+    def _evaluator(self, number: int) -> Evaluator:
+        stages = self.config.stages or []
+        stage, integrator = stages[number], self.integrator
+        part = _part(self.problem, self.config, number, stage)
+        if stage.max_depth is not None:
+            integrator = _integrator(self.plugin, stage.max_depth)
+            if hasattr(integrator, "told"):  # what has been said need not be said again
+                integrator.told |= self.integrator.told
+        views = tuple(scaled(view, stage.downscale) if not view.held_out else view for view in part.problem.views)
+        return Evaluator(replace(part.problem, views=views), integrator, self.record, part.moving)

@@ -1,0 +1,1 @@
+"""Optimisers: adaptive steps by gradients, and L-BFGS with a line search."""

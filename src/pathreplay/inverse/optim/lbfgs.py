@@ -1,0 +1,159 @@
+"""L-BFGS-B, SciPy's, as an optimiser that is told a loss and a gradient at a time: for few parameters.
+
+Each iteration of a job is one evaluation that it asks for, which may be a trial of its line search and worse than
+those before. What it comes to is the best one. SciPy keeps its state to itself; but all that it does follows from what
+it was told, so it is asked from the start again with everything that is known, until it asks for something new. That
+takes no time next to a rendering, and makes it possible to go on from a checkpoint bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+from numpy.typing import NDArray
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config.optimizer_options import Optimizer
+from pathreplay.inverse.optim.adaptive import State
+from pathreplay.inverse.parameters.values import Array, Arrays
+
+MOST = 1000
+"""Numbers that it takes: what it remembers, and what a checkpoint holds, grows with each evaluation."""
+
+ENDLESS = 10**9
+
+Vector = NDArray[np.float64]
+_START, _SCALE, _LOSSES, _GRADIENTS, _NEXT = (f"search:{n}" for n in ("start", "scale", "losses", "gradients", "next"))
+
+
+class _Asked(Exception):
+    """An evaluation is asked for that nobody has made."""
+
+
+class LineSearch:
+    """An `Optimiser` of variables that begin at ``values``, within ``bounds`` (lowest and highest) by key.
+
+    Lengths are measured in the first learning rate of each variable, and losses in the first one. Raises
+    PathreplayError where there are more than `MOST` numbers.
+    """
+
+    def __init__(self, values: Arrays, options: Optimizer, bounds: Mapping[str, tuple[float, float]]) -> None:
+        self._shapes = {key: value.shape for key, value in values.items()}
+        n = sum(value.size for value in values.values())
+        if n > MOST:
+            raise PathreplayError(
+                f"The parameters are {n} numbers, and type = '{options.type}' takes up to {MOST}; take 'adam'"
+            )
+        given = options.options()
+        self._memory, self._tolerance = given["memory"], given["tolerance"]
+        ends = [np.broadcast_to(np.array(bounds[key], float), (value.size, 2)) for key, value in values.items()]
+        self._bounds = np.concatenate(ends)
+        self._start, self._scale, self._next = np.zeros(0), np.zeros(0), np.zeros(0)
+        self._points: list[Vector] = []
+        self._losses: list[float] = []
+        self._gradients: list[Vector] = []
+        self.finished = ""
+
+    def step(
+        self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
+    ) -> dict[str, Array]:
+        """See `Optimiser`; the next point to be evaluated, or the best one where nothing more is to be found."""
+        if self.finished:
+            return self.answer()
+        if not self._losses:
+            self._scale = np.concatenate([np.full(value.size, rates[key]) for key, value in values.items()])
+            self._start = _flat(values) / self._scale
+        self._losses.append(float(loss))
+        self._gradients.append(_flat({key: gradients[key] for key in values}) * self._scale)
+        self._ask()
+        return self.answer() if self.finished else self._split(self._next)
+
+    def _ask(self) -> None:
+        """Hear from SciPy what it wants to know next, or that it has finished."""
+        self._points, unit = [], abs(self._losses[0]) or 1.0
+
+        def told(x: Vector) -> tuple[float, Vector]:
+            k = len(self._points)
+            self._points.append(x.copy())
+            if k == len(self._losses):
+                raise _Asked
+            return self._losses[k] / unit, self._gradients[k] / unit
+
+        try:
+            found = scipy.optimize.minimize(
+                told,
+                self._start,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=scipy.optimize.Bounds(*(self._bounds / self._scale[:, None]).T),
+                options={
+                    "maxcor": self._memory,
+                    "ftol": self._tolerance,
+                    "gtol": 0.0,
+                    "maxfun": ENDLESS,
+                    "maxiter": ENDLESS,
+                },
+            )
+        except _Asked:
+            self._next = self._points.pop()
+            return
+        falls = "the loss falls no further" if found.success else "no step lowers the loss: what is left may be noise"
+        self.finished = f"{falls} ({' '.join(str(found.message).split())})"
+
+    def _split(self, x: Vector) -> dict[str, Array]:
+        parts, at = {}, 0
+        for key, shape in self._shapes.items():
+            n = int(np.prod(shape))
+            parts[key] = (x[at : at + n] * self._scale[at : at + n]).astype(np.float32).reshape(shape)
+            at += n
+        return parts
+
+    def answer(self) -> dict[str, Array]:
+        """The point with the lowest loss so far; nothing before the first step."""
+        return self._split(self._points[int(np.argmin(self._losses))]) if self._losses else {}
+
+    def state(self) -> State:
+        """See `Optimiser`: what it was told."""
+        steps = dict.fromkeys(self._shapes, len(self._losses))
+        if not self._losses:
+            return State(steps, {})
+        arrays: dict[str, Any] = {
+            _START: self._start,
+            _SCALE: self._scale,
+            _LOSSES: np.array(self._losses, np.float64),
+            _GRADIENTS: np.array(self._gradients),
+        }
+        if not self.finished:
+            arrays[_NEXT] = self._next
+        return State(steps, arrays)
+
+    def restore(self, state: State, values: Arrays) -> None:
+        """See `Optimiser`."""
+        n = len(self._bounds)
+        (count,) = {state.steps[key] for key in values} or {0}
+        if {key: value.shape for key, value in values.items()} != self._shapes:
+            raise ValueError("its parameters have other shapes")
+        if rest := set(state.arrays) - {_START, _SCALE, _LOSSES, _GRADIENTS, _NEXT}:
+            raise ValueError(f"'{min(rest)}' is nothing that this optimizer keeps")
+        if not count:
+            return
+        shapes = {_START: (n,), _SCALE: (n,), _LOSSES: (count,), _GRADIENTS: (count, n), _NEXT: (n,)}
+        for name, array in state.arrays.items():
+            if array.shape != shapes[name] or array.dtype != np.float64:
+                raise ValueError(f"'{name}' is {array.dtype} of shape {array.shape}, not float64 of {shapes[name]}")
+        self._start, self._scale = (np.asarray(state.arrays[name], np.float64) for name in (_START, _SCALE))
+        if (self._scale <= 0).any():
+            raise ValueError(f"'{_SCALE}' is not positive")
+        self._losses = [float(loss) for loss in state.arrays[_LOSSES]]
+        self._gradients = [np.asarray(gradient, np.float64) for gradient in state.arrays[_GRADIENTS]]
+        self._ask()
+        expected = state.arrays.get(_NEXT)
+        if len(self._points) != count or (expected is not None and not np.array_equal(self._next, expected)):
+            raise ValueError("SciPy asks for other values than it did; it may be of another version")
+
+
+def _flat(arrays: Arrays) -> Vector:
+    return np.concatenate([np.ravel(array).astype(np.float64) for array in arrays.values()])

@@ -1,0 +1,1 @@
+"""What is optimised: variables, their reparameterizations, poses, regularizers, and what is derived from them."""

@@ -1,0 +1,229 @@
+"""What the optimiser moves: variables with bounds, rates and starts, as the parameters of a job ask for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config.schema import Config, Derivation, Parameter
+from pathreplay.inverse.config.user_functions import Modules
+from pathreplay.inverse.parameters import limits as parameter_limits
+from pathreplay.inverse.parameters.exposures import EXPOSURE
+from pathreplay.inverse.parameters.grids import Levels, make_levels, resampled
+from pathreplay.inverse.parameters.mesh import Surface
+from pathreplay.inverse.parameters.pose import PART_NAMES, Pose, make_pose
+from pathreplay.inverse.parameters.regularizers import Laplacian, Own, Penalty, Prior, Term, TotalVariation
+from pathreplay.inverse.parameters.reparameterization import Coordinates, Transform
+from pathreplay.inverse.parameters.values import Array, make_value, seen
+from pathreplay.scenes import parameters
+from pathreplay.scenes.stored import AS_STORED, Form, form_of
+
+RESERVED = frozenset({EXPOSURE, "__metadata__"})
+"""Names that mean something else where values are kept."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """What the optimiser moves: its name, bounds, learning rate, start value, and the truth where it is known.
+
+    The name is the key of a scene parameter, that of a pose with ':translation' or ':rotation' behind it, or that of
+    numbers which others are derived from.
+    """
+
+    key: str
+    like: Any
+    """A Dr.Jit value of its type and shape."""
+    bounds: tuple[float, float]
+    """Lowest and highest value that a step may end at."""
+    learning_rate: float
+    start: Array
+    truth: Array | None
+    """In the shape of ``start``, or for a grid in another resolution."""
+    levels: Levels | None = None
+    """Of a grid that is refined on the way."""
+    coordinates: Coordinates | None = None
+    """Where steps are taken, if not in the values themselves."""
+    penalty: Penalty | None = None
+    """What is added to the loss for its values alone."""
+    form: Form = AS_STORED
+    """How Mitsuba stores it; everything here is what people see."""
+
+    def held(self, values: Array) -> Any:
+        """Values as Dr.Jit holds them; a grid may have another resolution than at first."""
+        return type(self.like)(values) if dr.is_tensor_v(self.like) else parameters.to_value(self.like, values)
+
+
+def keys_of(
+    params: mi.SceneParameters, config: Config, integrator: mi.Integrator
+) -> tuple[dict[str, Parameter], dict[str, Derivation]]:
+    """The scene's keys that are recovered, and those that are derived, each with its entry.
+
+    Raises PathreplayError for those that cannot move, or are named twice.
+    """
+    found: dict[str, Parameter | Derivation] = {}
+    entries: list[Parameter | Derivation] = [entry for entry in config.parameters if entry.shape is None]
+    for entry in [*entries, *config.derived]:
+        for key in parameters.resolve_keys(params, entry.key):
+            if key in found:
+                raise PathreplayError(
+                    f"Parameter '{key}' is named twice, by '{found[key].key}' and '{entry.key}'; remove one"
+                )
+            parameters.require_differentiable(params, key, integrator)
+            found[key] = entry
+    return (
+        {key: entry for key, entry in found.items() if isinstance(entry, Parameter)},
+        {key: entry for key, entry in found.items() if isinstance(entry, Derivation)},
+    )
+
+
+def free_of(params: mi.SceneParameters, config: Config) -> dict[str, Parameter]:
+    """The entries with a shape of their own, by key. Raises PathreplayError for names that are others'."""
+    free: dict[str, Parameter] = {}
+    for entry in config.parameters:
+        if entry.shape is None:
+            continue
+        if entry.key in params:
+            raise PathreplayError(f"Parameter '{entry.key}' is one of the scene; leave 'shape' out, or rename it")
+        if entry.key in RESERVED or entry.key.endswith(PART_NAMES):
+            raise PathreplayError(f"Parameter '{entry.key}' with a 'shape' has the name of something else; rename it")
+        if entry.key in free:
+            raise PathreplayError(f"Parameter '{entry.key}' is named twice; remove one")
+        free[entry.key] = entry
+    return free
+
+
+def make_variables(
+    scene: mi.Scene,
+    params: mi.SceneParameters,
+    keys: dict[str, Parameter],
+    config: Config,
+    base: Path,
+    modules: Modules,
+) -> tuple[list[Variable], list[Pose]]:
+    """Of each key a variable, or a pose with those of its parts; truths are not known yet.
+
+    Raises PathreplayError for starts, rates and options that do not fit what is there.
+    """
+    variables: list[Variable] = []
+    poses: list[Pose] = []
+    for key, entry in keys.items():
+        rate = entry.learning_rate or config.learning_rate
+        # A step of SGD is the rate times the gradient, which may be anything.
+        bounded = parameter_limits.require_learning_rate if config.optimizer.type != "sgd" else lambda *_: None
+        if entry.pose is None:
+            form = AS_STORED if entry.shape else form_of(params, key)
+            like = seen(params, key) if entry.shape is None else _numbers(key, entry.shape)
+            start = _start(key, like, form, entry, base)
+            bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
+            coordinates = _coordinates(params, key, entry, start)
+            if isinstance(coordinates, Transform):
+                bounded(key, rate, coordinates.latent(start))
+            else:
+                bounded(key, rate, start, (entry.lower, entry.upper))
+            levels = _levels(key, entry, config.refine_at(entry), start)
+            if levels is not None:
+                start = resampled(start, levels.shapes[0])
+            if dr.is_tensor_v(like):
+                like = dr.zeros(type(like), start.shape)  # which nobody writes down
+            penalty = _penalty(params, key, entry, start, levels, modules)
+            variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
+            continue
+        parameter_limits.require_near(scene, key, parameters.get_array(params[key]), entry)
+        pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
+        poses.append(pose)
+        for part, name in pose.parts().items():
+            start = np.array(getattr(entry.start, part, None) or [0.0, 0.0, 0.0], np.float32)
+            if part == "rotation":
+                # Users write degrees. A learning rate without unit is taken in radians, fit for a scene of size 1.
+                start = np.radians(start)
+                degrees = entry.rotation_learning_rate
+                rate = rate if degrees is None else float(np.radians(degrees))
+            bounded(name, rate, start)
+            variables.append(Variable(name, mi.Vector3f(0), (-np.inf, np.inf), rate, start, None))
+    return variables, poses
+
+
+def _coordinates(params: mi.SceneParameters, key: str, entry: Parameter, start: Array) -> Coordinates | None:
+    if entry.transform is not None:
+        transform = Transform(entry.transform, *(-np.inf if x is None else x for x in (entry.lower, entry.upper)))
+        transform.require_inside(key, start)
+        return transform
+    if entry.smooth is None:
+        return None
+    faces = _faces(params, key, "smooth")
+    return Surface(parameters.get_array(params[key]), faces, entry.smooth)
+
+
+def _faces(params: mi.SceneParameters, key: str, option: str) -> NDArray[np.integer]:
+    """Of the mesh whose vertices a parameter is. Raises PathreplayError, for this option, where it is not."""
+    owner, _, name = key.rpartition(".")
+    if name != "vertex_positions" or (faces := f"{owner}.faces") not in params:
+        raise PathreplayError(f"Parameter '{key}' is no mesh's vertex_positions; leave '{option}' out")
+    return np.array(params[faces])
+
+
+def _penalty(
+    params: mi.SceneParameters, key: str, entry: Parameter, start: Array, levels: Levels | None, modules: Modules
+) -> Penalty | None:
+    """What the entry asks for. Raises PathreplayError for what cannot be computed, in some resolution."""
+    terms: list[Term] = []
+    if entry.total_variation is not None:
+        if start.ndim < 3:
+            raise PathreplayError(
+                f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'total_variation' out"
+            )
+        terms.append(TotalVariation(entry.total_variation))
+    if entry.prior is not None:
+        terms.append(Prior(entry.prior, start))
+    if entry.laplacian is not None:
+        faces = _faces(params, key, "laplacian")
+        terms.append(Laplacian(entry.laplacian, parameters.get_array(params[key]), faces))
+    if entry.penalty is not None:
+        terms.append(Own(modules.function("Penalty", entry.penalty, "values")))
+        for shape in levels.shapes if levels else [start.shape]:
+            terms[-1](resampled(start, shape))
+    return Penalty(tuple(terms)) if terms else None
+
+
+def _numbers(key: str, shape: list[int]) -> Any:
+    """Zeros that nobody has written down. Raises PathreplayError where memory has no room for them."""
+    parameter_limits.require_values({key: prod(shape)})
+    return dr.zeros(mi.TensorXf, shape)
+
+
+def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> Levels | None:
+    if entry.resolutions is None:
+        return None
+    if start.ndim < 3:
+        raise PathreplayError(
+            f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'resolutions' out"
+        )
+    parameter_limits.require_grid(key, start.shape, entry.resolutions)
+    return make_levels(start.shape, entry.resolutions, refine_at)
+
+
+def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path) -> Array:
+    if not dr.is_array_v(like):
+        raise PathreplayError(
+            f"Parameter '{key}' is a matrix, whose 16 numbers do not stay a motion; give it "
+            "pose = 'translation', 'rotation' or 'rigid'"
+        )
+    if entry.initial is None:
+        start = parameters.get_array(like)
+    else:
+        start = form.of_colours(key, make_value(key, like, entry.initial, base))
+    for bound, name, wrong in ((entry.lower, "lower", np.less), (entry.upper, "upper", np.greater)):
+        if bound is not None and wrong(start, np.float32(bound)).any():
+            extreme = start.min() if name == "lower" else start.max()
+            raise PathreplayError(
+                f"Parameter '{key}' starts at {extreme:g}, beyond its {name} bound {bound:g}; change one of them"
+            )
+    return start

@@ -1,0 +1,1 @@
+"""The inverse problem: scene, variables and views, checked before the first iteration."""

@@ -1,0 +1,322 @@
+"""The inverse problem: scene, variables with bounds, views with targets; checked before the first iteration."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+from pathreplay.integrators.diagnostics import COST_OF_EDGES
+from pathreplay.integrators.edge_notes import edges_note, moves_edges
+from pathreplay.integrators.film.image import fit_film
+from pathreplay.integrators.integrator import EDGES
+from pathreplay.integrators.reach import reached_sensors
+from pathreplay.inverse.config.schema import Config, Plugin
+from pathreplay.inverse.config.user_functions import Modules
+from pathreplay.inverse.dataset.capture import Shot, fingerprint, read_capture
+from pathreplay.inverse.dataset.targets import (
+    Targets,
+    by_view,
+    masked,
+    read_masks,
+    read_targets,
+    rendered_targets,
+    require_films,
+    require_weights,
+    target_scene,
+    truth_of,
+)
+from pathreplay.inverse.dataset.views import View, held_out_of, named_views, sensors_of, shares_of
+from pathreplay.inverse.images.background import require_known
+from pathreplay.inverse.images.disk_store import Album
+from pathreplay.inverse.images.io import picture_size
+from pathreplay.inverse.losses.pixelwise import Loss, find_loss
+from pathreplay.inverse.parameters import limits as parameter_limits
+from pathreplay.inverse.parameters.derived import Derived, make_derived
+from pathreplay.inverse.parameters.exposures import EXPOSURE, Factors, fixed_rows
+from pathreplay.inverse.parameters.exposures import start as start_of_exposures
+from pathreplay.inverse.parameters.grids import rmse
+from pathreplay.inverse.parameters.pose import Pose
+from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.parameters.variables import Variable, free_of, keys_of, make_variables
+from pathreplay.inverse.problem import feasibility
+from pathreplay.inverse.problem.completed import completed
+from pathreplay.platform.threads import one_thread
+from pathreplay.platform.traversal import traversed
+from pathreplay.scenes import parameters
+from pathreplay.scenes.descriptions import load_integrator
+from pathreplay.scenes.loading import load_scene_for
+
+
+class Held:
+    """The values that were asked for last, as Dr.Jit holds them: there are none beside them."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, tuple[weakref.ref[Array], Any]] = {}
+
+    def variables(self, problem: Problem, values: Arrays) -> dict[str, Any]:
+        """As `variables_of`, without derivatives; the same arrays as before, where the values are."""
+        keys = [v.key for v in problem.variables]
+        if any(key not in self._known or self._known[key][0]() is not values[key] for key in keys):
+            self._known = {}  # before there is more
+            made = variables_of(problem, values)
+            # Values may go when nobody else wants them, and their places in memory may be those of others.
+            self._known = {key: (weakref.ref(values[key]), value) for key, value in made.items()}
+        found = {key: self._known[key][1] for key in keys}
+        dr.disable_grad(found)
+        return found
+
+
+@dataclass(frozen=True)
+class Problem:
+    """min over the variables of the mean over views of loss(render(scene, view), target of the view)."""
+
+    config: Config
+    """The job, with what it leaves to others: see `completed`."""
+    scene: mi.Scene
+    params: mi.SceneParameters
+    integrator: mi.Integrator
+    rival: mi.Integrator | None
+    """Solves the same problem in the same time, for comparison."""
+    judge: mi.Integrator
+    """Renders the pictures by which both are compared: the one that made the targets, where it is known."""
+    variables: tuple[Variable, ...]
+    poses: tuple[Pose, ...]
+    views: tuple[View, ...]
+    loss: Loss
+    notes: tuple[str, ...]
+    """What was done to the scene that the user should know of."""
+    derived: tuple[Derived, ...] = ()
+    capture: str | None = None
+    """What tells its capture from others."""
+    album: Album = field(default_factory=Album)
+    """Where its pictures are kept, and starts and truths."""
+    held: Held = field(default_factory=Held)
+
+    def moves(self, moving: frozenset[str]) -> set[str]:
+        """The keys of the scene whose values are others when these variables are."""
+        made = {each.key for each in self.made() if not moving.isdisjoint(each.of)}
+        return {key for key in moving if key in self.params} | made
+
+    def reached(self, moving: frozenset[str]) -> set[int]:
+        """The places of the views whose pictures, before any exposure, depend on one of these variables."""
+        sensors = [self.scene.sensors()[view.sensor] for view in self.views]
+        found = reached_sensors(self.scene, sensors, self.params, self.moves(moving))
+        return {n for n, reached in enumerate(found) if reached}
+
+    def made(self) -> tuple[Pose | Derived, ...]:
+        """What is made of variables."""
+        return *self.poses, *self.derived
+
+    def trained(self) -> dict[int, View]:
+        """The views that are learned from, by their place."""
+        return {n: view for n, view in enumerate(self.views) if not view.held_out}
+
+
+def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
+    """The values of the variables (what people see) as Dr.Jit holds them, in memory of its own."""
+    # NumPy's memory, which Dr.Jit would take over, begins anywhere: to a frozen function that is another kind of input.
+    one = dr.opaque(mi.Float, 1)
+    variables = {v.key: v.held(values[v.key]) * one for v in problem.variables}
+    dr.eval(variables)
+    return variables
+
+
+def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, Any]:
+    """The scene's parameters, by key and as Mitsuba stores them; derivatives flow to the variables."""
+    plain = {v.key: v.form.store(variables[v.key]) for v in problem.variables if v.key in problem.params}
+    made = {each.key: each.form.store(each.value(variables)) for each in problem.derived}
+    return plain | made | {pose.key: pose.value(variables) for pose in problem.poses}
+
+
+def sensor_of(problem: Problem, view: View) -> mi.Sensor:
+    """The sensor of a view, whose film has the size of its picture."""
+    sensor = problem.scene.sensors()[view.sensor]
+    fit_film(sensor, view.target.shape)
+    return sensor
+
+
+def put_values(problem: Problem, values: Arrays) -> None:
+    """Give the scene these values of the variables, without derivatives."""
+    problem.params.update(scene_values(problem, problem.held.variables(problem, values)))
+
+
+def errors_of(problem: Problem, values: Arrays) -> dict[str, float]:
+    """How far all whose truth is known are from it, by key: root mean squares; of poses by name, see `PoseError.of`.
+
+    Raises PathreplayError where a derived parameter is no longer finite.
+    """
+    found = {v.key: rmse(values[v.key], v.truth) for v in problem.variables if v.truth is not None}
+    poses = [pose for pose in problem.poses if pose.truth is not None]
+    variables = problem.held.variables(problem, values) if problem.derived or poses else {}
+    for each in problem.derived:
+        value = each.require_finite(variables)
+        if each.truth is not None:
+            found[each.key] = rmse(parameters.get_array(value), each.truth)
+    for pose in poses:
+        if error := pose.error(parameters.get_array(pose.value(variables))):
+            found |= error.of(pose.key)
+    return found
+
+
+def build_problem(config: Config, base: Path, targets: Targets | None = None) -> Problem:
+    """Load and check everything that the job names; relative paths start at ``base``.
+
+    ``targets`` are those of an earlier part of the same run; otherwise they are read or rendered.
+    Raises PathreplayError for whatever in the job cannot work.
+    """
+    album = Album.of(config.budget)
+    modules = Modules(base)
+    loss = find_loss(config.loss, modules)
+    film = "rgba" if config.target.alpha == "compare" else "rgb"
+    shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
+    scene, config, notes = _loaded(config, base, shots)
+    params = traversed(scene)
+    parameters.require_finite(params)
+    integrator = _gradient_integrator(config.integrator)
+    named, made = keys_of(params, config, integrator)
+    free = free_of(params, config)
+    keys = [*named, *made]
+    notes += _edges(params, keys, integrator)
+    rival = None if config.rival is None else _gradient_integrator(config.rival)
+    if rival is not None:
+        keys_of(params, config, rival)
+        _edges(params, keys, rival)  # for its log: one note is enough
+    judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
+    # Before any target is rendered: the cheap mistakes first.
+    sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
+    taken = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
+    held_out = held_out_of(scene, sensors, config, list(shots))
+    feasibility.require_visible(scene, params, keys)
+    if config.target.alpha == "scene":
+        require_known(scene, params, keys)
+    require_films(scene, sensors, {"spp": config.most_spp, "picture_spp": config.picture_spp})
+    unsolved, moved = make_variables(scene, params, named | free, config, base, modules)
+    derived = make_derived(params, made, unsolved, modules)
+    parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
+
+    truth: dict[str, Array] = {}
+    first = targets is None
+    if not config.brings_pictures:
+        other = target_scene(config, base)
+        truth = truth_of(other, params, keys)
+        if targets is None:
+            with one_thread(config.deterministic):
+                targets = Targets(rendered_targets(config, other, sensors, album), {})
+        # Dr.Jit traces calls through every instance alive: the target scene would be in all our kernels.
+        del other
+        gc.collect()
+    elif targets is None:
+        targets, said = _pictures(config, taken, scene, sensors, base, album)
+        notes += said
+    if first and config.target.masks is not None:
+        masks = by_view("masks", config.target.masks, sensors, base)
+        targets = masked(targets, read_masks(masks, scene, sensors, base))
+
+    if missing := set(sensors) - set(targets.images):
+        raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
+    given = config.target.masks is not None or config.target.alpha == "mask"
+    require_weights(targets, {n for n in sensors if given or (n in taken and (taken[n].mask or taken[n].lens))})
+    shares = shares_of(scene, sensors, config, held_out)
+    views = tuple(
+        View(name, index, targets.images[name], targets.weights.get(name), name in held_out, shares[name])
+        for name, index in sensors.items()
+    )
+    unsolved += _exposures(scene, config, views)
+    for view in views:
+        feasibility.require_finite_loss(loss, view.name, view.target, view.weight)
+        album.rest()
+    variables = tuple(_kept(album, replace(variable, truth=truth.get(variable.key))) for variable in unsolved)
+    poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in moved)
+    derived = tuple(replace(each, truth=truth.get(each.key)) for each in derived)
+    # Traversed anew: an object from which values were read expects all its keys at the next update().
+    params = traversed(scene)
+    parameters.keep_only(params, keys)
+    known = fingerprint(taken.values()) if taken else None
+    return Problem(
+        config, scene, params, integrator, rival, judge, variables, poses, views, loss, notes, derived, known, album
+    )
+
+
+def _loaded(config: Config, base: Path, shots: Mapping[str, Shot]) -> tuple[mi.Scene, Config, tuple[str, ...]]:
+    """The scene, the job with what it leaves to the scene (see `completed`), and what is to be said about both."""
+    wanted = [entry.key for entry in config.parameters if entry.shape is None]
+    wanted += [entry.key for entry in config.derived]
+    cameras = {name: shot.camera for name, shot in shots.items()}
+    scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
+    config, differences = completed(config, scene)
+    return scene, config, notes + differences
+
+
+def _kept(album: Album, variable: Variable) -> Variable:
+    truth = None if variable.truth is None else album.keep(variable.truth)
+    return replace(variable, start=album.keep(variable.start), truth=truth)
+
+
+def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list[Variable]:
+    """The factors on the pictures, where the job asks for them."""
+    if (asked := config.exposure) is None:
+        return []
+    value = start_of_exposures(len(views), min(view.target.shape[2] for view in views), asked.white_balance)
+    trained = [n for n, view in enumerate(views) if not view.held_out]
+    reference = None
+    if asked.reference is not None:
+        places = named_views(scene, {view.name: view.sensor for view in views}, [asked.reference], "exposure.reference")
+        reference = places[0]
+        if views[[view.name for view in views].index(reference)].held_out:
+            raise PathreplayError(
+                f"exposure: the reference '{reference}' is held out; name a view that is learned from"
+            )
+    fixed = fixed_rows([view.name for view in views], trained, reference, asked.free)
+    rate = asked.learning_rate or config.learning_rate
+    return [Variable(EXPOSURE, mi.TensorXf(value), (-np.inf, np.inf), rate, value, None, coordinates=Factors(fixed))]
+
+
+def _pictures(
+    config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path, album: Album
+) -> tuple[Targets, tuple[str, ...]]:
+    """Targets from the files of a capture, or from those that the job names, and what is to be said about them."""
+    alpha, hidden = config.target.alpha, bool((config.integrator.model_extra or {}).get("hide_emitters"))
+    if config.capture is None:
+        files = by_view("target images", config.target.images or [], sensors, base)
+        return read_targets(files, alpha, scene, sensors, base, hidden=hidden, album=album)
+    if other := set(sensors) - set(shots):
+        raise PathreplayError(f"sensors: '{min(other)}' is no camera of the capture, and has no picture; leave it out")
+    pictures = {name: str(shot.image.resolve()) for name, shot in shots.items()}
+    masks = {name: str(shot.mask.resolve()) for name, shot in shots.items() if shot.mask is not None}
+    if masks and alpha == "mask":
+        raise PathreplayError("target: the capture has masks, and alpha = 'mask' is another; leave alpha out")
+    lenses = {name: shot.lens for name, shot in shots.items() if shot.lens is not None}
+    targets, notes = read_targets(
+        pictures, alpha, scene, sensors, base, resize=True, lenses=lenses, hidden=hidden, album=album
+    )
+    return masked(targets, read_masks(masks, scene, sensors, base, resize=True, lenses=lenses)), notes
+
+
+def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
+    integrator = load_integrator(plugin.model_dump())
+    if not isinstance(integrator, mi.CppADIntegrator):
+        raise PathreplayError(
+            f"Integrator '{plugin.type}' computes no gradients; use 'pathreplay' or another AD integrator"
+        )
+    return integrator
+
+
+def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
+    """What is to be said of edges that move. An integrator of ours need not say it once more."""
+    moving = [key for key in keys if moves_edges(params, key)]
+    edges = getattr(integrator, "edges", "none")
+    # By name: Mitsuba's projective integrators sample edges. Ours tells itself what it leaves out.
+    if not moving or "Projective" in type(integrator).__name__ or edges == "all":
+        return ()
+    if hasattr(integrator, "told"):
+        integrator.told.add(EDGES)
+    return (COST_OF_EDGES if edges == "auto" else edges_note(moving, edges),)

@@ -1,0 +1,9 @@
+"""Jobs: an optimisation that a config describes, from the first check to the report in its run folder."""
+
+from __future__ import annotations
+
+from pathreplay.inverse.config.schema import Config, load_config, make_config
+from pathreplay.jobs.job import RunResult, iterate, optimize
+from pathreplay.jobs.session import Session, State
+
+__all__ = ["Config", "RunResult", "Session", "State", "iterate", "load_config", "make_config", "optimize"]

@@ -1,1 +1,0 @@
-"""Media that Mitsuba lacks, and volumes from files."""

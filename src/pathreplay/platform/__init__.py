@@ -1,0 +1,1 @@
+"""The machine: LLVM and variants, devices, memory, threads, signals and files."""

@@ -1,0 +1,197 @@
+"""Points Dr.Jit at a libLLVM that works, and picks a variant of Mitsuba when asked.
+
+Dr.Jit looks for libLLVM once, while `drjit` is imported: it takes the file that DRJIT_LIBLLVM_PATH names, otherwise
+the newest in a few folders. So the variable has to be right by then, and `point_drjit` is the first thing that
+`import pathreplay` does. It runs no trial: pip's library is known to work. Trials (pathreplay.platform.llvm) are for
+`set_variant` and the doctor.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import difflib
+import logging
+import os
+import sys
+
+from pathreplay.errors import PathreplayError
+from pathreplay.platform import llvm
+from pathreplay.platform.llvm import ENVIRONMENT_VARIABLE, OLDEST_USABLE_MAJOR
+
+logger = logging.getLogger("pathreplay")
+
+
+def point_drjit() -> None:
+    """Make Dr.Jit load a libLLVM that works, without a trial. Raises nothing.
+
+    Before drjit is imported: sets DRJIT_LIBLLVM_PATH, unless it names a file that can be loaded, to pip's library,
+    otherwise to the system's newest that is not known to fail. Afterwards: reloads one that is known to fail.
+    """
+    if "drjit" in sys.modules:
+        path = None if loaded_is_plausible() else _untried_choice()
+        if path is not None and not reload_llvm(path) and not loaded_version():
+            logger.warning("drjit was imported before pathreplay and found no libLLVM: %s", _way_out(path))
+        return
+    asked_for = os.environ.get(ENVIRONMENT_VARIABLE, "")
+    problem = _known_problem(asked_for) if asked_for else ""
+    if (path := _untried_choice()) is not None and (problem or not asked_for):
+        if problem:
+            logger.warning("%s=%s: %s; using %s", ENVIRONMENT_VARIABLE, asked_for, problem, path)
+        os.environ[ENVIRONMENT_VARIABLE] = path
+        _preload(llvm.unlinked_siblings(path))
+
+
+def _known_problem(path: str) -> str:
+    """What can be said against a libLLVM without a trial: too old by its name, or not loadable."""
+    version = llvm.version_in_path(os.path.realpath(path))
+    if version and version < (OLDEST_USABLE_MAJOR,):
+        return f"LLVM {version[0]} is refused by Dr.Jit or aborts the process"
+    return _preload([*llvm.unlinked_siblings(path), path])
+
+
+def _way_out(path: str | None) -> str:
+    if path is None:
+        return llvm.WAY_OUT
+    return f"import pathreplay before mitsuba, or start Python with {ENVIRONMENT_VARIABLE}={path}"
+
+
+def _untried_choice() -> str | None:
+    usable = (path for path in llvm.system_libraries() if llvm.version_in_path(path) >= (OLDEST_USABLE_MAJOR,))
+    return llvm.pip_library() or next(usable, None)
+
+
+def _preload(paths: list[str]) -> str:
+    """Load shared libraries into this process; the reason in one line if one cannot be loaded, otherwise ""."""
+    for path in paths:
+        try:
+            ctypes.CDLL(path)
+        except OSError as error:
+            return str(error)
+    return ""
+
+
+def loaded_version() -> tuple[int, ...]:
+    """Version of the libLLVM that Dr.Jit uses in this process, e.g. (23, 1, 4); empty if its LLVM back end is off."""
+    import drjit as dr
+
+    return tuple(dr.detail.llvm_version()) if dr.has_backend(dr.JitBackend.LLVM) else ()
+
+
+def loaded_is_plausible() -> bool:
+    """Whether Dr.Jit's LLVM back end is on, with a version that is not known to abort the process."""
+    return loaded_version() >= (OLDEST_USABLE_MAJOR,)
+
+
+def reload_llvm(path: str) -> bool:
+    """Have Dr.Jit, which is loaded already, give up its libLLVM and load `path`; False if that is impossible.
+
+    Done only while Dr.Jit holds neither variables nor a CUDA device, which would be lost. Uses two functions of
+    libdrjit-core that Python does not offer (`jit_shutdown`, `jit_init`). Impossible as well where Dr.Jit found no
+    file at all that it could load: it never looks a second time.
+    """
+    import drjit as dr
+
+    active = bool(dr.has_backend(dr.JitBackend.LLVM))
+    in_use = active and "No variables registered" not in (dr.whos(as_string=True) or "")
+    if in_use or (active and dr.has_backend(dr.JitBackend.CUDA)):
+        return False
+    try:
+        core = ctypes.CDLL(os.path.join(os.path.dirname(dr.__file__), "libdrjit-core.so"))
+        shutdown, init = core._Z12jit_shutdowni, core._Z8jit_initj
+    except (OSError, AttributeError):  # another platform, or another Dr.Jit
+        return False
+    before = os.environ.get(ENVIRONMENT_VARIABLE)
+    os.environ[ENVIRONMENT_VARIABLE] = path
+    _preload(llvm.unlinked_siblings(path))
+    if active:
+        shutdown(ctypes.c_int(0))
+    init(ctypes.c_uint(1 << int(dr.JitBackend.LLVM.value)))
+    if not (works := loaded_is_plausible()):
+        del os.environ[ENVIRONMENT_VARIABLE]
+        if before is not None:
+            os.environ[ENVIRONMENT_VARIABLE] = before
+    return works
+
+
+def warn_of_bad_llvm() -> None:
+    """Log a warning if the libLLVM in this process is one that aborts it; for the moment an LLVM variant is set."""
+    if not loaded_is_plausible():
+        logger.warning(
+            "Dr.Jit has loaded libLLVM %s, which aborts the process at the first minimum or maximum: %s",
+            ".".join(map(str, loaded_version())), _way_out(_untried_choice()),
+        )  # fmt: skip
+
+
+def ensure_llvm() -> None:
+    """See to it that Dr.Jit's LLVM back end works in this process.
+
+    Pip's library is trusted once it is loaded; any other is tried (0.3 s), and replaced if it fails.
+    Raises PathreplayError if there is none that works, or if it is too late to change.
+    """
+    current = os.environ.get(ENVIRONMENT_VARIABLE, "")
+    plausible = loaded_is_plausible()
+    if plausible and current == llvm.pip_library():
+        return
+    tried = llvm.probe(current)
+    if plausible and tried.works:
+        return
+    library = llvm.find_llvm()
+    if current and library.path != current:
+        logger.warning("%s=%s does not work (%s): using %s", ENVIRONMENT_VARIABLE, current, tried.message, library.path)
+    if not reload_llvm(library.path):
+        raise PathreplayError(
+            f"Dr.Jit has loaded {current or 'a libLLVM'} that does not work ({tried.message or 'back end inactive'}), "
+            f"and cannot change it any more: start again with {ENVIRONMENT_VARIABLE}={library.path}"
+        )
+
+
+def is_usable_variant(name: str) -> bool:
+    """Whether pathreplay can differentiate in this variant of Mitsuba: automatic differentiation, no polarisation."""
+    return "_ad_" in name and not name.endswith("_polarized")
+
+
+def set_variant(name: str | None = None) -> str:
+    """Set a variant of Mitsuba that runs here, and return its name.
+
+    Without a name an active variant with automatic differentiation is kept; otherwise CUDA is taken if there is a
+    device (`cuda_ad_rgb`), otherwise LLVM (`llvm_ad_rgb`).
+
+    Raises PathreplayError for a name that does not exist, has no derivatives or is polarised, and if nothing runs here.
+    """
+    try:
+        import drjit as dr
+        import mitsuba as mi
+    except Exception as error:
+        raise PathreplayError(
+            f"Mitsuba cannot be imported ({error}): install it with `pip install 'mitsuba>=3.9.1,<3.10'`"
+        ) from error
+    if name is None:
+        active = mi.variant()
+        if active is not None and is_usable_variant(active):
+            return str(active)
+        name = "cuda_ad_rgb" if dr.has_backend(dr.JitBackend.CUDA) else "llvm_ad_rgb"
+    _check_name(name, mi.variants())
+    if name.startswith("llvm"):
+        ensure_llvm()
+    try:
+        mi.set_variant(name)
+    except ImportError as error:  # Mitsuba's way to say that a back end is off
+        if (error.name or "").startswith("pathreplay"):
+            raise  # a module of ours is missing: nothing that the user can mend
+        reason = " ".join(str(error).split())
+        raise PathreplayError(f"variant {name} does not run here ({reason}): see `pathreplay doctor`") from error
+    return name
+
+
+def _check_name(name: str, known: list[str]) -> None:
+    usable = [variant for variant in known if is_usable_variant(variant)]
+    if name in usable:
+        return
+    use, plain = f"use one of {', '.join(usable)}", name.removesuffix("_polarized")
+    if name in known and "_ad_" in name:
+        use = f"use {plain}" if plain in usable else use
+        raise PathreplayError(f"variant {name} is polarised, which pathreplay does not support: {use}")
+    if name in known:
+        raise PathreplayError(f"variant {name} has no derivatives: {use}")
+    near = difflib.get_close_matches(name, usable, n=1)
+    raise PathreplayError(f"there is no variant {name!r}: {f'did you mean {near[0]}?' if near else use}")

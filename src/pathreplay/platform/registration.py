@@ -1,0 +1,84 @@
+"""Registers our plugins for the active variant of Mitsuba and for every later one.
+
+A Python plugin is known to Mitsuba in the variant it was registered in, and a variant callback is called only for
+variants set after it was added. Where nothing can be differentiated, as in scalar variants, stand-ins say so and name
+the variant to use. Polarised variants get the plugins themselves, which say that they are not supported.
+"""
+
+from __future__ import annotations
+
+import importlib
+from functools import partial
+from typing import Any
+
+from pathreplay.errors import PathreplayError
+from pathreplay.platform.device import backend_of
+
+#: Each by name: what it is to Mitsuba, and the template of its class (see `on_base`).
+PLUGINS = {
+    "pathreplay": ("integrator", "pathreplay.integrators.integrator", "PathReplayIntegrator"),
+    "pathreplay_tape": ("integrator", "pathreplay.integrators.baselines.plugins", "TapeIntegrator"),
+    "pathreplay_rb": ("integrator", "pathreplay.integrators.baselines.plugins", "RadiativeIntegrator"),
+    "pathreplay_listing": ("integrator", "pathreplay.integrators.baselines.plugins", "ListingIntegrator"),
+    "smoothdielectric": ("bsdf", "pathreplay.plugins.smoothdielectric", "SmoothDielectric"),
+    "gridmedium": ("medium", "pathreplay.plugins.gridmedium", "GridMedium"),
+}
+
+
+def register(variant: str) -> None:
+    """Register all plugins for the active variant, whose name is `variant`; stand-ins where it has no derivatives."""
+    import mitsuba as mi
+
+    if "_ad_" not in variant:
+        _register_stand_ins(variant)
+        return
+    if backend_of(variant) == "llvm":
+        from pathreplay.platform.backend import warn_of_bad_llvm
+
+        warn_of_bad_llvm()
+    bases = {"integrator": mitsuba_integrator(), "bsdf": mi.BSDF, "medium": mi.Medium}
+    for name, (kind, module, template) in PLUGINS.items():
+        plugin = on_base(getattr(importlib.import_module(module), template), bases[kind])
+        getattr(mi, f"register_{kind}")(name, plugin)
+
+
+def mitsuba_integrator() -> Any:
+    """Mitsuba's ADIntegrator of the active variant: what it does to prepare a pass is what its users' seeds mean."""
+    # The name under which Mitsuba runs its Python modules anew for every variant. Of `mitsuba.ad`, the public name, an
+    # import statement makes a copy, which stays what it was in the first variant.
+    from mitsuba.python.ad.integrators.common import ADIntegrator
+
+    return ADIntegrator
+
+
+def on_base(template: type, base: type) -> type:
+    """The class that a template describes, on a base class of Mitsuba's. Each variant has its own, so that a template,
+    which is there before any of them, cannot have it; its methods call those of the base by their class."""
+    parts = [vars(part) for part in reversed(template.__mro__[:-1])]
+    body = {name: value for part in parts for name, value in part.items() if name not in ("__dict__", "__weakref__")}
+    return type(base)(template.__name__, (base,), body)  # type: ignore[no-any-return]
+
+
+def _register_stand_ins(variant: str) -> None:
+    import mitsuba as mi
+
+    from pathreplay.platform.backend import is_usable_variant
+
+    usable = [name for name in mi.variants() if is_usable_variant(name)]
+    colours = variant.removesuffix("_polarized").rsplit("_", 1)[-1]
+    alike = [name for name in usable if name.endswith(colours)] or usable
+
+    def refuse(plugin: str, props: Any) -> Any:
+        raise PathreplayError(f"{plugin}: variant {variant!r} has no derivatives: use {' or '.join(alike)}")
+
+    for plugin, (kind, *_) in PLUGINS.items():
+        getattr(mi, f"register_{kind}")(plugin, partial(refuse, plugin))
+
+
+def install() -> None:
+    """Register for the active variant, if any, and from now on for each one that is set. Sets no variant."""
+    import mitsuba as mi
+
+    mi.detail.add_variant_callback(lambda _old, new: register(new))
+    if (active := mi.variant()) is not None:
+        register(active)

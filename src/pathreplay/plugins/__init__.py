@@ -1,0 +1,1 @@
+"""Plugins that Mitsuba lacks: a smooth dielectric with a differentiable index, and a medium on a grid."""

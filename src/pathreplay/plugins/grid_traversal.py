@@ -1,0 +1,248 @@
+"""The walk of a ray from cell to cell: free flight with local majorants, transmittance with local control densities.
+
+A walk (Amanatides and Woo 1987) keeps the cell and the distance. The distance at which axis k is crossed next is
+found anew from the cell, t_k = (cell_k + [d_k > 0] - o_k) / d_k: nothing is summed up, so that rounding cannot lead
+astray, and every step leaves a cell for good, which bounds their number.
+
+All of this is detached, and runs inside symbolic loops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from pathreplay.plugins.supergrid import Bounds
+
+#: The residual collisions come this much denser than the largest residual density. Twice as many halve the exponent of
+#: the variance; four times as many cost more time than they save noise (`pathreplay bench gridmedium`).
+DENSER = 2.0
+#: Largest relative variance that crossing one cell adds to the transmittance of a ray that meets nothing in it. A ray
+#: meets 10 to 50 cells; with the mean as control density, whatever the risk, dense grids with edges have wild outliers.
+RISK = 0.1
+#: Estimates below this go on by chance only, which adds a variance of at most FAINT times the transmittance.
+FAINT = 1e-2
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Numbers by cell, ready to be walked through.
+
+    One layer of empty cells surrounds them, since rounding may carry a walk one cell too far. ``to_cell`` (3 x 4) maps
+    the world to cell space, ``shape`` counts the cells along x, y, z; both include the layer. ``table`` (Float, flat)
+    has the same count of numbers for every cell, x running fastest.
+    """
+
+    to_cell: NDArray[np.float64]
+    shape: tuple[int, ...]
+    table: mi.Float
+
+    @property
+    def is_single(self) -> bool:
+        return self.shape == (3, 3, 3)
+
+    def lookup(self, kind: Any, cell: mi.Vector3f, active: mi.Bool) -> Any:
+        """The numbers of a cell (Vector3f of whole numbers), as a Float or as a vector."""
+        index = mi.UInt32(dr.fma(dr.fma(cell.z, self.shape[1], cell.y), self.shape[0], cell.x))
+        return dr.gather(kind, self.table, index, active)
+
+
+def make_cells(bounds: Bounds, values: Sequence[mi.Float]) -> Cells:
+    """Cells with these numbers (each with one entry per cell of ``bounds``)."""
+    shape = tuple(n + 2 for n in bounds.shape)
+    count = int(np.prod(bounds.shape))
+    i = dr.arange(mi.UInt32, count)
+    x, rest = i % bounds.shape[0], i // bounds.shape[0]
+    y, z = rest % bounds.shape[1], rest // bounds.shape[1]
+    place = (x + 1) + shape[0] * ((y + 1) + shape[1] * (z + 1))
+    table = dr.zeros(mi.Float, int(np.prod(shape)) * len(values))
+    for k, value in enumerate(values):
+        dr.scatter(table, value, place * len(values) + k)
+    dr.make_opaque(table)
+    to_cell = bounds.to_cell.copy()
+    to_cell[:, 3] += 1
+    return Cells(to_cell, shape, table)
+
+
+# ----------------------------------------------------- the walk -----------------------------------------------------
+
+
+def through(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
+    """Distances at which the line of a ray enters and leaves a box; the first is larger where it misses. Attached.
+
+    What Mitsuba's `ray_intersect` of boxes finds: that one knows only the rays of the first variant of the process.
+    """
+    near, far = mi.Float(-dr.inf), mi.Float(dr.inf)
+    for k in range(3):
+        o, d = ray.o[k], ray.d[k]
+        low, high = float(box.min[k]), float(box.max[k])
+        along = d == 0
+        inverse = dr.rcp(dr.select(along, 1, d))
+        t0, t1 = (low - o) * inverse, (high - o) * inverse
+        beside = along & ((o < low) | (o > high))
+        near = dr.select(along, near, dr.fmax(near, dr.fmin(t0, t1)))
+        far = dr.select(along, dr.select(beside, -dr.inf, far), dr.fmin(far, dr.fmax(t0, t1)))
+    return near, far
+
+
+def clip(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
+    """The part [a, b] of the ray that lies in a box (a = 0, b = -1 if there is none). Never NaN for a finite ray."""
+    near, far = through(box, ray)
+    a, b = dr.fmax(near, 0), dr.fmin(far, ray.maxt)
+    met = a < b
+    return dr.select(met, a, 0), dr.select(met, b, -1)
+
+
+@dataclass(frozen=True)
+class CellWalk:
+    """A ray in cell space: axis k is crossed at the distance cell_k · inverse_k + offset_k."""
+
+    inverse: mi.Vector3f  # 1/d, 0 along axes on which the ray does not move
+    offset: mi.Vector3f  # ([d > 0] - o)/d, infinite there
+    stride: mi.Vector3f  # the step from cell to cell, ±1
+    start: mi.Vector3f  # the cell at the first distance
+    end: mi.Float  # the distance at which the walk is over
+
+    def crossing(self, cell: mi.Vector3f) -> mi.Vector3f:
+        """Distances at which the three axes are crossed next."""
+        return dr.fma(cell, self.inverse, self.offset)
+
+    def onward(self, cell: mi.Vector3f, crossings: mi.Vector3f, t: mi.Float) -> mi.Vector3f:
+        """The cell after the distance ``t``, which is at most the least of the crossings of this one."""
+        return dr.select(crossings <= t, cell + self.stride, cell)
+
+
+def begin(cells: Cells, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> CellWalk:
+    """A walk along the ray from distance a to b, both inside of the bounding box."""
+    o, d = _transformed(cells.to_cell, ray)
+    still, forward = d == 0, d > 0
+    inverse = dr.select(still, 0, dr.rcp(d))
+    offset = dr.select(still, dr.inf, (dr.select(forward, mi.Vector3f(1), mi.Vector3f(0)) - o) * inverse)
+    inner = mi.Vector3f([n - 2 for n in cells.shape])
+    start = dr.clip(dr.floor(dr.fma(d, a, o)), 1, inner)
+    # The walk ends where the last inner cell ends, as the walk itself finds it.
+    last = dr.fma(dr.select(forward, inner, mi.Vector3f(1)), inverse, offset)
+    stride = dr.select(forward, mi.Vector3f(1), mi.Vector3f(-1))
+    return CellWalk(inverse, offset, stride, start, dr.minimum(b, dr.min(last)))
+
+
+def _transformed(m: NDArray[np.float64], ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
+    """Origin and direction of a ray under an affine map, whose zeros cost nothing."""
+
+    def linear(row: NDArray[np.float64], v: mi.Vector3f) -> mi.Float:
+        terms = [float(row[k]) * v[k] for k in range(3) if row[k] != 0]
+        return sum(terms[1:], terms[0])
+
+    o = mi.Vector3f([linear(row, ray.o) + float(row[3]) for row in m])
+    return o, mi.Vector3f([linear(row, ray.d) for row in m])
+
+
+# ---------------------------------------------------- free flight ----------------------------------------------------
+
+
+def free_flight(
+    cells: Cells, box: mi.BoundingBox3f, ray: mi.Ray3f, u: mi.Float, active: mi.Bool
+) -> tuple[mi.Float, mi.Float]:
+    """Distance of the next tentative collision, and the majorant there; infinity and 0 where there is none.
+
+    The distance t solves ∫_0^t m ds = -log(1 - u), m the number of the cell (1 / unit length), 0 outside of ``box``.
+    """
+    a, b = clip(box, ray)
+    τ = -dr.log(1 - u)
+    active = mi.Mask(active) & (a < b)
+    if cells.is_single:
+        m = cells.lookup(mi.Float, mi.Vector3f(1), active)
+        t = a + τ / m
+        hit = active & (m > 0) & (t < b)
+        return dr.select(hit, t, dr.inf), dr.select(hit, m, 0)
+
+    trace = begin(cells, ray, a, b)
+
+    def step(active: Any, cell: Any, t: Any, τ: Any, m: Any) -> tuple[Any, ...]:
+        m = cells.lookup(mi.Float, cell, active)
+        crossings = trace.crossing(cell)
+        t_next = dr.minimum(dr.min(crossings), trace.end)
+        depth = m * dr.maximum(t_next - t, 0)
+        hit = depth > τ
+        cell = trace.onward(cell, crossings, t_next)
+        active = ~hit & (t_next < trace.end)
+        return active, cell, dr.select(hit, t, t_next), dr.select(hit, τ, τ - depth), dr.select(hit, m, 0)
+
+    state = (active & (a < trace.end), trace.start, a, τ, mi.Float(0))
+    labels = ("active", "cell", "t", "τ", "m")
+    going = dr.while_loop(state, lambda active, *_: active, step, labels=labels, label="gridmedium: free flight")
+    _, _, t, τ, m = going
+    hit = m > 0
+    return dr.select(hit, t + τ / m, dr.inf), m
+
+
+# --------------------------------------------------- transmittance ---------------------------------------------------
+
+
+def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
+    """Control density c and rate m of the residual collisions, by cell, for the density ``scale`` times the volume.
+
+    The relative variance of the estimate is exp(∫ (σ - c)²/m ds) - 1. The mean density is the best control on average,
+    but where a dense cell has empty parts, a ray through those sees (σ - c)²/m = c²/m. So c lies above the lowest
+    density by no more than keeps this below RISK in a crossing of the cell.
+    """
+    lowest, highest = _scaled(bounds, scale)
+    length = 2 / bounds.faces_per_length  # three faces are crossed in 2 mean sides
+    room = dr.sqrt(RISK / length * (highest - lowest))  # m is at least highest - lowest
+    c = dr.fmin(bounds.mean * scale, lowest + room)
+    return c, DENSER * dr.fmax(highest - c, c - lowest)
+
+
+def majorants(bounds: Bounds, scale: mi.Float) -> mi.Float:
+    """Upper bound of the density by cell, 0 where that is negative (an optimiser may overshoot)."""
+    return dr.fmax(_scaled(bounds, scale)[1], 0)
+
+
+def _scaled(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
+    a, b = bounds.lowest * scale, bounds.highest * scale
+    return dr.fmin(a, b), dr.fmax(a, b)
+
+
+@dr.syntax
+def transmittance(cells: Cells, box: Any, ray: Any, density: Callable[..., Any], sampler: Any, active: Any) -> Any:
+    """Unbiased estimate of exp(-∫ σ ds) along the ray, by channel (UnpolarizedSpectrum): residual ratio tracking.
+
+    With control density c and rate m by cell (Novák et al. 2014), T = exp(-∫ c ds) Π (1 - (σ - c)/m), the product over
+    residual collisions, which come with rate m. ``density(t, active)`` evaluates σ.
+    """
+    a, b = clip(box, ray)
+    trace = begin(cells, ray, a, b)
+    active = mi.Mask(active) & (a < trace.end)
+    cell, t = mi.Vector3f(trace.start), mi.Float(a)
+    τ = -dr.log(1 - sampler.next_1d(active))
+    depth = mi.Float(0)
+    T = mi.UnpolarizedSpectrum(1)
+
+    while dr.hint(active, exclude=[cells, box, ray, trace, density], label="gridmedium: transmittance"):
+        c, m = cells.lookup(mi.Vector2f, cell, active)
+        crossings = trace.crossing(cell)
+        t_next = dr.minimum(dr.min(crossings), trace.end)
+        expected = m * dr.maximum(t_next - t, 0)
+        hit = active & (expected > τ)
+        stop = dr.select(hit, t + τ / m, t_next)
+        depth += c * dr.maximum(stop - t, 0)
+        τ -= expected
+        cell = dr.select(hit, cell, trace.onward(cell, crossings, t_next))
+        t = stop
+        active &= hit | (t_next < trace.end)
+        if dr.hint(hit, exclude=[cells, box, ray, trace, density]):
+            T *= 1 - (density(t, mi.Mask(True)) - c) / m
+            # Whether the estimate is worth going on with.
+            kept = dr.minimum(dr.max(dr.abs(T)) * dr.exp(-depth) / FAINT, 1)
+            survives = sampler.next_1d() < kept
+            T = dr.select(survives, T / kept, 0)
+            active &= survives
+            τ = -dr.log(1 - sampler.next_1d())
+
+    return T * dr.exp(-depth)

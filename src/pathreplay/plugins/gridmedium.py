@@ -1,0 +1,216 @@
+"""`gridmedium`: Mitsuba's `heterogeneous` with a differentiable scale, emission, and majorants that follow the grid.
+
+With V, A and Q the volumes `sigma_t`, `albedo` and `emission`, and s the `scale`,
+
+    σ_t = s V(x),   σ_s = A(x) σ_t,   emitted radiance per unit length = Q(x)   (Q is not scaled) .
+
+Mitsuba's own integrators see one majorant for the whole medium and no emission. Ours calls `free_flight` (local
+majorants), `transmittance` (residual ratio tracking) and `emission_at`.
+
+Differentiated: the coefficients and the emission, by V, A, Q, s and the position. *Not* differentiated: majorants,
+free-flight distances and the estimate of transmittance (all detached), the bounding box and `to_world` of the volumes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.errors import PathreplayError
+from pathreplay.plugins import grid_traversal
+from pathreplay.plugins.supergrid import (
+    Bounds,
+    all_bounds,
+    cheapest,
+    constant_bounds,
+    find_lattice,
+    mean_chord,
+    voxel_bounds,
+)
+
+#: A density that is given as a number reaches this far from the origin along each axis: beyond any scene, and far from
+#: overflow. (A `constvolume` ends at the unit cube.)
+FAR = 1e6
+
+
+class GridMedium:
+    phase_function: Callable[[], mi.PhaseFunction]  # Mitsuba's
+
+    def __init__(self, props: Any) -> None:
+        mi.Medium.__init__(self, props)
+        phase = self.phase_function()
+        if mi.has_flag(phase.flags(), mi.PhaseFunctionFlags.Microflake):
+            raise PathreplayError(
+                f"gridmedium: with the phase function {phase.class_name()} the density depends on the "
+                "direction, and majorants do not follow that; use Mitsuba's heterogeneous"
+            )
+        self.sigma_t = _volume(props, "sigma_t", 1.0)
+        self.albedo = _volume(props, "albedo", 0.75)
+        self.emission = _volume(props, "emission", None)
+        self.scale = mi.Float(_number(props, "scale", 1.0))
+        self.supergrid = _choice(props)
+        self.m_is_homogeneous = False
+        self.parameters_changed([])
+        lowest = dr.min(self.levels[-1].lowest)[0]
+        if lowest < 0:
+            raise PathreplayError(f"gridmedium: sigma_t is {lowest:g} somewhere; give densities of at least 0")
+
+    # ------------------------------------------------ parameters ------------------------------------------------
+
+    def traverse(self, cb: Any) -> None:
+        for name in ("scale", "albedo", "sigma_t", "emission"):
+            if getattr(self, name) is not None:
+                cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+        cb.put("phase_function", self.phase_function(), mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        if keys and "sigma_t" not in keys and "scale" not in keys:
+            return
+        dr.make_opaque(self.scale)  # a literal would be compiled into the kernel, anew after every update
+        with dr.suspend_grad():
+            if not keys or "sigma_t" in keys:
+                self.box = self.sigma_t.bbox()
+                self.is_chromatic, self.levels = _look(self.sigma_t, self.supergrid is True)
+                self.m_has_spectral_extinction = self.is_chromatic
+            self._choose_cells()
+
+    def _choose_cells(self) -> None:
+        """Tables of majorants and of control densities for the present scale, each with the cells that pay."""
+        scale = dr.detach(self.scale)
+        # Where something glows or is differentiated, empty cells want (null) collisions, too: one a crossing.
+        with dr.resume_grad():
+            params = mi.traverse(self.sigma_t)
+            moves = dr.grad_enabled(self.scale) or any(dr.grad_enabled(params[key]) for key in params.keys())
+        chord = mean_chord(self.box)
+        least = 1 / chord if chord > 0 and (moves or self.emission is not None) else 0.0
+        majorants = [(dr.maximum(grid_traversal.majorants(level, scale), least),) for level in self.levels]
+        self.flight_cells = self._cheapest_cells(majorants)
+        self.shadow_cells = self._cheapest_cells([grid_traversal.control(level, scale) for level in self.levels])
+        self.majorant = mi.Float(majorants[-1][0])
+        dr.make_opaque(self.majorant)
+
+    def _cheapest_cells(self, values: list[tuple[Any, ...]]) -> grid_traversal.Cells:
+        """Of the numbers by cell, one tuple per level and the rate of collisions last, those that pay."""
+        rates = [dr.mean(numbers[-1]) for numbers in values]
+        dr.eval(values, rates)
+        last = len(values) - 1
+        first = last if self.supergrid is False else 0
+        last = max(last - 1, 0) if self.supergrid is True else last
+        allowed = slice(first, last + 1)
+        collisions = [float(rate[0]) for rate in rates[allowed]]
+        chosen = first + cheapest(self.levels[allowed], collisions, mean_chord(self.box))
+        return grid_traversal.make_cells(self.levels[chosen], values[chosen])
+
+    @property
+    def constants(self) -> tuple[object, ...]:
+        """All that kernels take for constants: one that was recorded is of no use where they are others."""
+        cells = self.flight_cells, self.shadow_cells
+        box = *map(float, self.box.min), *map(float, self.box.max)
+        return self.is_chromatic, box, *((each.shape, tuple(each.to_cell.ravel().tolist())) for each in cells)
+
+    def to_string(self) -> str:
+        lines = [f"sigma_t = {self.sigma_t}", f"albedo = {self.albedo}", f"emission = {self.emission}"]
+        cells = " x ".join(str(n - 2) for n in self.flight_cells.shape)
+        lines += [f"scale = {self.scale}", f"cells = {cells}"]
+        return "GridMedium[\n  " + ",\n".join(lines).replace("\n", "\n  ") + "\n]"
+
+    # -------------------------------------- what Mitsuba's integrators call --------------------------------------
+
+    def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+        return mi.UnpolarizedSpectrum(self.majorant)
+
+    def get_scattering_coefficients(self, mei: Any, active: Any = True) -> tuple[Any, Any, Any]:
+        σ_t = self.scale * self.sigma_t.eval(mei, active)
+        return σ_t * self.albedo.eval(mei, active), self.majorant - σ_t, σ_t
+
+    def intersect_aabb(self, ray: mi.Ray3f) -> tuple[mi.Bool, mi.Float, mi.Float]:
+        near, far = grid_traversal.through(self.box, ray)
+        return near <= far, near, far
+
+    # -------------------------------------------- what our own calls ---------------------------------------------
+
+    def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool = True) -> tuple[mi.Float, mi.Float]:
+        """Distance to the next tentative collision and the local majorant there. Detached.
+
+        The distance t solves ∫_0^t m ds = -log(1 - u) with m the local majorant, at least σ_t in all channels and
+        0 outside of the medium's bounding box. It is infinite, and the majorant 0, if there is no such t below
+        ray.maxt. ``u`` lies in [0, 1).
+        """
+        with dr.suspend_grad():
+            return grid_traversal.free_flight(self.flight_cells, self.box, dr.detach(ray), dr.detach(u), active)
+
+    def transmittance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+        """Unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) by channel. Detached."""
+        with dr.suspend_grad():
+            ray, scale = dr.detach(ray), dr.detach(self.scale)
+
+            def density(t: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+                at = dr.zeros(mi.Interaction3f)
+                at.p, at.time, at.wavelengths = ray(t), ray.time, ray.wavelengths
+                return scale * dr.detach(self.sigma_t.eval(at, active))
+
+            return grid_traversal.transmittance(self.shadow_cells, self.box, ray, density, sampler, active)
+
+    def emission_at(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+        """Radiance emitted per unit length at an interaction; 0 without emission."""
+        return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, active)
+
+
+# ---------------------------------------------- reading the properties ----------------------------------------------
+
+
+def _volume(props: Any, name: str, default: float | None) -> Any:
+    """The volume of that name, or None; textures, colours and numbers become a `constvolume`, without end."""
+    value = props[name] if name in props else default
+    if value is None or isinstance(value, mi.Volume):
+        return value
+    if isinstance(value, (str, bool)) or (isinstance(value, mi.Object) and not isinstance(value, mi.Texture)):
+        raise PathreplayError(f"gridmedium: {name} is {value!r:.40}; give a volume, a colour or a number")
+    constant = mi.Properties("constvolume")
+    constant["value"] = value
+    constant["to_world"] = mi.ScalarTransform4f().scale(2 * FAR).translate(-0.5)
+    return mi.PluginManager.instance().create_object(constant)
+
+
+def _number(props: Any, name: str, default: float) -> float:
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < float("inf"):
+        raise PathreplayError(f"gridmedium: {name} is {value}; give a finite number, at least 0")
+    return float(value)
+
+
+def _choice(props: Any) -> bool | str:
+    value = props.get("supergrid", "auto")
+    if value != "auto" and not isinstance(value, bool):
+        raise PathreplayError(f"gridmedium: supergrid is {value!r}; use true, false or 'auto'")
+    return value
+
+
+# ----------------------------------------------- looking at the density -----------------------------------------------
+
+
+def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
+    """Whether the volume differs between channels, and its bounds by cell, from fine to a single cell."""
+    params = mi.traverse(volume)
+    values = [dr.detach(params[key]) for key in params.keys()]
+    if volume.class_name() == "GridVolume":
+        channels = values[0].shape[-1]
+        if channels not in (1, 3, 4):
+            raise PathreplayError(f"gridmedium: sigma_t has {channels} channels; give a grid with 1 or 3")
+        if (lattice := find_lattice(volume, values[0].shape)) is not None:
+            return channels > 1 and not mi.is_monochromatic, all_bounds(voxel_bounds(lattice, values[0]))
+    if needs_grid:
+        raise PathreplayError(
+            f"gridmedium: sigma_t ({volume.class_name()}) shows no voxels; give a gridvolume, or leave supergrid "
+            "at 'auto'"
+        )
+    grey = all(dr.is_diff_v(value) and not dr.is_vector_v(value) and dr.width(value) == 1 for value in values)
+    lowest, highest = 0.0, float(volume.max())
+    if volume.class_name() == "ConstVolume" and not mi.is_spectral:
+        here = dr.detach(volume.eval(dr.zeros(mi.Interaction3f)))
+        lowest, highest = float(dr.min(here)[0]), float(dr.max(here)[0])
+    grey = mi.is_monochromatic or (bool(values) and grey)
+    return not grey, [constant_bounds(volume, lowest, (lowest + highest) / 2, highest)]

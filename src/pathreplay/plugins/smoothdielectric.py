@@ -1,0 +1,145 @@
+"""`smoothdielectric`: Mitsuba's `dielectric` with an index of refraction that can be differentiated.
+
+With η the index inside over the index outside, θ_i and θ_t the angles of incidence and refraction, F(θ_i, η) the
+unpolarised Fresnel reflectance and η_ti = 1/η (from outside) or η (from inside):
+
+    reflection      wo = (-wi_x, -wi_y, wi_z)                            f = F · specular_reflectance
+    transmission    wo = (-η_ti wi_x, -η_ti wi_y, -sign(wi_z) cos θ_t)   f = (1 - F) · specular_transmittance · s
+
+where s = η_ti² in radiance mode and 1 in importance mode. Flags and values are those of Mitsuba's plugin, and so is the
+probability of reflection, F, but for one range: near the critical angle, coming from the denser side, transmission is
+chosen at least once in four. There dF grows beyond all bounds, and samples that are as rare as 1 - F is small would
+carry nearly all of the derivative.
+
+Differentiated: wo and the weight with respect to `eta` and si.wi, the weight with respect to the tints.
+*Not* differentiated: the probability of choosing a lobe (bs.pdf is detached, and the weight is f / detach(pdf), so
+that its value is the tint while its derivative keeps the Fresnel term), and what total internal reflection switches
+on or off: F is continuous there, but an edge of the scene seen through the lobe is the business of the integrator.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.errors import PathreplayError
+
+#: Highest probability of reflection from the denser side, unless it is total.
+MAX_REFLECTION = 0.75
+TINTS = ("specular_reflectance", "specular_transmittance")
+
+
+def _index(props: Any, name: str, default: str) -> float:
+    """Index of refraction given as a number or as the name of a material in Mitsuba's table."""
+    if name in props and props.type(name) == mi.Properties.Type.Integer:
+        ior = float(props[name])
+    else:
+        try:
+            ior = float(mi.lookup_ior(props, name, default))
+        except RuntimeError:
+            raise PathreplayError(
+                f"smoothdielectric: {name} = {props[name]!r:.60} is no material that Mitsuba knows; give a number, "
+                "or a name such as 'bk7' or 'water'"
+            ) from None
+    if not 0 < ior < float("inf"):
+        raise PathreplayError(f"smoothdielectric: {name} is {ior:g}; give a finite index of refraction above 0")
+    return ior
+
+
+class SmoothDielectric:
+    specular_reflectance: mi.Texture | None  # None stands for one, at no cost
+    specular_transmittance: mi.Texture | None
+
+    def __init__(self, props: Any) -> None:
+        mi.BSDF.__init__(self, props)
+        if mi.is_polarized:
+            raise PathreplayError(
+                f"smoothdielectric: the variant {mi.variant()} is polarised, which it does not support; use "
+                f"{mi.variant().replace('_polarized', '')}, or Mitsuba's dielectric without derivatives"
+            )
+        self.eta = mi.Float(_index(props, "int_ior", "bk7") / _index(props, "ext_ior", "air"))
+        for name in TINTS:
+            setattr(self, name, props.get_texture(name, 1.0) if name in props else None)
+        both_sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
+        self.m_components = [
+            mi.BSDFFlags.DeltaReflection | both_sides,
+            mi.BSDFFlags.DeltaTransmission | both_sides | mi.BSDFFlags.NonSymmetric,
+        ]
+        self.m_flags = self.m_components[0] | self.m_components[1]
+        self.parameters_changed([])
+
+    # ------------------------------------------------ parameters ------------------------------------------------
+
+    def traverse(self, cb: Any) -> None:
+        # Discontinuous, as in Mitsuba's other dielectrics: moving refracted light moves the edges seen in it.
+        cb.put("eta", self.eta, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+        for name in TINTS:
+            if getattr(self, name) is not None:
+                cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: list[str]) -> None:
+        dr.make_opaque(self.eta)  # a literal would be compiled into the kernel, anew after every update
+
+    def to_string(self) -> str:
+        lines = [f"  eta = {self.eta},"]
+        for name in TINTS:
+            if getattr(self, name) is not None:
+                lines.append(f"  {name} = {getattr(self, name)},".replace("\n", "\n  "))
+        return "\n".join(["SmoothDielectric[", *lines, "]"])
+
+    # -------------------------------------------- sampling, evaluation --------------------------------------------
+
+    def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+        has_r = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0)
+        has_t = ctx.is_enabled(mi.BSDFFlags.DeltaTransmission, 1)
+        bs = dr.zeros(mi.BSDFSample3f)
+        if not (has_r or has_t):
+            return bs, mi.Spectrum(0)
+
+        # Fresnel reflectance, and the relative index in (it) and against (ti) the direction of travel
+        F, cos_t, η_it, η_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.eta)
+        # Under total reflection F is 1 at any angle, but fresnel's derivative is what rounding left, over cos θ_i.
+        F = dr.select(cos_t == 0, dr.detach(F), F)
+
+        # Choice of the lobe; its probability takes no part in differentiation
+        p_r = dr.detach(F)
+        p_r = dr.select((η_it < 1) & (p_r < 1), dr.minimum(p_r, MAX_REFLECTION), p_r)
+        selected_r = mi.Mask(active) & ((sample1 <= p_r) if has_t else True) & has_r
+        selected_t = ~selected_r & active
+        f = dr.select(selected_r, F, 1 - F)
+        if has_r and has_t:
+            bs.pdf = dr.select(selected_r, p_r, 1 - p_r)
+            weight = f / bs.pdf
+            # Mostly the quotient's value is one; it may miss it by rounding, and no probability at all is 0 / 0.
+            weight = dr.replace_grad(dr.select(p_r == F, 1, weight), weight)
+        else:
+            bs.pdf = mi.Float(1)
+            weight = F if has_r else 1 - F
+
+        bs.wo = dr.select(selected_r, mi.reflect(si.wi), mi.refract(si.wi, cos_t, η_ti))
+        bs.eta = dr.select(selected_r, 1, η_it)
+        bs.sampled_component = dr.select(selected_r, mi.UInt32(0), mi.UInt32(1))
+        bs.sampled_type = dr.select(
+            selected_r, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.DeltaTransmission)
+        )
+
+        tinted = mi.Spectrum(weight)
+        if self.specular_reflectance is not None:
+            tinted[selected_r] = tinted * self.specular_reflectance.eval(si, selected_r)
+        if self.specular_transmittance is not None:
+            tinted[selected_t] = tinted * self.specular_transmittance.eval(si, selected_t)
+        if ctx.mode == mi.TransportMode.Radiance:
+            # Refraction squeezes solid angles by η_ti² and radiance grows (or shrinks) with that.
+            tinted[selected_t] = tinted * dr.square(η_ti)
+        return bs, dr.select(active, tinted, 0)
+
+    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        return mi.Spectrum(0)  # both lobes are Dirac deltas
+
+    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        return mi.Float(0)
+
+    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+        return mi.Spectrum(0), mi.Float(0)

@@ -1,0 +1,366 @@
+"""What can be seen of a run while it runs: a page in its folder, pictures now and then, and a wish to stop it.
+
+All is in the folder ``previews``: ``page.json`` is what the page says, frames are called ITERATION-WHAT-NAME.webp.
+None of it is needed to go on: what cannot be written or rendered is left out, and never ends a run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+from pydantic import TypeAdapter
+
+from pathreplay.errors import PathreplayError, plain_line
+from pathreplay.inverse.config.schema import Config
+from pathreplay.inverse.dataset.views import View
+from pathreplay.inverse.images.io import Image, displayed, exposure_for
+from pathreplay.inverse.images.metrics import Likeness
+from pathreplay.inverse.loop.checkpoint import Run
+from pathreplay.inverse.loop.events import Event, Notes, Started, Stepped, Stopped
+from pathreplay.inverse.loop.loop import best_values, picture_of
+from pathreplay.inverse.parameters import grids
+from pathreplay.inverse.problem.problem import Problem
+from pathreplay.platform.interrupts import Stop
+from pathreplay.report.outcome import DIFFERENCE_GAIN, Recovered, ViewPictures, number_of, resume_command
+from pathreplay.report.page_parts import (
+    about,
+    common_exposure,
+    dropped_notice,
+    facts,
+    integrator_row,
+    lead,
+    numbers,
+    plots,
+    plots_note,
+    pose_note,
+    pose_rows,
+    target_row,
+    uri,
+)
+from pathreplay.report.pages import page as pages
+from pathreplay.report.pages.page import Page, Parameter, Picture, Still
+from pathreplay.report.recovered import poses_of, recovered_of
+from pathreplay.runs.run_folder import RunFolder
+
+FOLDER, PAGE, STOP = "previews", "previews/page.json", "stop"
+BUTTON = "the stop button"
+FRAME = re.compile(r"(\d{6,})-((?:view|texture|volume)-.+)\.webp")
+
+# Seconds between two states of the page at least, and how many times longer than writing one took.
+PAUSE_S, PAUSE = 1.0, 100
+# Pixels along the longer side: of pictures to compare, and of frames.
+LARGEST, FRAME_SIDE = 1024, 384
+# Of all frames in a report: enough for a film of each picture, and no burden to a page.
+MOST_FILM_BYTES = 2_000_000
+# Pixels along the longer side of the small pictures that a notebook shows.
+SMALL_SIDE = 192
+# Samples per pixel of a picture at least, where the job's own pictures have as many: fewer are hard to look at.
+LEAST_SPP = 16
+
+CAPTIONS = {"target": "target", "result": "now", "difference": f"difference ×{DIFFERENCE_GAIN:g}"}
+
+PAGES = TypeAdapter(Page)
+
+
+class Previews:
+    """Observes a run: tells ``stop`` of a file `STOP` in its folder, and keeps its page up to date."""
+
+    def __init__(
+        self, folder: RunFolder, config: Config, problem: Problem, run: Run, before: Mapping[str, Image], stop: Stop
+    ) -> None:
+        self.folder, self.config, self.problem, self.run, self.stop = folder, config, problem, run, stop
+        self._share = config.preview.share
+        self._began = self._written = time.perf_counter()
+        self._exposure = common_exposure([view.target for view in problem.views])
+        self._views = _chosen(problem, config.preview.views) if self._share else []
+        self._before = {view.name: before[view.name] for view in self._views}
+        self._now = {v.name: _pictures_of(v, self._before[v.name], self._before[v.name]) for v in self._views}
+        self._pause = PAUSE_S
+        self._spent = self._cost = 0.0
+        self._resumed, self._stride = 0, 1.0
+        self._kept = [0]
+        self._likenesses = self._alike()
+        self._shown_at = 0
+        self._stale = (folder.path / STOP).exists()  # a wish to stop an earlier part of the run
+        self._log: list[str] = list(problem.notes)
+        self._notes = Notes()
+
+    def observe(self, event: Event) -> None:
+        """Raises nothing but what ends the process."""
+        if note := self._notes.of(event):
+            self._log.append(note)
+        if isinstance(event, Started):
+            self._log.append(f"iterations {event.done} to {event.wanted}")
+            self._resumed = event.done
+            if event.done == 0:
+                self._write(self._begun() | (self._frames(0, self._before) if self._share else {}))
+        elif isinstance(event, Stepped):
+            if event.entry.iteration == self._resumed:
+                self._went_on()
+            if self.stop.by is None and (self.folder.path / STOP).exists():
+                self.stop.by = BUTTON
+            self._stepped(event.entry.iteration + 1, event.entry.seconds)
+        elif isinstance(event, Stopped):
+            self._take_wish()
+            by, took = f" by {self.stop.by}" if self.stop.by else "", time.perf_counter() - self._began
+            self._log.append(f"ended after {event.done} iterations{by}")
+            self._log.append(f"pictures while it ran took {self._spent:.1f} of {took:.1f} s")
+            self._write({})
+
+    @property
+    def shown_at(self) -> int:
+        """After how many iterations there were pictures the last time."""
+        return self._shown_at
+
+    def small_pictures(self) -> tuple[pages.View, ...]:
+        """Target, now and difference of the views, small, each within its address."""
+        found = []
+        for view in self._views:
+            shown, stored = self._now[view.name].pictures(), self._stored(view)
+            small = {kind: _encoded(shown[kind], stored, SMALL_SIDE, "webp") for kind in CAPTIONS}
+            pictures = tuple(Picture(kind, CAPTIONS[kind], uri("image/webp", data)) for kind, data in small.items())
+            found.append(pages.View(view.name, pictures))
+        return tuple(found)
+
+    def _take_wish(self) -> None:
+        self.folder.discard([STOP])
+
+    def finished(self, after: Mapping[str, Image]) -> dict[str, tuple[Still, ...]]:
+        """Films for the report, by view-NAME, texture-NAME and volume-NAME; their last frames are the results."""
+        if self._share:
+            with contextlib.suppress(PathreplayError):
+                self.folder.write(self._frames(len(self.run.history), {name: after[name] for name in self._before}))
+        return films(self.folder.path, MOST_FILM_BYTES)
+
+    def _stepped(self, done: int, seconds: float) -> None:
+        now = time.perf_counter()
+        # An iteration renders its views, and differentiates them: pictures of a few take less.
+        if self._share and self._spent + (self._cost or seconds) <= self._share * (now - self._began):
+            files = self._look(done)
+            passed = self._passed(done)
+            self._write(files, passed)
+            self._cost = time.perf_counter() - now
+            self._spent += self._cost
+        elif now - self._written >= self._pause:
+            self._write({})
+
+    def _passed(self, done: int) -> set[int]:
+        """Keep the frame of this iteration, and let others go: the last one is always there, the rest are apart."""
+        kept = self._kept
+        passed = {kept.pop()} if len(kept) > 1 and kept[-1] - kept[-2] < self._stride else set()
+        kept.append(done)
+        if len(kept) > self.config.preview.frames + 1:
+            passed |= set(kept[1:-1:2])
+            kept[:] = [i for i in kept if i not in passed]
+            self._stride = (kept[-1] - kept[0]) / max(1, len(kept) - 1)
+        return passed
+
+    def _forget(self, passed: Callable[[int], bool]) -> None:
+        found = frames(self.folder.path)
+        self.folder.discard(f"{FOLDER}/{path.name}" for iteration, _, path in found if passed(iteration))
+
+    def _look(self, done: int) -> dict[str, bytes]:
+        """Pictures of the views as they are now."""
+        try:
+            spp = max(self.config.most_spp, min(LEAST_SPP, self.config.picture_spp))
+            values = best_values(self.problem, self.run)
+            images = {v.name: picture_of(self.problem, self.config, values, v, spp) for v in self._views}
+        except RuntimeError as error:
+            if self.stop.aborted:
+                raise
+            self._share = 0.0
+            self._log.append(f"no more pictures: {plain_line(str(error))}")
+            return {}
+        self._now = {v.name: _pictures_of(v, self._before[v.name], images[v.name]) for v in self._views}
+        self._likenesses, self._shown_at = self._alike(), done
+        files = self._frames(done, images)
+        for view in self._views:
+            for kind in ("result", "difference"):
+                image = self._now[view.name].pictures()[kind]
+                files[f"{FOLDER}/{kind}-{view.name}.png"] = _encoded(image, self._stored(view), LARGEST, "png")
+        return files
+
+    def _alike(self) -> dict[str, Likeness]:
+        return {name: Likeness.of(it.result, it.target, it.exposure, it.weight) for name, it in self._now.items()}
+
+    def _stored(self, view: View) -> float:
+        return min(self._exposure, exposure_for(view.target))
+
+    def _begun(self) -> dict[str, bytes]:
+        """The pictures that do not change, and those of the start as the first that do."""
+        files = {}
+        for view in self._views:
+            for kind, image in self._now[view.name].pictures().items():
+                files[f"{FOLDER}/{kind}-{view.name}.png"] = _encoded(image, self._stored(view), LARGEST, "png")
+        for item in recovered_of(self.problem, self.run):
+            for kind, image in _grids(item).items():
+                files[_address(kind, item)] = _encoded(image, 1.0, LARGEST, "png")
+        return files
+
+    def _frames(self, done: int, images: Mapping[str, Image]) -> dict[str, bytes]:
+        found = {}
+        for view in self._views:
+            found[f"view-{view.name}"] = (images[view.name], self._stored(view))
+        for item in recovered_of(self.problem, self.run):
+            for what, shown in (("texture", item.textures()), ("volume", item.volumes())):
+                if shown:
+                    found[f"{what}-{item.file_name}"] = (shown["result"], 1.0)
+        return {
+            f"{FOLDER}/{done:06d}-{name}.webp": _encoded(image, exposure, FRAME_SIDE, "webp")
+            for name, (image, exposure) in found.items()
+        }
+
+    def _went_on(self) -> None:
+        """The first step is done, so this run can go on, and may clear away what an earlier part of it has left.
+
+        Frames that a killed run has made beyond its checkpoint are none of this run's.
+        """
+        self._forget(lambda iteration: iteration > self._resumed)
+        self._kept = sorted({0, *(iteration for iteration, _, _ in frames(self.folder.path))})
+        if self._stale:
+            self._take_wish()
+        if self._resumed:
+            self._write(self._begun())
+
+    def _write(self, files: Mapping[str, bytes], passed: Collection[int] = ()) -> None:
+        """Pictures and page; the frames of iterations that have ``passed`` go, once newer ones are there."""
+        begin = time.perf_counter()
+        with contextlib.suppress(PathreplayError):  # a full disk ends the run with its next checkpoint
+            if files:
+                self.folder.write(files)
+            if passed:
+                self._forget(passed.__contains__)
+            self.folder.write({PAGE: PAGES.dump_json(self._page())})
+        self._written = time.perf_counter()
+        self._pause = max(PAUSE_S, PAUSE * (self._written - begin))
+
+    def _page(self) -> Page:
+        config, history = self.config, self.run.history
+        learned = len(self.problem.trained())
+        done, wanted = len(history), config.iterations
+        (_, first), *others = facts(config, history)
+        stopping = (f"Asked to stop by {self.stop.by}.",) if self.stop.by else ()
+        shown = films(self.folder.path)
+        return Page(
+            title=self.folder.path.name,
+            lead=lead(config, self._count(), learned, len(self.problem.views) - learned),
+            notices=stopping + dropped_notice(history),
+            facts=((f"{done} of {wanted}", first), *others),
+            views=tuple(self._view(view, shown) for view in self._views),
+            views_note=f"{len(self._views)} of {len(self.problem.views)} views, the last time after {self._shown_at} "
+            "iterations. Difference: red where it is brighter than the target, blue where it is darker.",
+            exposure=self._exposure,
+            plots=plots(history),
+            plots_note=plots_note(history),
+            parameters=self._parameters(shown),
+            command=resume_command(self.folder.name),
+            how=(integrator_row(config), target_row(config)),
+            log=tuple(self._log),
+            titles={"plots": "Curves", "parameters": "Parameters", "how": "How it goes on if it is stopped"},
+        )
+
+    def _view(self, view: View, shown: Mapping[str, tuple[Still, ...]]) -> pages.View:
+        it, stored = self._now[view.name], self._stored(view)
+        pictures = tuple(
+            Picture(kind, CAPTIONS.get(kind, kind), f"{FOLDER}/{kind}-{view.name}.png?{self._shown_at}")
+            for kind in it.pictures()
+        )
+        likeness = self._likenesses[view.name]
+        note = (
+            f"Root mean square difference from the target {it.error(it.result):.4g}, PSNR {likeness.psnr:.2f} dB, "
+            f"SSIM {likeness.ssim:.4f}, noise included."
+        )
+        film = shown.get(f"view-{view.name}", ())
+        return pages.View(view.name, pictures, stored, it.exposure, view.held_out, note, film)
+
+    def _count(self) -> int:
+        items = recovered_of(self.problem, self.run)
+        return number_of(items) + len(self.problem.poses)
+
+    def _parameters(self, shown: Mapping[str, tuple[Still, ...]]) -> tuple[Parameter, ...]:
+        found = []
+        for item in recovered_of(self.problem, self.run):
+            film = shown.get(f"texture-{item.file_name}") or shown.get(f"volume-{item.file_name}") or ()
+            pictures = [
+                Picture(kind, kind, _address(kind, item)) for kind in ("start", "truth") if kind in _grids(item)
+            ]
+            if film:
+                pictures.insert(1, Picture("now", f"after {film[-1].iteration} iterations", film[-1].src))
+            rows = numbers(item)
+            found.append(Parameter(item.key, tuple(pictures), rows=rows, note="" if rows else about(item), film=film))
+        for pose in poses_of(self.problem, self.run):
+            found.append(Parameter(pose.pose.key, rows=pose_rows(pose), note=pose_note(pose)))
+        return tuple(found)
+
+
+def _chosen(problem: Problem, count: int) -> list[View]:
+    """So many views, evenly among those that are learned from and those that are not; both, where there are both."""
+    out = [view for view in problem.views if view.held_out]
+    learned = [view for view in problem.views if not view.held_out]
+    some = min(len(out), count // 2)
+    chosen = {view.name for view in (*_evenly(learned, max(1, count - some)), *_evenly(out, some))}
+    return [view for view in problem.views if view.name in chosen]
+
+
+def _evenly(views: list[View], count: int) -> list[View]:
+    return views if len(views) <= count else [views[i * len(views) // count] for i in range(count)]
+
+
+def _grids(item: Recovered) -> dict[str, Image]:
+    """Start and truth of a texture or a volume, as far as they are known."""
+    return {kind: image for kind, image in (item.textures() or item.volumes()).items() if kind in ("start", "truth")}
+
+
+def _address(kind: str, item: Recovered) -> str:
+    return f"{FOLDER}/{kind}-of-{item.file_name}.png"
+
+
+def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
+    exposure = exposure_for(view.target)
+    return ViewPictures(view.name, view.target, before, now, exposure, None, view.weight, view.held_out)
+
+
+def _encoded(image: Image, exposure: float, side: int, kind: str) -> bytes:
+    """The picture as a display shows it, no longer than ``side`` pixels: PNG, or WebP, which loses what few see."""
+    # In double precision a large texture would take more than all else that is known of it.
+    pixels = np.round(255 * displayed(grids.shown(image, 2 * side), exposure)).astype(np.uint8)
+    picture = PIL.Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
+    if max(picture.size) > side:
+        factor = side / max(picture.size)
+        picture = picture.resize([max(1, round(n * factor)) for n in picture.size], PIL.Image.Resampling.BOX)
+    buffer = io.BytesIO()
+    picture.save(buffer, kind, **({"quality": 88, "method": 2} if kind == "webp" else {}))
+    return buffer.getvalue()
+
+
+def frames(run: Path) -> Iterator[tuple[int, str, Path]]:
+    """Iteration, what it shows and file of each frame in a run folder, in order."""
+    found = [(FRAME.fullmatch(path.name), path) for path in (run / FOLDER).glob("*.webp") if not path.is_symlink()]
+    yield from sorted((int(match[1]), match[2], path) for match, path in found if match)
+
+
+def films(run: Path, most_bytes: int | None = None) -> dict[str, tuple[Still, ...]]:
+    """The frames of a run by what they show; whole, as many as the limit lets, or by address without one."""
+    found: dict[str, list[tuple[int, Path]]] = {}
+    for iteration, what, path in frames(run):
+        found.setdefault(what, []).append((iteration, path))
+    if most_bytes is None:
+        return {
+            what: tuple(Still(iteration, f"{FOLDER}/{path.name}") for iteration, path in stills)
+            for what, stills in found.items()
+        }
+    sizes = sum(path.stat().st_size for stills in found.values() for _, path in stills)
+    step = max(1, -(-sizes // most_bytes))
+    kept = {what: [s for i, s in enumerate(reversed(stills)) if i % step == 0][::-1] for what, stills in found.items()}
+    return {
+        what: tuple(Still(iteration, uri("image/webp", path.read_bytes())) for iteration, path in stills)
+        for what, stills in kept.items()
+        if len(stills) > 1
+    }

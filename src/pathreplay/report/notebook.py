@@ -1,0 +1,106 @@
+"""What the user sees in a notebook while a job runs: one output that is drawn anew, instead of lines."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from typing import Any
+
+from pathreplay.errors import plain_line
+from pathreplay.inverse.loop.events import Event, Notes, Started, Stepped
+from pathreplay.report.live_page import Previews
+from pathreplay.report.pages.page import View
+from pathreplay.report.pages.panel import Panel
+
+# Between two states of the output: each is sent to the browser as a whole.
+PAUSE_S = 1.0
+MOST_NOTES = 8
+
+
+def in_notebook() -> bool:
+    """Whether this Python is the kernel of a notebook, which shows HTML, and not a terminal."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return getattr(shell, "kernel", None) is not None
+
+
+class NotebookPanel:
+    """The same as `Progress`, in a notebook; use as a context manager, which ends with the last state on show."""
+
+    def __init__(self) -> None:
+        from IPython.display import HTML, display
+
+        self._html, self._title, self._status = HTML, "optimize", "preparing"
+        self._wanted = self._before = 0
+        self._lines: list[str] = []
+        self._notes = Notes()
+        self._previews: Previews | None = None
+        self._views: tuple[int, tuple[View, ...]] = -1, ()
+        self._begin = self._told = time.monotonic()
+        self._handle: Any = display(self._html(self._panel().html()), display_id=True)
+
+    def __enter__(self) -> NotebookPanel:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._status = "ended" if kind is None else f"ended by {kind.__name__}"
+        self._draw()
+
+    def follow(self, previews: Previews) -> None:
+        """Show the pictures and losses of a run from now on."""
+        self._previews, self._title = previews, str(previews.folder.name)
+
+    def say(self, text: str) -> None:
+        """Name what is going on now."""
+        self._status = text
+        self._draw()
+
+    def status(self, text: str) -> None:
+        """What is so for a moment."""
+        self._status = f"optimizing: {text}"
+
+    def remark(self, text: str) -> None:
+        """One line that stays, for who looks on."""
+        self.note(text)
+
+    def note(self, text: str) -> None:
+        """One line that stays, while there are few."""
+        self._lines = [*self._lines, plain_line(text)][-MOST_NOTES:]
+        self._draw()
+
+    def observe(self, event: Event) -> None:
+        """Show what the run tells."""
+        if isinstance(event, Started):
+            self._begin, self._before, self._wanted = time.monotonic(), event.done, event.wanted
+            self.say("optimizing")
+        elif isinstance(event, Stepped):
+            if time.monotonic() - self._told >= PAUSE_S or event.entry.iteration + 1 == self._wanted:
+                self._draw()
+        elif note := self._notes.of(event):
+            self.note(note)
+
+    def _draw(self) -> None:
+        with contextlib.suppress(OSError, RuntimeError):  # nobody is there to see it, or a signal came in between
+            self._handle.update(self._html(self._panel().html()))
+        self._told = time.monotonic()
+
+    def _panel(self) -> Panel:
+        if self._previews is not None and self._previews.shown_at != self._views[0]:
+            self._views = self._previews.shown_at, self._previews.small_pictures()
+        history = self._previews.run.history if self._previews else []
+        return Panel(
+            self._title,
+            self._status,
+            len(history),
+            self._wanted,
+            self._left(len(history)),
+            tuple(entry.loss for entry in history),
+            self._views[1],
+            tuple(self._lines),
+        )
+
+    def _left(self, done: int) -> str:
+        steps = done - self._before
+        if not 0 < steps or done == self._wanted:
+            return ""
+        return f"about {(time.monotonic() - self._begin) / steps * (self._wanted - done):.0f} s left"

@@ -1,0 +1,46 @@
+"""What a notebook shows of a run while it is under way, as a piece of HTML that needs no script."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pathreplay.report.pages.document import template
+from pathreplay.report.pages.page import View, thinned
+
+WIDTH, HEIGHT, BORDER = 480, 120, 4
+"""Of the curve, in pixels."""
+MOST_POINTS = 240
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Everything that it says, from top to bottom. Texts are shown letter by letter."""
+
+    title: str
+    status: str
+    done: int = 0
+    wanted: int = 0
+    left: str = ""
+    """How long it may still take, in words."""
+    losses: tuple[float, ...] = ()
+    views: tuple[View, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def html(self) -> str:
+        """The curve is logarithmic where all losses are above zero; of many iterations it takes every so many."""
+        losses = [self.losses[i] for i in thinned(len(self.losses), MOST_POINTS)]
+        log = bool(losses) and min(losses) > 0
+        return template("panel.html.j2").render(
+            panel=self, points=_points([math.log(x) for x in losses] if log else losses),
+            log=log, width=WIDTH, height=HEIGHT,
+        )  # fmt: skip
+
+
+def _points(values: list[float]) -> str:
+    """The corners of a line through values, in pixels; none where there is no line."""
+    if len(values) < 2:
+        return ""
+    low, high = min(values), max(values)
+    across, up = (WIDTH - 2 * BORDER) / (len(values) - 1), (HEIGHT - 2 * BORDER) / ((high - low) or 1)
+    return " ".join(f"{BORDER + i * across:.1f},{BORDER + (high - y) * up:.1f}" for i, y in enumerate(values))

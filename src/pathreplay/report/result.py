@@ -1,0 +1,168 @@
+"""The end of a run: its outcome, the files of it, and what Python gets."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from pathreplay.inverse.images.io import Image, exposure_for, exr_bytes, png_bytes
+from pathreplay.inverse.images.metrics import Likeness
+from pathreplay.inverse.loop.checkpoint import Entry, Run
+from pathreplay.inverse.loop.verdict import Verdict
+from pathreplay.inverse.parameters.exposures import EXPOSURE
+from pathreplay.inverse.parameters.pose import PoseError
+from pathreplay.inverse.parameters.values import Array
+from pathreplay.inverse.problem.problem import Problem
+from pathreplay.platform.atomic_files import Content, made
+from pathreplay.platform.tensor_files import safetensors_chunks
+from pathreplay.report.outcome import Outcome, ViewPictures, resume_command
+from pathreplay.report.recovered import poses_of, recovered_of, with_faces, with_scene
+from pathreplay.report.report import Film, report_files
+from pathreplay.runs.run_folder import Job
+from pathreplay.scenes.volume_files import vol_bytes
+
+
+@dataclass(frozen=True, repr=False)
+class RunResult:
+    """What a run came to; everything in it is also in ``folder``."""
+
+    folder: Path
+    report: Path
+    iterations: int
+    """Completed iterations; fewer than the job's when it was stopped."""
+    stopped: bool
+    """True when a signal ended the run early; it can be resumed."""
+    stopped_by: str | None
+    """'Ctrl-C', 'SIGTERM', 'SIGHUP', 'the stop button' or 'finish()'."""
+    history: tuple[Entry, ...]
+    parameters: dict[str, Array]
+    errors: dict[str, float]
+    """Root mean square error of each parameter whose truth is known; poses are told apart."""
+    poses: dict[str, PoseError]
+    """How far each pose whose truth is known is from it."""
+    views: dict[str, Likeness]
+    """How alike each view is to its target."""
+    held_out: tuple[str, ...]
+    """The views that were not learned from."""
+    verdict: Verdict
+    """Which values still move, have arrived, or are not determined by the pictures."""
+
+    def __repr__(self) -> str:
+        """Short: a notebook prints it, and the history may have thousands of entries."""
+        loss = f", loss {self.history[-1].loss:.4g}" if self.history else ""
+        stopped = ", stopped early" if self.stopped else ""
+        count = f"{len(self.parameters)} parameters"
+        return f"<RunResult: {self.iterations} iterations{loss}{stopped}, {count}, {self.report}>"
+
+    def describe(self) -> str:
+        """A few lines for the terminal: loss, errors, where the report is, how to go on; the verdict on the values."""
+        lines = []
+        if self.history:
+            first, last = self.history[0].loss, self.history[-1].loss
+            lines.append(f"loss {first:.4g} -> {last:.4g} in {self.iterations} iterations")
+        for key, error in self.errors.items():
+            value = self.parameters[key]
+            found = f"{value.item():.5g}, " if value.size == 1 else ""
+            lines.append(f"{key}: {found}root mean square error {error:.4g}")
+        lines += [f"{key}: {error}" for key, error in self.poses.items()]
+        if self.held_out:
+            psnr, ssim = (np.mean([getattr(self.views[v], kind) for v in self.held_out]) for kind in ("psnr", "ssim"))
+            flips = [flip for v in self.held_out if (flip := self.views[v].flip) is not None]
+            told = f", FLIP {np.mean(flips):.4f}" if flips else ""
+            lines.append(f"held-out views ({len(self.held_out)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}{told}")
+        lines.append(f"report: {self.report}")
+        if self.stopped:
+            lines.append(f"stopped early by {self.stopped_by}; go on with: {resume_command(self.folder)}")
+        lines.append(str(self.verdict))
+        return "\n".join(lines)
+
+
+def outcome_of(
+    job: Job,
+    folder: Path,
+    problem: Problem,
+    run: Run,
+    before: dict[str, Image],
+    after: dict[str, Image],
+    rivals: dict[str, Image],
+    verdict: Verdict,
+) -> Outcome:
+    """All that is told of a run; ``before``, ``after`` and the ``rivals`` are pictures by view."""
+    views = tuple(
+        ViewPictures(
+            v.name,
+            v.target,
+            before[v.name],
+            after[v.name],
+            exposure_for(v.target),
+            rivals.get(v.name),
+            v.weight,
+            v.held_out,
+            tuple(run.values[EXPOSURE][n].tolist()) if EXPOSURE in run.values else (),
+        )
+        for n, v in enumerate(problem.views)
+    )
+    recovered, poses = with_faces(problem, recovered_of(problem, run)), poses_of(problem, run)
+    values = with_scene(problem, run.values)
+    return Outcome(
+        job.config, job.source, job.changes, folder, views, recovered, poses, run, values, problem.notes, verdict
+    )
+
+
+def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Content]:
+    """All files of the end of a run, the report with its ``films`` among them, by name in the run folder."""
+    table = {item.key: item.as_dict() for item in outcome.recovered}
+    table |= {item.pose.key: item.as_dict() for item in outcome.poses}
+    files: dict[str, Content] = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}
+    views = {view.name: view.as_dict() for view in outcome.views}
+    files["views.json"] = (json.dumps(views, indent=2) + "\n").encode()
+    files |= _run_files("", outcome.run.history, outcome.values)
+    if rival := outcome.run.rival:
+        files |= _run_files("rival/", rival.history, rival.values)
+    for view in outcome.views:
+        files[f"images/result-{view.name}.exr"] = made(exr_bytes, view.result)
+        for kind in view.kinds():
+            files[f"images/{kind}-{view.name}.png"] = made(_png, view, kind)
+    for item in outcome.recovered:
+        for kind, image in item.textures().items():
+            files[f"images/texture-{kind}-{item.file_name}.png"] = png_bytes(image)
+        for kind, image in item.volumes().items():
+            files[f"images/volume-{kind}-{item.file_name}.png"] = png_bytes(image)
+        if item.result.ndim == 4:
+            files[f"volumes/{item.file_name}.vol"] = made(vol_bytes, item.result)
+    return {**files, **report_files(outcome, films)}
+
+
+def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
+    """What Python gets; ``stopped_by`` is the name of a signal, say, which may have come too late to stop anything."""
+    stopped = not outcome.complete
+    return RunResult(
+        folder=outcome.folder,
+        report=outcome.folder / "report.html",
+        iterations=len(outcome.run.history),
+        stopped=stopped,
+        stopped_by=stopped_by if stopped else None,
+        history=tuple(outcome.run.history),
+        parameters=outcome.values,
+        errors={item.key: error for item in outcome.recovered if (error := item.error()) is not None},
+        poses={item.pose.key: errors["error"] for item in outcome.poses if (errors := item.errors())},
+        views={view.name: view.likenesses["result"] for view in outcome.views},
+        held_out=tuple(view.name for view in outcome.held_out()),
+        verdict=outcome.verdict,
+    )
+
+
+def _png(view: ViewPictures, kind: str) -> bytes:
+    return png_bytes(view.picture(kind), view.exposure)
+
+
+def _run_files(folder: str, history: Sequence[Entry], values: Mapping[str, Array]) -> dict[str, Content]:
+    return {
+        f"{folder}parameters.safetensors": partial(safetensors_chunks, values, {}),
+        f"{folder}history.jsonl": "".join(json.dumps(asdict(entry)) + "\n" for entry in history).encode(),
+    }

@@ -1,0 +1,206 @@
+"""Runs side by side: a table of what they came to and where their jobs differ, and a page of curves and pictures."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import PIL.Image
+
+from pathreplay.errors import PathreplayError, shown
+from pathreplay.inverse.loop.checkpoint import Entry
+from pathreplay.platform.files import file_names
+from pathreplay.report.page_parts import uri
+from pathreplay.report.pages.page import Head, Page, Parameter, Picture, Plot, Row, Series, Table, View, thinned
+from pathreplay.report.report import MOST_PIXELS, MOST_VIEWS
+from pathreplay.report.watch.past import Past
+from pathreplay.report.watch.run_files import read_own
+
+
+def table(runs: list[Past]) -> Table:
+    """A column for each run: iterations, seconds, loss, likeness, errors, and what their jobs have set differently."""
+    rows = [
+        Row("iterations", tuple(f"{len(run.history)} of {run.config.iterations}" for run in runs)),
+        Row("seconds", tuple(f"{sum(entry.seconds for entry in run.history):.1f}" for run in runs)),
+        Row("loss", tuple(_loss(run) for run in runs)),
+    ]
+    for kind, unit in (("psnr", " dB"), ("ssim", "")):
+        for name, views in (("views that are learned from", _learned), ("held-out views", Past.held_out)):
+            cells = tuple(_mean([run.likeness(view, kind) for view in views(run)], unit) for run in runs)
+            if any(cells):
+                rows.append(Row(f"{kind.upper()}, {name}", cells))
+    for key in _keys(run.history[-1].errors if run.history else {} for run in runs):
+        rows.append(Row(f"error of {key}", tuple(_number(_last(run).get(key)) for run in runs)))
+    return Table((Head(""), *(Head(run.name) for run in runs)), (*rows, *_differences(runs)))
+
+
+def page(runs: list[Past]) -> Page:
+    """What the table says, with curves, and with pictures of the views that all runs have."""
+    kinds = {run.config.loss for run in runs}
+    said = "" if len(kinds) == 1 else f"The losses are of different kinds ({', '.join(sorted(kinds))})."
+    views = _views(runs)
+    return Page(
+        title=" and ".join(run.name for run in runs) if len(runs) < 4 else f"{len(runs)} runs",
+        lead=(f"{len(runs)} runs side by side: ", ", ".join(run.config.scene for run in runs[:1]), ""),
+        notices=(said,) if said else (),
+        views=views,
+        likeness=table(runs),
+        likeness_note="PSNR and SSIM are means over views, each at an exposure of its own, noise included.",
+        left=runs[0].name,
+        right=runs[1].name,
+        plots=_plots(runs),
+        parameters=_parameters(runs),
+        titles={"views": "Side by side", "plots": "Curves", "parameters": "Textures and volumes"},
+    )
+
+
+def _loss(run: Past) -> str:
+    if not run.history:
+        return ""
+    return f"{run.history[0].loss:.4g} → {run.history[-1].loss:.4g} ({run.config.loss})"
+
+
+def _learned(run: Past) -> list[str]:
+    return [view for view in run.views if view not in run.held_out()]
+
+
+def _mean(values: list[float | None], unit: str) -> str:
+    known = [value for value in values if value is not None]
+    return f"{np.mean(known):.4g}{unit}" if known else ""
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"
+
+
+def _last(run: Past) -> Mapping[str, float]:
+    return run.history[-1].errors if run.history else {}
+
+
+def _keys(tables: Iterable[Mapping[str, Any]]) -> list[str]:
+    """The keys of all tables, each once, in the order in which they come."""
+    return list(dict.fromkeys(itertools.chain.from_iterable(tables)))
+
+
+def _differences(runs: list[Past]) -> list[Row]:
+    """What the jobs say differently; but for where they write to."""
+    flat = [dict(_flattened("", run.config.model_dump())) for run in runs]
+    for each in flat:
+        each.pop("output", None)
+    rows = []
+    for key in _keys(flat):
+        values = [each.get(key) for each in flat]
+        if any(value != values[0] for value in values):
+            rows.append(Row(f"job: {key}", tuple("" if value is None else shown(value, 60) for value in values)))
+    return rows
+
+
+def _flattened(name: str, value: Any) -> Iterable[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from _flattened(f"{name}.{key}" if name else str(key), each)
+    elif isinstance(value, list) and any(isinstance(each, dict) for each in value):
+        for i, each in enumerate(value):
+            yield from _flattened(f"{name}.{i}", each)
+    else:
+        yield name, value
+
+
+def _plots(runs: list[Past]) -> tuple[Plot, ...]:
+    def plot(title: str, code: str, value: Callable[[Entry], float | None], seconds: bool = False) -> Plot:
+        series = []
+        for run in runs:
+            taken = thinned(len(run.history))
+            times = np.cumsum([entry.seconds for entry in run.history])
+            x = tuple(float(f"{times[i]:.4g}") if seconds else float(i) for i in taken)
+            y = tuple(None if (v := value(run.history[i])) is None else float(f"{v:.6g}") for i in taken)
+            series.append(Series(run.name, x, y))
+        return Plot(title, tuple(series), code=code, along="second" if seconds else "iteration")
+
+    found = [plot("loss by iterations", "", _loss_of), plot("loss by seconds", "", _loss_of, seconds=True)]
+    lasts = [run.history[-1] for run in runs if run.history]
+    for key in _keys(entry.gradient_norms | entry.errors for entry in lasts):
+        if any(key in entry.errors for entry in lasts):
+            found.append(plot("error of", key, lambda entry, key=key: entry.errors.get(key)))  # type: ignore[misc]
+        if any(key in entry.gradient_norms for entry in lasts):
+            norm = lambda entry, key=key: entry.gradient_norms.get(key)  # noqa: E731
+            found.append(plot("gradient norm of", key, norm))
+    return tuple(found)
+
+
+def _loss_of(entry: Entry) -> float:
+    return entry.loss
+
+
+def _views(runs: list[Past]) -> tuple[View, ...]:
+    names = [name for name in runs[0].views if all(name in run.views for run in runs)][:MOST_VIEWS]
+    share = MOST_PIXELS / max(1, len(names) * (len(runs) + 1))
+    found = []
+    for name in names:
+        pictures = [_picture(runs[0], "target", "target", f"target-{name}", share)]
+        for run in runs:
+            psnr = run.likeness(name, "psnr")
+            caption = run.name if psnr is None else f"{run.name}, {psnr:.2f} dB"
+            pictures.append(_picture(run, run.name, caption, f"result-{name}", share))
+        held_out = any(name in run.held_out() for run in runs)
+        shown = tuple(picture for picture in pictures if picture is not None)
+        if len(shown) > 1:
+            found.append(View(name, shown, held_out=held_out))
+    return tuple(found)
+
+
+def _parameters(runs: list[Past]) -> tuple[Parameter, ...]:
+    keys = [key for run in runs if run.history for key in run.history[-1].gradient_norms]
+    found = []
+    for key in dict.fromkeys(keys):
+        for what, columns in (("texture", 3), ("volume", 2)):
+            pictures = []
+            for run in runs:
+                names = file_names(run.history[-1].gradient_norms if run.history else ())
+                if key in names:
+                    file = f"{what}-{{}}-{names[key]}"
+                    pictures += [_picture(run, run.name, run.name, file.format("result"), MOST_PIXELS / 16)]
+            truth = [_picture(runs[0], "truth", "truth", f"{what}-truth-{file_names([key])[key]}", MOST_PIXELS / 16)]
+            shown = tuple(picture for picture in (*pictures, *truth) if picture is not None)
+            if shown:
+                found.append(Parameter(key, shown, columns))
+    return tuple(found)
+
+
+def _picture(run: Past, kind: str, caption: str, file: str, most_pixels: float) -> Picture | None:
+    """A picture among a run's images, made smaller where it has too many pixels; None where there is none."""
+    data = read_own(run.folder / "images" / f"{file}.png")
+    if data is None:
+        return None
+    try:
+        with PIL.Image.open(io.BytesIO(data), formats=("PNG",)) as picture:
+            factor = (most_pixels / (picture.width * picture.height)) ** 0.5
+            if factor < 1:
+                small = picture.convert("RGB").resize(
+                    (max(1, round(picture.width * factor)), max(1, round(picture.height * factor))),
+                    PIL.Image.Resampling.BOX,
+                )
+                buffer = io.BytesIO()
+                small.save(buffer, "png")
+                data = buffer.getvalue()
+    except (OSError, ValueError, PIL.Image.DecompressionBombError) as error:
+        path = run.folder / "images" / f"{file}.png"
+        raise PathreplayError(f"Picture {path} cannot be read ({error}); give the folder of a whole run") from None
+    return Picture(kind, caption, uri("image/png", data))
+
+
+def print_table(it: Table) -> None:
+    """The table on the terminal; whatever stands in it is text."""
+    from rich.console import Console
+    from rich.table import Table as Drawn
+    from rich.text import Text
+
+    drawn = Drawn(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for head in it.heads:
+        drawn.add_column(Text(head.text), overflow="fold")
+    for row in it.rows:
+        drawn.add_row(*(Text(cell) for cell in (row.name, *row.cells)))
+    Console().print(drawn)

@@ -1,0 +1,79 @@
+"""What a run folder tells of a run, whether it has ended or not: its job, its history, and what it came to."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import safetensors
+from pydantic import TypeAdapter, ValidationError
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config.schema import Config
+from pathreplay.inverse.loop.checkpoint import Entry
+from pathreplay.report.watch.run_files import read_own
+from pathreplay.runs.run_folder import CHECKPOINT, read_job
+
+_HISTORY = TypeAdapter(list[Entry])
+
+
+@dataclass(frozen=True)
+class Past:
+    """A run by its folder; ``name`` tells it from others that are looked at beside it."""
+
+    folder: Path
+    name: str
+
+    @cached_property
+    def config(self) -> Config:
+        """Raises PathreplayError where it cannot be read."""
+        return read_job(self.folder).config
+
+    @cached_property
+    def history(self) -> list[Entry]:
+        """Up to the last checkpoint. Raises PathreplayError where that is missing or damaged."""
+        path = self.folder / CHECKPOINT
+        try:
+            with safetensors.safe_open(str(path), framework="numpy") as file:
+                return _HISTORY.validate_json((file.metadata() or {}).get("history", ""), strict=True)
+        except (OSError, safetensors.SafetensorError, ValidationError) as error:
+            why = "its history is damaged" if isinstance(error, ValidationError) else str(error)
+            raise PathreplayError(f"Checkpoint {path} cannot be read ({why}); give the folder of a whole run") from None
+
+    @cached_property
+    def views(self) -> dict[str, dict[str, Any]]:
+        """What views.json says of each view; empty before the end of the run."""
+        table = self._json("views.json")
+        return table if all(isinstance(view, dict) for view in table.values()) else {}
+
+    def likeness(self, view: str, kind: str) -> float | None:
+        """PSNR or SSIM of a view in the result."""
+        result = self.views.get(view, {}).get("result")
+        value = result.get(kind) if isinstance(result, dict) else None
+        return float(value) if isinstance(value, (int, float)) else None
+
+    def held_out(self) -> list[str]:
+        return [name for name, view in self.views.items() if view.get("held_out") is True]
+
+    def _json(self, name: str) -> dict[str, Any]:
+        try:
+            table = json.loads(read_own(self.folder / name) or b"{}")
+        except (ValueError, RecursionError):
+            raise PathreplayError(f"{self.folder / name} is no JSON; give the folder of a whole run") from None
+        return table if isinstance(table, dict) else {}
+
+
+def pasts(folders: list[Path]) -> list[Past]:
+    """The runs in these folders, by names that differ. Raises PathreplayError where one is no run."""
+    names = [folder.resolve().name for folder in folders]
+    found = []
+    for folder, name in zip(folders, names, strict=True):
+        if not (folder / "run.json").is_file():
+            raise PathreplayError(f"{folder} is no run folder (no run.json); give a folder that optimize has made")
+        found.append(Past(folder, name if names.count(name) == 1 else str(folder)))
+    if len({past.folder.resolve() for past in found}) < len(found):
+        raise PathreplayError("A run is named twice; name different ones")
+    return found

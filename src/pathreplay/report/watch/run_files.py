@@ -1,0 +1,104 @@
+"""What a run folder shows to who looks at it: its page or its report, its pictures, and whether it is under way."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import socket
+import stat
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from pathreplay.errors import PathreplayError
+from pathreplay.platform.files import file_problem
+from pathreplay.report.live_page import FOLDER, PAGE, PAGES, STOP
+from pathreplay.report.pages.page import Page
+from pathreplay.runs.folder_lock import LOCK
+
+REPORT = "report.html"
+# Far above what any of these takes.
+MOST_BYTES = 256 * 2**20
+PICTURES = {".png": "image/png", ".webp": "image/webp"}
+
+
+def require_run(run: Path) -> None:
+    """Raise PathreplayError where there is nothing to look at."""
+    if not run.is_dir():
+        raise PathreplayError(f"No run folder {run}; give a folder that optimize has made")
+    if not (run / "run.json").is_file():
+        raise PathreplayError(f"{run} is no run folder (no run.json); give a folder that optimize has made")
+    if not (run / PAGE).is_file() and not (run / REPORT).is_file():
+        raise PathreplayError(f"Run folder {run} shows nothing yet: there is no {PAGE} and no {REPORT}; wait for one")
+
+
+def read_own(path: Path) -> bytes | None:
+    """The content of a regular file of the run; None where there is none, or a link is in its place."""
+    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    try:
+        with open(os.open(path, flags), "rb") as file:
+            about = os.fstat(file.fileno())
+            return file.read() if stat.S_ISREG(about.st_mode) and about.st_size <= MOST_BYTES else None
+    except (OSError, ValueError):
+        return None
+
+
+def picture(run: Path, name: str) -> tuple[str, bytes] | None:
+    """Kind and content of a picture among the previews; None for whatever is not there, or somewhere else."""
+    kind = PICTURES.get(Path(name).suffix)
+    if kind is None or not re.fullmatch(r"[\w.-]+", name) or (run / FOLDER).is_symlink():
+        return None
+    data = read_own(run / FOLDER / name)
+    return None if data is None else (kind, data)
+
+
+def report(run: Path) -> bytes | None:
+    """The report, where the run has ended with one: then it is newer than the page that followed the run."""
+    with contextlib.suppress(OSError):
+        written = (run / REPORT).stat().st_mtime_ns
+        with contextlib.suppress(FileNotFoundError):
+            if (run / PAGE).stat().st_mtime_ns > written:
+                return None
+        return read_own(run / REPORT)
+    return None
+
+
+def page(run: Path) -> Page:
+    """What the page of the run says. Raises PathreplayError where it is damaged."""
+    path = run / PAGE
+    if problem := file_problem(path, MOST_BYTES):
+        raise PathreplayError(f"{path} {problem}; wait for the run to write it")
+    try:
+        return PAGES.validate_json(read_own(path) or b"", strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise PathreplayError(f"{path} is damaged ({where}: {first['msg']}); wait for the run to write it") from None
+
+
+def holder(run: Path) -> str | None:
+    """The process that holds the run, as far as this machine can tell; None where it has ended."""
+    data = read_own(run / LOCK) or b""
+    match = re.fullmatch(r"(\d+) ([\w.-]+)\s*", data.decode("ascii", "replace"))
+    if match is None:
+        return None
+    if match[2] == socket.gethostname():
+        try:
+            os.kill(int(match[1]), 0)
+        except PermissionError:
+            pass
+        except (OSError, OverflowError):
+            return None
+    return f"process {match[1]} on {match[2]}"
+
+
+def ask_to_stop(run: Path) -> None:
+    """Leave the wish to stop where the loop looks for it. Raises PathreplayError where that cannot be written."""
+    # A pipe that nobody reads, say, must not keep us waiting.
+    flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    try:
+        os.close(os.open(run / STOP, flags, 0o644))
+    except OSError as error:
+        why = file_problem(run / STOP) or f"cannot be written ({error.strerror})"
+        raise PathreplayError(f"{run / STOP} {why}; remove it, or stop the run with SIGTERM") from None

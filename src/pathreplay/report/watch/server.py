@@ -1,0 +1,221 @@
+"""A small server for one run: its page, the pictures of that, and a button that asks it to stop; nothing else.
+
+All addresses begin with a token that only who started the server knows. A page of another host that has its own name
+lead here (DNS rebinding) is refused by the name that it asks for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import ipaddress
+import secrets
+import socket
+import sys
+import threading
+import time
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from pathreplay.errors import PathreplayError
+from pathreplay.report.live_page import FOLDER
+from pathreplay.report.pages.document import document, policy
+from pathreplay.report.watch import run_files
+
+# Seconds after which a client is left that has not said what it wants, or not taken what it is sent.
+PATIENCE = 30
+# Connections at once: several browsers. More get no answer.
+MOST = 32
+
+
+class RunServer(ThreadingHTTPServer):
+    """Serves ``run`` at ``address``, a URL with a token in it, until `shutdown`."""
+
+    daemon_threads = True
+    request_queue_size = MOST
+
+    def __init__(self, run: Path, host: str, port: int, token: str | None = None) -> None:
+        """Raises PathreplayError where the address cannot be listened at."""
+        self.run = run
+        self.room = threading.BoundedSemaphore(MOST)
+        self.token = token or secrets.token_urlsafe(18)
+        try:
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+            self.address_family = found[0]
+            super().__init__(found[4], Handler)  # type: ignore[arg-type]
+        except (OSError, OverflowError, UnicodeError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise PathreplayError(
+                f"Nothing can be served at {host}, port {port} ({why}); give another --port or --host"
+            ) from None
+        self.names = {"localhost", host.lower(), socket.gethostname().lower(), socket.getfqdn().lower()}
+        everywhere = host in ("", "0.0.0.0", "::")
+        shown = socket.gethostname() if everywhere else f"[{host}]" if ":" in host else host
+        self.address = f"http://{shown}:{self.server_address[1]}/{self.token}/"
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """In a thread of its own, where there is room for one more."""
+        if not self.room.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer, and make room again."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self.room.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that goes away is no error of ours."""
+        if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
+            super().handle_error(request, client_address)
+
+    def knows(self, host: str) -> bool:
+        """Whether a request for this name may be answered: an address in numbers, or a name of this machine."""
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        with contextlib.suppress(ValueError):
+            ipaddress.ip_address(name)
+            return True
+        return name in self.names
+
+
+class _Within(io.RawIOBase):
+    """What a client sends until a moment; then reading raises TimeoutError, however many bytes still drip."""
+
+    def __init__(self, connection: socket.socket, seconds: float) -> None:
+        self.connection, self.end = connection, time.monotonic() + seconds
+
+    def readable(self) -> bool:
+        """It is."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Wait for bytes as long as there is time."""
+        if (left := self.end - time.monotonic()) <= 0:
+            raise TimeoutError
+        self.connection.settimeout(left)
+        try:
+            return self.connection.recv_into(buffer)
+        finally:
+            self.connection.settimeout(PATIENCE)
+
+
+class Handler(BaseHTTPRequestHandler):
+    """Answers one request, the only one of its connection: what is sent behind it is never read."""
+
+    server: RunServer
+    timeout = PATIENCE
+    protocol_version = "HTTP/1.0"
+    server_version, sys_version = "pathreplay", ""
+
+    def setup(self) -> None:
+        """Give the client a time in which to say what it wants."""
+        super().setup()
+        self.rfile = io.BufferedReader(_Within(self.connection, PATIENCE))
+
+    def do_GET(self) -> None:
+        """The page, or one of its pictures."""
+        place = self._place()
+        if place is None:
+            return
+        if place == "":
+            self._page()
+        elif place.startswith(f"{FOLDER}/") and (found := run_files.picture(self.server.run, place[len(FOLDER) + 1 :])):
+            self._answer(200, *found)
+        else:
+            self._answer(404, "text/plain", b"not here\n")
+
+    def do_POST(self) -> None:
+        """A wish to stop the run."""
+        place = self._place()
+        if place is None:
+            return
+        if place != "stop" or not self._from_our_page():
+            self._answer(404 if place != "stop" else 403, "text/plain", b"not here\n")
+            return
+        try:
+            run_files.ask_to_stop(self.server.run)
+        except PathreplayError as error:
+            self._answer(500, "text/plain", f"{error}\n".encode())
+        else:
+            self._answer(200, "text/plain", b"stopping\n")
+
+    def _from_our_page(self) -> bool:
+        """Whether no page of another origin asks."""
+        origin = self.headers.get("Origin")
+        with contextlib.suppress(ValueError):  # what is no URL
+            return origin is None or urlsplit(origin).netloc == self.headers.get("Host")
+        return False
+
+    def _place(self) -> str | None:
+        """What is asked for behind the token; None where the request was refused."""
+        if not self.server.knows(self.headers.get("Host", "")):
+            self._answer(403, "text/plain", b"this server is not called that\n")
+            return None
+        try:
+            path = urlsplit(self.path).path
+        except ValueError:
+            self._answer(404, "text/plain", b"this is no address\n")
+            return None
+        token, slash, place = unquote(path).lstrip("/").partition("/")
+        if not secrets.compare_digest(token.encode("utf-8", "replace"), self.server.token.encode()):
+            self._answer(403, "text/plain", b"give the whole address that pathreplay watch printed\n")
+            return None
+        if not slash:  # what the page names would be looked for beside it
+            self._answer(404, "text/plain", b"the address ends with a /\n")
+            return None
+        return place
+
+    def _page(self) -> None:
+        run = self.server.run
+        if (report := run_files.report(run)) is not None:
+            self._answer(200, "text/html; charset=utf-8", report)
+            return
+        try:
+            page = run_files.page(run)
+        except PathreplayError as error:
+            self._answer(500, "text/plain; charset=utf-8", f"{error}\n".encode())
+            return
+        held = run_files.holder(run)
+        gone = () if held else ("The process of this run has ended without a report.",)
+        self._answer(200, "text/html; charset=utf-8", document(replace(page, notices=gone + page.notices), live=True))
+
+    def _answer(self, status: int, kind: str, data: bytes) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Content-Security-Policy", policy("'self' data:", "'self'") + "; frame-ancestors 'none'")
+        for name, value in SAFE.items():
+            self.send_header(name, value)
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(data)
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        """Says nothing: the terminal belongs to the address."""
+
+
+SAFE = {
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+}
+
+
+def serve(server: RunServer) -> None:
+    """Answer until a signal ends the command; the port is free then."""
+    try:
+        server.serve_forever(poll_interval=0.2)
+    finally:
+        server.server_close()

@@ -1,0 +1,42 @@
+"""The history of a run for TensorBoard: loss, errors and norms of gradients, by iteration, at the times they had."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+from pathreplay.errors import PathreplayError
+from pathreplay.report.watch.past import Past
+
+
+def write_events(run: Past, output: Path) -> int:
+    """Write event files into ``output``, a folder of its own for each run; returns how many iterations there are.
+
+    Raises PathreplayError where the package tensorboard is absent, or the folder cannot be written.
+    """
+    try:
+        from tensorboard.summary import Writer
+    except ImportError:
+        raise PathreplayError(
+            "TensorBoard is not installed; pip install 'pathreplay[tensorboard]', or tensorboard by itself"
+        ) from None
+    history = run.history
+    folder = output / Path(run.name).name
+    if folder.exists():
+        raise PathreplayError(f"{folder} exists; remove it, or give another --output")
+    began = (run.folder / "run.json").stat().st_mtime
+    times = itertools.accumulate((entry.seconds for entry in history), initial=began)
+    next(times)
+    try:
+        writer = Writer(str(folder))
+        for entry, time in zip(history, times, strict=True):
+            scalars = {"loss": entry.loss, "penalty": entry.penalty, "picture_error": entry.picture_error}
+            scalars |= {f"error/{key}": value for key, value in entry.errors.items()}
+            scalars |= {f"gradient_norm/{key}": value for key, value in entry.gradient_norms.items()}
+            for tag, value in scalars.items():
+                if value is not None:
+                    writer.add_scalar(tag, value, entry.iteration, wall_time=time)
+        writer.close()
+    except OSError as error:
+        raise PathreplayError(f"{folder} cannot be written ({error.strerror}); give another --output") from None
+    return len(history)

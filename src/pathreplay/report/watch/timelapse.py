@@ -1,0 +1,117 @@
+"""A film of a recovery: the target beside what the run saw of it, iteration by iteration, as WebP or as MP4."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+
+import PIL.Image
+import PIL.ImageDraw
+import PIL.ImageFont
+
+from pathreplay.errors import PathreplayError
+from pathreplay.report.live_page import FOLDER, frames
+from pathreplay.report.watch.run_files import read_own
+
+# Pixels: of the pictures, and of the line of text below them.
+HEIGHT, TEXT = 288, 24
+# Textures and volumes beside the view.
+MOST_BESIDE = 2
+KINDS = (".webp", ".mp4")
+
+
+def film(run: Path, output: Path, view: str | None = None, seconds: float = 6.0) -> int:
+    """Write the film of a view (the first, if none is named) to ``output``; returns how many frames it has.
+
+    Raises PathreplayError where the run has no frames, the kind of file is unknown, or ffmpeg is wanted and absent.
+    """
+    if output.suffix.lower() not in KINDS:
+        raise PathreplayError(f"--output {output} is neither .webp nor .mp4; give a name that ends so")
+    pictures = _pictures(run, view)
+    pause = max(20, round(1000 * seconds / len(pictures)))
+    part = output.with_name(f".{output.stem}.part{output.suffix}")
+    try:
+        if output.suffix.lower() == ".webp":
+            durations = [pause] * (len(pictures) - 1) + [pause + 1500]
+            pictures[0].save(
+                part, "webp", save_all=True, append_images=pictures[1:], duration=durations, loop=0, quality=85
+            )
+        else:
+            _mp4(pictures, part, 1000 / pause)
+        part.replace(output)
+    except OSError as error:
+        raise PathreplayError(
+            f"{output} cannot be written ({error.strerror or error}); give another --output"
+        ) from None
+    finally:
+        part.unlink(missing_ok=True)
+    return len(pictures)
+
+
+def _pictures(run: Path, view: str | None) -> list[PIL.Image.Image]:
+    by_what: dict[str, dict[int, Path]] = {}
+    for iteration, what, path in frames(run):
+        by_what.setdefault(what, {})[iteration] = path
+    views = [what.removeprefix("view-") for what in by_what if what.startswith("view-")]
+    if not views:
+        raise PathreplayError(f"Run {run} has no frames in {FOLDER}; run the job with preview.share above 0")
+    if view is not None and view not in views:
+        raise PathreplayError(f"Run {run} has no frames of view '{view}', but of {', '.join(views)}; name one of them")
+    chosen = view or views[0]
+    beside = [what for what in by_what if not what.startswith("view-")][:MOST_BESIDE]
+    target = _opened(run / FOLDER / f"target-{chosen}.png")
+    whole = [i for i in by_what[f"view-{chosen}"] if all(i in by_what[what] for what in beside)]
+    if not whole:
+        raise PathreplayError(f"Run {run} has no frames of '{chosen}' and its textures at one time; make a new run")
+    sheets = []
+    for i in whole:
+        now = {"target": target, f"after {i} iterations": _opened(by_what[f"view-{chosen}"][i])}
+        now |= {what.split("-", 1)[1]: _opened(by_what[what][i]) for what in beside}
+        sheets.append(now)
+    # Grids that were refined had other sizes before; a film has one.
+    sizes = [(max(2, round(p.width * HEIGHT / p.height)), HEIGHT) for p in sheets[-1].values()]
+    return [_side_by_side(now, sizes) for now in sheets]
+
+
+def _side_by_side(pictures: Mapping[str, PIL.Image.Image], sizes: list[tuple[int, int]]) -> PIL.Image.Image:
+    """Pictures in these sizes with a line of text below each; the sides are even numbers, as videos need them."""
+    width = sum(w for w, _ in sizes) + 4 * (len(sizes) - 1)
+    sheet = PIL.Image.new("RGB", (width + width % 2, HEIGHT + TEXT), (20, 23, 27))
+    draw, font, x = PIL.ImageDraw.Draw(sheet), PIL.ImageFont.load_default(14), 0
+    for (name, picture), size in zip(pictures.items(), sizes, strict=True):
+        # Texels stay squares; what is made smaller is averaged.
+        kind = PIL.Image.Resampling.NEAREST if picture.height <= HEIGHT else PIL.Image.Resampling.BOX
+        sheet.paste(picture.resize(size, kind), (x, 0))
+        draw.text((x + 4, HEIGHT + 3), name[: max(4, size[0] // 8)], fill=(231, 234, 238), font=font)
+        x += size[0] + 4
+    return sheet
+
+
+def _opened(path: Path) -> PIL.Image.Image:
+    try:
+        return PIL.Image.open(io.BytesIO(read_own(path) or b"")).convert("RGB")
+    except (OSError, ValueError, PIL.Image.DecompressionBombError):
+        raise PathreplayError(f"Picture {path} is missing or damaged; start the job from its config") from None
+
+
+def _mp4(pictures: list[PIL.Image.Image], path: Path, rate: float) -> None:
+    tool = shutil.which("ffmpeg")
+    if tool is None:
+        raise PathreplayError(
+            "MP4 needs ffmpeg, which is not installed; install it, or give an --output that ends in .webp"
+        )
+    width, height = pictures[0].size
+    command = [
+        tool, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}",
+        "-r", f"{rate:.4f}", "-i", "-", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path.absolute()),
+    ]  # fmt: skip
+    data = b"".join(picture.tobytes() for picture in pictures)
+    done = subprocess.run(command, input=data, capture_output=True, check=False)
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip().splitlines()
+        raise PathreplayError(
+            f"ffmpeg failed ({said[-1] if said else done.returncode}); take an --output that ends in .webp"
+        )

@@ -1,0 +1,1 @@
+"""Run folders: what a job writes, and the lock of who writes it."""

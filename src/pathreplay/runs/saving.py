@@ -1,0 +1,140 @@
+"""A run in its folder: what is written of it at the start and now and then, and how it goes on from that."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+from pathreplay.errors import PathreplayError
+from pathreplay.integrators.film.image import picture_shape
+from pathreplay.inverse.dataset.targets import Targets
+from pathreplay.inverse.images.io import Image, exr_bytes, read_image
+from pathreplay.inverse.loop import checkpoint
+from pathreplay.inverse.loop.checkpoint import Run
+from pathreplay.inverse.loop.checksums import Sums, with_sums
+from pathreplay.inverse.loop.events import Event, Started, Stepped, Stopped
+from pathreplay.inverse.parameters.values import require_finite_array
+from pathreplay.inverse.problem.problem import Problem
+from pathreplay.platform.atomic_files import Content, made
+from pathreplay.platform.files import file_problem
+from pathreplay.runs.run_folder import CHECKPOINT, RIVAL_CHECKPOINT, RunFolder
+
+CAPTURE = "capture.sha256"
+"""What tells the cameras of a run from those of a capture that was changed since."""
+
+
+class Saving:
+    """Writes the checkpoints of a run into the folder, after every so many iterations (``every``) and at the end."""
+
+    def __init__(self, folder: RunFolder, run: Run, every: int) -> None:
+        self.folder, self.run, self.every = folder, run, every
+        self.saved = 0
+
+    def observe(self, event: Event) -> None:
+        """Raises PathreplayError where the folder is gone, or cannot be written."""
+        if isinstance(event, Started):
+            self.saved = event.done
+        elif isinstance(event, Stepped):
+            done = event.entry.iteration + 1
+            self.folder.require_in_place(f"iterations {self.saved + 1} to {done} are")
+            if done % self.every == 0:
+                self._write(done)
+        elif isinstance(event, Stopped) and event.done > self.saved:
+            self._write(event.done)
+
+    def close(self) -> None:
+        """Write what is not yet saved. Raises as `observe` does."""
+        if self._runs_are_whole() and len(self.run.history) > self.saved:
+            self._write(len(self.run.history))
+
+    def rescued(self) -> bool:
+        """Write what is not yet saved after an error of the run; whether all that was done is saved now."""
+        if not self._runs_are_whole() or not self.run.history:
+            return False
+        with contextlib.suppress(PathreplayError):  # the first error is the one to tell
+            self.close()
+        return self.saved == len(self.run.history)
+
+    def _runs_are_whole(self) -> bool:
+        return all(run.whole for run in _runs(self.run).values())
+
+    def _write(self, done: int) -> None:
+        self.folder.write(_checkpoints(self.run))
+        self.saved = done
+
+
+def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict[str, Content]:
+    """What a run goes on from, by name: targets, pictures of its start (by view), their checksums, checkpoints."""
+    pictures = {_picture("target", view.name): view.target for view in problem.views}
+    pictures |= {_picture("weight", view.name): view.weight for view in problem.views if view.weight is not None}
+    pictures |= {_picture("start", name): image for name, image in before.items()}
+    files = with_sums({name: made(exr_bytes, image) for name, image in pictures.items()})
+    if problem.capture is not None:
+        files[CAPTURE] = problem.capture.encode() + b"\n"
+    return files | _checkpoints(run)
+
+
+def saved_targets(folder: Path) -> Targets:
+    """The targets in a run folder. Raises PathreplayError where one is not what was written."""
+    sums = Sums(folder)
+    images, weights = (
+        {path.stem.removeprefix(f"{kind}-"): _read(path, sums) for path in sorted(folder.glob(_picture(kind, "*")))}
+        for kind in ("target", "weight")
+    )
+    return Targets(images, weights)
+
+
+def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) -> dict[str, Image]:
+    """Bring a run to where the folder's checkpoint was; returns the pictures of its start.
+
+    ``held`` are variables that some stages do not step.
+
+    Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
+    """
+    _require_capture(folder / CAPTURE, problem)
+    keep, sums = problem.album.keep, Sums(folder)
+    before = {view.name: keep(_read(folder / _picture("start", view.name), sums)) for view in problem.views}
+    for view in problem.views:
+        wanted = picture_shape(problem.scene.sensors()[view.sensor])
+        for kind, found in (("target", view.target), ("start", before[view.name])):
+            path = folder / _picture(kind, view.name)
+            if found.shape != wanted:
+                raise PathreplayError(
+                    f"{path} has shape {found.shape} (height, width, channels), sensor '{view.name}' renders {wanted}; "
+                    "start the job from its config"
+                )
+            require_finite_array(str(path), found)
+    for name, each in _runs(run).items():
+        checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables}, held)
+    return before
+
+
+def _require_capture(path: Path, problem: Problem) -> None:
+    """Raise PathreplayError if the cameras of the capture are no longer those that the run was started with."""
+    if problem.capture is None:
+        return
+    try:
+        saved = "" if file_problem(path, 1024) else path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError):
+        saved = ""
+    if saved != problem.capture:
+        changed = "has other cameras than when this run was started" if saved else f"has no mark in {path}"
+        raise PathreplayError(f"The capture {changed}; put it back as it was, or start a new run")
+
+
+def _runs(run: Run) -> dict[str, Run]:
+    return {CHECKPOINT: run} if run.rival is None else {CHECKPOINT: run, RIVAL_CHECKPOINT: run.rival}
+
+
+def _checkpoints(run: Run) -> dict[str, Content]:
+    return {name: checkpoint.save(each) for name, each in _runs(run).items()}
+
+
+def _picture(kind: str, view: str) -> str:
+    return f"images/{kind}-{view}.exr"
+
+
+def _read(path: Path, sums: Sums) -> Image:
+    sums.require(path)
+    return read_image(path)

@@ -1,0 +1,1 @@
+"""Random numbers: counter-based, Owen-scrambled Sobol points, and those of pixels."""

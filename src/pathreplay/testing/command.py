@@ -1,0 +1,137 @@
+"""Checks for a reader: how far they are, each when it is done, a JSON file for other programs."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
+
+from pathreplay.errors import PathreplayError
+from pathreplay.platform.files import file_problem
+from pathreplay.platform.traversal import traversed
+from pathreplay.scenes.parameters import resolve_differentiable
+from pathreplay.testing.gradient import GradientCheck, check_gradient
+from pathreplay.testing.reference import Spec, integrator_under_test
+
+# Seconds between two lines where standard error is no terminal.
+_PAUSE_S = 10.0
+_STYLES = {"pass": "green", "zero": "green", "fail": "bold red", "inconclusive": "yellow"}
+
+
+def check_all(
+    scene: mi.Scene,
+    patterns: Sequence[str],
+    *,
+    integrator: Spec = None,
+    max_depth: int | None = None,
+    edges: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Iterator[GradientCheck]:
+    """``check_gradient(scene, key, **options)`` of each key that the patterns name, as soon as it is there.
+
+    Standard error tells how far it is. ``edges`` are further properties of `pathreplay`. Raises what
+    :func:`check_gradient` and :func:`resolve_differentiable` do.
+    """
+    tested = integrator_under_test(integrator, scene, max_depth, edges)
+    keys = resolve_differentiable(traversed(scene), patterns, tested)
+    for i, key in enumerate(keys):
+        with _told(f"{key} ({i + 1}/{len(keys)})") as progress:
+            result = check_gradient(scene, key, integrator=tested, progress=progress, **options)
+        yield result
+
+
+@contextmanager
+def _told(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar on standard error that goes when all is done; where that is no terminal, a line now and then."""
+    console = Console(stderr=True, force_jupyter=False)
+    if console.is_terminal:
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console, transient=True) as bar:
+            task = bar.add_task(escape(what), total=None)
+            yield lambda done, total: bar.update(task, completed=done, total=total)
+        return
+
+    def say(line: str) -> None:
+        console.print(Text(f"pathreplay: {line}"), soft_wrap=True)
+
+    last = [time.monotonic()]
+
+    def tell(done: int, total: int) -> None:
+        if done == 0:
+            say(f"checking {what}")
+        elif time.monotonic() - last[0] >= _PAUSE_S:
+            last[0] = time.monotonic()
+            say(f"{what}: {done} of {total} renderings")
+
+    yield tell
+
+
+def print_checks(results: Iterable[GradientCheck]) -> list[GradientCheck]:
+    """Print what is compared, then for each parameter the verdict, the two estimates, and what the verdict means.
+
+    Each is printed when it comes. Returns them all.
+    """
+    console = Console(highlight=False, soft_wrap=True)
+    printed: list[GradientCheck] = []
+    for result in results:
+        if not printed:
+            console.print(
+                f"{result.integrator} ({result.mode}) against finite differences of {result.reference_integrator}: "
+                f"{result.seeds} seeds, {result.spp} spp (differences {result.fd_spp} spp)\n"
+            )
+        printed.append(result)
+        verdict = Text(f"{result.verdict.upper():<6}", style=_STYLES[result.verdict])
+        reference_error = math.hypot(result.reference_se, result.step_error)
+        console.print(verdict, Text(result.key, style="bold"))
+        console.print(f"       gradient   {_with_error(result.gradient, result.gradient_se)}")
+        console.print(f"       reference  {_with_error(result.reference, reference_error)}")
+        console.print(f"       z = {result.z:+.2f}   {result.reason}\n")
+    counts = Counter(result.verdict for result in printed)
+    console.print(f"{len(printed)} checked: " + ", ".join(f"{n} {verdict}" for verdict, n in counts.items()))
+    return printed
+
+
+def _with_error(value: float, error: float) -> str:
+    """'+0.03199 ± 0.00015': the value as far as its error, which has two digits, lets it be known."""
+    if not (math.isfinite(value) and math.isfinite(error)):
+        return f"{value:+.4g}"
+    if error == 0:
+        return f"{value:+.5g} ± 0"
+    digits = 1 - math.floor(math.log10(error))
+    if not 0 <= digits <= 7:
+        return f"{value:+.3e} ± {error:.1e}"
+    return f"{value:+.{digits}f} ± {error:.{digits}f}"
+
+
+def write_checks(results: Sequence[GradientCheck], path: Path) -> None:
+    """Write all fields of the checks as a JSON list, the samples too; NaN and infinity become null."""
+    records = [{**asdict(result), "passed": result.passed, "variant": mi.variant()} for result in results]
+    finite = json.loads(json.dumps(records), parse_constant=lambda name: None)
+    try:
+        path.write_text(json.dumps(finite, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise PathreplayError(f"{path} cannot be written ({error.strerror}); give --json another file") from None
+
+
+def require_writable(path: Path) -> None:
+    """Raise PathreplayError for what is no regular file, has no folder, or may not be written."""
+    problem = file_problem(path)
+    if problem.startswith(("is ", "cannot be reached")):
+        raise PathreplayError(f"{path} {problem}; give --json the name of a file")
+    if not path.parent.is_dir():
+        raise PathreplayError(f"Folder {path.parent} for {path.name} does not exist; make it first")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise PathreplayError(f"{path} may not be written (its permissions); give --json another file")

@@ -1,0 +1,166 @@
+"""Truths and timings on a machine with a GPU, into one file that can be sent in: `pathreplay doctor --gpu`.
+
+Each item runs in a process of its own, since what does not fit a device may bring the process down; an item that does
+is told in the file, and the others go on.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timezone
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from pathreplay import __version__
+from pathreplay.errors import PathreplayError
+from pathreplay.platform import backend, interrupts
+from pathreplay.platform.atomic_files import require_writable, write_whole
+from pathreplay.platform.device import device_of
+
+TIMEOUT_S = 300
+"""Of an item: far above what any takes on a processor."""
+ROUNDS = 7
+WALLS = "red.reflectance.value"
+
+# Scene, its arguments, the parameter, and options of `check_gradient`: surfaces, what moves, textures, media.
+TRUTHS: dict[str, tuple[str, dict[str, int], str, dict[str, Any]]] = {
+    "colour of a wall": ("cornell-box", {"resolution": 32}, WALLS, {}),
+    "texture": ("cornell-box-photo", {"resolution": 32, "texture": 16}, "back.bsdf.reflectance.data", {}),
+    "index of glass": ("glass-pane", {"resolution": 24}, "glass.eta", {}),
+    "density": ("cloud", {"resolution": 16, "grid": 8, "views": 1}, "cloud.interior_medium.sigma_t.data", {}),
+}
+# Integrator and options, side of the picture, samples per pixel, depth.
+TIMINGS: dict[str, tuple[dict[str, Any], int, int, int]] = {
+    f"{name}, {side} x {side}, depth {depth}": ({"type": kind, **more}, side, 16, depth)
+    for side in (128, 512)
+    for depth in (8, 64)
+    for name, kind, more in (
+        ("prb", "prb", {}),
+        ("sweep", "pathreplay", {"driver": "sweep"}),
+        ("replay", "pathreplay", {"driver": "replay"}),
+    )
+}
+# What `auto` is to decide: what records of so many vertices cost, and where there are none.
+TIMINGS |= {
+    f"{driver}, 512 x 512, depth {depth}": ({"type": "pathreplay", "driver": driver}, 512, 16, depth)
+    for driver, depth in (("sweep", 256), ("sweep", 448), ("replay", 448), ("replay", 2048))
+}
+
+
+@dataclass(frozen=True)
+class Item:
+    """What came of one item: facts, or why there are none."""
+
+    name: str
+    facts: dict[str, Any]
+    error: str = ""
+
+
+def examine(variant: str | None, output: Path, names: Sequence[str] = (), tell: Callable[[str], None] = print) -> str:
+    """Run all items (or those named) in a variant (default: cuda_ad_rgb), and write the file; returns the last line.
+
+    Raises PathreplayError where the variant does not run here, or the file cannot be written.
+    """
+    require_writable(output, "--output")
+    with interrupts.undisturbed():
+        chosen = backend.set_variant(variant or "cuda_ad_rgb")
+    device = device_of(chosen)
+    if variant is None and not device.is_gpu:
+        raise PathreplayError(f"{chosen} does not run on a GPU; leave --gpu out")
+    found = []
+    for name in names or (*(f"truth: {n}" for n in TRUTHS), *(f"time: {n}" for n in TIMINGS)):
+        found.append(_in_process(chosen, name))
+        tell(f"{name}: {found[-1].error or _told(found[-1].facts)}")
+    report = {
+        "pathreplay": __version__,
+        "mitsuba": version("mitsuba"),
+        "drjit": version("drjit"),
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "variant": chosen,
+        "device": asdict(device),
+        "items": [asdict(item) for item in found],
+    }
+    write_whole(output, json.dumps(report, indent=1).encode() + b"\n", "--output")
+    wrong = [item.name for item in found if item.error or item.facts.get("verdict") == "fail"]
+    return f"{output}: {len(found)} items, {len(wrong)} failed" + (f" ({'; '.join(wrong)})" if wrong else "")
+
+
+def _told(facts: dict[str, Any]) -> str:
+    if "verdict" in facts:
+        return f"{facts['verdict']} (z = {facts['z']:+.1f})"
+    return f"{facts['seconds']:.4f} s"
+
+
+def _in_process(variant: str, name: str) -> Item:
+    command = [sys.executable, "-m", "pathreplay.testing.gpu", variant, name]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return Item(name, {}, f"gave no answer within {TIMEOUT_S} s")
+    lines = [line for line in done.stdout.splitlines() if '{"facts"' in line]
+    if done.returncode or not lines:
+        last = [line for line in done.stderr.splitlines() if line.strip()] or [f"ended with status {done.returncode}"]
+        return Item(name, {}, last[-1].strip()[:300])
+    return Item(name, json.loads(lines[-1][lines[-1].index('{"facts"') :])["facts"])
+
+
+def truth(name: str) -> dict[str, Any]:
+    """The gradient of a truth next to finite differences."""
+    from pathreplay.scenes.loading import load_scene_for
+    from pathreplay.testing.gradient import check_gradient
+
+    scene, arguments, key, options = TRUTHS[name]
+    loaded, _ = load_scene_for(scene, [key], **arguments)
+    found = check_gradient(loaded, key, **{"seeds": 8, "spp": 64, "fd_spp": 256, **options})
+    facts = {key: getattr(found, key) for key in ("verdict", "gradient", "gradient_se", "reference", "reference_se")}
+    return facts | {"z": found.z if math.isfinite(found.z) else 0.0}
+
+
+def timing(name: str) -> dict[str, Any]:
+    """Seconds of a gradient pass (the fastest and the median of some), and of the first."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from pathreplay.integrators.film.image import picture_shape
+    from pathreplay.scenes.loading import load_scene
+
+    options, side, spp, depth = TIMINGS[name]
+    scene = load_scene("cornell-box", resolution=side)
+    params = mi.traverse(scene)
+    dr.enable_grad(params[WALLS])
+    params.update()
+    integrator = mi.load_dict({**options, "max_depth": depth, "rr_depth": 5})
+    shape = picture_shape(scene.sensors()[0])
+    taken = []
+    for seed in range(ROUNDS + 1):
+        begin = time.perf_counter()
+        integrator.render_backward(scene, params, dr.ones(mi.TensorXf, shape), seed=seed, spp=spp)
+        dr.eval(dr.grad(params[WALLS]))
+        dr.sync_thread()
+        taken.append(time.perf_counter() - begin)
+    return {"first": taken[0], "seconds": statistics.median(taken[1:]), "fastest": min(taken[1:])}
+
+
+def main(variant: str, name: str) -> None:
+    """One item, in this process: its facts go to stdout as a line of JSON."""
+    backend.set_variant(variant)
+    kind, _, what = name.partition(": ")
+    facts = truth(what) if kind == "truth" else timing(what)
+    print(json.dumps({"facts": facts}), flush=True)
+    os._exit(0)  # what a driver does at the end of the process is no part of the item
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

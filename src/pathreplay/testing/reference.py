@@ -1,0 +1,89 @@
+"""Which integrators a check compares: the one under test, and the plain path tracer that serves as its reference.
+
+The reference must estimate the same image: same path length, same treatment of directly visible emitters. These are
+read off the integrator under test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+import mitsuba as mi
+
+from pathreplay.errors import PathreplayError
+from pathreplay.integrators.path_limits import read_limits
+from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.scenes.descriptions import load_integrator
+
+Spec: TypeAlias = "mi.Integrator | Mapping[str, Any] | str | None"
+"""An integrator: finished, described, by name, or left to us."""
+
+NO_ROULETTE = 2**30
+"""A ``rr_depth`` that no path reaches."""
+
+LONGEST_WITHOUT_ROULETTE = 64
+"""Above this length the reference keeps Russian roulette: without it, no path of a closed room ends before its time."""
+
+
+def integrator_under_test(
+    spec: Spec, scene: mi.Scene, max_depth: int | None = None, edges: Mapping[str, Any] | None = None
+) -> mi.Integrator:
+    """The integrator that ``spec`` means: an object (taken as it is), a dictionary, a plugin name, or None.
+
+    None is the scene's own integrator if that one is made for differentiation, else ``pathreplay``. A plugin given by
+    name, or chosen by None, gets the path limits of the scene's own integrator; ``max_depth`` overrides them, and
+    ``edges`` are properties of `pathreplay` that are added (``edges``, ``edge_spp``).
+
+    Raises PathreplayError where Mitsuba cannot make it, ``max_depth`` is no depth or given with a finished one, or
+    edges are asked of another integrator than `pathreplay`.
+    """
+    if max_depth is not None and (type(max_depth) is not int or (max_depth < 1 and max_depth != -1)):
+        raise PathreplayError(f"max_depth is {max_depth!r}; give a path length of at least 1, or -1 for no bound")
+    own = scene.integrator()
+    if spec is None and max_depth is None and not edges and isinstance(own, mi.CppADIntegrator):
+        return own
+    if isinstance(spec, mi.Integrator):
+        if max_depth is not None or edges:
+            what = "max_depth" if max_depth is not None else "edges"
+            raise PathreplayError(f"{what} cannot be given along with a finished integrator; set it there")
+        return spec
+    if isinstance(spec, Mapping):
+        description = dict(spec)
+    else:
+        limits = None if own is None else read_limits(own)
+        description = {"type": spec or "pathreplay", **({} if limits is None else vars(limits))}
+        if description["type"] == "pathreplay" and hasattr(own, "edge_spp"):
+            description |= {"edges": own.edges, "edge_spp": own.edge_spp}
+    if max_depth is not None:
+        description["max_depth"] = max_depth
+    if edges and description.get("type") != "pathreplay":
+        raise PathreplayError(
+            f"'{min(edges)}' is a property of 'pathreplay', and the integrator is '{description.get('type')}'; test "
+            "'pathreplay', or leave it out"
+        )
+    return load_integrator(description | dict(edges or {}))
+
+
+def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> mi.Integrator:
+    """The integrator whose images are differenced: ``spec`` if given, else ``path``, or ``volpath`` with media.
+
+    Its Russian roulette is switched off where paths are short enough. That leaves the expected image alone, keeps
+    decisions from flipping between +h and -h, and lets throughputs be negative, as they are beside a reflectance of 0.
+
+    Raises PathreplayError where the path length of the tested one cannot be read, or ``spec`` cannot be made.
+    """
+    if isinstance(spec, mi.Integrator):
+        return spec
+    if isinstance(spec, Mapping):
+        return load_integrator(dict(spec))
+    limits = read_limits(tested)
+    if limits is None:
+        raise PathreplayError(
+            f"Integrator {type(tested).__name__} does not say its max_depth; pass a reference integrator that computes "
+            "the same image, such as reference={'type': 'path', 'max_depth': 6}"
+        )
+    short = 0 <= limits.max_depth <= LONGEST_WITHOUT_ROULETTE
+    name = spec or ("volpath" if facts_of(scene).has_media else "path")
+    rr_depth = NO_ROULETTE if short else limits.rr_depth
+    return load_integrator({"type": name, **vars(limits), "rr_depth": rr_depth})

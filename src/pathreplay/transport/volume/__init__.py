@@ -1,0 +1,1 @@
+"""Participating media along rays: free flight, transmittance, null boundaries."""

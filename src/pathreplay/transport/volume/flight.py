@@ -1,0 +1,225 @@
+"""Free flight through a medium: delta tracking to the next real collision, and what later passes make of it.
+
+Tentative collisions are drawn from a majorant; at each, chance decides whether it is real. Real ones end the flight,
+as does the surface that bounds the medium. This walk is not differentiated. The derivative is that of the integrand,
+transmittance times scattering coefficient, where it was found:
+
+    d log T = -∫ dσ_t ds,  estimated at evenly spaced points y of the flight:  -(t - a) · mean of dσ_t(y).
+
+It divides by nothing that may be zero, so that it also holds where null collisions are never drawn (a constant grid).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.transport.vertex import Arrival, Flight, NullCollision, TraceConfig, reciprocal
+from pathreplay.transport.volume.media import Media, carried, interaction, is_grid, majorant, span
+
+# Points of a flight at which the derivative of its transmittance is taken. Few leave a variance of their own, many take
+# time; of the cloud of `pathreplay bench media` four make the least of both.
+POINTS = 4
+
+
+def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
+    """1 / (p + c (1 - p)), where p is the probability of a real collision and c counts null ones.
+
+    The derivative of a collision, dσ_s L_s, is needed also where σ_s is zero and collisions are never real. Real ones
+    estimate it with p / (p + c (1 - p)) of their weight, and null ones with c (1 - p) / (p + c (1 - p)): together all.
+    Each real collision has an estimate of L_s, but only one null collision of a path has. With c the inverse of their
+    number all estimates count alike.
+    """
+    return dr.rcp(p + c * (1 - p))
+
+
+@dr.syntax
+def fly(trace: TraceConfig, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: mi.Bool) -> Flight:
+    """Sample the flight along ``at.ray``, in ``at.medium``, up to the surface ``at.hit``. Detached.
+
+    ``β`` is the throughput: in chromatic media a collision is real with probability p = Σ_k β_k σ_k / (σ̄ Σ_k β_k), the
+    history of all channels.
+    """
+    media = trace.media
+    ray, medium = dr.detach(at.ray), at.medium
+    flying = active & (medium != None)  # noqa: E711 (an array of pointers)
+    reach = dr.select(at.hit.is_valid(), at.hit.t, dr.inf)
+    a, b = span(medium, ray, reach, flying)
+    flying &= a < b
+    σ_max = majorant(medium, ray, flying)
+    if dr.hint(trace.branch, mode="scalar"):  # null collisions are wanted also where the whole medium is empty
+        σ_max = dr.maximum(σ_max, dr.select(dr.isfinite(b), dr.rcp(b - a), 0))
+
+    t = mi.Float(a)
+    event = mi.Bool(False)
+    density = mi.Float(1)
+    p_real = mi.Float(1)
+    W = mi.Spectrum(1)
+    σ_s = mi.Spectrum(0)
+    E = mi.Spectrum(0)
+    t_emit, c_emit, count = mi.Float(0), mi.Spectrum(0), mi.Float(0)
+    t_null, ω_null, bare, mass, nulls = mi.Float(0), mi.Spectrum(0), mi.Float(0), mi.Float(0), mi.Float(0)
+
+    while dr.hint(flying, exclude=[trace, at, media], label="pathreplay: flight"):
+        step, σ_bar = _tentative(trace, medium, ray, t, b, sampler.next_1d(flying), σ_max, flying)
+        t_next = t + step
+        inside = flying & (t_next < b)
+        mei = interaction(medium, ray, t_next)
+        σ_s_here, _, σ_t = medium.get_scattering_coefficients(mei, inside)
+        σ_s_here, σ_t = dr.detach(σ_s_here), dr.detach(σ_t)
+
+        if dr.hint(media.emissive, mode="scalar"):
+            for grid in media.grids:
+                if dr.hint(grid.emission is not None, mode="scalar"):
+                    glows = inside & is_grid(grid, medium)
+                    c = mi.Spectrum(W * dr.rcp(σ_bar))
+                    E = dr.select(glows, E + c * dr.detach(grid.emission_at(mei, glows)), E)
+                    count = dr.select(glows, count + 1, count)
+                    picked = glows & (sampler.next_1d(glows) * count < 1)
+                    t_emit = dr.select(picked, t_next, t_emit)
+                    c_emit = dr.select(picked, c, c_emit)
+
+        p = _reality(media, dr.abs(β * W), σ_t, σ_bar)
+        real = inside & (sampler.next_1d(inside) < p)
+        flying = inside & ~real
+        if dr.hint(trace.branch, mode="scalar"):
+            share = trace.branching * branch_weight(p, trace.branching) / σ_bar
+            m = share * dr.mean(dr.abs(β) * dr.maximum(dr.abs(W), 1))
+            mass += dr.select(flying, m, 0)
+            nulls += dr.select(flying, 1, 0)
+            kept = flying & (sampler.next_1d(flying) * mass < m)
+            t_null = dr.select(kept, t_next, t_null)
+            ω_null = dr.select(kept, W * (share / m), ω_null)
+            bare = dr.select(kept, share / m, bare)
+        if dr.hint(media.chromatic, mode="scalar"):
+            W = dr.select(flying, W * (1 - σ_t / σ_bar) * reciprocal(1 - p), W)
+        event |= real
+        density = dr.select(real, p * σ_bar, density)
+        p_real = dr.select(real, p, p_real)
+        σ_s = dr.select(real, σ_s_here, σ_s)
+        t = dr.select(inside, t_next, t)
+
+    along = sampler.next_1d(active)
+    flight = Flight(event=event, t=t, density=density, W=W, along=along, σ_s=σ_s)
+    if dr.hint(media.emissive, mode="scalar"):
+        flight.t_emit, flight.c_emit, flight.E = t_emit, c_emit * count, E
+    if dr.hint(trace.branch, mode="scalar"):
+        flight.p, flight.null = p_real, NullCollision(t_null, ω_null, bare, mass, nulls, sampler.next_1d(active))
+    return flight
+
+
+def _tentative(
+    trace: TraceConfig,
+    medium: mi.MediumPtr,
+    ray: mi.Ray3f,
+    t: mi.Float,
+    b: mi.Float,
+    u: mi.Float,
+    σ: mi.Float,
+    active: mi.Bool,
+) -> tuple[mi.Float, mi.Float]:
+    """How far it is from ``t`` to the next tentative collision, and the majorant there: σ, but in grids."""
+    step = dr.select(σ > 0, -dr.log(1 - u) * dr.rcp(σ), dr.inf)
+    for grid in trace.media.grids:
+        mine = active & is_grid(grid, medium)
+        onward = mi.Ray3f(ray.o + t * ray.d, ray.d, ray.time, ray.wavelengths)
+        onward.maxt = b - t
+        step_grid, σ_grid = grid.free_flight(onward, u, mine)
+        step, σ = dr.select(mine, step_grid, step), dr.select(mine, σ_grid, σ)
+    return step, mi.Float(σ)
+
+
+def _reality(media: Media, βW: mi.Spectrum, σ_t: mi.Spectrum, σ_bar: mi.Float) -> mi.Float:
+    """The probability that a collision is real."""
+    p = σ_t[0] / σ_bar
+    if media.chromatic:
+        total = dr.sum(βW)
+        p = dr.select(total > 0, dr.sum(βW * σ_t) / (σ_bar * total), dr.mean(σ_t) / σ_bar)
+    return dr.clip(p, 0, 1)
+
+
+@dataclass
+class Flown:
+    """A flight once more, differentiable."""
+
+    mei: mi.MediumInteraction3f  # of the collision
+    w: mi.Spectrum  # weight of what comes after, σ_s/density at a collision, times transmittance (1, relative)
+    e: mi.Spectrum  # emission on the way, and a control variate: value zero, derivative of mean zero
+
+
+def fly_again(
+    trace: TraceConfig, at: Arrival, flight: Flight, reach: mi.Float, attached: bool, active: mi.Bool
+) -> Flown:
+    """The kept flight, differentiable in the coefficients of the medium and, if ``attached``, in ray and ``reach``.
+
+    ``reach`` is the distance to the surface (infinity if there is none). A collision keeps its place relative to the
+    two ends of the medium on its ray, so that it moves with the ray and with the surface, and no derivative is lost
+    where the flight is cut off. With b any function of position and direction (`TraceConfig.baseline`),
+
+        (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (the last term at a collision x only)
+
+    is the score of the sampling itself, times b: its mean is zero. It takes out the variance that comes from the
+    radiance being large and its change with the medium small.
+    """
+    medium, ray = at.medium, at.ray
+    in_medium = active & (medium != None)  # noqa: E711
+    event = in_medium & flight.event
+    with dr.suspend_grad(when=not attached):
+        a, b = span(medium, ray, reach, in_medium)
+        t, stretch = flight.t, mi.Float(1)
+        if attached:
+            t, stretch = carried(t, a, b, event)
+        end = dr.select(event, t, b)
+        mei = interaction(medium, ray, t)
+        through = in_medium & dr.isfinite(end)
+        length = dr.select(through, end - a, 0)
+        points = [interaction(medium, ray, a + (flight.along + k) / POINTS * length) for k in range(POINTS)]
+
+    σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
+    σ_y = [medium.get_scattering_coefficients(y, through)[2] for y in points]
+    if trace.branch:  # The rest of the derivative of a collision, but not by its place, is left to null ones.
+        rest = 1 - flight.p * branch_weight(flight.p, trace.branching)
+        still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
+        σ_s, σ_t = (σ - rest * (σ_0 - dr.detach(σ_0)) for σ, σ_0 in ((σ_s, still[0]), (σ_t, still[2])))
+    w_event = σ_s * stretch * dr.rcp(flight.density)
+    w = dr.select(event, w_event, 1) * flight.W
+    e = mi.Spectrum(0)
+    if dr.grad_enabled(σ_y, length):
+        log_T = dr.select(through, -length / POINTS * sum(σ_y), 0)
+        w *= dr.replace_grad(mi.Spectrum(1), log_T)
+        if trace.baseline is not None:
+            σ_bar = majorant(medium, ray, in_medium)
+            guesses = [σ * _guess(trace, y, σ, σ_bar, through) for y, σ in zip(points, σ_y, strict=True)]
+            score = dr.select(through, length / POINTS * sum(guesses), 0)
+            score -= dr.select(event, σ_t * stretch * dr.rcp(flight.density) * _guess(trace, mei, σ_t, σ_bar, event), 0)
+            e += score - dr.detach(score)
+
+    if trace.media.emissive:
+        emitted = mi.Spectrum(0)
+        for grid in trace.media.grids:
+            if grid.emission is not None:
+                glows = in_medium & is_grid(grid, medium) & (flight.t_emit > 0)
+                with dr.suspend_grad(when=not attached):
+                    t, J = flight.t_emit, mi.Float(1)
+                    if attached:
+                        t, J = carried(t, a, b, glows)
+                    length = dr.select(glows, t - a, 0)
+                    at_e = interaction(medium, ray, t)
+                    at_y = interaction(medium, ray, a + flight.along * length)
+                ε = grid.emission_at(at_e, glows) * flight.c_emit * J
+                _, _, σ_y = medium.get_scattering_coefficients(at_y, glows)
+                if dr.grad_enabled(σ_y, length):
+                    ε *= dr.replace_grad(mi.Spectrum(1), -length * σ_y)
+                emitted += dr.select(glows, ε, 0)
+        e += dr.replace_grad(flight.E, emitted)
+    return Flown(mei=mei, w=w, e=e)
+
+
+def _guess(
+    trace: TraceConfig, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool
+) -> mi.Spectrum:
+    """The baseline; where collisions are never real, and null ones not asked, it would be a bias, and is left out."""
+    b = trace.baseline(mei, σ_t, σ_bar, active)  # type: ignore[misc]
+    return b if trace.branch else mi.Spectrum(dr.select(dr.detach(σ_t) != 0, b, 0))

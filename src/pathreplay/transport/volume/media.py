@@ -1,0 +1,122 @@
+"""Facts about the media of a scene, found on the host before a kernel is traced, and what a medium is at one place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.transport.facts.nodes import nodes_of, with_gradients
+
+
+@dataclass(frozen=True)
+class Media:
+    """What the walk wants to know about the media of a scene."""
+
+    grids: tuple[mi.Medium, ...]  # those with functions of their own for free flight and transmittance (`gridmedium`)
+    plain: bool  # there are others, which only Mitsuba knows
+    homogeneous: bool  # some of those have the same coefficients everywhere
+    chromatic: bool  # some extinction differs between channels
+    emissive: bool  # some medium emits
+    passes: bool  # some surface may let light straight through by chance
+    branches: bool  # the gradient by some extinction would miss what collisions tell where there are none
+    around: mi.Medium | None  # the one that the sensor is in
+
+
+def scene_media(
+    media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | None, branches: bool | None = None
+) -> Media | None:
+    """Look at the media of a scene; None if there are none. ``passes`` is that of `Media`; the sensor may be in one.
+
+    So is ``branches``, if it is known already.
+    """
+    if not media:
+        return None
+    grids = tuple(medium for medium in media if hasattr(medium, "free_flight"))
+    plain = [medium for medium in media if not hasattr(medium, "free_flight")]
+    below = set() if sensor is None else nodes_of(sensor)
+    return Media(
+        grids=grids,
+        plain=bool(plain),
+        homogeneous=any(medium.is_homogeneous() for medium in plain),
+        chromatic=any(grid.is_chromatic for grid in grids) or any(map(_is_chromatic, plain)),
+        emissive=any(grid.emission is not None for grid in grids),
+        passes=passes,
+        branches=wants_branch(media) if branches is None else branches,
+        around=next((node for node in below if isinstance(node, mi.Medium)), None),
+    )
+
+
+def _is_chromatic(medium: mi.Medium) -> bool:
+    if dr.size_v(mi.Spectrum) == 1:
+        return False
+    params = mi.traverse(medium)
+    extinction = [params[key] for key in params.keys() if key.startswith("sigma_t.")]
+    one_number = [
+        value.shape[-1] == 1 if dr.is_tensor_v(value) else not dr.is_vector_v(value)
+        for value in extinction
+        if dr.is_tensor_v(value) or dr.is_diff_v(value)
+    ]
+    return not one_number or not all(one_number)
+
+
+def wants_branch(media: Sequence[mi.Medium]) -> bool:
+    """Whether the gradient by some extinction would miss what collisions tell where there are none."""
+    return any(map(_misses, media))
+
+
+def _misses(medium: mi.Medium) -> bool:
+    """Whether the extinction has gradients, and varies in space or is zero, or may be while `dr.freeze` records."""
+    moving = with_gradients(medium, "sigma_t", "scale")
+    known = medium.is_homogeneous() and not dr.flag(dr.JitFlag.FreezingScope)
+    return bool(moving) and not (known and all(dr.all(dr.detach(value) != 0, axis=None) for value in moving))
+
+
+def interaction(medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float) -> mi.MediumInteraction3f:
+    """The interaction at distance ``t`` along ``ray``; it follows both."""
+    mei = dr.zeros(mi.MediumInteraction3f)
+    mei.t = t
+    mei.p = ray.o + t * ray.d
+    mei.wi = -ray.d
+    mei.sh_frame = mi.Frame3f(mei.wi)
+    mei.time = ray.time
+    mei.wavelengths = ray.wavelengths
+    mei.medium = medium
+    return mei
+
+
+def span(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    """The part [a, b] of the ray up to distance ``reach`` in which the medium may interact; empty (a = b = 0) outside.
+
+    Differentiable in the ray and in ``reach``.
+    """
+    met, near, far = medium.intersect_aabb(ray)
+    met &= active & (dr.isfinite(near) | dr.isfinite(far))
+    a, b = dr.maximum(near, 0), dr.minimum(far, reach)
+    met &= a < b
+    return dr.select(met, a, 0), dr.select(met, b, 0)
+
+
+def carried(t: mi.Float, a: mi.Float, b: mi.Float, where: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    """A distance that keeps its place relative to the ends of [a, b] as they move, and how much that stretches.
+
+    Values are those without motion, ``t`` and 1; derivatives are those of a + x (b - a) and (b - a) / (b₀ - a₀), with
+    x the place. Where ``where`` is false, or the end is infinitely far, nothing moves.
+    """
+    a0, b0 = dr.detach(a), dr.detach(b)
+    held = where & dr.isfinite(b0) & (a0 < b0)
+    scale = dr.select(held, dr.rcp(b0 - a0), 0)
+    moved = dr.select(held, dr.replace_grad(t, a + (t - a0) * scale * (b - a)), t)
+    return moved, dr.select(held, dr.replace_grad(mi.Float(1), (b - a) * scale), 1)
+
+
+def majorant(medium: mi.MediumPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+    """An upper bound of the extinction in all channels, everywhere in the medium. Detached."""
+    return dr.max(dr.detach(medium.get_majorant(interaction(medium, dr.detach(ray), mi.Float(0)), active)))
+
+
+def is_grid(grid: mi.Medium, medium: mi.MediumPtr) -> mi.Bool:
+    """Where an array of media points at this grid."""
+    return medium == mi.MediumPtr(grid)

@@ -1,0 +1,76 @@
+"""Passage: what a straight line meets behind null boundaries, and what media on the way leave of its light.
+
+Edges are looked for as if null boundaries were not there: light goes straight through them, so that they hide nothing.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.transport.facts.traits import is_null
+from pathreplay.transport.meet import meet
+from pathreplay.transport.vertex import TraceConfig
+from pathreplay.transport.volume.shadow import Stretch, shadow, transmittance
+
+SHORT_OF = 1 - 1e-3
+"""Of the way to an edge, the part that its sides share: a little less than all, so that both still meet something."""
+STEP = 1e-5
+"""Share of distance and coordinates that lie between a boundary and what is looked for behind it."""
+
+
+@dr.syntax
+def skip_null(
+    trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
+) -> mi.PreliminaryIntersection3f:
+    """The hit, or the first one behind null boundaries; distances are told along ``ray``."""
+    here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
+    passing = active & _is_boundary(here)
+    while dr.hint(passing, exclude=[trace, ray], label="pathreplay: beyond null boundaries"):
+        # On the same line, from which `spawn_ray` would depart.
+        gone = t + STEP * (1 + dr.max(dr.abs(ray.o)) + t)
+        onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
+        here = meet(trace, onward, passing)
+        t = gone + here.t
+        passing &= _is_boundary(here)
+    here.t = t
+    return here
+
+
+def _is_boundary(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
+    return hit.is_valid() & is_null(hit.shape.bsdf())
+
+
+@dr.syntax
+def transmittance_up_to(
+    trace: TraceConfig, ray: mi.Ray3f, reach: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
+) -> tuple[mi.Spectrum, mi.MediumPtr]:
+    """The transmittance of the first ``reach`` of a ray that starts in ``medium``, and the medium there. Detached."""
+    ray = mi.Ray3f(ray)
+    ray.maxt = reach
+    stretch = Stretch.begin(ray, medium, active)
+    T = mi.Spectrum(1)
+    while dr.hint(stretch.active, exclude=[trace], label="pathreplay: passage"):
+        hit, a, b, inside = stretch.part(trace)
+        T = dr.select(inside, T * transmittance(trace, stretch.medium, stretch.ray, a, b, sampler, inside), T)
+        stretch, T = stretch.beyond(hit, T)
+    return T, stretch.medium
+
+
+def transmittance_past_edge(
+    trace: TraceConfig, ray: mi.Ray3f, t: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
+) -> mi.Spectrum:
+    """The transmittance of a shadow ray that passes an edge at distance ``t``. Detached.
+
+    In two parts, so that it passes on its side: null boundaries push rays aside by more than they are off the edge.
+    """
+    t = SHORT_OF * t
+    T, medium = transmittance_up_to(trace, ray, t, medium, sampler, active)
+    return T * shadow(trace, further(ray, t), medium, sampler, active & dr.any(T != 0)).T
+
+
+def further(ray: mi.Ray3f, t: mi.Float) -> mi.Ray3f:
+    """The rest of a ray, from distance ``t`` on."""
+    rest = mi.Ray3f(ray)
+    rest.o, rest.maxt = ray.o + t * ray.d, ray.maxt - t
+    return rest

@@ -1,0 +1,156 @@
+"""Shadow rays through media and null boundaries: ratio tracking, and the derivative of the transmittance it found.
+
+T = exp(-∫ σ_t ds) is estimated by walking from boundary to boundary; in homogeneous media it is known. Its derivative
+is taken at one point y, uniform over the whole length Λ of medium on the ray:  d log T = -Λ dσ_t(y).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from pathreplay.transport.meet import meet
+from pathreplay.transport.vertex import Shadow, TraceConfig
+from pathreplay.transport.volume.media import carried, interaction, is_grid, majorant, span
+
+
+@dataclass
+class Stretch:
+    """A shadow ray on its way (loop state): the stretch up to the next surface, in one medium or in none."""
+
+    ray: mi.Ray3f  # from the last surface on
+    far: mi.Float  # length of the whole
+    gone: mi.Float  # distance from its origin
+    medium: mi.MediumPtr
+    active: mi.Bool
+
+    @staticmethod
+    def begin(ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool) -> Stretch:
+        """The first one of a ray that starts in ``medium``. Detached."""
+        ray = mi.Ray3f(dr.detach(ray))
+        return Stretch(ray, mi.Float(ray.maxt), mi.Float(0), mi.MediumPtr(medium), mi.Bool(active))
+
+    def part(self, trace: TraceConfig) -> tuple[mi.PreliminaryIntersection3f, mi.Float, mi.Float, mi.Bool]:
+        """The surface at its end, the part [a, b] of the ray that a medium fills, and whether there is one."""
+        self.ray.maxt = self.far - self.gone
+        hit = meet(trace, self.ray, self.active)
+        inside = self.active & (self.medium != None)  # noqa: E711 (an array of pointers)
+        a, b = span(self.medium, self.ray, dr.select(self.active & hit.is_valid(), hit.t, self.ray.maxt), inside)
+        return hit, a, b, inside & (a < b)
+
+    def beyond(self, hit: mi.PreliminaryIntersection3f, T: mi.Spectrum) -> tuple[Stretch, mi.Spectrum]:
+        """The stretch behind that surface, and ``T`` times what the surface lets pass."""
+        met, ray = self.active & hit.is_valid(), mi.Ray3f(self.ray)
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, met)
+        T = dr.select(met, T * si.bsdf(ray).eval_null_transmission(si, met), T)
+        medium = dr.select(met & si.is_medium_transition(), si.target_medium(ray.d), self.medium)
+        onward = si.spawn_ray(ray.d)
+        gone = self.gone + dr.select(met, dr.norm(onward.o - ray.o), 0)
+        ray.o = dr.select(met, onward.o, ray.o)
+        return Stretch(ray, self.far, gone, medium, met & (gone < self.far) & dr.any(T != 0)), T
+
+
+@dr.syntax
+def shadow(trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool) -> Shadow:
+    """Estimate the transmittance along a shadow ray, which starts in ``medium``. Detached."""
+    stretch = Stretch.begin(ray, medium, active)
+    T = mi.Spectrum(1)
+    y, y_medium, length = mi.Float(0), dr.zeros(mi.MediumPtr), mi.Float(0)
+
+    while dr.hint(stretch.active, exclude=[trace], label="pathreplay: shadow"):
+        hit, a, b, inside = stretch.part(trace)
+        T = dr.select(inside, T * transmittance(trace, stretch.medium, stretch.ray, a, b, sampler, inside), T)
+        length += b - a
+        u = sampler.next_1d(inside) * length
+        picked = inside & (u < b - a)
+        y = dr.select(picked, stretch.gone + a + u, y)
+        y_medium = dr.select(picked, stretch.medium, y_medium)
+        stretch, T = stretch.beyond(hit, T)
+
+    return Shadow(T=T, y=y, medium=y_medium, length=length)
+
+
+def transmittance(
+    trace: TraceConfig,
+    medium: mi.MediumPtr,
+    ray: mi.Ray3f,
+    a: mi.Float,
+    b: mi.Float,
+    sampler: mi.Sampler,
+    active: mi.Bool,
+) -> mi.Spectrum:
+    """An unbiased estimate of the transmittance of one medium between the distances a and b."""
+    media = trace.media
+    T = mi.Spectrum(1)
+    rest = mi.Bool(active)
+    for grid in media.grids:
+        mine = active & is_grid(grid, medium)
+        part = mi.Ray3f(ray.o + a * ray.d, ray.d, ray.time, ray.wavelengths)
+        part.maxt = b - a
+        T = dr.select(mine, grid.transmittance(part, sampler, mine), T)
+        rest &= ~mine
+    if media.homogeneous:
+        same = rest & medium.is_homogeneous()
+        σ_t = dr.detach(medium.get_scattering_coefficients(interaction(medium, ray, a), same)[2])
+        T = dr.select(same, mi.Spectrum(dr.exp(-σ_t * (b - a))), T)
+        rest &= ~same
+    if media.plain:
+        T = dr.select(rest, ratio_tracking(medium, ray, a, b, sampler, rest), T)
+    return T
+
+
+@dr.syntax
+def ratio_tracking(
+    medium: mi.MediumPtr, ray: mi.Ray3f, a: mi.Float, b: mi.Float, sampler: mi.Sampler, active: mi.Bool
+) -> mi.Spectrum:
+    """T = Π (1 - σ_t/σ̄) over tentative collisions between a and b, with Mitsuba's majorant of the whole medium."""
+    σ_bar = majorant(medium, ray, active)
+    active = active & (σ_bar > 0)
+    t = mi.Float(a)
+    T = mi.Spectrum(1)
+    while dr.hint(active, label="pathreplay: ratio tracking"):
+        t -= dr.log(1 - sampler.next_1d(active)) / σ_bar
+        active &= t < b
+        _, _, σ_t = medium.get_scattering_coefficients(interaction(medium, ray, t), active)
+        T = dr.select(active, T * (1 - dr.detach(σ_t) / σ_bar), T)
+        active &= dr.any(T != 0)
+    return T
+
+
+def shadow_again(trace: TraceConfig, ray: mi.Ray3f, kept: Shadow, attached: bool, active: mi.Bool) -> mi.Spectrum:
+    """The kept transmittance, differentiable in σ_t and, if ``attached``, in the two ends of the ray.
+
+    The point y keeps its place between the two surfaces (or ends of the ray) next to it.
+    """
+    walked = active & (kept.medium != None)  # noqa: E711
+    y, growth = kept.y, mi.Float(1)
+    if attached:
+        still = dr.detach(ray)
+        near, reach = _boundary(trace, ray, still, kept.y, -1, walked), _boundary(trace, ray, still, kept.y, 1, walked)
+        a, b = span(kept.medium, ray, reach, walked)
+        a = dr.maximum(a, near)
+        y, growth = carried(y, a, b, walked)
+    else:
+        ray = dr.detach(ray)
+    _, _, σ_t = kept.medium.get_scattering_coefficients(interaction(kept.medium, ray, y), walked)
+    if not dr.grad_enabled(σ_t, growth):
+        return kept.T
+    log_T = dr.select(walked, -kept.length * growth * σ_t, 0)
+    return kept.T * dr.replace_grad(mi.Spectrum(1), log_T)
+
+
+def _boundary(trace: TraceConfig, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int, active: mi.Bool) -> mi.Float:
+    """Distance along ``ray`` of the first surface that is met from y on towards its end (sign 1) or origin (sign -1).
+
+    Where none is met it is the end of the ray, or its origin (0). Differentiable in the ray and in the surface.
+    """
+    probe = mi.Ray3f(still.o + y * still.d, sign * still.d, still.time, still.wavelengths)
+    probe.maxt = still.maxt - y if sign > 0 else y
+    hit = meet(trace, probe, active)
+    met = active & hit.is_valid()
+    # The same surface, as the attached ray meets it from y on: a sphere answers for what a ray meets first.
+    probe.o, probe.d = ray.o + y * ray.d, sign * ray.d
+    si = hit.compute_surface_interaction(probe, mi.RayFlags.All, met)
+    return dr.select(met, dr.replace_grad(y + sign * hit.t, y + sign * si.t), ray.maxt if sign > 0 else 0)
