@@ -1,4 +1,4 @@
-"""The lights driver: where only what lights emit has gradients, one walk is enough, and nothing is recorded.
+"""The emission-only driver: where only what lights emit has gradients, one walk is enough, and nothing is recorded.
 
 L = Σ β_i e_i is linear in what lights emit, and β knows nothing of it. So δL β_i de_i is back-propagated on the way."""
 
@@ -33,7 +33,7 @@ def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
 
 
 def lights_or(other: Driver) -> Driver:
-    """A driver: `lights` where that will do, and the ``other`` elsewhere."""
+    """A driver: `emission_only` where that will do, and the ``other`` elsewhere."""
 
     def driver(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
         return (emission_only if only_emission_varies(trace, start) else other)(trace, start, δL, lost)

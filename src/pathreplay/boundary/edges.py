@@ -1,9 +1,9 @@
 """Edges: what their motion adds to a gradient, carried from where they were found back to parameters and camera.
 
-Two searches find edges along camera paths: `primary_boundary` those that a path slides over, `secondary_boundary` those
-that a scattering vertex sees. Both tell how the edge moves at their vertex, as a function of the ray that arrives
-there. The rest is the same for both: reverse mode takes the adjoint of that ray back along the records of the path,
-forward mode brings its tangent from the camera.
+Two searches find edges along camera paths: `primary` finds those that a path slides over, `secondary` those that a
+scattering vertex sees. Both give the motion of the edge at their vertex as a function of the ray that arrives there.
+The rest is the same for both: reverse mode takes the adjoint of that ray back along the records of the path, forward
+mode brings its tangent from the camera.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ class SelectedVertex:
 
 @dataclass
 class SquareLine(PlaneLine):
-    """A line in the unit square of one emitter (see `lamps`), which is reflected at the border."""
+    """A line in the unit square of one emitter (see `emitters`), which is reflected at the border."""
 
     lamp: Lamp
     share: mi.Float  # 1 / probability of the emitter

@@ -1,7 +1,7 @@
 """Loss functions: how far a rendered picture is from its target, with a derivative.
 
 A loss is f(I, T), entry by entry, with I the rendered picture (noisy, differentiable) and T the target; what counts is
-its mean over pixels and channels, or over those that a weight leaves. No path is judged by itself (see `recorded`),
+its mean over pixels and channels, or over those that a weight leaves. No path is judged by itself (see `frozen`),
 hence a loss whose f' is linear in I has an unbiased gradient: ``l2`` and ``relative-l2``. The gradients of the others
 are biased by the noise in I (less with more samples); they pay where outliers would rule ``l2``. Losses in which pixels
 meet are in `picture_losses`.
