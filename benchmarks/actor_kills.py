@@ -36,7 +36,7 @@ def main(
 ) -> None:
     """Kill actors of a run, and compare."""
     stages = [{**stage, "iterations": iterations} for stage in JOB["stages"]]
-    job: dict[str, Any] = {**JOB, "stages": stages, "checkpoint_every": iterations, "sample_ranges": 2}
+    job: dict[str, Any] = {**JOB, "stages": stages, "checkpoint_every": iterations, "spp_shards": 2}
     with tempfile.TemporaryDirectory() as name:
         begin = time.perf_counter()
         optimize(make_config({**job, "output": f"{name}/whole"}), progress=False)

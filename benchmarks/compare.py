@@ -19,7 +19,7 @@ from .measures.methods import STOCK, parts
 from .tables import markdown, pooled
 
 # Two runs of the same code differ by more than each of them tells: kernels lie elsewhere in memory, rivals meet other
-# loads. In ratios to a rival that takes turns it is a few per cent; seconds alone drift with the machine's clock.
+# loads. In ratios to a baseline that takes turns it is a few per cent; seconds alone drift with the machine's clock.
 MARGIN = 0.05
 ALONE_MARGIN = 0.15
 
@@ -140,7 +140,7 @@ def _time(a: Point, b: Point, rivals: tuple[Point, Point] | None, same_machine: 
     if rivals is not None and _timed(a) and _timed(b):
         return _judged(b, f"time / {rivals[0].method}", _relative_time(a, b, *rivals), MARGIN)
     if not (same_machine and _timed(a) and _timed(b)):
-        return _row(b, "time", "not comparable", "another machine and no rival in both, or a single round")
+        return _row(b, "time", "not comparable", "another machine and no baseline in both, or a single round")
     return _judged(b, "time", unpaired_ratio(b.seconds, a.seconds, np.median), ALONE_MARGIN)
 
 
@@ -151,7 +151,7 @@ def _judged(point: Point, quantity: str, change: Estimate, margin: float) -> Row
 
 
 def _relative_time(a: Point, b: Point, rival_of_a: Point, rival_of_b: Point) -> Estimate:
-    """Change of the time relative to a rival's: round by round, where both have had the same number of rounds."""
+    """Change of the time relative to a baseline's: round by round, where both have had the same number of rounds."""
     pairs = (b, rival_of_b), (a, rival_of_a)
     if all(len(ours.seconds) == len(theirs.seconds) for ours, theirs in pairs):
         return unpaired_ratio(*(np.divide(ours.seconds, theirs.seconds) for ours, theirs in pairs), np.median)

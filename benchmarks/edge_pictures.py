@@ -81,7 +81,7 @@ def glass_ball() -> dict[str, Any]:
         "type": "scene",
         "camera": {"type": "perspective", "fov": 35, "to_world": T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
                    "film": film()},
-        "ball": {"type": "sphere", "radius": 0.8, "bsdf": {"type": "smoothdielectric", "int_ior": 1.5}},
+        "ball": {"type": "sphere", "radius": 0.8, "bsdf": {"type": "dielectric_ad", "int_ior": 1.5}},
         "wall": {"type": "rectangle", "to_world": T().translate([0, 0, -2]).scale([4, 4, 1]), "bsdf": wall},
         "lamp": {"type": "rectangle", "to_world": T().translate([0.4, 0.3, -1.7]).scale([0.5, 0.4, 1]),
                  "emitter": glow},

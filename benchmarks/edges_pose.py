@@ -49,8 +49,8 @@ def rows(name: str, config: Config) -> None:
     if result.stopped:
         raise SystemExit(f"stopped by {result.stopped_by}")
     runs = {config.integrator.type: "history.jsonl"}
-    if config.rival is not None:
-        runs[config.rival.type] = "rival/history.jsonl"
+    if config.baseline is not None:
+        runs[config.baseline.type] = "baseline/history.jsonl"
     for integrator, history in runs.items():
         cells = name, overlap(result.folder), str(config.seed), integrator, *ended(result.folder / history)
         print(f"| {' | '.join(cells)} |", flush=True)

@@ -161,13 +161,13 @@ def _is_biased(point: Point) -> bool:
 
 
 def _efficiencies(methods: dict[str, Point]) -> dict[str, Estimate]:
-    rival = methods.get(media.RIVAL)
-    if rival is None or not rival.squared_errors:
+    baseline = methods.get(media.RIVAL)
+    if baseline is None or not baseline.squared_errors:
         return {}
     return {
-        name: Versus(point, rival).efficiency()
+        name: Versus(point, baseline).efficiency()
         for name, point in methods.items()
-        if point is not rival and point.squared_errors
+        if point is not baseline and point.squared_errors
     }
 
 

@@ -57,22 +57,22 @@ def pooled(points: Iterable[Point]) -> list[Point]:
     return list(found.values())
 
 
-def time_cells(point: Point, rival: Point | None) -> list[str]:
-    """Cells: median seconds, then time relative to a rival."""
+def time_cells(point: Point, baseline: Point | None) -> list[str]:
+    """Cells: median seconds, then time relative to a baseline."""
     if point.error:
         return [point.error, ""]
-    if rival is None or rival.error or rival is point:
-        return [median_seconds(point), "1" if rival is point else ""]
-    return [median_seconds(point), str(Versus(point, rival).time())]
+    if baseline is None or baseline.error or baseline is point:
+        return [median_seconds(point), "1" if baseline is point else ""]
+    return [median_seconds(point), str(Versus(point, baseline).time())]
 
 
-def comparison(point: Point, rival: Point | None) -> list[str]:
-    """Cells: those of `time_cells`, then variance and time x variance relative to a rival."""
-    times = time_cells(point, rival)
+def comparison(point: Point, baseline: Point | None) -> list[str]:
+    """Cells: those of `time_cells`, then variance and time x variance relative to a baseline."""
+    times = time_cells(point, baseline)
     # Both have squared errors, or (a single round) neither.
-    if point.error or rival is None or rival is point or not (point.squared_errors and rival.squared_errors):
-        return [*times, *["1" if rival is point and not point.error else ""] * 2]
-    versus = Versus(point, rival)
+    if point.error or baseline is None or baseline is point or not (point.squared_errors and baseline.squared_errors):
+        return [*times, *["1" if baseline is point and not point.error else ""] * 2]
+    versus = Versus(point, baseline)
     return [*times, str(versus.variance()), str(versus.cost())]
 
 

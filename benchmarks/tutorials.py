@@ -93,7 +93,7 @@ def run(name: str, way: str, scenes: Path | None, quick: bool) -> dict[str, Any]
         dr.sync_thread()
         seconds = time.perf_counter() - begin[0]
     else:
-        changes: dict[str, Any] = {"picture_spp": 4}
+        changes: dict[str, Any] = {"eval_spp": 4}
         if quick:
             changes |= {"stages": [{"iterations": 2}], "iterations": 2} if config.stages else {"iterations": 2}
         table = config.model_dump(exclude_unset=True) | changes

@@ -32,7 +32,7 @@ from pathreplay.inverse.images.io import png_bytes  # isort: skip
 from variant import VARIANT  # isort: skip
 
 #: Files that compute and neither read nor write pictures, which a pool of one thread would wait for for ever.
-COMPUTING = {"test_truth_media", "test_pixel_sweep", "test_replay_attached", "test_primal_media", "test_rivals",
+COMPUTING = {"test_truth_media", "test_pixel_sweep", "test_replay_attached", "test_primal_media", "test_baselines",
              "test_truth_materials", "test_truth_attached", "test_motion_noise", "test_fixed_set", "test_drivers",
              "test_terms", "test_evaluated", "test_step", "test_truth_edges", "test_truth_edges_inner",
              "test_truth_edges_media"}  # fmt: skip
@@ -42,7 +42,7 @@ TIMEOUT_S = 120
 LONGEST = ("test_truth_edges_inner", "test_truth_edges", "test_truth_media", "test_edges_ordinary",
            "test_mitsuba_configs", "test_edges_in_use", "test_truth_edges_media", "test_pixel_sweep",
            "test_replay_attached", "test_ordinary_use", "test_primal_media", "test_truth_materials",
-           "test_truth_attached", "test_rivals", "test_inverse_run", "test_motion_noise", "test_variants",
+           "test_truth_attached", "test_baselines", "test_inverse_run", "test_motion_noise", "test_variants",
            "test_inverse_grids", "test_deterministic", "test_volume_example")  # fmt: skip
 
 

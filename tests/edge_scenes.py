@@ -31,7 +31,7 @@ def paint(*value: float) -> dict:
 
 BLACK = paint(0, 0, 0)
 BRUSHED = {"type": "twosided", "inner": {"type": "roughconductor", "alpha_u": 0.15, "alpha_v": 0.5}}
-GLASS = {"type": "smoothdielectric", "int_ior": 1.5}
+GLASS = {"type": "dielectric_ad", "int_ior": 1.5}
 BACK = T().translate([0, 0, -1]).scale([6, 6, 1])
 
 

@@ -170,7 +170,7 @@ def glossy() -> dict:
 
 
 def glass() -> dict:
-    tinted = {"type": "smoothdielectric", "int_ior": 1.4, "specular_transmittance": rgb(0.9, 0.8, 0.7)}
+    tinted = {"type": "dielectric_ad", "int_ior": 1.4, "specular_transmittance": rgb(0.9, 0.8, 0.7)}
     pane = to().translate([1.2, 0, 1]).rotate([0, 1, 0], 30).scale(0.7)
     return {
         "type": "scene",
@@ -366,7 +366,7 @@ def within() -> dict:
         **cameras((0, 0, 0.9), fov=60, medium={"type": "ref", "id": "fog"}),
         "object": {"type": "cube", "bsdf": NULL, "interior": {"type": "ref", "id": "fog"}},
         "pane": {"type": "rectangle", "to_world": to().translate([0.25, 0, -0.2]).rotate([0, 1, 0], -20).scale(0.3),
-                 "bsdf": {"type": "smoothdielectric"}},
+                 "bsdf": {"type": "dielectric_ad"}},
         "gauze": {"type": "rectangle", "to_world": at, "bsdf": gauze},
         "light": {**panel(), "to_world": to().translate([0, 3, 0]).rotate([1, 0, 0], 90).scale(1.5)},
         "sky": sky(),

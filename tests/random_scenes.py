@@ -60,7 +60,7 @@ class Draw:
             {"type": "conductor"},
             {"type": "roughconductor", "alpha": 0.2},
             {"type": "dielectric"},
-            {"type": "smoothdielectric"},
+            {"type": "dielectric_ad"},
             {"type": "roughdielectric", "alpha": 0.3},
             {"type": "plastic", "diffuse_reflectance": self.colour()},
             {"type": "principled", "base_color": self.colour(), "roughness": 0.4},

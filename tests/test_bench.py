@@ -121,8 +121,8 @@ def test_rows_that_only_one_record_has_are_named() -> None:
 def test_stages_are_compared_with_the_same_stage_of_the_rival() -> None:
     def start(slowness: float, seed: int) -> Record:
         stages = ("import", 0.1), ("first gradient", 1.0)
-        rival = [point(f"prb, {stage}", length, seed=seed) for stage, length in stages]
-        return record(*rival, *(point(f"sweep, {stage}", length * slowness, seed=seed) for stage, length in stages))
+        baseline = [point(f"prb, {stage}", length, seed=seed) for stage, length in stages]
+        return record(*baseline, *(point(f"sweep, {stage}", length * slowness, seed=seed) for stage, length in stages))
 
     times = [row for row in compare(start(1, 1), start(1.4, 2)).rows if "time" in row.quantity]
     assert [(row.method, row.quantity, row.outcome) for row in times] == [
@@ -142,7 +142,7 @@ JOB = Job(
     resolution=4,
     spp=1,
     rounds=2,
-    warm_up=0,
+    warmup=0,
     threads=1,
 )
 

@@ -51,8 +51,8 @@ JOB: dict[str, Any] = {
     "learning_rate_schedule": "constant",
     "iterations": 10,
     "spp": 1,
-    "picture_spp": 1,
-    "capture": {"transforms": "capture/transforms.json", "hold_out_every": 3},
+    "eval_spp": 1,
+    "capture": {"transforms": "capture/transforms.json", "test_every": 3},
     "parameters": [{"key": KEY, "lower": 0.0}],
 }
 
@@ -107,7 +107,7 @@ def test_cameras_are_pinholes_as_the_file_says(lens: dict[str, float], scale: in
 def test_a_job_learns_from_a_capture() -> None:
     result = optimize(make_config(JOB), progress=False)
     assert result.parameters[KEY] == pytest.approx([0.8] * 3, abs=1e-3)
-    assert result.held_out == ("shot_0", "shot_3")
+    assert result.test_views == ("shot_0", "shot_3")
     assert set(result.views) == {"shot_0", "shot_1", "shot_2", "shot_3"}
     assert min(each.psnr for each in result.views.values()) > 50
     assert "capture/transforms.json" in result.report.read_text()
@@ -163,7 +163,7 @@ def test_lenses_of_a_transforms_json_are_undone(folder: Path) -> None:
 def test_pictures_are_brought_to_the_width_of_renderings() -> None:
     job = {**JOB, "capture": {"transforms": "capture/transforms.json", "width": 6}, "sensors": ["shot_1", "shot_2"]}
     result = optimize(make_config(job), progress=False)
-    assert set(result.views) == {"shot_1", "shot_2"} and result.held_out == ()
+    assert set(result.views) == {"shot_1", "shot_2"} and result.test_views == ()
     assert picture_size(result.folder / "images" / "target-shot_1.exr") == (6, 4)
     assert result.parameters[KEY] == pytest.approx([0.8] * 3, abs=1e-3)
 
@@ -267,7 +267,7 @@ JOBS_REFUSED = {
     "pictures twice": ({"target": {"images": ["a.png"]}}, "'capture' brings the pictures; leave 'images' out"),
     "another camera": ({"sensors": ["other", "shot_1"]}, "'other' is no camera of the capture"),
     "no alpha": ({"target": {"alpha": "mask"}}, "has no alpha to be its mask"),
-    "every": ({"capture": {"transforms": "capture/transforms.json", "hold_out_every": 1}}, "capture.hold_out_every"),
+    "every": ({"capture": {"transforms": "capture/transforms.json", "test_every": 1}}, "capture.test_every"),
     "misspelt": ({"capture": {"transform": "capture/transforms.json"}}, "did you mean 'transforms'?"),
 }
 
@@ -299,11 +299,11 @@ def test_the_example_finds_texture_roughness_and_sky(folder: Path) -> None:
     """A small version, by its own script and config."""
     example, pictures = small_capture(folder)
     assert len(json.loads((pictures / "transforms.json").read_text())["frames"]) == 12
-    changes = [f"capture.transforms={pictures / 'transforms.json'}", "iterations=300", "picture_spp=64"]
+    changes = [f"capture.transforms={pictures / 'transforms.json'}", "iterations=300", "eval_spp=64"]
     result = optimize(example / "config.toml", output="found", progress=False, define=changes)
-    assert result.held_out == ("00", "06")
+    assert result.test_views == ("00", "06")
     before = json.loads((result.folder / "views.json").read_text())
-    for name in result.held_out:
+    for name in result.test_views:
         assert result.views[name].psnr > before[name]["start"]["psnr"] + 6
     assert result.parameters["ball.bsdf.roughness.value"].item() < 0.4
     paint = runpy.run_path(str(example / "make_capture.py"))["paint"]()
@@ -329,7 +329,7 @@ def test_a_run_in_stages_with_exposures_comes_out_with_its_cameras(folder: Path)
         "iterations": 4,
         "stages": [{"iterations": 2, "downscale": 2}, {"iterations": 2, "max_depth": 3}],
         "spp": 4,
-        "picture_spp": 256,
+        "eval_spp": 256,
         "output": "run",
     }
     result = optimize(make_config({**JOB, **changes}), progress=False)
@@ -367,7 +367,7 @@ def test_exposures_of_a_capture_are_found(folder: Path) -> None:
         example / "config.toml",
         output="found",
         progress=False,
-        define=[*changes, "views_per_step=10", "picture_spp=64"],
+        define=[*changes, "view_batch_size=10", "eval_spp=64"],
     )
     assert result.parameters["exposure"].ravel() == pytest.approx(factors, rel=0.03)
 

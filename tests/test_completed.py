@@ -27,7 +27,7 @@ SCENE = """<scene version="3.0.0">
   <emitter type="constant"/>
 </scene>"""
 JOB: dict[str, Any] = {
-    "scene": "scene.xml", "iterations": 1, "spp": 4, "picture_spp": 4,
+    "scene": "scene.xml", "iterations": 1, "spp": 4, "eval_spp": 4,
     "parameters": [{"key": "box.bsdf.reflectance.value"}], "target": {"scene": "scene.xml", "spp": 256},
 }  # fmt: skip
 

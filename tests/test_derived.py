@@ -146,7 +146,7 @@ def config(parameters: list[dict[str, Any]], derived: list[dict[str, Any]], **mo
         "scene": "room.xml",
         "integrator": {"type": "pathreplay", "max_depth": 3, "edges": "none"},
         "spp": 8,
-        "picture_spp": 16,
+        "eval_spp": 16,
         "iterations": 4,
         "learning_rate": 0.05,
         "deterministic": True,
@@ -248,7 +248,7 @@ def test_three_colours_are_one_and_a_rival_agrees() -> None:
     result = run(
         [free("share", 1, initial=0.3)],
         [made("*.reflectance.value", "grey", "share")],
-        target=target, iterations=60, learning_rate=0.03, rival={"type": "prb", "max_depth": 3},
+        target=target, iterations=60, learning_rate=0.03, baseline={"type": "prb", "max_depth": 3},
     )  # fmt: skip
     assert result.parameters["share"] == pytest.approx([0.7], abs=0.01)
     assert result.parameters[WALL] == pytest.approx(np.full(3, 0.49), abs=0.015)
@@ -345,7 +345,7 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any] | None, str]] = {
         "cannot be computed",
     ),
     "one resolution of a penalty": (
-        free("small", 4, 4, 3, resolutions=[2, 4], refine_at=[1], penalty="own:small_penalty"),
+        free("small", 4, 4, 3, resolutions=[2, 4], refine_at=[1], regularizer="own:small_penalty"),
         made(PAPER, "stretched", "small"),
         "Penalty 'own:small_penalty' cannot be computed",
     ),
@@ -372,14 +372,18 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any] | None, str]] = {
     ),
     "a pose": ({**SHARE, "pose": "rigid"}, made(WALL, "grey", "share"), "'shape' does not go with a pose"),
     "smooth": (
-        {**SHARE, "smooth": 2.0},
+        {**SHARE, "large_steps_lambda": 2.0},
         made(WALL, "grey", "share"),
-        "is no mesh's vertex_positions; leave 'smooth' out",
+        "is no mesh's vertex_positions; leave 'large_steps_lambda' out",
     ),
-    "no mesh": ({"key": WALL, "laplacian": 1.0}, None, "is no mesh's vertex_positions; leave 'laplacian' out"),
-    "two numbers": ({"key": WALL, "penalty": "own:two"}, None, "Penalty 'own:two' gives 2 numbers; return one"),
-    "no slope": ({"key": WALL, "penalty": "own:lost"}, None, "has a derivative that is no finite number"),
-    "no module": ({"key": WALL, "penalty": "elsewhere:f"}, None, "Penalty 'elsewhere:f' cannot be imported"),
+    "no mesh": (
+        {"key": WALL, "laplacian_weight": 1.0},
+        None,
+        "is no mesh's vertex_positions; leave 'laplacian_weight' out",
+    ),
+    "two numbers": ({"key": WALL, "regularizer": "own:two"}, None, "Penalty 'own:two' gives 2 numbers; return one"),
+    "no slope": ({"key": WALL, "regularizer": "own:lost"}, None, "has a derivative that is no finite number"),
+    "no module": ({"key": WALL, "regularizer": "elsewhere:f"}, None, "Penalty 'elsewhere:f' cannot be imported"),
 }
 
 
@@ -399,11 +403,11 @@ def test_a_name_is_given_once() -> None:
 
 def test_a_camera_that_is_derived_takes_no_batches_of_pixels() -> None:
     with pytest.raises(PathreplayError, match=r"its camera moves; hold 'Camera\.001\.to_world'"):
-        run([free("angle", 1)], [made(CAMERA, "round_about", "angle")], pixels_per_step=20)
+        run([free("angle", 1)], [made(CAMERA, "round_about", "angle")], pixel_batch_size=20)
 
 
 def test_a_penalty_of_ones_own_pulls() -> None:
-    entry = {"key": WALL, "penalty": "own:width"}
+    entry = {"key": WALL, "regularizer": "own:width"}
     result = run([entry], [])
     start = np.float32([0.6, 0.5, 0.2])
     assert result.history[0].penalty == pytest.approx(3 * float(np.mean((start - 0.25) ** 2)), rel=1e-5)
@@ -417,7 +421,7 @@ def test_a_laplacian_takes_bumps_out() -> None:
         return Laplacian(1.0, before, faces)(positions)[0]
 
     free_run = run([{"key": BODY, "learning_rate": 0.02}], [], iterations=8)
-    held = run([{"key": BODY, "learning_rate": 0.02, "laplacian": 100.0}], [], iterations=8)
+    held = run([{"key": BODY, "learning_rate": 0.02, "laplacian_weight": 100.0}], [], iterations=8)
     assert roughness(held.parameters[BODY]) < 0.5 * roughness(free_run.parameters[BODY])
     assert held.history[0].penalty == pytest.approx(100 * roughness(before), rel=1e-4)
 
@@ -429,7 +433,7 @@ def test_other_variants_make_and_recover_them(variant: str) -> None:
     tables = [free("share", 1, initial=0.5)], [made("*.reflectance.value", "grey", "share")]
     Path("job.json").write_text(
         json.dumps(
-            config(*tables, target=target, iterations=30, learning_rate_decay=0.1, variant=variant, output="run")
+            config(*tables, target=target, iterations=30, final_learning_rate_ratio=0.1, variant=variant, output="run")
         )
     )
     command = [sys.executable, "-m", "pathreplay.cli", "optimize", "job.json", "--quiet"]
@@ -443,7 +447,7 @@ def test_functions_may_change_what_they_are_given() -> None:
     found = run([free("share", 1, initial=0.6)], [made(WALL, "in_place", "share")]).parameters
     same = run([free("share", 1, initial=0.6)], [made(WALL, "grey", "share")]).parameters
     assert found["share"] == pytest.approx(same["share"], rel=1e-5) and abs(found["share"][0] - 0.6) > 0.05
-    pulled = [run([{"key": WALL, "penalty": f"own:{name}"}], []) for name in ("shallow", "width")]
+    pulled = [run([{"key": WALL, "regularizer": f"own:{name}"}], []) for name in ("shallow", "width")]
     assert pulled[0].parameters[WALL] == pytest.approx(pulled[1].parameters[WALL], rel=1e-5)
     assert pulled[0].history[0].gradient_norms == pytest.approx(pulled[1].history[0].gradient_norms)
 
@@ -451,7 +455,7 @@ def test_functions_may_change_what_they_are_given() -> None:
 def test_a_value_that_becomes_infinite_on_the_way_names_its_function() -> None:
     with pytest.raises(PathreplayError, match="Derivation 'own:worse' gives NaN or infinite numbers for 'Body"):
         run(
-            [free("share", 1, initial=0.6, prior=1e-9)],
+            [free("share", 1, initial=0.6, l2_to_initial=1e-9)],
             [made(BODY, "worse", "share")],
             iterations=20,
             learning_rate=0.2,
@@ -459,7 +463,7 @@ def test_a_value_that_becomes_infinite_on_the_way_names_its_function() -> None:
 
 
 def test_a_penalty_may_be_nothing_where_nothing_is_wrong() -> None:
-    result = run([{"key": WALL, "penalty": "own:where_wrong", "learning_rate": 0.1}], [], iterations=6)
+    result = run([{"key": WALL, "regularizer": "own:where_wrong", "learning_rate": 0.1}], [], iterations=6)
     assert result.history[0].penalty > 0 == result.history[-1].penalty
 
 
@@ -499,7 +503,7 @@ def test_modules_see_themselves_and_their_neighbours_and_are_run_once() -> None:
         "def grey(first, share):\n    return first * 0 + share.array * Factor(near.HALF).value\n"
         "def tame(v):\n    return 0.0\n"
     )
-    problem_of([free("share", 1, penalty="own:tame")], [made("*.reflectance.value", "grey", "share")])
+    problem_of([free("share", 1, regularizer="own:tame")], [made("*.reflectance.value", "grey", "share")])
     assert Path("runs.txt").read_text() == "x"
     assert not {"own", "near"} & (set(sys.modules) - before)
     Path("own.py").write_text("import sys\nsys.exit(0)\n")

@@ -27,7 +27,7 @@ ROOM: dict[str, Any] = {
     "cam": {"type": "perspective", "fov": 40, "to_world": T().translate([0, 0, -4]), "film": FILM},
     "wall": {"type": "rectangle", "to_world": T().translate([0, 0, 1.5]).rotate([0, 1, 0], 180).scale(3)},
     "card": {"type": "cube", "to_world": T().translate([0.5, 0, 0]).scale([0.4, 0.6, 0.02])},
-    "ball": {"type": "sphere", "center": [-0.6, 0, 0], "radius": 0.4, "bsdf": {"type": "smoothdielectric"}},
+    "ball": {"type": "sphere", "center": [-0.6, 0, 0], "radius": 0.4, "bsdf": {"type": "dielectric_ad"}},
     "rough": {"type": "sphere", "center": [0, 1, 0], "radius": 0.2, "bsdf": {"type": "roughdielectric"}},
     "lamp": {"type": "point", "position": [0, 2, -3]},
     "sky": {"type": "envmap", "bitmap": mi.Bitmap(np.linspace(0.1, 1, 32, dtype=np.float32).reshape(4, 8, 1))},

@@ -31,8 +31,8 @@ KEY = "body.vertex_positions"
 BODY = {
     "key": KEY,
     "pose": "rigid",
-    "start": {"translation": [0.3, -0.15, 0.3], "rotation": [20, -30, 25]},
-    "distance": 1.0,
+    "initial": {"translation": [0.3, -0.15, 0.3], "rotation": [20, -30, 25]},
+    "error_scale": 1.0,
 }
 JOB: dict[str, Any] = {
     "scene": "silhouettes",
@@ -40,7 +40,7 @@ JOB: dict[str, Any] = {
     "integrator": {"type": "pathreplay", "max_depth": 2, "edges": "film"},
     "iterations": 2,
     "spp": 8,
-    "picture_spp": 16,
+    "eval_spp": 16,
     "parameters": [BODY],
     "target": {"scene": "silhouettes", "spp": 256, "integrator": {"type": "path", "max_depth": 2}},
 }
@@ -123,7 +123,7 @@ def test_a_job_says_what_its_edges_leave_out_or_cost(edges: str, told: str) -> N
 
 @pytest.mark.slow
 def test_errors_of_poses_are_in_the_history_and_beside_a_rivals() -> None:
-    result = run(rival={**JOB["integrator"], "edges": "all"})
+    result = run(baseline={**JOB["integrator"], "edges": "all"})
     lines = [json.loads(line) for line in (result.folder / "history.jsonl").read_text().splitlines()]
     error = result.poses[KEY]
     assert lines[-1]["errors"] == pytest.approx({f"{KEY}:position": error.position, f"{KEY}:degrees": error.degrees})
@@ -162,10 +162,13 @@ def test_copies_of_a_vertex_stay_together() -> None:
 
 
 SMOOTH_REFUSED = {
-    "bounds": ({"key": KEY, "smooth": 5, "lower": 0}, "'smooth' does not go with 'lower' and 'upper'"),
-    "pose": ({**BODY, "smooth": 5}, "'smooth' does not go with a pose"),
-    "colour": ({"key": "body.bsdf.reflectance.value", "smooth": 5}, "no mesh's vertex_positions"),
-    "zero": ({"key": KEY, "smooth": 0}, "'parameters.0.smooth' is 0"),
+    "bounds": (
+        {"key": KEY, "large_steps_lambda": 5, "lower": 0},
+        "'large_steps_lambda' does not go with 'lower' and 'upper'",
+    ),
+    "pose": ({**BODY, "large_steps_lambda": 5}, "'large_steps_lambda' does not go with a pose"),
+    "colour": ({"key": "body.bsdf.reflectance.value", "large_steps_lambda": 5}, "no mesh's vertex_positions"),
+    "zero": ({"key": KEY, "large_steps_lambda": 0}, "'parameters.0.large_steps_lambda' is 0"),
 }
 
 
@@ -191,7 +194,10 @@ def test_a_body_is_closed_and_turned_outwards() -> None:
 
 @pytest.mark.slow
 def test_a_mesh_goes_on_where_it_was_stopped() -> None:
-    smooth = {"parameters": [{"key": KEY, "smooth": 20.0, "learning_rate": 0.1}], "learning_rate_decay": 1.0}
+    smooth = {
+        "parameters": [{"key": KEY, "large_steps_lambda": 20.0, "learning_rate": 0.1}],
+        "final_learning_rate_ratio": 1.0,
+    }
     smooth["scene_parameters"] = {"resolution": 8, "views": 1}
     start = np.ravel(knobs(ball(4)[0]))
     smooth["target"] = {**JOB["target"], "values": {"sky.radiance.value": 0.5}}
@@ -211,7 +217,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 def example(name: str, iterations: int, **changes: Any) -> Any:
     """What comes of an example's first part; it would take several times as many steps to end."""
-    changes = {"rival": None, "picture_spp": 16, "iterations": iterations, "learning_rate_decay": 0.1, **changes}
+    changes = {"baseline": None, "eval_spp": 16, "iterations": iterations, "final_learning_rate_ratio": 0.1, **changes}
     return optimize(load_config(EXAMPLES / name / "config.toml").model_copy(update=changes), progress=False)
 
 

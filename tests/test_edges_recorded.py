@@ -27,7 +27,7 @@ SCENE = """<scene version="3.0.0">
   <shape type="disk" id="card"><transform name="to_world"><scale value="0.5"/></transform></shape>
 </scene>
 """
-POSE = {"key": "card.to_world", "pose": "translation", "start": {"translation": [0.2, 0.1, 0]}}
+POSE = {"key": "card.to_world", "pose": "translation", "initial": {"translation": [0.2, 0.1, 0]}}
 JOB = {
     "scene": "scene.xml",
     "parameters": [POSE],

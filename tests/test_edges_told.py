@@ -94,13 +94,13 @@ XML = """<scene version="3.0.0">
   <shape type="cube" id="head"><bsdf type="diffuse" id="skin"><rgb name="reflectance" value="0.5"/></bsdf></shape>
   <emitter type="constant"/>
 </scene>"""
-MOVED = {"key": "head.vertex_positions", "pose": "translation", "start": {"translation": [0.1, 0, 0]}}
+MOVED = {"key": "head.vertex_positions", "pose": "translation", "initial": {"translation": [0.1, 0, 0]}}
 PAINTED = {"key": "head.bsdf.reflectance.value"}
 
 
 def run(parameter: dict[str, Any], integrator: dict[str, Any] | None = None, **target: Any) -> Any:
     config = {
-        "scene": "scene.xml", "iterations": 3, "spp": 2, "picture_spp": 2, "parameters": [parameter],
+        "scene": "scene.xml", "iterations": 3, "spp": 2, "eval_spp": 2, "parameters": [parameter],
         "integrator": {"type": "pathreplay", "max_depth": 2, **(integrator or {})},
         "target": target or {"scene": "scene.xml", "spp": 2},
     }  # fmt: skip

@@ -22,7 +22,7 @@ from test_inverse_run import JOB, TEXTURE, room  # noqa: F401 (room: its folder,
 
 SWEEP = {"integrator": {"type": "pathreplay", "max_depth": 3, "edges": "none"}}
 POSE = {
-    "parameters": [{"key": "wall.to_world", "pose": "rigid", "start": {"translation": [0.1, 0, 0]}}],
+    "parameters": [{"key": "wall.to_world", "pose": "rigid", "initial": {"translation": [0.1, 0, 0]}}],
     "target": {"values": {}, "scene": "room.xml", "spp": 8},
 }
 KINDS: dict[str, dict[str, Any]] = {

@@ -253,7 +253,7 @@ def test_jobs_have_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         "parameters": [{"key": "red.reflectance.value", "initial": 0.5}],
         "target": {"values": {"red.reflectance.value": [0.6, 0.1, 0.1]}, "spp": 256,
                    "integrator": {"type": "path", "max_depth": 3}},
-        "iterations": 80, "spp": 8, "learning_rate": 0.05, "learning_rate_decay": 0.1, "picture_spp": 8,
+        "iterations": 80, "spp": 8, "learning_rate": 0.05, "final_learning_rate_ratio": 0.1, "eval_spp": 8,
     }  # fmt: skip
     result = optimize(make_config(job), progress=False)
     assert result.parameters["red.reflectance.value"] == pytest.approx([0.6, 0.1, 0.1], abs=0.02)

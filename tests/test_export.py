@@ -112,7 +112,7 @@ def test_values_come_out_with_the_scene(case: str, tmp_path: Path) -> None:
 
 
 def test_the_index_of_glass_comes_out_as_that_of_mitsubas_plugin(tmp_path: Path) -> None:
-    source = Source(BUILTINS["glass-ball"](resolution=8), {}, {"dielectric": "smoothdielectric"}, {})
+    source = Source(BUILTINS["glass-ball"](resolution=8), {}, {"dielectric": "dielectric_ad"}, {})
     found = exported(source, {"glass.eta": np.float32([1.31])})
     same_pictures(found, tmp_path / "out")
     assert b'type="dielectric"' in found.files["scene.xml"] and b"1.309" in found.files["scene.xml"]
@@ -228,7 +228,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "room.xml").write_text(SCENE)
     texels = np.array([[0.1, 0.4], [0.6, 0.9]], np.float32)[:, :, None] * np.array([1, 0.8, 0.6], np.float32)
     (folder / "texture.exr").write_bytes(exr_bytes(texels))
-    pose = {"key": "right.to_world", "pose": "rigid", "start": {"translation": [0.1, 0.0, 0.0]}}
+    pose = {"key": "right.to_world", "pose": "rigid", "initial": {"translation": [0.1, 0.0, 0.0]}}
     changes = {"iterations": 2, "parameters": [*JOB["parameters"], pose], "scene": str(folder / "room.xml")}
     changes["integrator"] = {"type": "pathreplay", "max_depth": 3}
     changes["target"] = {**JOB["target"], "scene": str(folder / "room.xml")}
@@ -323,12 +323,12 @@ def test_a_volume_and_a_mesh_of_runs_come_out(tmp_path: Path, monkeypatch: pytes
     grid = "cloud.interior_medium.sigma_t.data"
     jobs = {
         "cloud": ({"grid": 4, "views": 1}, {"key": grid, "initial": 1.0, "resolutions": [3]}, "volpath"),
-        "silhouettes": ({"views": 1}, {"key": "body.vertex_positions", "smooth": 5.0}, "path"),
+        "silhouettes": ({"views": 1}, {"key": "body.vertex_positions", "large_steps_lambda": 5.0}, "path"),
     }
     for name, (arguments, parameter, plain) in jobs.items():
         job = {
             "scene": name, "scene_parameters": {"resolution": 8, **arguments}, "parameters": [parameter], "spp": 4,
-            "iterations": 1, "picture_spp": 4, "integrator": {"type": "pathreplay", "max_depth": 4, "edges": "none"},
+            "iterations": 1, "eval_spp": 4, "integrator": {"type": "pathreplay", "max_depth": 4, "edges": "none"},
             "target": {"scene": name, "scene_parameters": {"resolution": 8, **arguments}, "spp": 4},
         }  # fmt: skip
         job["target"]["integrator"] = {"type": plain, "max_depth": 4}

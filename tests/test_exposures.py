@@ -43,10 +43,10 @@ JOB: dict[str, Any] = {
     "integrator": {"type": "pathreplay", "max_depth": 2},
     "iterations": 150,
     "spp": 1,
-    "picture_spp": 4,
+    "eval_spp": 4,
     "learning_rate": 0.08,
-    "learning_rate_decay": 0.01,
-    "held_out": ["eye-3"],
+    "final_learning_rate_ratio": 0.01,
+    "test_views": ["eye-3"],
     "exposure": {},
     "target": {"images": [f"{k}.exr" for k in range(4)]},
     "parameters": [{"key": KEY, "lower": 0.0, "upper": 1.0}],
@@ -139,13 +139,13 @@ def test_exposures_and_scene_are_recovered_up_to_the_scale_that_is_fixed() -> No
     assert result.parameters[KEY] == pytest.approx([0.4] * 3, abs=0.01)
     assert result.parameters[EXPOSURE].ravel() == pytest.approx([2, 1, 0.5, 1.5], abs=0.03)
     views = json.loads((result.folder / "views.json").read_text())
-    assert views["eye-3"]["recovered_exposure"] == pytest.approx([1.5], abs=0.03) and views["eye-3"]["held_out"]
+    assert views["eye-3"]["recovered_exposure"] == pytest.approx([1.5], abs=0.03) and views["eye-3"]["test_views"]
     assert all(view["result"]["psnr"] > 35 for view in views.values())
     assert "exposure found" in result.report.read_text()
 
 
 @SLOW
-@pytest.mark.parametrize("given", [{"reference": "eye-1"}, {"reference": 1}, {"free": True}])
+@pytest.mark.parametrize("given", [{"reference": "eye-1"}, {"reference": 1}, {"fix_scale": False}])
 def test_a_view_can_be_the_reference(given: dict[str, Any]) -> None:
     job = {**JOB, "parameters": [{"key": KEY, "initial": 0.4, "learning_rate": 1e-9}], "exposure": given}
     result = optimize(make_config(job), progress=False)
@@ -167,7 +167,7 @@ def test_white_balance_has_a_factor_for_each_colour(folder: Path) -> None:
 
 @SLOW
 def test_a_run_that_goes_on_has_the_exposures_of_one_that_did_not_stop(folder: Path) -> None:
-    job = {**JOB, "iterations": 8, "deterministic": True, "learning_rate_decay": 1.0}
+    job = {**JOB, "iterations": 8, "deterministic": True, "final_learning_rate_ratio": 1.0}
     whole = optimize(make_config(job), output="whole", progress=False)
     part = optimize(make_config({**job, "iterations": 4}), output="part", progress=False)
     config = part.folder / "config.json"
@@ -197,7 +197,10 @@ def test_held_out_views_are_fitted_where_their_mask_is() -> None:
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "both": ({"exposure": {"free": True, "reference": 0}}, "exposure: 'free' and 'reference' exclude each other"),
+    "both": (
+        {"exposure": {"fix_scale": False, "reference": 0}},
+        "exposure: fix_scale = false and 'reference' exclude each other",
+    ),
     "no view": ({"exposure": {"reference": "eye-9"}}, "No sensor 'eye-9' in the scene"),
     "held out": ({"exposure": {"reference": "eye-3"}}, "the reference 'eye-3' is held out; name a view"),
     "misspelt": ({"exposure": {"white_ballance": True}}, "did you mean 'white_balance'?"),
@@ -222,7 +225,7 @@ def test_one_channel_has_no_white_balance(folder: Path) -> None:
 @SLOW
 def test_views_count_as_much_as_they_weigh(folder: Path) -> None:
     """The best constant for 0.8 and 0.2 is their mean by weight."""
-    job = {**JOB, "held_out": [], "sensors": [0, 2], "target": {"images": ["0.exr", "2.exr"]}}
+    job = {**JOB, "test_views": [], "sensors": [0, 2], "target": {"images": ["0.exr", "2.exr"]}}
     del job["exposure"]
     result = optimize(make_config({**job, "view_weights": {"eye-0": 3.0}, "iterations": 100}), progress=False)
     assert result.parameters[KEY] == pytest.approx([(3 * 0.8 + 0.2) / 4] * 3, abs=0.01)

@@ -14,7 +14,7 @@ from pathreplay.jobs import iterate, make_config, optimize
 from small_job import checkpoint_bits
 from test_exposures import JOB, KEY, LEVELS, folder  # noqa: F401 (folder: for every test)
 
-PLAIN = {key: value for key, value in JOB.items() if key not in ("iterations", "learning_rate_decay")}
+PLAIN = {key: value for key, value in JOB.items() if key not in ("iterations", "final_learning_rate_ratio")}
 KINDS: dict[str, dict[str, Any]] = {
     "stages": {
         **PLAIN,
@@ -24,7 +24,7 @@ KINDS: dict[str, dict[str, Any]] = {
             {"iterations": 3},
         ],
     },
-    "halves": {**PLAIN, "iterations": 8, "spp": 2, "signal_to_noise": True},
+    "halves": {**PLAIN, "iterations": 8, "spp": 2, "measure_snr": True},
     "line search": {**PLAIN, "iterations": 30, "spp": 4, "optimizer": {"type": "l-bfgs-b"}},
 }
 

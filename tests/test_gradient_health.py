@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.noise_options import AutoSpp
+from pathreplay.inverse.config.noise_options import AdaptiveSpp
 from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.inverse.loop.events import LowSNR
 from pathreplay.inverse.loop.loop import iterate, new_run
@@ -65,7 +65,7 @@ def test_a_gradient_that_is_no_number_is_named_once_and_counted(
     spoilt: type[Spoilt], capsys: pytest.CaptureFixture[str]
 ) -> None:
     spoilt.passes = 4
-    result = optimize(make_config(job(non_finite_in_a_row=5)))
+    result = optimize(make_config(job(max_consecutive_nonfinite=5)))
     told = [line for line in capsys.readouterr().err.splitlines() if "NaN" in line]
     assert told == [
         f"pathreplay: 3 gradient entries of '{KEY}' were NaN or infinite in view 'view-0' at iteration 2, and count as "
@@ -78,7 +78,7 @@ def test_a_gradient_that_is_no_number_is_named_once_and_counted(
 
 def test_a_row_of_them_ends_the_run_with_a_checkpoint(spoilt: type[Spoilt]) -> None:
     with pytest.raises(PathreplayError) as told:
-        optimize(make_config(job(non_finite_in_a_row=3, checkpoint_every=100)), progress=False)
+        optimize(make_config(job(max_consecutive_nonfinite=3, checkpoint_every=100)), progress=False)
     line = str(told.value)
     assert f"The gradient of '{KEY}' was NaN or infinite, half of it or more, in iterations 2 to 4" in line
     assert line.endswith("what was done is saved, go on with: pathreplay optimize --resume run")
@@ -89,7 +89,7 @@ def test_a_row_of_them_ends_the_run_with_a_checkpoint(spoilt: type[Spoilt]) -> N
 
 def test_a_few_bad_entries_end_nothing(spoilt: type[Spoilt]) -> None:
     spoilt.entries = 1
-    result = optimize(make_config(job(non_finite_in_a_row=2)), progress=False)
+    result = optimize(make_config(job(max_consecutive_nonfinite=2)), progress=False)
     assert result.iterations == 12 and result.history[-1].dropped_shares == {KEY: pytest.approx(1 / 3)}
 
 
@@ -145,7 +145,7 @@ def entries(count: int, spp: int, norm: float) -> list[Entry]:
 
 
 def test_samples_follow_the_ratio() -> None:
-    auto = AutoSpp(ratio=1.0, lowest=4, highest=32)
+    auto = AdaptiveSpp(target_snr=1.0, min=4, max=32)
     norm = {ratio: float(np.sqrt(1 + ratio**2)) for ratio in (0.5, 1.5, 2.5)}
     assert next_spp(auto, []) == 4
     assert next_spp(auto, entries(WINDOW, 8, norm[0.5])) == 16
@@ -159,7 +159,7 @@ def test_samples_follow_the_ratio() -> None:
 
 
 def halved(**changes: Any) -> dict[str, Any]:
-    return {**JOB, "signal_to_noise": True, "spp": 8, "iterations": 20, **changes}
+    return {**JOB, "measure_snr": True, "spp": 8, "iterations": 20, **changes}
 
 
 def test_halves_are_two_shards_and_their_mean_is_stepped_by() -> None:
@@ -204,7 +204,7 @@ def test_a_gradient_that_is_noise_is_told_of_once(capsys: pytest.CaptureFixture[
 
 @pytest.mark.slow
 def test_automatic_samples_double_and_go_on_from_a_checkpoint() -> None:
-    changes = {"spp": "auto", "auto_spp": {"ratio": 1e6, "lowest": 2, "highest": 8}, "iterations": 3 * WINDOW}
+    changes = {"spp": "auto", "adaptive_spp": {"target_snr": 1e6, "min": 2, "max": 8}, "iterations": 3 * WINDOW}
     whole = optimize(make_config({**JOB, **changes, "output": "whole"}), progress=False)
     assert [entry.spp for entry in whole.history] == [2] * WINDOW + [4] * WINDOW + [8] * WINDOW
     from pathreplay.jobs import iterate as states
@@ -219,16 +219,19 @@ def test_automatic_samples_double_and_go_on_from_a_checkpoint() -> None:
 
 
 REFUSED = {
-    "odd": ({"signal_to_noise": True, "spp": 5}, "spp is 5; make it even"),
-    "unused": ({"auto_spp": {"ratio": 2.0}}, "auto_spp goes with spp = 'auto', and spp is 4"),
+    "odd": ({"measure_snr": True, "spp": 5}, "spp is 5; make it even"),
+    "unused": ({"adaptive_spp": {"target_snr": 2.0}}, "adaptive_spp goes with spp = 'auto', and spp is 4"),
     "misspelt": ({"spp": "atuo"}, "'spp' is 'atuo': input should be a valid integer"),
     "true": ({"spp": True}, "'spp' is True: input should be a valid integer"),
     "none": ({"spp": 0}, "'spp' is 0: input should be greater than or equal to 1"),
-    "no power": ({"spp": "auto", "auto_spp": {"lowest": 6}}, "lowest = 6 is no power of two from 2 on; take 4"),
-    "one": ({"spp": "auto", "auto_spp": {"lowest": 1}}, "take 2"),
-    "order": ({"spp": "auto", "auto_spp": {"lowest": 64, "highest": 8}}, "lowest = 64 is above highest = 8"),
-    "key": ({"spp": "auto", "auto_spp": {"ration": 1.0}}, "unknown key 'auto_spp.ration'; did you mean 'ratio'?"),
-    "zero": ({"non_finite_in_a_row": 0}, "'non_finite_in_a_row' is 0"),
+    "no power": ({"spp": "auto", "adaptive_spp": {"min": 6}}, "min = 6 is no power of two from 2 on; take 4"),
+    "one": ({"spp": "auto", "adaptive_spp": {"min": 1}}, "take 2"),
+    "order": ({"spp": "auto", "adaptive_spp": {"min": 64, "max": 8}}, "min = 64 is above max = 8"),
+    "key": (
+        {"spp": "auto", "adaptive_spp": {"target_snd": 1.0}},
+        "unknown key 'adaptive_spp.target_snd'; did you mean 'target_snr'?",
+    ),
+    "zero": ({"max_consecutive_nonfinite": 0}, "'max_consecutive_nonfinite' is 0"),
 }
 
 

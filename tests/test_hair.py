@@ -45,10 +45,10 @@ def test_a_pass_without_gradients_is_told_what_is_wrong() -> None:
 
 @pytest.mark.parametrize("edges", ["none", pytest.param("all", marks=pytest.mark.slow)])
 def test_its_pigments_can_be_optimised_and_exported(edges: str) -> None:
-    pose = {"key": "ball.to_world", "pose": "translation", "start": {"translation": [0.1, 0, 0]}}
+    pose = {"key": "ball.to_world", "pose": "translation", "initial": {"translation": [0.1, 0, 0]}}
     parameters = [{"key": KEY, "initial": 0.5}, *([pose] if edges == "all" else [])]
     job = {
-        "scene": "hair.xml", "parameters": parameters, "iterations": 2, "spp": 2, "picture_spp": 2, "output": "run",
+        "scene": "hair.xml", "parameters": parameters, "iterations": 2, "spp": 2, "eval_spp": 2, "output": "run",
         "integrator": {"type": "pathreplay", "max_depth": 2, "edges": edges},
         "target": {"values": {KEY: 0.3}, "spp": 4},
     }  # fmt: skip

@@ -23,7 +23,7 @@ DATA = Path(__file__).parent / "data" / "vdb.zip"
 #: Far above what all cases take on two quiet cores, which is eight minutes.
 LIMIT_S = 2400
 
-#: Of a job with edges, a rival, stages and numbers of samples of its own, which compiles some dozens of kernels.
+#: Of a job with edges, a baseline, stages and numbers of samples of its own, which compiles some dozens of kernels.
 MANY_KERNELS_S = 400
 
 #: Told at the end of the session: see conftest.py.

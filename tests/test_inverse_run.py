@@ -44,7 +44,7 @@ JOB = {
     "integrator": {"type": "prb", "max_depth": 3},
     "iterations": 6,
     "spp": 4,
-    "picture_spp": 16,
+    "eval_spp": 16,
     "learning_rate": 0.1,
     "parameters": [
         {"key": TEXTURE, "initial": 0.5, "lower": 0.0, "upper": 1.0},

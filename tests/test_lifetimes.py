@@ -80,7 +80,7 @@ def test_a_dropped_scene_goes_before_the_next_pass_without_the_collector() -> No
     with without_collector():
         description = mi.cornell_box()
         description["sensor"]["film"] |= {"width": 8, "height": 8}
-        description["white"] = {"type": "smoothdielectric"}  # in Python, and so it can tell when it goes
+        description["white"] = {"type": "dielectric_ad"}  # in Python, and so it can tell when it goes
         scene = mi.load_dict(description)
         gradient(scene, by)
         facts = weakref.ref(facts_of(scene))

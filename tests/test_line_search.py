@@ -140,7 +140,7 @@ def saved(folder: str) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("transform", [None, pytest.param("logit", marks=pytest.mark.slow)])
 def test_a_job_ends_by_itself_and_at_its_best(transform: str | None, room: Path) -> None:
-    entry = ENTRY if transform is None else {**ENTRY, "transform": transform}
+    entry = ENTRY if transform is None else {**ENTRY, "parameterization": transform}
     result = optimize(make_config({**SEARCHED, "parameters": [entry], "output": "run"}), progress=False)
     assert result.iterations < 40 and not result.stopped and "No more steps" in result.report.read_text()
     losses = [entry.loss for entry in result.history]
@@ -185,10 +185,10 @@ def test_a_job_that_was_left_goes_on_bit_for_bit(room: Path) -> None:
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "stages": ({"stages": [{"iterations": 40}]}, "leave 'stages' out"),
-    "batches": ({"views_per_step": 1}, "leave 'views_per_step' out"),
-    "pixels": ({"pixels_per_step": 9}, "leave 'pixels_per_step' out"),
-    "rival": ({"rival": {"type": "prb"}}, "leave 'rival' out"),
-    "schedule": ({"learning_rate_decay": 0.5}, "leave 'learning_rate_decay' out"),
+    "batches": ({"view_batch_size": 1}, "leave 'view_batch_size' out"),
+    "pixels": ({"pixel_batch_size": 9}, "leave 'pixel_batch_size' out"),
+    "baseline": ({"baseline": {"type": "prb"}}, "leave 'baseline' out"),
+    "schedule": ({"final_learning_rate_ratio": 0.5}, "leave 'final_learning_rate_ratio' out"),
     "auto": ({"spp": "auto"}, "leave 'spp = 'auto'' out"),
     "grids": (
         {"parameters": [{"key": "a", "resolutions": [2, 4], "refine_at": [3]}]},

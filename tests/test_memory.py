@@ -180,18 +180,18 @@ def test_large_textures_are_shown_smaller() -> None:
     ("text", "size"), [("8 GiB", 8 * 2**30), ("800MB", 800 * 10**6), (" 1.5 GB ", 15 * 10**8), ("1TiB", 2**40)]
 )
 def test_budgets_are_read(text: str, size: int) -> None:
-    assert make_config({**JOB, "memory": text}).budget == size
+    assert make_config({**JOB, "memory_limit": text}).budget == size
     assert make_config(JOB).budget is None
 
 
 @pytest.mark.parametrize(
     ("given", "said"),
     [("8", "number and a unit"), ("8 Gib", "number and a unit"), ("-1 GB", "number and a unit"),
-     ("10 MB", "512 MiB' or more"), (8, "memory"), ("9" * 400 + " GB", "number and a unit")],
+     ("10 MB", "512 MiB' or more"), (8, "memory_limit"), ("9" * 400 + " GB", "number and a unit")],
 )  # fmt: skip
 def test_other_budgets_are_refused(given: Any, said: str) -> None:
     with pytest.raises(PathreplayError, match=said) as error:
-        make_config({**JOB, "memory": given})
+        make_config({**JOB, "memory_limit": given})
     assert "\n" not in str(error.value) and len(str(error.value)) < 300
 
 
@@ -203,7 +203,9 @@ def test_a_budget_holds_within_its_block(monkeypatch: pytest.MonkeyPatch) -> Non
         memory.require_kept()
         monkeypatch.setattr(memory, "taken", lambda: 5 * 10**9)
         assert memory.available() == 0
-        with pytest.raises(PathreplayError, match=r"takes 5 GB of memory, and its 'memory' is 4 GB; take smaller"):
+        with pytest.raises(
+            PathreplayError, match=r"takes 5 GB of memory, and its 'memory_limit' is 4 GB; take smaller"
+        ):
             memory.require_kept()
     memory.require_kept()
     assert not memory.is_crowded()
@@ -213,8 +215,8 @@ def test_a_run_beyond_its_budget_ends_with_a_line_and_a_checkpoint(monkeypatch: 
     """Nothing half-written: what was done is there, and the run goes on from it with more memory."""
     sizes = iter([10**8] * 60)
     monkeypatch.setattr(memory, "taken", lambda: next(sizes, 2 * 10**9))
-    with pytest.raises(PathreplayError, match=r"'memory' is 1 GB; .*go on with: pathreplay optimize --resume"):
-        optimize(make_config({**JOB, "memory": "1 GB", "iterations": 40}), output="run", progress=False)
+    with pytest.raises(PathreplayError, match=r"'memory_limit' is 1 GB; .*go on with: pathreplay optimize --resume"):
+        optimize(make_config({**JOB, "memory_limit": "1 GB", "iterations": 40}), output="run", progress=False)
     assert (Path("run") / "checkpoint.safetensors").exists() and not list(Path("run").rglob("*.part"))
 
 

@@ -63,7 +63,7 @@ def job(keys: list[str], **more: Any) -> RunResult:
                 "scene": "scene.xml",
                 "iterations": 3,
                 "spp": 4,
-                "picture_spp": 4,
+                "eval_spp": 4,
                 "parameters": [{"key": key, "initial": 0.6} for key in keys],
                 "target": {"scene": "scene.xml", "spp": 8, "integrator": {"type": "path", "max_depth": 3}},
                 **more,

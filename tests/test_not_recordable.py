@@ -30,7 +30,7 @@ COLOUR = {
     "target": {"values": {"ball.bsdf.reflectance.value": 0.7}, "spp": 16},
 }
 POSE = {
-    "parameters": [{"key": "ball.to_world", "pose": "translation", "start": {"translation": [0.1, 0, 0]}}],
+    "parameters": [{"key": "ball.to_world", "pose": "translation", "initial": {"translation": [0.1, 0, 0]}}],
     "target": {"scene": "scene.xml", "spp": 16},
 }
 

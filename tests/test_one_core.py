@@ -25,7 +25,7 @@ SCENE = """<scene version="3.0.0">
 CONFIG = """scene = "ball.xml"
 iterations = 2
 spp = 1
-picture_spp = 1
+eval_spp = 1
 checkpoint_every = 1
 integrator = { type = "prb", max_depth = 3 }
 parameters = [ { key = "paint.reflectance.data", initial = "texture.exr" } ]

@@ -29,7 +29,7 @@ SCENE = """<scene version="3.0.0">
 CONFIG = """scene = "ball.xml"
 iterations = 1
 spp = 1
-picture_spp = 1
+eval_spp = 1
 integrator = { type = "prb", max_depth = 3 }
 parameters = [ { key = "paint.reflectance.data", lower = 0, upper = 1 } ]
 target = { images = ["target.exr"] }
@@ -175,9 +175,9 @@ BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     ),
     # Sizes: told before anything of that size is made.
     "spp beyond 32 bits": (replace("spp = 1\np", "spp = 200000000\np"), ["'spp' is 200000000", "up to 178956970"]),
-    "picture_spp beyond 32 bits": (
-        replace("picture_spp = 1", "picture_spp = 200000000"),
-        ["'picture_spp' is 200000000", "6 x 4", "up to 178956970"],
+    "eval_spp beyond 32 bits": (
+        replace("eval_spp = 1", "eval_spp = 200000000"),
+        ["'eval_spp' is 200000000", "6 x 4", "up to 178956970"],
     ),
     "target.spp beyond 32 bits": (
         replace(IMAGES, '{ values = { "sky.radiance.value" = 0.5 }, spp = 200000000 }'),
@@ -219,8 +219,11 @@ BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
         posed("pivot = [1e38, 1e38, 1e38]"),
         ["eye.to_world", "'pivot'", "1e+38"],
     ),
-    "start out of the world": (posed("start = { translation = [0, 1e38, 0] }"), ["'start.translation'", "1e+38"]),
-    "start turned too often": (posed("start = { rotation = [0, 1e38, 0] }"), ["eye.to_world", "between -360 and 360"]),
+    "start out of the world": (posed("initial = { translation = [0, 1e38, 0] }"), ["'initial.translation'", "1e+38"]),
+    "start turned too often": (
+        posed("initial = { rotation = [0, 1e38, 0] }"),
+        ["eye.to_world", "between -360 and 360"],
+    ),
     # Of another type, with what to write instead.
     "spp = true": (replace("spp = 1\np", "spp = true\np"), ["'spp' is True", "such as 16"]),
     "spp = 16.0": (replace("spp = 1\np", "spp = 16.0\np"), ["'spp' is 16.0", "such as 16"]),
@@ -231,8 +234,8 @@ BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
         ["'diffuse' is a BSDF", "'path' for targets"],
     ),
     "no integrator": (replace('type = "prb", max_depth = 3', 'type = "diffuse"'), ["'diffuse' is a BSDF"]),
-    "rival is no integrator": (
-        replace("spp = 1\np", 'rival = { type = "diffuse" }\nspp = 1\np'),
+    "baseline is no integrator": (
+        replace("spp = 1\np", 'baseline = { type = "diffuse" }\nspp = 1\np'),
         ["'diffuse' is a BSDF"],
     ),
     "option beyond 32 bits": (replace("max_depth = 3", "max_depth = 100000000000"), ["'max_depth' of 'prb'", "below"]),

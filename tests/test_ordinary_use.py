@@ -66,7 +66,7 @@ def job_of(use: Use) -> dict[str, Any]:
         "variant": use.variant,
         "iterations": ITERATIONS,
         "spp": 16,
-        "picture_spp": 16,
+        "eval_spp": 16,
         "learning_rate": use.rate,
         "integrator": {"type": "pathreplay", "max_depth": 4},
         "parameters": [{"key": use.key, "initial": use.start, "lower": 0.0}],
@@ -127,7 +127,7 @@ def test_batches_of_pixels(write: Write, tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     use = write(tmp_path)
     (tmp_path / "scene.xml").write_text(use.xml, encoding="utf-8")
-    job = {**job_of(use), "iterations": 2 * ITERATIONS, "pixels_per_step": 48}
+    job = {**job_of(use), "iterations": 2 * ITERATIONS, "pixel_batch_size": 48}
     (tmp_path / "job.toml").write_text(toml(job), encoding="utf-8")
     status, words = command(use.variant, "optimize", "job.toml", "--quiet")
     if write.__name__ in NOT_BY_PIXELS:
@@ -166,7 +166,7 @@ def test_derived_parameters(write: Write, tmp_path: Path, monkeypatch: pytest.Mo
     job["parameters"] = [{"key": "factor", "shape": [1], "initial": 0.5, "learning_rate": 0.1}]
     job["derived"] = [{"key": use.key, "function": "own:scaled", "of": ["factor"]}]
     job["target"] = {"scene": "scene.xml", "spp": 256, "integrator": {"type": use.target, "max_depth": 4}}
-    job |= {"iterations": 12, "learning_rate_decay": 0.1}  # Adam goes past, and has few iterations to come back
+    job |= {"iterations": 12, "final_learning_rate_ratio": 0.1}  # Adam goes past, and has few iterations to come back
     (tmp_path / "job.toml").write_text(toml(job), encoding="utf-8")
     status, words = command(use.variant, "optimize", "job.toml", "--quiet")
     assert status == 0, words

@@ -112,7 +112,7 @@ JOBS: dict[str, tuple[dict[str, Any], str]] = {
     "loss leaves": ({"loss": "own:leaves"}, "Loss 'own:leaves' cannot be computed (it ends Python: SystemExit(7)); "),
     "loss leaves later": ({"loss": "own:leaves_later"}, "(it ends Python: SystemExit('no more'))"),
     "penalty leaves": (
-        {"parameters": [{"key": TEXTURE, "penalty": "own:leaves"}]},
+        {"parameters": [{"key": TEXTURE, "regularizer": "own:leaves"}]},
         "Penalty 'own:leaves' cannot be computed (it ends Python: SystemExit(7)); ",
     ),
     "derivation leaves": (

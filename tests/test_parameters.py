@@ -93,7 +93,7 @@ def test_a_glob_keeps_what_has_a_derivative_and_an_exact_key_must(params: Any) -
 @pytest.mark.parametrize(
     ("key", "way_out"),
     [
-        ("glass.bsdf.eta", "smoothdielectric"),
+        ("glass.bsdf.eta", "dielectric_ad"),
         ("lacquer.bsdf.eta", "no replacement yet"),
         ("smoke.interior_medium.scale", "multiply the values of 'sigma_t'"),
         ("png.bsdf.reflectance.data", "format='variant'"),

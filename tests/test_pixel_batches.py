@@ -137,7 +137,7 @@ JOB: dict[str, Any] = {
     "iterations": 3,
     "scene_parameters": {"resolution": 16},
     "integrator": {"type": "pathreplay", "max_depth": 3, "edges": "none"},
-    "pixels_per_step": 40,
+    "pixel_batch_size": 40,
 }
 
 
@@ -193,7 +193,7 @@ def test_the_mean_of_batches_is_the_whole_where_all_is_rendered_alike(
     Whole pictures of what moves would be followed by the film, which no sweep of pixels does.
     """
     monkeypatch.setattr(integrators, "can_follow", lambda trace, sensor: False)
-    pose = {"key": "large-box.vertex_positions", "pose": "translation", "start": {"translation": [0, 0, 0.3]}}
+    pose = {"key": "large-box.vertex_positions", "pose": "translation", "initial": {"translation": [0, 0, 0.3]}}
     colour = {"key": RED, "initial": 0.2}
     boxed = {"scene": "cornell-box-photo", "scene_parameters": {"resolution": 16, "texture": 8}, "sensors": [0]}
     target = {**boxed, "spp": 16}
@@ -233,11 +233,11 @@ def test_a_job_takes_batches_of_pixels(tmp_path: Path, monkeypatch: pytest.Monke
 def test_stages_halves_and_ranges_take_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     stages = [
-        {"iterations": 3, "downscale": 2, "pixels_per_step": 16},
+        {"iterations": 3, "downscale": 2, "pixel_batch_size": 16},
         {"iterations": 3, "max_depth": 2, "spp": 8},
-        {"iterations": 3, "pixels_per_step": 400},  # more than there are
+        {"iterations": 3, "pixel_batch_size": 400},  # more than there are
     ]
-    changes = {"stages": stages, "signal_to_noise": True, "sample_ranges": 2, "iterations": 9, "output": "run"}
+    changes = {"stages": stages, "measure_snr": True, "spp_shards": 2, "iterations": 9, "output": "run"}
     changes["spp"] = 16
     result = optimize(make_config({**JOB, **changes}), progress=False)
     assert len(result.history) == 9 and all(entry.noise_norms[RED] > 0 for entry in result.history)
@@ -255,26 +255,26 @@ def test_pixels_that_are_none_are_refused(opened) -> None:
 
 
 MOVED = {
-    "parameters": [{"key": "sensor.to_world", "pose": "translation", "start": {"translation": [0.1, 0, 0]}}],
+    "parameters": [{"key": "sensor.to_world", "pose": "translation", "initial": {"translation": [0.1, 0, 0]}}],
     "target": {"scene": "cornell-box", "scene_parameters": {"resolution": 16}, "spp": 16},
 }
 PRB = {"type": "prb", "max_depth": 3}
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "loss": ({"loss": "ssim"}, "loss = 'ssim' wants whole pictures; take l2 or relative-l2"),
     "loss, in a stage": (
-        {"loss": "l1", "pixels_per_step": None, "stages": [{"iterations": 3, "pixels_per_step": 4}]},
+        {"loss": "l1", "pixel_batch_size": None, "stages": [{"iterations": 3, "pixel_batch_size": 4}]},
         "loss = 'l1' wants whole pictures",
     ),
-    "exposure": ({"exposure": {"free": True}}, "'exposure' wants whole pictures; leave one of them out"),
+    "exposure": ({"exposure": {"fix_scale": False}}, "'exposure' wants whole pictures; leave one of them out"),
     "auto": ({"spp": "auto"}, "spp = 'auto' cannot lessen"),
     "integrator": ({"integrator": PRB}, "PRBIntegrator renders whole pictures; take the integrator 'pathreplay'"),
-    "rival": ({"rival": PRB}, "PRBIntegrator renders whole pictures"),
+    "baseline": ({"baseline": PRB}, "PRBIntegrator renders whole pictures"),
     "replay": ({"integrator": {"type": "pathreplay", "driver": "replay"}}, "driver = 'replay'.*; take 'sweep'"),
     "one sample": ({"spp": 1}, "1 samples a pixel cannot judge each other; take 2 or more"),
-    "one sample of a half": ({"spp": 2, "signal_to_noise": True}, "1 samples a pixel"),
+    "one sample of a half": ({"spp": 2, "measure_snr": True}, "1 samples a pixel"),
     "too many": ({"spp": 1024}, "1024 samples a pixel of 3 vertices are more than the 682 that are held; take fewer"),
     "late": ({"stages": [{"iterations": 2}, {"iterations": 1, "max_depth": 1500}]}, "of 1500 vertices"),
-    "camera": (MOVED, "its camera moves; hold 'sensor.to_world', or leave 'pixels_per_step' out"),
+    "camera": (MOVED, "its camera moves; hold 'sensor.to_world', or leave 'pixel_batch_size' out"),
 }
 
 

@@ -186,7 +186,7 @@ def steps(problem, config, passes: str) -> np.ndarray:
 
 BOXED = {"scene": "cornell-box-photo", "scene_parameters": {"resolution": 32}}
 POSE = {
-    "parameters": [{"key": "large-box.vertex_positions", "pose": "translation", "start": {"translation": [0.1] * 3}}],
+    "parameters": [{"key": "large-box.vertex_positions", "pose": "translation", "initial": {"translation": [0.1] * 3}}],
     "target": {"scene": "cornell-box", "spp": 16},
 }
 GLASS = {

@@ -124,16 +124,16 @@ WITH_GLASS = SCENE.replace(
 EYE = {
     "key": "eye.to_world",
     "pose": "rigid",
-    "start": {"translation": [0.05, -0.08, 0.06], "rotation": [1, -1, 2]},
+    "initial": {"translation": [0.05, -0.08, 0.06], "rotation": [1, -1, 2]},
     "pivot": [0, 0, 0],
-    "distance": 3.05,
+    "error_scale": 3.05,
 }
 JOB = {
     "scene": "sheet.xml",
     "integrator": {"type": "pathreplay", "max_depth": 2, "edges": "none"},  # paint shows it
     "iterations": 4,
     "spp": 8,
-    "picture_spp": 16,
+    "eval_spp": 16,
     "parameters": [EYE],
     "target": {"scene": "sheet.xml", "spp": 256, "integrator": {"type": "path", "max_depth": 2}},
 }
@@ -144,7 +144,7 @@ def sheet(tmp_path: Path, variant: None) -> None:
     from pathreplay.inverse.images.io import exr_bytes
 
     (tmp_path / "sheet.xml").write_text(SCENE)
-    for glass in ("dielectric", "smoothdielectric"):
+    for glass in ("dielectric", "dielectric_ad"):
         (tmp_path / f"{glass}.xml").write_text(WITH_GLASS.replace("{glass}", glass))
     x, y = np.meshgrid(np.linspace(-1, 1, 32), np.linspace(-1, 1, 32))
     paint = [0.5 + 0.2 * np.cos((9 + k) * x + 2 * k) * np.sin((11 - k) * y + k) for k in range(3)]
@@ -157,7 +157,7 @@ def run(**changes: Any) -> Any:
 
 @pytest.mark.usefixtures("sheet")
 def test_a_camera_finds_its_place_and_the_report_tells() -> None:
-    result = run(iterations=80, learning_rate_decay=0.02)
+    result = run(iterations=80, final_learning_rate_ratio=0.02)
     error = result.poses["eye.to_world"]
     assert error.relative < 0.01 and error.degrees < 0.5  # from 5 % and 2.4 degrees
     assert "% of its distance" in result.describe() and "° off" in result.describe()
@@ -174,8 +174,8 @@ def test_a_camera_finds_its_place_and_the_report_tells() -> None:
 @pytest.mark.usefixtures("sheet")
 def test_a_pose_goes_on_where_it_was_stopped() -> None:
     # A constant rate: lengthening a run would stretch its decay.
-    whole = run(learning_rate_decay=1.0)
-    half = run(learning_rate_decay=1.0, iterations=2)
+    whole = run(final_learning_rate_ratio=1.0)
+    half = run(final_learning_rate_ratio=1.0, iterations=2)
     config = half.folder / "config.json"
     config.write_text(config.read_text().replace('"iterations": 2', '"iterations": 4'))
     resumed = optimize(resume=half.folder, progress=False)
@@ -198,7 +198,7 @@ def test_only_the_named_part_moves() -> None:
 def test_stock_glass_is_replaced_when_its_index_is_asked_for() -> None:
     target = {**JOB["target"], "scene": "dielectric.xml"}  # type: ignore[dict-item]
     result = run(scene="dielectric.xml", target=target, parameters=[{"key": "glass.eta", "initial": 1.3}], iterations=1)
-    assert "replaced 'dielectric' by 'smoothdielectric'" in html_text(result)
+    assert "replaced 'dielectric' by 'dielectric_ad'" in html_text(result)
     # The truth is that of the stock plugin in the target scene: bk7 in air. Nobody sees the ball, so nothing moves.
     assert result.errors["glass.eta"] == pytest.approx(1.5046 / 1.000277 - 1.3, abs=1e-3)
 
@@ -219,7 +219,7 @@ def test_the_target_scene_is_gone_when_iterations_begin(monkeypatch: pytest.Monk
         return scene
 
     monkeypatch.setattr(targets, "load_scene_with_floats", watched)
-    target = {**JOB["target"], "scene": "smoothdielectric.xml"}  # type: ignore[dict-item]
+    target = {**JOB["target"], "scene": "dielectric_ad.xml"}  # type: ignore[dict-item]
     problem.build_problem(make_config({**JOB, "target": target}), Path.cwd())
     assert len(seen) == 1 and seen[0]() is None
 
@@ -227,24 +227,24 @@ def test_the_target_scene_is_gone_when_iterations_begin(monkeypatch: pytest.Monk
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "unknown pose": ({"pose": "affine"}, "'parameters.0.pose' is 'affine'"),
     "pose on a colour": (
-        {"key": "sheet.bsdf.reflectance.value", "start": None, "pivot": None},
+        {"key": "sheet.bsdf.reflectance.value", "initial": None, "pivot": None},
         "'sheet.bsdf.reflectance.value' is a Float and has no pose",
     ),
     "no pose for a matrix": (
-        {"pose": None, "start": None, "pivot": None, "distance": None},
+        {"pose": None, "initial": None, "pivot": None, "error_scale": None},
         "'eye.to_world' is a matrix",
     ),
-    "two numbers": ({"start": {"translation": [1, 2]}}, "'parameters.0.start.translation' is [1, 2]"),
-    "unknown part": ({"start": {"rotatin": [1, 2, 3]}}, "did you mean 'rotation'?"),
+    "two numbers": ({"initial": {"translation": [1, 2]}}, "'parameters.0.initial.translation' is [1, 2]"),
+    "unknown part": ({"initial": {"rotatin": [1, 2, 3]}}, "did you mean 'rotation'?"),
     "NaN": ({"pivot": [0, float("nan"), 0]}, "'parameters.0.pivot.1' is nan"),
-    "start of what does not move": ({"pose": "translation"}, "'start.rotation' is not part of pose = 'translation'"),
+    "start of what does not move": ({"pose": "translation"}, "'initial.rotation' is not part of pose = 'translation'"),
     "rate of what does not move": (
-        {"pose": "translation", "start": None, "rotation_learning_rate": 1},
+        {"pose": "translation", "initial": None, "rotation_learning_rate": 1},
         "'rotation_learning_rate' is not part of pose = 'translation'",
     ),
     "bound on a pose": ({"lower": 0}, "'lower' does not go with a pose"),
     "start without a pose": ({"pose": None}, "belongs to a pose"),
-    "no distance": ({"distance": 0}, "'parameters.0.distance' is 0"),
+    "no distance": ({"error_scale": 0}, "'parameters.0.error_scale' is 0"),
 }
 
 

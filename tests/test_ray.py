@@ -36,7 +36,7 @@ from test_inverse_run import JOB, room  # noqa: F401 (room: its folder, for ever
 SWEEP = {"integrator": {"type": "pathreplay", "max_depth": 3}}
 VIEWS = {"scene_parameters": {**CLOUD["scene_parameters"], "views": 3}}
 JOBS: dict[str, dict[str, Any]] = {
-    "surfaces": {**SWEEP, "sample_ranges": 2, "signal_to_noise": True, "spp": 8},
+    "surfaces": {**SWEEP, "spp_shards": 2, "measure_snr": True, "spp": 8},
     "medium": {**CLOUD, **VIEWS, "spp": 4},
     "stages": {**SWEEP, "stages": [{"iterations": 10, "max_depth": 2, "downscale": 2}, {"iterations": 10}]},
 }
@@ -44,7 +44,7 @@ SLOW = pytest.mark.slow
 
 
 def job_of(name: str, **changes: Any) -> dict[str, Any]:
-    job = {**JOB, "iterations": 20, "deterministic": True, "picture_spp": 4, **JOBS[name], **changes}
+    job = {**JOB, "iterations": 20, "deterministic": True, "eval_spp": 4, **JOBS[name], **changes}
     return {key: value for key, value in job.items() if not (key == "iterations" and "stages" in job)}
 
 
@@ -99,17 +99,17 @@ def test_the_example_has_many_views_and_the_token_is_for_its_owner() -> None:
 
 
 def test_ranges_must_divide_the_samples() -> None:
-    with pytest.raises(PathreplayError, match="sample_ranges = 3 does not divide the 4 samples"):
-        make_config({**JOB, "sample_ranges": 3})
+    with pytest.raises(PathreplayError, match="spp_shards = 3 does not divide the 4 samples"):
+        make_config({**JOB, "spp_shards": 3})
     with pytest.raises(PathreplayError, match="does not divide the 8 samples per pixel, in two halves"):
-        make_config({**JOB, "spp": AUTO, "sample_ranges": 8})
-    assert make_config({**JOB, "sample_ranges": 4}).parts == 4
+        make_config({**JOB, "spp": AUTO, "spp_shards": 8})
+    assert make_config({**JOB, "spp_shards": 4}).parts == 4
 
 
 @pytest.mark.parametrize("noise", [False, True])
 def test_ranges_of_samples_are_means_over_more_seeds(noise: bool) -> None:
     """The gradient of four ranges is that of four jobs with a fourth of the samples and those seeds, on average."""
-    config = make_config({**JOB, **SWEEP, "spp": 16, "sample_ranges": 4 - 2 * noise, "signal_to_noise": noise})
+    config = make_config({**JOB, **SWEEP, "spp": 16, "spp_shards": 4 - 2 * noise, "measure_snr": noise})
     problem = build_problem(config, Path.cwd())
     run, shards = new_run(problem, problem.integrator, record=False), []
     kept, evaluate = [], run.executor.evaluate  # type: ignore[attr-defined]

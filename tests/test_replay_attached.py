@@ -26,7 +26,7 @@ RESOLUTION = 8
 SPP = 16
 DIFFUSE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.7, 0.9]}}
 MIRROR = {"type": "conductor"}
-GLASS = {"type": "smoothdielectric", "int_ior": 1.5}
+GLASS = {"type": "dielectric_ad", "int_ior": 1.5}
 ROUGH = {"type": "roughconductor", "alpha": 0.2}
 
 

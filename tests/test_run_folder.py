@@ -32,7 +32,7 @@ from pathreplay.runs.folder_lock import LOCK, FolderLock
 from small_job import write_job
 from test_inverse_run import TEXTURE
 
-ONE = {"iterations": 2, "spp": 1, "picture_spp": 1, "target": {"scene": "room.xml", "spp": 1}}
+ONE = {"iterations": 2, "spp": 1, "eval_spp": 1, "target": {"scene": "room.xml", "spp": 1}}
 CHECKPOINT = "checkpoint.safetensors"
 
 

@@ -113,11 +113,11 @@ def test_glass_is_replaced_only_for_its_index(wanted: list[str], replaced: bool,
     (tmp_path / "glass.xml").write_text(GLASS)
     scene, notes = load_scene_for("glass.xml", wanted, tmp_path)
     names = [type(shape.bsdf()).__name__ for shape in scene.shapes()]
-    assert names.count("SmoothDielectric") == (2 if replaced else 0)
+    assert names.count("DielectricAD") == (2 if replaced else 0)
     assert isinstance(mi.traverse(scene)["glass.eta"], float) != replaced
     assert len(notes) == replaced
     if replaced:
-        assert "all 2" in notes[0] and "'smoothdielectric'" in notes[0] and "\n" not in notes[0]
+        assert "all 2" in notes[0] and "'dielectric_ad'" in notes[0] and "\n" not in notes[0]
 
 
 def test_glass_of_a_builtin_is_replaced_too() -> None:

@@ -18,7 +18,7 @@ from test_deterministic import CLOUD
 from test_steps import JOB, SCENE
 
 KEY = JOB["parameters"][0]["key"]
-MEDIUM = {**CLOUD, "spp": 4, "picture_spp": 4, "deterministic": True, "iterations": 3}
+MEDIUM = {**CLOUD, "spp": 4, "eval_spp": 4, "deterministic": True, "iterations": 3}
 
 
 @pytest.fixture(autouse=True)

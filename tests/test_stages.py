@@ -84,7 +84,7 @@ def test_what_is_masked_does_not_reach_smaller_pictures() -> None:
 
 def test_a_job_goes_through_its_stages() -> None:
     values, batches = [], []
-    session = iterate(staged(learning_rate_decay=0.1))
+    session = iterate(staged(final_learning_rate_ratio=0.1))
     for state in session:
         values.append({key: value.copy() for key, value in state.values.items()})
         batches.append(set(state.gradient_norms))
@@ -103,10 +103,10 @@ def test_a_job_goes_through_its_stages() -> None:
 
 
 def test_stages_choose_views_and_batches() -> None:
-    config = staged(stages=[{"iterations": 1, "sensors": [1]}, {"iterations": 1, "views_per_step": 1}])
+    config = staged(stages=[{"iterations": 1, "sensors": [1]}, {"iterations": 1, "view_batch_size": 1}])
     problem = build_problem(config, Path.cwd())
     one, two = (part_at(problem, config, i) for i in (0, 1))
-    assert [view.name for view in one.problem.trained().values()] == ["right"] and two.config.views_per_step == 1
+    assert [view.name for view in one.problem.trained().values()] == ["right"] and two.config.view_batch_size == 1
     assert len(two.problem.trained()) == 2
     assert part_at(problem, config, 99).number == 1
 
@@ -116,7 +116,7 @@ GRIDS = [{"iterations": 2, "downscale": 2}, {"iterations": 2, "parameters": [FLO
 CASES = {"surface": STAGED, "grid": {**STAGED, **GRID, "stages": GRIDS}}
 CASES["medium"] = {
     **{key: value for key, value in CLOUD.items()},
-    "spp": 4, "picture_spp": 4, "deterministic": True, "output": "run",
+    "spp": 4, "eval_spp": 4, "deterministic": True, "output": "run",
     "stages": [{"iterations": 2, "downscale": 3, "max_depth": 2}, {"iterations": 3}],
 }  # fmt: skip
 
@@ -156,14 +156,14 @@ def test_recorded_passes_and_traced_ones_agree() -> None:
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "not the sum": ({"iterations": 6}, "iterations is 6, and the stages have 7; leave 'iterations' out"),
-    "odd": ({"signal_to_noise": True, "stages": [{"iterations": 1, "spp": 3}]}, "a stage has spp = 3; make it even"),
+    "odd": ({"measure_snr": True, "stages": [{"iterations": 1, "spp": 3}]}, "a stage has spp = 3; make it even"),
     "none": ({"stages": []}, "'stages'"),
     "empty": ({"stages": [{}]}, "key 'stages.0.iterations' is missing; add it"),
     "misspelt": ({"stages": [{"iterations": 1, "dpp": 3}]}, "unknown key 'stages.0.dpp'; did you mean 'spp'?"),
     "divisor": ({"stages": [{"iterations": 1, "downscale": 4}]}, "12 x 10 pixels of sensor 'left'; take one of 2"),
     "no view": ({"stages": [{"iterations": 1, "sensors": ["up"]}]}, "sensor 'up' is none of the job's views"),
     "held out": (
-        {"held_out": ["right"], "stages": [{"iterations": 1, "sensors": ["right"]}]},
+        {"test_views": ["right"], "stages": [{"iterations": 1, "sensors": ["right"]}]},
         "sensor 'right' is held out; name some of left",
     ),
     "no key": ({"stages": [{"iterations": 1, "parameters": ["flor.*"]}]}, "No parameter 'flor.*'"),

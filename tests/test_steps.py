@@ -24,7 +24,7 @@ JOB: dict[str, Any] = {
     "integrator": {"type": "prb", "max_depth": 2},
     "iterations": 8,
     "spp": 4,
-    "picture_spp": 4,
+    "eval_spp": 4,
     "deterministic": True,
     "parameters": [{"key": "wall.bsdf.reflectance.value", "initial": [0.2, 0.5, 0.7]}],
     "target": {"values": {"wall.bsdf.reflectance.value": [0.6, 0.5, 0.1]}, "spp": 16},
@@ -103,7 +103,7 @@ def test_rates_follow_their_schedule() -> None:
 
 
 def test_rates_are_constant_where_no_decay_is_given() -> None:
-    decay = {"learning_rate_decay": 0.01}
+    decay = {"final_learning_rate_ratio": 0.01}
     plain, falling = (make_config({**JOB, **change}) for change in ({}, decay))
     named = make_config({**JOB, **decay, "learning_rate_schedule": "linear"})
     assert [each.learning_rate_schedule for each in (plain, falling, named)] == ["constant", "exponential", "linear"]
@@ -113,7 +113,7 @@ def test_rates_are_constant_where_no_decay_is_given() -> None:
 
 @pytest.mark.slow
 def test_a_schedule_is_that_of_the_job() -> None:
-    changed = {"optimizer": {"type": "sgd"}, "learning_rate_schedule": "cosine", "warm_up": 2}
+    changed = {"optimizer": {"type": "sgd"}, "learning_rate_schedule": "cosine", "warmup_steps": 2}
     result = optimize(make_config({**JOB, **changed}), progress=False)
     found = result.parameters[JOB["parameters"][0]["key"]]
     rates = [rate("cosine", i, JOB["iterations"], 0.1, 2) for i in range(JOB["iterations"])]
@@ -148,7 +148,7 @@ def test_no_step_leaves_the_range_or_loses_the_number(name: str) -> None:
 
 
 def test_a_job_steps_in_the_logarithm() -> None:
-    entry = {**JOB["parameters"][0], "transform": "log", "learning_rate": 0.1}
+    entry = {**JOB["parameters"][0], "parameterization": "log", "learning_rate": 0.1}
     result = optimize(
         make_config({**JOB, "parameters": [entry], "iterations": 1, "optimizer": {"type": "adam"}}), progress=False
     )
@@ -162,7 +162,9 @@ def test_a_prior_keeps_values_between_start_and_truth() -> None:
     entry, rest = JOB["parameters"][0], {"optimizer": {"type": "sgd"}, "learning_rate_schedule": "constant"}
     job = {**JOB, **rest, "learning_rate": 5.0, "iterations": 30}
     free = optimize(make_config(job), output="free", progress=False)
-    held = optimize(make_config({**job, "parameters": [{**entry, "prior": 0.1}]}), output="held", progress=False)
+    held = optimize(
+        make_config({**job, "parameters": [{**entry, "l2_to_initial": 0.1}]}), output="held", progress=False
+    )
     start, truth = np.float32(entry["initial"]), np.float32(JOB["target"]["values"][entry["key"]])
     for k in (0, 2):  # the second channel starts at the truth
         moved = [float((r.parameters[entry["key"]][k] - start[k]) / (truth[k] - start[k])) for r in (held, free)]
@@ -180,21 +182,21 @@ REFUSED = {
     "beyond": ({"optimizer": {"beta_2": 1.0}}, "optimizer.beta_2"),
     "nesterov alone": ({"optimizer": {"type": "sgd", "nesterov": True}}, "add momentum"),
     "constant decays": (
-        {"learning_rate_schedule": "constant", "learning_rate_decay": 0.5},
+        {"learning_rate_schedule": "constant", "final_learning_rate_ratio": 0.5},
         "does not go with learning_rate_schedule = 'constant'",
     ),
-    "too long": ({"warm_up": 8}, "warm_up 8 is not before the end of the 8 iterations"),
+    "too long": ({"warmup_steps": 8}, "warmup_steps = 8 is not before the end of the 8 iterations"),
     "at a bound": (
-        {"parameters": [{"key": "wall.bsdf.reflectance.value", "initial": [0.1, 1, 0.5], "transform": "logit"}]},
-        "starts at 1, and transform = 'logit' wants values below 1",
+        {"parameters": [{"key": "wall.bsdf.reflectance.value", "initial": [0.1, 1, 0.5], "parameterization": "logit"}]},
+        "starts at 1, and parameterization = 'logit' wants values below 1",
     ),
     "of nothing": (
-        {"parameters": [{"key": "wall.bsdf.reflectance.value", "initial": 0.0, "transform": "log"}]},
-        "starts at 0, and transform = 'log' wants values above 0",
+        {"parameters": [{"key": "wall.bsdf.reflectance.value", "initial": 0.0, "parameterization": "log"}]},
+        "starts at 0, and parameterization = 'log' wants values above 0",
     ),
     "twice": (
-        {"parameters": [{"key": "wall.vertex_positions", "smooth": 3.0, "transform": "log"}]},
-        "'smooth' does not go with 'transform'",
+        {"parameters": [{"key": "wall.vertex_positions", "large_steps_lambda": 3.0, "parameterization": "log"}]},
+        "'large_steps_lambda' does not go with 'parameterization'",
     ),
 }
 

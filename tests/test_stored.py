@@ -37,9 +37,9 @@ JOB: dict[str, Any] = {
     "integrator": {"type": "prb", "max_depth": 3},
     "iterations": 3,
     "spp": 4,
-    "picture_spp": 4,
+    "eval_spp": 4,
     "learning_rate": 0.01,
-    "learning_rate_decay": 0.1,
+    "final_learning_rate_ratio": 0.1,
     "target": {"values": {"env.data": "other.exr"}, "spp": 16, "integrator": {"type": "path", "max_depth": 3}},
 }
 

@@ -14,7 +14,7 @@ from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.platform.threads import one_thread, spare_thread
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
 
-SMOOTH = {"dielectric": "smoothdielectric"}
+SMOOTH = {"dielectric": "dielectric_ad"}
 SCENE = """<scene version="3.0.0">
     <default name="index" value="1.3"/>
     <include filename="materials.xml"/>

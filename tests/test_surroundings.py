@@ -18,7 +18,7 @@ from pathreplay.report.watch.server import RunServer
 from small_job import ERROR, write_job
 from test_inverse_run import JOB
 
-ONE = {"iterations": 2, "spp": 1, "picture_spp": 1, "target": {"scene": "room.xml", "spp": 1}}
+ONE = {"iterations": 2, "spp": 1, "eval_spp": 1, "target": {"scene": "room.xml", "spp": 1}}
 
 
 @pytest.fixture(autouse=True)

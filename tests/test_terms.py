@@ -192,7 +192,7 @@ def test_facts_are_found_once_and_keep_up_with_the_scene(load) -> None:
     # Another BSDF on a shape, and another scene.
     scene.shapes()[0].set_bsdf(mi.load_dict({"type": "conductor"}))
     assert integrator._walk(scene, None).traits.lobes == 1
-    other = mi.load_dict(lit_room({"type": "smoothdielectric"}))
+    other = mi.load_dict(lit_room({"type": "dielectric_ad"}))
     assert integrator._walk(other, None).traits.lobes == 2
     assert facts_of(other) is not facts_of(scene)
 

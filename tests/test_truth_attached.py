@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pathreplay.platform.registration import on_base
-from pathreplay.plugins.smoothdielectric import SmoothDielectric
+from pathreplay.plugins.dielectric_ad import DielectricAD
 from truth import (
     Bench,
     Case,
@@ -36,9 +36,9 @@ from truth import (
 
 
 def register_one_lobe() -> None:
-    """`one_lobe`: a smoothdielectric that only ever samples one of its lobes (property ``lobe``)."""
+    """`one_lobe`: a dielectric_ad that only ever samples one of its lobes (property ``lobe``)."""
 
-    class OneLobe(on_base(SmoothDielectric, mi.BSDF)):
+    class OneLobe(on_base(DielectricAD, mi.BSDF)):
         def __init__(self, props):
             super().__init__(props)
             self.lobe = props.get("lobe", 1)
@@ -97,7 +97,7 @@ def lens(bsdf):
 
 
 T, R = {"type": "one_lobe", "lobe": 1}, {"type": "one_lobe", "lobe": 0}
-GLASS = {"type": "smoothdielectric"}
+GLASS = {"type": "dielectric_ad"}
 MIRROR = {"type": "conductor"}
 METAL = {"type": "roughconductor", "alpha": 0.2}
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}
@@ -212,8 +212,8 @@ def bumpy_room():
 
 # In expectation, against Mitsuba's path.
 CELLS = [
-    Case("smoothdielectric eta, ball", lambda: under_sky(GLASS), ETA, add(), **{**BOTH, "depth": 6}),
-    Case("smoothdielectric eta, pane", lambda: quad(normals(GLASS)), "object.bsdf.nested_bsdf.eta", add(), **BOTH),
+    Case("dielectric_ad eta, ball", lambda: under_sky(GLASS), ETA, add(), **{**BOTH, "depth": 6}),
+    Case("dielectric_ad eta, pane", lambda: quad(normals(GLASS)), "object.bsdf.nested_bsdf.eta", add(), **BOTH),
     Case("thindielectric eta", lambda: under_sky({"type": "thindielectric"}), ETA, add(), **{**BOTH, "depth": 6}),
     Case("roughdielectric eta", lambda: under_sky({"type": "roughdielectric", "alpha": 0.2}), ETA, add(),
          **{**BOTH, "depth": 6, "spp": 512}),
@@ -256,7 +256,7 @@ CELLS = [
 
 QUICK_LANES = {"index of a glass ball, refraction", "normal map on glass", "glass mesh bends",
                "rough metal alpha, all", "camera moves, textured wall", "mirror ball moves"}  # fmt: skip
-QUICK_CELLS = {"smoothdielectric eta, ball", "diffuse mesh bends", "mesh lamp stretches"}
+QUICK_CELLS = {"dielectric_ad eta, ball", "diffuse mesh bends", "mesh lamp stretches"}
 
 
 def _params(cases, quick):

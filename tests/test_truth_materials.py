@@ -11,7 +11,7 @@ from truth import Case, add, bitmap, environment, hold, lit_room, noise, random,
 # Cells that are left out, and why; printed with the table.
 EXCLUSIONS = {
     "roughplastic alpha": "Mitsuba's own transmittance tables carry no derivative (prb has +0.024 for -0.436)",
-    "dielectric eta, plastic eta": "plain numbers in Mitsuba; smoothdielectric has a differentiable index",
+    "dielectric eta, plastic eta": "plain numbers in Mitsuba; dielectric_ad has a differentiable index",
     "blend with a delta child": "its primal image is biased: the density that it returns mixes Dirac deltas and others",
     "mask opacity at exactly 0 or 1": "the lobe that would appear is never drawn",
     "plastic, diffuse reflectance exactly 0": "the diffuse lobe is then never drawn, so only its direct light counts",

@@ -88,7 +88,7 @@ def uniform(**props: Any) -> dict:
     return heterogeneous(constant(1.2), constant(0.6), **props)
 
 
-GLASS = {"type": "smoothdielectric"}
+GLASS = {"type": "dielectric_ad"}
 ROUGH = {"type": "roughdielectric", "alpha": 0.3}
 ETA = "object.bsdf.eta"
 DENSE = {"depth": 512, "rr_depth": 1000, "spp": 4, "reference_spp": 8, "step": 0.4}

@@ -36,7 +36,7 @@ def small(name: str, **changes: Any) -> dict[str, Any]:
     job["target"] |= {"spp": 1024, "scene": str(EXAMPLES / job["scene"])}
     job["target"]["scene_parameters"] = {**job["target"].get("scene_parameters", {}), **arguments}
     job["scene"] = str(EXAMPLES / job["scene"])
-    return {**job, "picture_spp": 4, **changes}
+    return {**job, "eval_spp": 4, **changes}
 
 
 def test_there_are_five_and_each_is_valid() -> None:
@@ -55,7 +55,7 @@ def test_there_are_five_and_each_is_valid() -> None:
 )
 def test_a_colour_is_found(name: str, key: str, tmp_path: Path) -> None:
     """With a learning rate for fewer steps; at full length the error is below 0.01."""
-    job = small(name, iterations=60, learning_rate=0.12, learning_rate_decay=0.1, spp=16)
+    job = small(name, iterations=60, learning_rate=0.12, final_learning_rate_ratio=0.1, spp=16)
     result = optimize(make_config(job), output=tmp_path / "run", progress=False)
     assert result.errors[key] < 0.2 * result.history[0].errors[key]
 
@@ -113,7 +113,7 @@ def test_material_and_light_are_found_in_one_photo(tmp_path: Path) -> None:
     made["main"](resolution=24, spp=512, into=tmp_path)
     job = load_config(example / "config.toml").model_dump(exclude_unset=True)
     job |= {
-        "scene": str(example / "scene.xml"), "scene_parameters": {"res": 24}, "iterations": 200, "picture_spp": 4,
+        "scene": str(example / "scene.xml"), "scene_parameters": {"res": 24}, "iterations": 200, "eval_spp": 4,
         "target": {"images": [str(tmp_path / "photo.png")]},
     }  # fmt: skip
     found = optimize(make_config(job), output=tmp_path / "run", progress=False).parameters

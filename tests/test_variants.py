@@ -16,7 +16,7 @@ from pathreplay.platform.backend import ensure_llvm
 import drjit as dr, mitsuba as mi
 
 ensure_llvm()
-glass = {"type": "smoothdielectric", "int_ior": 1.2}
+glass = {"type": "dielectric_ad", "int_ior": 1.2}
 
 def scene(extra):
     return mi.load_dict({
@@ -136,7 +136,7 @@ job = '''scene = "room.xml"
 variant = "VARIANT"
 iterations = 5
 spp = 16
-picture_spp = 4
+eval_spp = 4
 learning_rate = 0.08
 integrator = { type = "pathreplay", max_depth = 3 }
 parameters = [ { key = "ball.bsdf.reflectance.value", lower = 0, upper = 1 } ]

@@ -117,7 +117,7 @@ def test_a_run_says_what_came_of_its_values(case: str, tmp_path: Path, monkeypat
     keys, learning_rate, verdict = RUNS[case]
     job = {
         "scene": "scene.xml", "target": {"scene": "scene.xml", "spp": 64}, "iterations": 60, "spp": 4,
-        "picture_spp": 4, "integrator": {"type": "pathreplay", "max_depth": 2}, "loss": "relative-l2",
+        "eval_spp": 4, "integrator": {"type": "pathreplay", "max_depth": 2}, "loss": "relative-l2",
         "parameters": [
             {"key": key, "lower": 0, "initial": 0.2 if key == PAINT else 16 if key == LAMP else 0.5,
              "learning_rate": learning_rate * (20 if key == LAMP else 1)}
@@ -145,7 +145,7 @@ def test_what_moves_together_is_told_apart_by_what_stands_still(
     job = {
         "scene": "scene.xml", "target": {"scene": "scene.xml", "spp": 1},
         "integrator": {"type": "pathreplay", "max_depth": 2, "edges": "none"},
-        "parameters": [{"key": key, "pose": "translation", "start": start} for key in keys],
+        "parameters": [{"key": key, "pose": "translation", "initial": start} for key in keys],
     }  # fmt: skip
     problem = build_problem(make_config(job), tmp_path)
     values = new_run(problem, problem.integrator).values

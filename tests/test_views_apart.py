@@ -20,7 +20,7 @@ from pathreplay.jobs import iterate, make_config, optimize
 from pathreplay.scenes.parameters import get_array
 from test_inverse_run import JOB, SCENE, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 
-RIGID = {"key": "left.to_world", "pose": "rigid", "start": {"translation": [0.1, 0, 0]}}
+RIGID = {"key": "left.to_world", "pose": "rigid", "initial": {"translation": [0.1, 0, 0]}}
 WIDE = {"key": "left.x_fov", "initial": 50.0, "learning_rate": 0.5}
 LEFT = {
     **JOB,
@@ -68,8 +68,8 @@ def test_the_loss_of_a_view_that_nothing_reaches_is_that_of_its_picture() -> Non
     "changes",
     [
         pytest.param({}, marks=pytest.mark.slow),
-        pytest.param({"views_per_step": 1}, marks=pytest.mark.slow),
-        {"parameters": [WIDE], "views_per_step": 1},
+        pytest.param({"view_batch_size": 1}, marks=pytest.mark.slow),
+        {"parameters": [WIDE], "view_batch_size": 1},
     ],
 )
 def test_a_job_of_two_views_moves_one_of_its_cameras(changes: dict[str, Any]) -> None:
@@ -77,10 +77,10 @@ def test_a_job_of_two_views_moves_one_of_its_cameras(changes: dict[str, Any]) ->
 
 
 def test_a_later_stage_moves_one_of_the_cameras_and_is_gone_on_with() -> None:
-    session = iterate(make_config({**STAGED, "views_per_step": 1, "deterministic": True}))
+    session = iterate(make_config({**STAGED, "view_batch_size": 1, "deterministic": True}))
     whole = [state.values["left.to_world:translation"] for state in session]
     assert (whole[0] == whole[1]).all() and (whole[-1] != whole[1]).any()
-    session = iterate(make_config({**STAGED, "views_per_step": 1, "deterministic": True, "output": "again"}))
+    session = iterate(make_config({**STAGED, "view_batch_size": 1, "deterministic": True, "output": "again"}))
     for state in session:
         if state.iteration == 2:
             session.close()
@@ -100,9 +100,9 @@ def test_only_exposures_move() -> None:
     "changes",
     [
         {"sensors": ["right"]},
-        {"held_out": ["left"]},
+        {"test_views": ["left"]},
         {**STAGED, "stages": [STAGES[0], {**STAGES[1], "sensors": ["right"]}]},
-        {**STAGED, "stages": [STAGES[0], {**STAGES[1], "sensors": ["right"]}], "views_per_step": 1},
+        {**STAGED, "stages": [STAGES[0], {**STAGES[1], "sensors": ["right"]}], "view_batch_size": 1},
     ],
 )
 def test_cameras_that_no_view_has_are_told_before_the_first_iteration(changes: dict[str, Any], room: Path) -> None:  # noqa: F811

@@ -34,7 +34,7 @@ def test_the_example_is_valid_and_uses_five_views_or_more() -> None:
 def test_a_small_cloud_is_recovered_shown_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     job = shrunk(
-        scene_parameters={"resolution": 12, "grid": 8, "views": 3}, iterations=40, spp=8, picture_spp=8, rival=None,
+        scene_parameters={"resolution": 12, "grid": 8, "views": 3}, iterations=40, spp=8, eval_spp=8, baseline=None,
         resolutions=[4, 8], refine_at=[8], learning_rate=0.6, target={"spp": 64},
     )  # fmt: skip
     result = optimize(make_config(job), progress=False)
@@ -55,7 +55,7 @@ def test_the_cloud_ends_nearer_to_the_truth_than_with_prbvolpath(
     """A short form of the example (about a minute); its full length widens the distance."""
     monkeypatch.chdir(tmp_path)
     result = optimize(make_config(shrunk(iterations=24, refine_at=[6, 14], target={"spp": 128})), progress=False)
-    lines = (result.folder / "rival/history.jsonl").read_text().splitlines()
-    rival = json.loads(lines[-1])
-    assert result.errors[KEY] < rival["errors"][KEY]
-    assert result.history[-1].picture_error < rival["picture_error"]
+    lines = (result.folder / "baseline/history.jsonl").read_text().splitlines()
+    baseline = json.loads(lines[-1])
+    assert result.errors[KEY] < baseline["errors"][KEY]
+    assert result.history[-1].picture_error < baseline["picture_error"]

@@ -270,7 +270,7 @@ def test_an_address_that_cannot_be_is_told(server: RunServer, folder: Path, host
 
 
 def config(**changes: object) -> Config:
-    return make_config({**JOB, "output": "run", "held_out": ["right"], **changes})
+    return make_config({**JOB, "output": "run", "test_views": ["right"], **changes})
 
 
 @pytest.mark.slow
@@ -278,7 +278,7 @@ def test_a_run_keeps_its_page_and_a_bounded_number_of_frames(room: Path, monkeyp
     monkeypatch.setattr("pathreplay.report.live_page.time.perf_counter", iter(range(0, 10**9, 1000)).__next__)
     optimize(config(iterations=12, preview={"frames": 3, "share": 0.5}), progress=False)
     page = PAGES.validate_json((room / "run" / PAGE).read_bytes(), strict=True)
-    assert [view.name for view in page.views] == ["left", "right"] and page.views[1].held_out
+    assert [view.name for view in page.views] == ["left", "right"] and page.views[1].test_views
     assert page.facts[0][0] == "12 of 12" and page.plots[0].series[0].x == tuple(range(12))
     assert {f"{plot.title} {plot.code}" for plot in page.plots} >= {
         f"error of {TEXTURE}",

@@ -45,7 +45,7 @@ JOB: dict[str, Any] = {
     "learning_rate_schedule": "constant",
     "iterations": 20,
     "spp": 1,
-    "picture_spp": 1,
+    "eval_spp": 1,
     "parameters": [{"key": KEY, "lower": 0.0, "upper": 1.0}],
     "target": {"images": ["target.exr"]},
 }
@@ -109,12 +109,12 @@ def test_a_run_goes_on_with_its_mask(room: Path) -> None:
 
 def test_views_that_are_held_out_are_looked_at_only(room: Path) -> None:
     (room / "bright.exr").write_bytes(exr_bytes(np.full((4, 8, 3), 0.9, np.float32)))
-    job = {**JOB, "sensors": None, "held_out": ["other"], "target": {"images": ["target.exr", "bright.exr"]}}
+    job = {**JOB, "sensors": None, "test_views": ["other"], "target": {"images": ["target.exr", "bright.exr"]}}
     result = optimize(make_config(job), progress=False)
     alone = optimize(make_config(JOB), progress=False)
     assert result.parameters[KEY].mean() == pytest.approx(0.8, abs=1e-3)
     assert result.history[0].loss == pytest.approx(alone.history[0].loss, rel=1e-4)
-    assert result.held_out == ("other",)
+    assert result.test_views == ("other",)
     assert result.views["one"].psnr > 30 > result.views["other"].psnr
     assert "held-out views (1): PSNR" in result.describe()
     html = result.report.read_text()
@@ -139,14 +139,14 @@ class Views:
 
 def test_batches_have_every_view_once_in_a_round() -> None:
     views: Any = Views(0, 2, 3, 5, 7)
-    config = make_config({**JOB, "views_per_step": 2, "seed": 3})
+    config = make_config({**JOB, "view_batch_size": 2, "seed": 3})
     seen = [batch(views, config, i) for i in range(12)]
     assert [len(each) for each in seen] == 4 * [2, 2, 1]
     rounds = np.concatenate(seen).reshape(4, 5)
     assert (np.sort(rounds, axis=1) == [0, 2, 3, 5, 7]).all()
     assert len({tuple(each) for each in rounds.tolist()}) > 1
-    assert seen != [batch(views, make_config({**JOB, "views_per_step": 2, "seed": 4}), i) for i in range(12)]
-    everything = batch(views, make_config({**JOB, "views_per_step": 5}), 3)
+    assert seen != [batch(views, make_config({**JOB, "view_batch_size": 2, "seed": 4}), i) for i in range(12)]
+    everything = batch(views, make_config({**JOB, "view_batch_size": 5}), 3)
     assert everything == [7, 5, 3, 2, 0] == batch(views, make_config(JOB), 1)
 
 
@@ -156,7 +156,7 @@ def test_a_batch_stands_for_all_views(room: Path) -> None:
     both = {**JOB, "sensors": None, "target": {"images": ["target.exr", "target.exr"]}}
     all_of, one_of = (
         optimize(make_config({**both, **more}), output=str(k), progress=False)
-        for k, more in enumerate(({}, {"views_per_step": 1}))
+        for k, more in enumerate(({}, {"view_batch_size": 1}))
     )
     assert [e.loss for e in all_of.history] == pytest.approx([e.loss for e in one_of.history], rel=1e-3, abs=1e-8)
     assert one_of.parameters[KEY] == pytest.approx(all_of.parameters[KEY], abs=1e-5)
@@ -174,9 +174,9 @@ REFUSED = {
     ),
     "no alpha": ({"target": {"images": ["target.exr"], "alpha": "mask"}}, "has no alpha to be its mask"),
     "no picture": ({"target": {"values": {KEY: 0.5}, "alpha": "mask"}}, "alpha = 'mask' is about 'images'"),
-    "nothing left": ({"held_out": [0]}, "Every sensor of the job is held out"),
-    "elsewhere": ({"held_out": ["other"]}, "sensor 'other' is not among 'sensors'"),
-    "unknown view": ({"held_out": ["third"]}, "No sensor 'third' in the scene"),
+    "nothing left": ({"test_views": [0]}, "Every sensor of the job is held out"),
+    "elsewhere": ({"test_views": ["other"]}, "sensor 'other' is not among 'sensors'"),
+    "unknown view": ({"test_views": ["third"]}, "No sensor 'third' in the scene"),
     "no module": ({"loss": "not_there:loss"}, "Loss 'not_there:loss' cannot be imported (No module named 'not_there')"),
     "no function": ({"loss": "broken:loss"}, "has no attribute 'loss'"),
     "a number": ({"loss": "broken:number"}, "is no function of image and target, but 3"),

@@ -16,7 +16,7 @@ scene: room.xml
 integrator: {type: prb, max_depth: 2}
 iterations: 8
 spp: 4
-picture_spp: 4
+eval_spp: 4
 deterministic: true
 learning_rate: 2e-2   # no text, as it is to YAML 1.1
 parameters:
@@ -59,7 +59,7 @@ REFUSED = {
     "spp: -0x10": "'spp' is '-0x10'",
     "spp: 1:30": "'spp' is '1:30'",
     "seed: 2001-01-01": "'seed' is '2001-01-01'",
-    "warm_up: .nan": "'warm_up' is nan",
+    "warmup_steps: .nan": "'warmup_steps' is nan",
     "spp:": "'spp' is None",
     "spp: 16": "'spp' is given twice",
     "spq: 16": "unknown key 'spq'; did you mean 'spp'?",

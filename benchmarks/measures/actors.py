@@ -67,7 +67,7 @@ class Iterations(Measure):
 
     def _described(self, folder: Path) -> dict[str, Any]:
         size = self.job.resolution
-        common = {"iterations": self.ITERATIONS, "spp": self.job.spp, "picture_spp": 1, "preview": {"share": 0}}
+        common = {"iterations": self.ITERATIONS, "spp": self.job.spp, "eval_spp": 1, "preview": {"share": 0}}
         if self.scene == "cloud":
             density = {"*.sigma_t.data": 2.0}
             return {

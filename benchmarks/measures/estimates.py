@@ -49,18 +49,18 @@ def unpaired_ratio(
 
 @dataclass(frozen=True)
 class Versus:
-    """A method relative to a rival that it took turns with."""
+    """A method relative to a baseline that it took turns with."""
 
     ours: Point
-    rival: Point
+    baseline: Point
 
     def time(self) -> Estimate:
         """Median over rounds of (our seconds) / (their seconds of the same round)."""
-        return interval(np.median, np.divide(self.ours.seconds, self.rival.seconds), paired=True)
+        return interval(np.median, np.divide(self.ours.seconds, self.baseline.seconds), paired=True)
 
     def variance(self) -> Estimate:
         """Ratio of the means of squared errors."""
-        return mean_ratio(self.ours.squared_errors, self.rival.squared_errors)
+        return mean_ratio(self.ours.squared_errors, self.baseline.squared_errors)
 
     def cost(self) -> Estimate:
         """Time ratio x variance ratio: the time for equal variance."""
@@ -68,8 +68,8 @@ class Versus:
         def cost(times: np.ndarray, a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
             return np.median(times, axis) * a.mean(axis) / b.mean(axis)
 
-        times = np.divide(self.ours.seconds, self.rival.seconds)
-        return interval(cost, times, self.ours.squared_errors, self.rival.squared_errors, paired=True)
+        times = np.divide(self.ours.seconds, self.baseline.seconds)
+        return interval(cost, times, self.ours.squared_errors, self.baseline.squared_errors, paired=True)
 
     def efficiency(self) -> Estimate:
         """How many times less (time x variance) we need than they do.
@@ -80,7 +80,9 @@ class Versus:
         def gain(t: np.ndarray, a: np.ndarray, u: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
             return (u.sum(axis) * b.sum(axis)) / (t.sum(axis) * a.sum(axis))
 
-        return interval(gain, *(s for p in (self.ours, self.rival) for s in (p.seconds, p.squared_errors)), paired=True)
+        return interval(
+            gain, *(s for p in (self.ours, self.baseline) for s in (p.seconds, p.squared_errors)), paired=True
+        )
 
 
 def bias_share(bias_products: Sequence[float], squared_errors: Sequence[float]) -> Estimate:

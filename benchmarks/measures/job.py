@@ -34,7 +34,7 @@ class Job:
 
     Scenes are named in `benchmarks.scenes`, methods in `methods.py` or where the measure is; a name is all there is.
 
-    Round k of every method has the seed k. ``warm_up`` rounds before the first compile the kernels and are not kept;
+    Round k of every method has the seed k. ``warmup`` rounds before the first compile the kernels and are not kept;
     after them all integrators are made anew, and again every ``restart`` rounds: what a method learns from its passes
     it learns in rounds that are kept.
     """
@@ -47,7 +47,7 @@ class Job:
     resolution: int  # pixels, width = height
     spp: int
     rounds: int
-    warm_up: int = 2
+    warmup: int = 2
     restart: int = 0  # make all integrators anew every so many rounds; 0 = never
     threads: int = 0  # 0 = all processors
     patience: float = 0  # seconds after which a method sits out the rounds that are left; 0 = endless
@@ -61,7 +61,7 @@ class Job:
     @property
     def passes(self) -> int:
         """Passes in all, for the progress bar."""
-        return (self.rounds + self.warm_up) * len(self.methods)
+        return (self.rounds + self.warmup) * len(self.methods)
 
     @property
     def limits(self) -> dict[str, int]:

@@ -105,11 +105,11 @@ class WholeRun(Measure):
             "scene": str(folder / "scene.xml"),
             "iterations": ITERATIONS,
             "spp": self.job.spp,
-            "picture_spp": self.job.spp,
+            "eval_spp": self.job.spp,
             "integrator": {"type": "pathreplay", **self.job.limits},
             "parameters": [wall],
             "target": {"images": [str(folder / "target.exr")] * self.views},
-            **({"memory": self.memory} if self.memory else {}),
+            **({"memory_limit": self.memory} if self.memory else {}),
         }
 
 

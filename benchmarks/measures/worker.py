@@ -134,7 +134,7 @@ def run(job: Job) -> None:
     measure = _measure(job)
     kept: dict[str, list[Any]] = {name: [] for name in job.methods}
     spent = dict.fromkeys(job.methods, 0.0)
-    for k in range(-job.warm_up, job.rounds):
+    for k in range(-job.warmup, job.rounds):
         if k == 0 or (k > 0 and job.restart and k % job.restart == 0):
             measure.forget()
         for method in list(kept):

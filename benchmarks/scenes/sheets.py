@@ -52,7 +52,7 @@ def corridor(bsdf: SceneDict, resolution: int) -> SceneDict:
 
 def panes(interfaces: int, wall: SceneDict | None, resolution: int) -> SceneDict:
     """Bent panes of glass, one behind the other, in front of a wall if there is one: chains of delta lobes."""
-    glass = {"type": "smoothdielectric", "int_ior": 1.5}
+    glass = {"type": "dielectric_ad", "int_ior": 1.5}
     scene = {
         "type": "scene",
         "environment": smooth_environment(),

@@ -151,7 +151,7 @@ def _camera_in_a_cloud() -> SceneDict:
 
 
 def _fog_in_glass() -> SceneDict:
-    return _cloud(_fog(), object={"type": "sphere", "bsdf": {"type": "smoothdielectric"}, "interior": _fog()})
+    return _cloud(_fog(), object={"type": "sphere", "bsdf": {"type": "dielectric_ad"}, "interior": _fog()})
 
 
 TRUTH_SCENES: dict[str, Callable[[], SceneDict]] = {
@@ -163,7 +163,7 @@ TRUTH_SCENES: dict[str, Callable[[], SceneDict]] = {
     ),
     "rough metal ball": lambda: _ball({"type": "roughconductor", "material": "Au", "alpha": 0.2}),
     "principled ball": lambda: _ball({"type": "principled", "roughness": 0.4, "metallic": 0.3, "specular": 0.6}),
-    "glass ball": lambda: _ball({"type": "smoothdielectric"}),
+    "glass ball": lambda: _ball({"type": "dielectric_ad"}),
     "rough glass ball": lambda: _ball(
         {"type": "roughdielectric", "alpha": 0.3, "specular_transmittance": _rgb(0.8, 0.7, 0.9)}
     ),

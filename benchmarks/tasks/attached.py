@@ -41,7 +41,7 @@ def jobs(quick: bool) -> list[Job]:
             resolution=16,
             spp=spp,
             rounds=1,
-            warm_up=1,
+            warmup=1,
             threads=1,
         )
         for depth, spp in by_depth + by_paths

@@ -63,9 +63,7 @@ def jobs(quick: bool) -> list[Job]:
             resolution=16,
             spp=4,
             rounds=3 if quick else 5,
-            warm_up=2
-            if scene == MEDIA
-            else 1,  # a method that learns may have another kernel for when it knows nothing
+            warmup=2 if scene == MEDIA else 1,  # a method that learns may have another kernel for when it knows nothing
             threads=1,
             patience=PATIENCE_S,
         )

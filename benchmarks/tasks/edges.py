@@ -73,7 +73,7 @@ def jobs(quick: bool) -> list[Job]:
             resolution=side,
             spp=16 if quick else 64,
             rounds=4 if quick else CHEAP_ROUNDS if scene in FILM else ROUNDS,
-            warm_up=1 if patience else 2,
+            warmup=1 if patience else 2,
             patience=patience,
             measure="edges",
         )
@@ -92,7 +92,7 @@ def by_number(scene: str, key: str, depth: int, quick: bool) -> Job:
         resolution=TINY,
         spp=4 if quick else 16,
         rounds=4 if quick else 32,
-        warm_up=0,
+        warmup=0,
         measure="number",
     )
 
@@ -159,26 +159,28 @@ def costs(found: list[dict[str, Point]]) -> str:
         at = {name: job for job in jobs for name, point in job.items() if point.paths == least}
         times = [_versus(at[name][name], at[name].get("prb"))[1] if name in at else "" for name in timed]
         times.append(_versus(large["edges alone"]["edges alone"], large["edges alone"]["prb"])[1] if large else "")
-        rows.append([scene, *times, *(_cost(at.get(ours), ours, at.get(rival), rival) for ours, rival in VERSUS)])
+        rows.append(
+            [scene, *times, *(_cost(at.get(ours), ours, at.get(baseline), baseline) for ours, baseline in VERSUS)]
+        )
     return markdown(header, rows)
 
 
-def _versus(point: Point, rival: Point | None) -> list[str]:
+def _versus(point: Point, baseline: Point | None) -> list[str]:
     """As `comparison`, of the rounds that both have: one may have sat out the last."""
-    if rival is None or rival is point:
-        return comparison(point, rival)
-    n = min(len(point.seeds), len(rival.seeds))
-    first = [replace(p, seconds=p.seconds[:n], squared_errors=p.squared_errors[:n]) for p in (point, rival)]
+    if baseline is None or baseline is point:
+        return comparison(point, baseline)
+    n = min(len(point.seeds), len(baseline.seeds))
+    first = [replace(p, seconds=p.seconds[:n], squared_errors=p.squared_errors[:n]) for p in (point, baseline)]
     return comparison(*first)
 
 
-def _cost(job: dict[str, Point] | None, ours: str, other: dict[str, Point] | None, rival: str) -> str:
-    """Time x variance next to a rival. If that ran in another job, the times of `prb` in both make up for the load."""
-    if job is None or other is None or job[ours].error or other[rival].error:
+def _cost(job: dict[str, Point] | None, ours: str, other: dict[str, Point] | None, baseline: str) -> str:
+    """Time x variance next to a baseline. If it ran in another job, times of `prb` in both correct for the load."""
+    if job is None or other is None or job[ours].error or other[baseline].error:
         return ""
     seconds = [st.median(x["prb"].seconds) if "prb" in x and x["prb"].seconds else 1.0 for x in (job, other)]
-    scaled = tuple(s * seconds[0] / seconds[1] for s in other[rival].seconds)
-    return _versus(job[ours], replace(other[rival], seconds=scaled))[3]
+    scaled = tuple(s * seconds[0] / seconds[1] for s in other[baseline].seconds)
+    return _versus(job[ours], replace(other[baseline], seconds=scaled))[3]
 
 
 def _steps(steps: dict[str, Point]) -> str:

@@ -34,7 +34,7 @@ def jobs(quick: bool) -> list[Job]:
             spp=4,
             rounds=2 if counted else 3 if quick else 7,
             patience=0 if counted else PATIENCE_S,
-            warm_up=0 if counted else 2,  # a method that learns may have another kernel for when it knows nothing
+            warmup=0 if counted else 2,  # a method that learns may have another kernel for when it knows nothing
             threads=1,
             measure="events" if counted else "gradient",
         )

@@ -38,7 +38,7 @@ def jobs(quick: bool) -> list[Job]:
             resolution=128 if quick else 256,  # rays: its square times spp
             spp=1 if quick else 2,
             rounds=3 if quick else 16,
-            warm_up=1,
+            warmup=1,
             measure=measure,
         )
         for measure, scales in SCALES.items()
@@ -76,8 +76,8 @@ def _gain(found: dict[str, Point], name: str) -> str:
     return str(mean_ratio(one.seconds, other.seconds))
 
 
-def _cost(point: Point, rival: Point | None) -> list[str]:
-    if point.error or rival is None or rival.error or point.z is None:
+def _cost(point: Point, baseline: Point | None) -> list[str]:
+    if point.error or baseline is None or baseline.error or point.z is None:
         return [point.error or "", "", "", ""]
-    errors, cost = f"{st.fmean(point.squared_errors):.2e}", Versus(rival, point).efficiency()
+    errors, cost = f"{st.fmean(point.squared_errors):.2e}", Versus(baseline, point).efficiency()
     return [f"{st.fmean(point.seconds):.4f}", errors, str(cost), f"{point.z:.1f}"]

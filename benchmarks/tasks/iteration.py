@@ -36,7 +36,7 @@ def jobs(quick: bool) -> list[Job]:
             resolution=min(resolution, 64) if quick else resolution,
             spp=16,
             rounds=4 if quick else rounds,
-            warm_up=2,
+            warmup=2,
             measure="step",
         )
         for scene, parameters, methods, depth, resolution, rounds in (ROWS[:1] if quick else ROWS)

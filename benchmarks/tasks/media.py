@@ -46,7 +46,7 @@ def jobs(quick: bool) -> list[Job]:
             rounds=4 if quick else runs * RUN,
             # Of kernels only, since what was learned is dropped; several, since a method may have two: with and without
             # something learned.
-            warm_up=3,
+            warmup=3,
             restart=RUN,
             weights="wave",
             update=True,
@@ -68,19 +68,19 @@ def table(record: Record) -> str:
     return markdown(header, rows)
 
 
-def _cells(point: Point, rival: Point | None) -> list[str]:
+def _cells(point: Point, baseline: Point | None) -> list[str]:
     if point.error:
         return [point.error, *[""] * 5]
     cells = [median_seconds(point)]
-    if rival is None or rival.error:
+    if baseline is None or baseline.error:
         cells += [""] * 4
-    elif rival is point:
+    elif baseline is point:
         cells += ["1", "1", "1" if point.smooth_errors else "", "1"]
     else:
-        cells.append(str((versus := Versus(point, rival)).time()))
-        smooth = bool(point.smooth_errors and rival.smooth_errors)
-        along = str(mean_ratio(point.smooth_errors, rival.smooth_errors)) if smooth else ""
-        finite = point.squared_errors and rival.squared_errors
+        cells.append(str((versus := Versus(point, baseline)).time()))
+        smooth = bool(point.smooth_errors and baseline.smooth_errors)
+        along = str(mean_ratio(point.smooth_errors, baseline.smooth_errors)) if smooth else ""
+        finite = point.squared_errors and baseline.squared_errors
         cells += [str(versus.variance()), along, str(versus.efficiency())] if finite else [""] * 3
     told = point.bias_products and point.method != REFERENCE
     return [*cells, str(bias_share(point.bias_products, point.squared_errors)) if told else ""]

@@ -48,7 +48,7 @@ def jobs(quick: bool) -> list[Job]:
             resolution=16,
             spp=16,
             rounds=2 if quick else 3,
-            warm_up=1,
+            warmup=1,
             measure="noise",
         )
         for scene, bounces, methods in (QUICK if quick else ROWS)

@@ -34,7 +34,7 @@ def jobs(quick: bool) -> list[Job]:
         resolution=32 if quick else 128,
         spp=4,
         rounds=1,
-        warm_up=0,
+        warmup=0,
         measure="whole run",
     )
     views = [replace(run, scene=name_of(n, 100)) for n in (QUICK_VIEWS if quick else VIEWS)]
@@ -50,14 +50,14 @@ def jobs(quick: bool) -> list[Job]:
     shapes = [
         replace(
             run, scene=shapes_name(n), parameters=(COLOUR,), methods=("prb", "sweep"), max_depth=4, resolution=32,
-            spp=16, rounds=2 if n == SHAPES[-1] or quick else 5, warm_up=1, measure="gradient",
+            spp=16, rounds=2 if n == SHAPES[-1] or quick else 5, warmup=1, measure="gradient",
         )
         for n in (SHAPES[:2] if quick else SHAPES)
     ]  # fmt: skip
     ways = f"prb, {USUAL}", f"sweep, {OWN}"
     # The median is that of recorded steps: the first two are traced.
     steps = [
-        replace(job, methods=ways, measure="step", warm_up=0, rounds=7 if job is shapes[-1] else 15) for job in shapes
+        replace(job, methods=ways, measure="step", warmup=0, rounds=7 if job is shapes[-1] else 15) for job in shapes
     ]
     return [*views, *texels, *both, *sums, *shapes, *steps, *_by_actors(run, quick)]
 

@@ -25,7 +25,7 @@ def jobs(quick: bool) -> list[Job]:
             resolution=64,
             spp=16,
             rounds=1 if quick else 5,
-            warm_up=1,
+            warmup=1,
             measure=measure,
         )
         for measure in ("cold start", "warm start")

@@ -30,7 +30,7 @@ def jobs(quick: bool) -> list[Job]:
             resolution=32 if quick else 64,
             spp=16 if quick else 64,  # enough that tracing the kernels does not count
             rounds=4 if quick else 5,
-            warm_up=3,
+            warmup=3,
             measure=measure,
             weights="wave",
             update=True,
@@ -52,12 +52,12 @@ def table(record: Record) -> str:
     return markdown(["grid", "pass", "majorants", "seconds (median)", "speed-up", "variance ratio"], rows)
 
 
-def _cells(point: Point, rival: Point | None) -> list[str]:
+def _cells(point: Point, baseline: Point | None) -> list[str]:
     if point.error:
         return [point.error, "", ""]
-    if rival is None or rival.error:
+    if baseline is None or baseline.error:
         return [median_seconds(point), "", ""]
-    if rival is point:
+    if baseline is point:
         return [median_seconds(point), "1", "1"]
-    variance = unpaired_ratio(point.squared_errors, rival.squared_errors, np.mean)
-    return [median_seconds(point), str(unpaired_ratio(rival.seconds, point.seconds, np.median)), str(variance)]
+    variance = unpaired_ratio(point.squared_errors, baseline.squared_errors, np.mean)
+    return [median_seconds(point), str(unpaired_ratio(baseline.seconds, point.seconds, np.median)), str(variance)]

@@ -88,7 +88,7 @@ def jobs(quick: bool) -> list[Job]:
             resolution=16,
             spp=cell.spp,
             rounds=6 if quick else 12,
-            warm_up=0,
+            warmup=0,
             measure="truth",
         )
         for cell in CELLS.values()

@@ -27,17 +27,18 @@ LISTED: dict[str, Any] = {"camera_angle_x": 0.7, "frames": FRAMES}
 
 #: Jobs that work, with a capture of either kind and with a pattern.
 CAPTURED: dict[str, Any] = {key: value for key, value in JOB.items() if key != "target"} | {
-    "capture": {"transforms": "photos/transforms.json", "hold_out_every": 3},
+    "capture": {"transforms": "photos/transforms.json", "test_every": 3},
     "exposure": {},
 }
-MODELLED = {**CAPTURED, "capture": {"colmap": "sparse/0", "images": "images", "width": 8, "hold_out_every": 3}}
+MODELLED = {**CAPTURED, "capture": {"colmap": "sparse/0", "images": "images", "width": 8, "test_every": 3}}
 PATTERN = {**JOB, "target": {"images": "photos/0.p*"}}
 
 KEYS: dict[str, Mapping[str, Any]] = {
     **dict.fromkeys(
-        "capture capture.transforms capture.masks capture.images capture.width capture.hold_out_every exposure "
-        "exposure.white_balance exposure.reference exposure.free exposure.learning_rate view_weights view_weights.1 "
-        "target target.alpha sensors held_out".split(),
+        "capture capture.transforms capture.masks capture.images capture.width capture.test_every exposure "
+        "exposure.white_balance exposure.reference exposure.fix_scale exposure.learning_rate view_weights "
+        "view_weights.1 "
+        "target target.alpha sensors test_views".split(),
         CAPTURED,
     ),
     "capture.colmap": MODELLED,
@@ -159,7 +160,7 @@ def pictures_of_two_shapes_and_one_said_size(room: Room, rng: np.random.Generato
 
 @recipe(KIND, refused=True)
 def all_views_held_out(room: Room, rng: np.random.Generator) -> None:
-    _photos(room, job={**CAPTURED, "held_out": ["0", "1", "2"]})
+    _photos(room, job={**CAPTURED, "test_views": ["0", "1", "2"]})
 
 
 @recipe(KIND, refused=True)

@@ -25,17 +25,20 @@ KEYS: dict[str, Mapping[str, Any]] = {
     **dict.fromkeys(
         (
             "scene scene_parameters sensors variant integrator integrator.type integrator.max_depth "
-            "integrator.rr_depth integrator.hide_emitters integrator.driver integrator.noise integrator.numbers rival "
+            "integrator.rr_depth integrator.hide_emitters integrator.driver integrator.noise integrator.numbers "
+            "baseline "
             "parameters parameters.0 parameters.0.key parameters.0.lower parameters.0.upper parameters.0.learning_rate "
             "parameters.0.initial parameters.0.initial.image parameters.0.resolutions parameters.0.refine_at "
-            "parameters.0.pose target target.images loss spp picture_spp seed learning_rate learning_rate_decay "
-            "views_per_step pixels_per_step held_out capture capture.transforms capture.colmap exposure "
-            "exposure.reference exposure.white_balance exposure.free view_weights view_weights.eye target.masks "
-            "target.alpha learning_rate_schedule warm_up "
+            "parameters.0.pose target target.images loss spp eval_spp seed learning_rate final_learning_rate_ratio "
+            "view_batch_size pixel_batch_size test_views capture capture.transforms capture.colmap exposure "
+            "exposure.reference exposure.white_balance exposure.fix_scale view_weights view_weights.eye target.masks "
+            "target.alpha learning_rate_schedule warmup_steps "
             " optimizer optimizer.type optimizer.beta_1 optimizer.epsilon "
-            "parameters.0.transform parameters.0.total_variation parameters.0.prior checkpoint_every unknown "
-            "auto_spp auto_spp.ratio auto_spp.lowest auto_spp.highest signal_to_noise non_finite_in_a_row "
-            "preview preview.share preview.views preview.frames parameters.0.laplacian parameters.0.penalty"
+            "parameters.0.parameterization parameters.0.total_variation parameters.0.l2_to_initial "
+            "checkpoint_every unknown "
+            "adaptive_spp adaptive_spp.target_snr adaptive_spp.min adaptive_spp.max measure_snr "
+            "max_consecutive_nonfinite "
+            "preview preview.share preview.views preview.frames parameters.0.laplacian_weight parameters.0.regularizer"
         ).split(),
         JOB,
     ),
@@ -48,8 +51,8 @@ KEYS: dict[str, Mapping[str, Any]] = {
     ),
     **dict.fromkeys(
         (
-            "parameters.0.start parameters.0.start.translation parameters.0.start.rotation parameters.0.pivot "
-            "parameters.0.distance parameters.0.rotation_learning_rate parameters.0.learning_rate"
+            "parameters.0.initial parameters.0.initial.translation parameters.0.initial.rotation parameters.0.pivot "
+            "parameters.0.error_scale parameters.0.rotation_learning_rate parameters.0.learning_rate"
         ).split(),
         POSED,
     ),
@@ -63,8 +66,8 @@ KEYS: dict[str, Mapping[str, Any]] = {
     **dict.fromkeys(
         (
             "stages stages.0 stages.0.iterations stages.0.downscale stages.0.spp stages.0.max_depth stages.0.sensors "
-            "stages.0.views_per_step stages.0.pixels_per_step stages.0.parameters stages.0.learning_rate_factor "
-            "iterations warm_up"
+            "stages.0.view_batch_size stages.0.pixel_batch_size stages.0.parameters stages.0.learning_rate_factor "
+            "iterations warmup_steps"
         ).split(),
         STAGED,
     ),
@@ -97,7 +100,7 @@ def _valued(key: str, value: Any, *, job: Mapping[str, Any] = JOB, refused: bool
 _valued("spp", True)
 _valued("spp", 10**9)
 _valued("spp", 2**31)
-_valued("picture_spp", 10**9)
+_valued("eval_spp", 10**9)
 _valued("target.spp", 10**9, job=RENDERED)
 _valued("spp", Raw("9" * 10_000))
 _valued("scene_parameters", {"res": 10**9})
@@ -123,15 +126,15 @@ _valued("target.integrator.type", "diffuse", job=RENDERED)
 _valued("target.integrator.type", "scene", job=RENDERED)
 _valued("integrator.type", "hdrfilm")
 _valued("integrator", {"type": "path"})
-_valued("rival", {"type": "sphere"})
+_valued("baseline", {"type": "sphere"})
 _valued("integrator.max_depth", Raw("nan"))
 _valued("integrator.max_depth", 10**12)
 _valued("integrator.max_depth", "6")
 _valued("integrator.max_depth", 1.5)
 _valued("integrator.type", "prb.dll/../..")
 _valued("parameters.0.pivot", [1e38, 1e38, 1e38], job=POSED)
-_valued("parameters.0.start.translation", [1e38, 0, 0], job=POSED)
-_valued("parameters.0.start.rotation", [1e38, 0, 0], job=POSED, refused=False)
+_valued("parameters.0.initial.translation", [1e38, 0, 0], job=POSED)
+_valued("parameters.0.initial.rotation", [1e38, 0, 0], job=POSED, refused=False)
 _valued("target.values", {"paint.reflectance.data": 1e300}, job=RENDERED)
 _valued("target.values", {"*": 0.5}, job=RENDERED, refused=False)
 _valued("target.values", {"eye.to_world": 0.5}, job=RENDERED)
@@ -161,16 +164,16 @@ _valued("stages.0.learning_rate_factor", 1e30, job=STAGED, refused=False)
 _valued("stages.1.learning_rate_factor", -1, job=STAGED)
 _valued("stages", [{"iterations": 1, "unknown": ESCAPE}], job=STAGED)
 _valued("iterations", 5, job=STAGED)
-_valued("signal_to_noise", True, job={**JOB, "spp": 3})
-_valued("auto_spp", {"lowest": 3}, job={**JOB, "spp": "auto"})
-_valued("auto_spp", {"lowest": 64, "highest": 8}, job={**JOB, "spp": "auto"})
-_valued("auto_spp", {"highest": 2**30}, job={**JOB, "spp": "auto"})
-_valued("auto_spp", {"ratio": 1e38, "highest": 8}, job={**JOB, "spp": "auto"}, refused=False)
+_valued("measure_snr", True, job={**JOB, "spp": 3})
+_valued("adaptive_spp", {"min": 3}, job={**JOB, "spp": "auto"})
+_valued("adaptive_spp", {"min": 64, "max": 8}, job={**JOB, "spp": "auto"})
+_valued("adaptive_spp", {"max": 2**30}, job={**JOB, "spp": "auto"})
+_valued("adaptive_spp", {"target_snr": 1e38, "max": 8}, job={**JOB, "spp": "auto"}, refused=False)
 _valued("spp", "automatic")
 _valued("preview", {"share": 1.0})
 _valued("preview", {"views": 10**6})
 _valued("preview", {"share": 0.5, "frames": 1000, "views": 64}, refused=False)
-_valued("non_finite_in_a_row", 0)
+_valued("max_consecutive_nonfinite", 0)
 _valued("iterations", 0)
 _valued("iterations", Raw("1979-05-27T07:32:00Z"))
 

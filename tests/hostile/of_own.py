@@ -104,7 +104,7 @@ def use(room: Room, where: str, body: str, head: str = "def f(first, *others):")
     if where == "loss":
         room.change("loss", "own:f")
     elif where == "penalty":
-        room.change("parameters.0.penalty", "own:f", JOB)
+        room.change("parameters.0.regularizer", "own:f", JOB)
     else:
         room.change("derived.0.function", "own:f", DERIVED)
 

@@ -52,7 +52,7 @@ def _code(name: str, code: str, *, refused: bool = True, variant: str = "llvm_ad
 
 OPTIONS = {
     "pathreplay": ("max_depth", "rr_depth", "hide_emitters", "driver", "attach", "noise", "branch"),
-    "smoothdielectric": ("int_ior", "ext_ior", "specular_reflectance", "specular_transmittance"),
+    "dielectric_ad": ("int_ior", "ext_ior", "specular_reflectance", "specular_transmittance"),
     "gridmedium": ("sigma_t", "albedo", "scale", "emission", "supergrid"),
 }
 for _plugin, _options in OPTIONS.items():

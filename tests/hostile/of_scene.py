@@ -43,7 +43,7 @@ def a_hostile_number_somewhere(room: Room, rng: np.random.Generator) -> Action:
 @recipe(KIND, fuzz=True)
 def a_plugin_of_another_type(room: Room, rng: np.random.Generator) -> Action:
     types = ("perspective", "hdrfilm", "box", "independent", "diffuse", "bitmap", "sphere", "ply", "obj", "constant")
-    others = (*types, "pathreplay", "smoothdielectric", "gridmedium", "merge", "", "../x", "nothing", "path", "aov")
+    others = (*types, "pathreplay", "dielectric_ad", "gridmedium", "merge", "", "../x", "nothing", "path", "aov")
     room.edit("ball.xml", f'type="{pick(rng, types)}"', f'type="{pick(rng, others)}"')
     return _either(rng)
 
@@ -225,10 +225,10 @@ PIECES = {
     "an unknown metal": PAINTED.format(bsdf="conductor", inner='<string name="material" value="Xx"/>'),
     "an index of zero": '<shape type="sphere"><bsdf type="dielectric"><float name="int_ior" value="0"/></bsdf></shape>',
     "our glass with an index of NaN": (
-        '<shape type="sphere"><bsdf type="smoothdielectric"><float name="int_ior" value="nan"/></bsdf></shape>'
+        '<shape type="sphere"><bsdf type="dielectric_ad"><float name="int_ior" value="nan"/></bsdf></shape>'
     ),
     "our glass with a name for an index": (
-        '<shape type="sphere"><bsdf type="smoothdielectric"><string name="int_ior" value="cheese"/></bsdf></shape>'
+        '<shape type="sphere"><bsdf type="dielectric_ad"><string name="int_ior" value="cheese"/></bsdf></shape>'
     ),
     "our medium with a density below zero": (
         '<shape type="sphere"><bsdf type="null"/><medium type="gridmedium" name="interior">'

@@ -15,21 +15,21 @@ from .values import TEXTS, VALUES, pick, spoiled
 KIND = "stages"
 _PLAIN = {key: value for key, value in JOB.items() if key != "iterations"}
 STAGED = {**_PLAIN, "stages": [{"iterations": 1, "downscale": 2, "spp": 2}, {"iterations": 1, "max_depth": 2}]}
-AUTO = {**JOB, "spp": "auto", "auto_spp": {"ratio": 1.0, "lowest": 2, "highest": 4}}
-SEARCHED = {**JOB, "optimizer": {"type": "l-bfgs-b", "memory": 3, "tolerance": 1e-6}}
+AUTO = {**JOB, "spp": "auto", "adaptive_spp": {"target_snr": 1.0, "min": 2, "max": 4}}
+SEARCHED = {**JOB, "optimizer": {"type": "l-bfgs-b", "history_size": 3, "tolerance": 1e-6}}
 
 # Without iterations: as many as are asked for are taken.
 KEYS: dict[str, Mapping[str, Any]] = {
     **dict.fromkeys(
         (
             "stages stages.0 stages.0.downscale stages.0.spp stages.0.max_depth stages.0.sensors stages.0.parameters "
-            "stages.0.views_per_step stages.0.pixels_per_step stages.0.learning_rate_factor stages.1.unknown"
+            "stages.0.view_batch_size stages.0.pixel_batch_size stages.0.learning_rate_factor stages.1.unknown"
         ).split(),
         STAGED,
     ),
-    **dict.fromkeys("signal_to_noise non_finite_in_a_row".split(), JOB),
-    **dict.fromkeys("auto_spp auto_spp.ratio auto_spp.lowest auto_spp.highest".split(), AUTO),
-    **dict.fromkeys("optimizer.memory optimizer.tolerance".split(), SEARCHED),
+    **dict.fromkeys("measure_snr max_consecutive_nonfinite".split(), JOB),
+    **dict.fromkeys("adaptive_spp adaptive_spp.target_snr adaptive_spp.min adaptive_spp.max".split(), AUTO),
+    **dict.fromkeys("optimizer.history_size optimizer.tolerance".split(), SEARCHED),
 }
 
 
@@ -54,10 +54,10 @@ _refused("stages", [], STAGED)
 _refused("stages", {"iterations": 1}, STAGED)
 _refused("iterations", 3, STAGED)
 _refused("spp", "Auto", AUTO)
-_refused("auto_spp.highest", 2**30, AUTO)
-_refused("auto_spp.lowest", 0, AUTO)
+_refused("adaptive_spp.max", 2**30, AUTO)
+_refused("adaptive_spp.min", 0, AUTO)
 _refused("stages", [{"iterations": 1}], SEARCHED)
-_refused("optimizer.memory", 0, SEARCHED)
+_refused("optimizer.history_size", 0, SEARCHED)
 
 
 # ------------------------------------------------------------------------------

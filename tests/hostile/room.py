@@ -17,7 +17,7 @@ JOB: dict[str, Any] = {
     "scene": "ball.xml",
     "iterations": 2,
     "spp": 2,
-    "picture_spp": 2,
+    "eval_spp": 2,
     "checkpoint_every": 1,
     "integrator": {"type": "pathreplay", "max_depth": 3},
     "parameters": [{"key": "paint.reflectance.data", "lower": 0.0, "upper": 1.0, "initial": 0.4}],
@@ -30,7 +30,7 @@ RENDERED = {**JOB, "target": {"values": {"paint.reflectance.data": 0.7}, "spp": 
 #: The same for where the camera stands.
 POSED = {
     **RENDERED,
-    "parameters": [{"key": "eye.to_world", "pose": "rigid", "start": {"translation": [0.1, 0, 0]}}],
+    "parameters": [{"key": "eye.to_world", "pose": "rigid", "initial": {"translation": [0.1, 0, 0]}}],
 }
 
 #: The same for a number from which the picture's brightness is derived.

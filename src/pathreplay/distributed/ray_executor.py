@@ -72,7 +72,7 @@ class _Call:
 
 @dataclass
 class WorkerPool:
-    """The actors of a run, and what they are asked; the executors of a job and of its rival share them."""
+    """The actors of a run, and what they are asked; the executors of a job and of its baseline share them."""
 
     cluster: Cluster
     actors: dict[int, Any]
@@ -192,10 +192,10 @@ class WorkerPool:
 
 
 class RayExecutor:
-    """Evaluates shards by actors of Ray: an `Executor`. `crew_of` makes the crew; ``rival`` says whose integrator."""
+    """Evaluates shards by actors of Ray: an `Executor`. ``baseline`` says whose integrator."""
 
-    def __init__(self, pool: WorkerPool, names: Sequence[str] = (), rival: bool = False) -> None:
-        self.pool, self.names, self.rival = pool, names, rival
+    def __init__(self, pool: WorkerPool, names: Sequence[str] = (), baseline: bool = False) -> None:
+        self.pool, self.names, self.baseline = pool, names, baseline
         self.scheduler = Scheduler()
         pool.schedulers.append(self.scheduler)
 
@@ -247,7 +247,7 @@ class RayExecutor:
             self.pool.counts.twice += len(step.again) - late
             indices = (first, *step.along(number, size, len(self.pool.ready)))
             self.pool.ask(
-                number, _Call(number, step, indices), self.rival, values, [shards[i] for i in indices], learned
+                number, _Call(number, step, indices), self.baseline, values, [shards[i] for i in indices], learned
             )
 
     def _lost(self, call: _Call, step: Step, shards: Sequence[Shard], losses: dict[int, int]) -> None:
@@ -347,4 +347,4 @@ def _count(ray: Any, config: Config, threads: int, problem: Problem) -> int:
     if config.ray.actors is not None:
         return config.ray.actors
     views = len(problem.trained())
-    return min(room, config.parts * min(views, config.views_per_step or views))
+    return min(room, config.parts * min(views, config.view_batch_size or views))

@@ -82,33 +82,33 @@ class RayActor:
         machine = f"{_processor()}, LLVM {'.'.join(map(str, backend.loaded_version()))}"
         return Ready(platform.node(), os.getpid(), versions(), machine)
 
-    def evaluate(self, rival: bool, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Answer] | None:
-        """Shards by the job's integrator, or by that of its rival; None where this actor was started again since."""
-        return None if self.problem is None else [self._answer(rival, values, shard, learned) for shard in shards]
+    def evaluate(self, baseline: bool, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Answer] | None:
+        """Shards by the job's integrator, or by that of its baseline; None where this actor was started again since."""
+        return None if self.problem is None else [self._answer(baseline, values, shard, learned) for shard in shards]
 
-    def _answer(self, rival: bool, values: Arrays, shard: Shard, learned: Arrays) -> Answer:
+    def _answer(self, baseline: bool, values: Arrays, shard: Shard, learned: Arrays) -> Answer:
         config = self.config
-        plugin = config.rival if rival and config.rival is not None else config.integrator
+        plugin = config.baseline if baseline and config.baseline is not None else config.integrator
         self.log.lines.clear()
         begin = time.perf_counter()
         with one_thread(config.deterministic), told(f"Integrator '{plugin.type}' cannot do this job"):
-            evaluation = self._evaluator(rival)(values, shard, learned)
+            evaluation = self._evaluator(baseline)(values, shard, learned)
         return Answer(evaluation, time.perf_counter() - begin, tuple(self.log.lines))
 
-    def _evaluator(self, rival: bool) -> Evaluate:
-        if rival not in self.evaluators:
+    def _evaluator(self, baseline: bool) -> Evaluate:
+        if baseline not in self.evaluators:
             config, problem = self.config, self.problem
             assert problem is not None
             plugin, integrator = config.integrator, problem.integrator
-            if rival and config.rival is not None and problem.rival is not None:
-                plugin, integrator = config.rival, problem.rival
+            if baseline and config.baseline is not None and problem.baseline is not None:
+                plugin, integrator = config.baseline, problem.baseline
             record = not config.deterministic
-            self.evaluators[rival] = (
+            self.evaluators[baseline] = (
                 Evaluator(problem, integrator, record)
                 if config.stages is None
                 else Staged(problem, config, integrator, plugin, record)
             )
-        return self.evaluators[rival]
+        return self.evaluators[baseline]
 
 
 def _kept_log() -> Any:

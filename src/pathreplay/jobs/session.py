@@ -72,7 +72,7 @@ class State:
     def picture(self, view: str | None = None) -> Image:
         """A rendering of a view (default: the first) with these values: linear, height x width x channels.
 
-        It has ``picture_spp`` samples per pixel. Takes time, and changes nothing of what comes after. Raises
+        It has ``eval_spp`` samples per pixel. Takes time, and changes nothing of what comes after. Raises
         PathreplayError where there is no such view.
         """
         name = self.views[0] if view is None else view
@@ -157,8 +157,8 @@ def _states(
             bar.note(note)
         pool = stack.enter_context(crew_of(config, job.base, problem, bar.remark, bar.status))
         run = _run(problem, config, problem.integrator, config.integrator, pool)
-        if problem.rival is not None and config.rival is not None:
-            run.rival = _run(problem, config, problem.rival, config.rival, pool, rival=True)
+        if problem.baseline is not None and config.baseline is not None:
+            run.baseline = _run(problem, config, problem.baseline, config.baseline, pool, baseline=True)
         if resumed is None:
             folder, before = _begun(output, home, job, problem, run)
             stack.callback(folder.lock.close)
@@ -195,11 +195,11 @@ def _states(
         bar.say("writing")
         run = replace(run, values=best_values(problem, run))
         with computing(config):
-            for each in filter(None, (run, run.rival)):
+            for each in filter(None, (run, run.baseline)):
                 each.values = dict(with_exposures(problem, config, each.values))
             verdict = verdict_of(problem, run, stop.by is not None)
             after = render_views(problem, config, run.values)
-            theirs = render_views(problem, config, run.rival.values) if run.rival else {}
+            theirs = render_views(problem, config, run.baseline.values) if run.baseline else {}
         outcome = outcome_of(job, folder.name, problem, run, before, after, theirs, verdict)
         files = result_files(outcome, previews.finished(after))
         problem.album.rest()
@@ -218,12 +218,12 @@ def _run(
     integrator: mi.Integrator,
     plugin: Plugin,
     pool: WorkerPool | None,
-    rival: bool = False,
+    baseline: bool = False,
 ) -> Run:
     """A run that begins, by an integrator, which is made of that plugin; in this process, if there is no crew."""
     record = not config.deterministic
     if pool is not None:
-        executor = RayExecutor(pool, [view.name for view in problem.views], rival)
+        executor = RayExecutor(pool, [view.name for view in problem.views], baseline)
         return new_run(problem, integrator, record, config.optimizer, executor=executor)
     staged = None if config.stages is None else Staged(problem, config, integrator, plugin, record)
     return new_run(problem, integrator, record, config.optimizer, staged)
@@ -251,7 +251,9 @@ def _looker(problem: Problem, config: Config) -> Callable[[Mapping[str, Array], 
 @contextmanager
 def computing(config: Config) -> Iterator[None]:
     """Around what the job's integrators do: in one thread if that is wanted, and their errors told."""
-    names = config.integrator.type if config.rival is None else f"{config.integrator.type}' or '{config.rival.type}"
+    names = (
+        config.integrator.type if config.baseline is None else f"{config.integrator.type}' or '{config.baseline.type}"
+    )
     with one_thread(config.deterministic), told(f"Integrator '{names}' cannot do this job"):
         yield
 

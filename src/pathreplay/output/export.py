@@ -105,7 +105,7 @@ def _source(job: Job, values: Arrays) -> Source:
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, job.base, picture_size, film)
     cameras = {name: shot.camera for name, shot in shots.items()}
-    plugins = {"dielectric": "smoothdielectric"} if any(key.endswith(".eta") for key in values) else {}
+    plugins = {"dielectric": "dielectric_ad"} if any(key.endswith(".eta") for key in values) else {}
     if config.scene in BUILTINS:
         return Source(builtin_dict(config.scene, config.scene_parameters), {}, plugins, cameras)
     path = job.base / config.scene

@@ -145,7 +145,7 @@ class Placing:
             _remove(node.props, "focal_length")
             node.props["fov_axis"] = "x"
             node.props["fov"] = float(value[0])
-        elif plugin == "smoothdielectric" and place == "eta":
+        elif plugin == "dielectric_ad" and place == "eta":
             node.props["int_ior"], node.props["ext_ior"] = float(value[0]), 1.0
         elif place.endswith(".value") or place == "value":
             name = place.split(".")[0]

@@ -30,7 +30,7 @@ from pathreplay.scenes.substitute import load_dict_with, load_file_with
 
 SCENE = "scene.xml"
 
-_STANDS_IN = {"smoothdielectric": "dielectric"}
+_STANDS_IN = {"dielectric_ad": "dielectric"}
 """What Mitsuba's own scenes have in the place of our plugins."""
 _DEPTHS = {"direct_projective": 2} | dict.fromkeys(
     ("pathreplay", "prb", "prb_basic", "prb_projective", "rb", "prbvolpath"), 6

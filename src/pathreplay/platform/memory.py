@@ -67,8 +67,8 @@ def require_kept() -> None:
     """Raise PathreplayError if the process has taken more than its budget."""
     if _budget is not None and (now := taken()) > _budget:
         raise PathreplayError(
-            f"The run takes {_readable(now)} of memory, and its 'memory' is {_readable(_budget)}; take smaller films "
-            "or parameters, or raise it"
+            f"The run takes {_readable(now)} of memory, and its 'memory_limit' is {_readable(_budget)}; take smaller "
+            "films or parameters, or raise it"
         )
 
 

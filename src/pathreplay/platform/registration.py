@@ -20,7 +20,7 @@ PLUGINS = {
     "pathreplay_tape": ("integrator", "pathreplay.integrators.baselines.plugins", "TapeIntegrator"),
     "pathreplay_rb": ("integrator", "pathreplay.integrators.baselines.plugins", "RadiativeIntegrator"),
     "pathreplay_listing": ("integrator", "pathreplay.integrators.baselines.plugins", "ListingIntegrator"),
-    "smoothdielectric": ("bsdf", "pathreplay.plugins.smoothdielectric", "SmoothDielectric"),
+    "dielectric_ad": ("bsdf", "pathreplay.plugins.dielectric_ad", "DielectricAD"),
     "gridmedium": ("medium", "pathreplay.plugins.gridmedium", "GridMedium"),
 }
 

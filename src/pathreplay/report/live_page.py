@@ -169,7 +169,7 @@ class Previews:
     def _look(self, done: int) -> dict[str, bytes]:
         """Pictures of the views as they are now."""
         try:
-            spp = max(self.config.most_spp, min(LEAST_SPP, self.config.picture_spp))
+            spp = max(self.config.most_spp, min(LEAST_SPP, self.config.eval_spp))
             values = best_values(self.problem, self.run)
             images = {v.name: picture_of(self.problem, self.config, values, v, spp) for v in self._views}
         except RuntimeError as error:
@@ -278,7 +278,7 @@ class Previews:
             f"SSIM {likeness.ssim:.4f}, noise included."
         )
         film = shown.get(f"view-{view.name}", ())
-        return pages.View(view.name, pictures, stored, it.exposure, view.held_out, note, film)
+        return pages.View(view.name, pictures, stored, it.exposure, view.test_views, note, film)
 
     def _count(self) -> int:
         items = recovered_of(self.problem, self.run)
@@ -302,8 +302,8 @@ class Previews:
 
 def _chosen(problem: Problem, count: int) -> list[View]:
     """So many views, evenly among those that are learned from and those that are not; both, where there are both."""
-    out = [view for view in problem.views if view.held_out]
-    learned = [view for view in problem.views if not view.held_out]
+    out = [view for view in problem.views if view.test_views]
+    learned = [view for view in problem.views if not view.test_views]
     some = min(len(out), count // 2)
     chosen = {view.name for view in (*_evenly(learned, max(1, count - some)), *_evenly(out, some))}
     return [view for view in problem.views if view.name in chosen]
@@ -324,7 +324,7 @@ def _address(kind: str, item: Recovered) -> str:
 
 def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
     exposure = exposure_for(view.target)
-    return ViewPictures(view.name, view.target, before, now, exposure, None, view.weight, view.held_out)
+    return ViewPictures(view.name, view.target, before, now, exposure, None, view.weight, view.test_views)
 
 
 def _encoded(image: Image, exposure: float, side: int, kind: str) -> bytes:

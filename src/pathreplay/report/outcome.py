@@ -33,17 +33,17 @@ def resume_command(folder: Path) -> str:
 
 @dataclass(frozen=True)
 class ViewPictures:
-    """One view: target, start, result and rival's result (linear), and the exposure under which all are shown."""
+    """One view: target, start, result and baseline's result (linear), and the exposure under which all are shown."""
 
     name: str
     target: Image
     start: Image
     result: Image
     exposure: float
-    rival: Image | None = None
+    baseline: Image | None = None
     weight: Image | None = None
     """How much pixels count, if not all the same."""
-    held_out: bool = False
+    test_views: bool = False
     factors: tuple[float, ...] = ()
     """What the result is multiplied with, where exposures were recovered: one number, or one for each colour."""
 
@@ -54,17 +54,17 @@ class ViewPictures:
 
     @cached_property
     def likenesses(self) -> dict[str, Likeness]:
-        """Of 'start', 'result' and 'rival', where there is one: of what counts, at the exposure of the view."""
-        images = {"result": self.result, "start": self.start, "rival": self.rival}
+        """Of 'start', 'result' and 'baseline', where there is one: of what counts, at the exposure of the view."""
+        images = {"result": self.result, "start": self.start, "baseline": self.baseline}
         return {
-            kind: Likeness.of(image, self.target, self.exposure, self.weight, flip=self.held_out)
+            kind: Likeness.of(image, self.target, self.exposure, self.weight, flip=self.test_views)
             for kind, image in images.items()
             if image is not None
         }
 
     def as_dict(self) -> dict[str, Any]:
         """For views.json."""
-        table: dict[str, Any] = {"held_out": self.held_out, "exposure": self.exposure}
+        table: dict[str, Any] = {"test_views": self.test_views, "exposure": self.exposure}
         if self.factors:
             table["recovered_exposure"] = list(self.factors)
         for kind, likeness in self.likenesses.items():
@@ -74,12 +74,12 @@ class ViewPictures:
 
     def kinds(self) -> tuple[str, ...]:
         """Kinds of pictures to show; a difference is result - target, red above, blue below, DIFFERENCE_GAIN times."""
-        return (*_KINDS, *(() if self.rival is None else ("rival", "rival-difference")))
+        return (*_KINDS, *(() if self.baseline is None else ("baseline", "baseline-difference")))
 
     def picture(self, kind: str) -> Image:
         """The picture of a kind."""
-        if kind in ("difference", "rival-difference"):
-            image = self.result if kind == "difference" else self.rival
+        if kind in ("difference", "baseline-difference"):
+            image = self.result if kind == "difference" else self.baseline
             assert image is not None
             return self._difference(image)
         return getattr(self, kind)
@@ -95,7 +95,7 @@ class ViewPictures:
 
 @dataclass(frozen=True)
 class Recovered:
-    """One parameter: start, result, truth where it is known, and the rival's result where there was one."""
+    """One parameter: start, result, truth where it is known, and the baseline's result where there was one."""
 
     key: str
     file_name: str
@@ -103,14 +103,14 @@ class Recovered:
     start: Array
     result: Array
     truth: Array | None
-    rival: Array | None = None
+    baseline: Array | None = None
     faces: NDArray[np.integer] | None = None
     """Of a mesh whose vertices these are (3 m numbers)."""
     derived: bool = False
     """From others, which are recovered."""
 
     def known(self, *kinds: str) -> dict[str, Array]:
-        """What there is of these kinds: 'start', 'result', 'rival', 'truth'."""
+        """What there is of these kinds: 'start', 'result', 'baseline', 'truth'."""
         return {kind: value for kind in kinds if (value := getattr(self, kind)) is not None}
 
     def textures(self) -> dict[str, Image]:
@@ -121,13 +121,13 @@ class Recovered:
         return {kind: shown(image) for kind, image in self.known("start", "result", "truth").items()}
 
     def volumes(self) -> dict[str, Image]:
-        """Middle slices of start, result, rival's result and truth, white at the largest value of the last of them.
+        """Middle slices of start, result, baseline's result and truth, white at the largest value of the last of them.
 
         Empty for what is no volume (z, y, x, one to four channels). All are shown in the finest resolution.
         """
         if self.result.ndim != 4 or self.result.shape[3] > 4:
             return {}
-        given = self.known("start", "result", "rival", "truth")
+        given = self.known("start", "result", "baseline", "truth")
         finest = max(given.values(), key=lambda volume: volume.size)
         white = float((self.result if self.truth is None else self.truth).max()) or 1.0
         return {kind: slices(matched(volume, finest)) / white for kind, volume in given.items()}
@@ -139,7 +139,7 @@ class Recovered:
         return {kind: value.tolist() for kind, value in self.known("start", "result", "truth").items()}
 
     def error(self, kind: str = "result") -> float | None:
-        """Root mean square error of 'start', 'result' or 'rival' against the truth; None where there is none."""
+        """Root mean square error of 'start', 'result' or 'baseline' against the truth; None where there is none."""
         value = getattr(self, kind)
         return None if self.truth is None or value is None else rmse(value, self.truth)
 
@@ -239,9 +239,9 @@ class Outcome:
         """Whether all iterations are done, or the optimiser takes no more."""
         return len(self.run.history) >= self.config.iterations or bool(self.run.optimiser.finished)
 
-    def held_out(self) -> list[ViewPictures]:
+    def test_views(self) -> list[ViewPictures]:
         """The views that were not learned from."""
-        return [view for view in self.views if view.held_out]
+        return [view for view in self.views if view.test_views]
 
     def has_flip(self) -> bool:
         """Whether there is FLIP to be told of."""
@@ -256,27 +256,27 @@ class Outcome:
         return f"pathreplay optimize {shlex.quote(str(job))}{changes if self.source else ''}"
 
     def names(self) -> tuple[str, str]:
-        """What the job and its rival are called: their integrators; a run against itself has one name twice."""
+        """What the job and its baseline are called: their integrators; a run against itself has one name twice."""
         ours = self.config.integrator.type
-        theirs = ours if self.config.rival is None else self.config.rival.type
-        return ours, theirs if theirs != ours else f"{theirs} (rival)"
+        theirs = ours if self.config.baseline is None else self.config.baseline.type
+        return ours, theirs if theirs != ours else f"{theirs} (baseline)"
 
     def caption(self, kind: str) -> str:
         """What stands below a picture, texture or volume of that kind."""
         ours, theirs = self.names()
         captions = {
-            "result": "recovered" if self.run.rival is None else f"recovered by {ours}",
-            "rival": f"recovered by {theirs}",
+            "result": "recovered" if self.run.baseline is None else f"recovered by {ours}",
+            "baseline": f"recovered by {theirs}",
             "difference": f"difference ×{DIFFERENCE_GAIN:g}",
-            "rival-difference": f"its difference ×{DIFFERENCE_GAIN:g}",
+            "baseline-difference": f"its difference ×{DIFFERENCE_GAIN:g}",
         }
         return captions.get(kind, kind)
 
     def comparison(self) -> list[Contestant]:
-        """The job and its rival in numbers; empty where there was none."""
-        if self.run.rival is None:
+        """The job and its baseline in numbers; empty where there was none."""
+        if self.run.baseline is None:
             return []
-        runs = zip(self.names(), (self.run, self.run.rival), ("result", "rival"), strict=True)
+        runs = zip(self.names(), (self.run, self.run.baseline), ("result", "baseline"), strict=True)
         known = [item for item in self.recovered if item.truth is not None]
         found = []
         for name, run, kind in runs:

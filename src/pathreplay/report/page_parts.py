@@ -31,9 +31,9 @@ def common_exposure(targets: Sequence[Image]) -> float:
     return exposure_for(np.concatenate(levels, axis=1)) if levels else 1.0
 
 
-def lead(config: Config, parameters: int, learned: int, held_out: int) -> tuple[str, str, str]:
+def lead(config: Config, parameters: int, learned: int, test_views: int) -> tuple[str, str, str]:
     """What was recovered from what, around the name of the scene."""
-    out = f", {held_out} held out" if held_out else ""
+    out = f", {test_views} held out" if test_views else ""
     pictures = f" recovered from {learned} picture{'s' if learned != 1 else ''}{out}"
     return f"{parameters} parameter{'s' if parameters != 1 else ''} of ", config.scene, pictures
 
@@ -107,7 +107,7 @@ def numbers(item: Recovered) -> tuple[Row, ...]:
     return tuple(found)
 
 
-def about(item: Recovered, rival: str = "") -> str:
+def about(item: Recovered, baseline: str = "") -> str:
     """A line on the size and the error of a parameter of many numbers."""
     shape, result = item.result.shape, item.result
     words = {3: " x ".join(map(str, shape[1::-1])) + " texels", 4: " x ".join(map(str, shape[2::-1])) + " voxels"}
@@ -122,8 +122,8 @@ def about(item: Recovered, rival: str = "") -> str:
     text += f", root mean square error {item.error('start'):.4g} at the start, {item.error():.4g} recovered"
     if item.volumes() and (relative := item.relative_error()) is not None:
         text += f" ({100 * relative:.0f} % of the truth)"
-    if item.error("rival") is not None:
-        text += f", {item.error('rival'):.4g} by {rival}"
+    if item.error("baseline") is not None:
+        text += f", {item.error('baseline'):.4g} by {baseline}"
     return f"{text}."
 
 

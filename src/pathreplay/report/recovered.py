@@ -27,7 +27,7 @@ def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
     known += made.items()
     starts = with_scene(problem, {v.key: v.start for v in problem.variables})
     values = with_scene(problem, run.values)
-    theirs = with_scene(problem, run.rival.values) if run.rival else {}
+    theirs = with_scene(problem, run.baseline.values) if run.baseline else {}
     files_of = file_names([*(v.key for v in problem.variables), *made])
     return tuple(
         Recovered(key, files_of[key], starts[key], values[key], truth, theirs.get(key), derived=key in made)

@@ -75,11 +75,11 @@ def report_page(
     ended = f"Stopped after {len(history)} of {config.iterations} iterations."
     if why := outcome.run.optimiser.finished:
         ended = f"No more steps after {len(history)} of {config.iterations} iterations: {why}."
-    held_out, count = len(outcome.held_out()), number_of(outcome.recovered) + len(outcome.poses)
+    test_views, count = len(outcome.test_views()), number_of(outcome.recovered) + len(outcome.poses)
     exposure = common_exposure([view.target for view in outcome.views])
     return Page(
         title=outcome.folder.name,
-        lead=lead(config, count, len(outcome.views) - held_out, held_out),
+        lead=lead(config, count, len(outcome.views) - test_views, test_views),
         notices=((ended,) if len(history) < config.iterations else ()) + dropped_notice(history) + _verdict(outcome),
         facts=facts(config, history),
         comparison=_comparison(outcome, contestants, drawings["comparison"]) if contestants else None,
@@ -119,9 +119,9 @@ def _comparison(outcome: Outcome, contestants: Sequence[Contestant], drawing: st
         rows.append(Row(each.name, cells))
     note = (
         "Root mean square errors. Those of the pictures are without the noise of rendering them; "
-        f"{judge} rendered them for both. The rival started from the same values and had the same samples per step and "
-        "seeds. Both took turns: after each step the rival took as many as brought it to the same time, with the "
-        "learning rate and resolution of the other. Compiling counts, judging does not."
+        f"{judge} rendered them for both. The baseline started from the same values and had the same samples per step "
+        "and seeds. Both took turns: after each step the baseline took as many as brought it to the same time, with "
+        "the learning rate and resolution of the other. Compiling counts, judging does not."
     )
     title = f"Next to {contestants[1].name}, in the same time"
     return Comparison(title, drawing, Table(tuple(heads), tuple(rows)), note)
@@ -139,13 +139,13 @@ def _likeness(outcome: Outcome) -> Table:
             cells += ["" if each.flip is None else f"{each.flip:.4f}" for each in (before, after)]
         if exposed:
             cells.append("× " + ", ".join(f"{factor:.3f}" for factor in view.factors))
-        rows.append(Row(view.name + " (held out)" * view.held_out, tuple(cells)))
+        rows.append(Row(view.name + " (held out)" * view.test_views, tuple(cells)))
     return Table(tuple(Head(text) for text in heads), tuple(rows))
 
 
 def _likeness_note(outcome: Outcome) -> str:
     said = "Of what a display shows of each view at an exposure of its own, noise included."
-    if outcome.held_out():
+    if outcome.test_views():
         said += " Nothing was learned from views that are held out"
         said += "; their exposures are fitted to their pictures at the end." if outcome.config.exposure else "."
         said += "" if outcome.has_flip() else " FLIP of them comes with: pip install 'pathreplay[flip]'."
@@ -186,7 +186,7 @@ def _views(outcome: Outcome, exposure: float, films: Mapping[str, Film]) -> tupl
             f"{view.error(view.result):.4g} in the result, noise included{mask}. Shown at exposure {stored:.3g}."
         )
         film = films.get(f"view-{view.name}", ())
-        found.append(View(view.name, pictures, stored, view.exposure, view.held_out, note, film))
+        found.append(View(view.name, pictures, stored, view.exposure, view.test_views, note, film))
     return tuple(found)
 
 
@@ -214,7 +214,7 @@ def _parameters(outcome: Outcome, films: Mapping[str, Film]) -> tuple[Parameter,
         made = {kind: uri("image/png", png_bytes(image)) for kind, image in images.items()}
         return tuple(Picture(kind, outcome.caption(kind), source) for kind, source in made.items())
 
-    rival = outcome.names()[1]
+    baseline = outcome.names()[1]
     kinds: list[list[Parameter]] = [[], [], [], []]
     for item in outcome.recovered:
         if images := item.textures():
@@ -222,7 +222,7 @@ def _parameters(outcome: Outcome, films: Mapping[str, Film]) -> tuple[Parameter,
             kinds[0].append(Parameter(item.key, pictures(images), note=about(item), film=film))
         elif images := item.volumes():
             film = films.get(f"volume-{item.file_name}", ())
-            kinds[1].append(Parameter(item.key, pictures(images), 2, note=about(item, rival), film=film))
+            kinds[1].append(Parameter(item.key, pictures(images), 2, note=about(item, baseline), film=film))
         elif rows := numbers(item):
             kinds[2].append(Parameter(item.key, rows=rows))
         else:

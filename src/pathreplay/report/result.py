@@ -47,7 +47,7 @@ class RunResult:
     """How far each pose whose truth is known is from it."""
     views: dict[str, Likeness]
     """How alike each view is to its target."""
-    held_out: tuple[str, ...]
+    test_views: tuple[str, ...]
     """The views that were not learned from."""
     verdict: Verdict
     """Which values still move, have arrived, or are not determined by the pictures."""
@@ -70,11 +70,11 @@ class RunResult:
             found = f"{value.item():.5g}, " if value.size == 1 else ""
             lines.append(f"{key}: {found}root mean square error {error:.4g}")
         lines += [f"{key}: {error}" for key, error in self.poses.items()]
-        if self.held_out:
-            psnr, ssim = (np.mean([getattr(self.views[v], kind) for v in self.held_out]) for kind in ("psnr", "ssim"))
-            flips = [flip for v in self.held_out if (flip := self.views[v].flip) is not None]
+        if self.test_views:
+            psnr, ssim = (np.mean([getattr(self.views[v], kind) for v in self.test_views]) for kind in ("psnr", "ssim"))
+            flips = [flip for v in self.test_views if (flip := self.views[v].flip) is not None]
             told = f", FLIP {np.mean(flips):.4f}" if flips else ""
-            lines.append(f"held-out views ({len(self.held_out)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}{told}")
+            lines.append(f"held-out views ({len(self.test_views)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}{told}")
         lines.append(f"report: {self.report}")
         if self.stopped:
             lines.append(f"stopped early by {self.stopped_by}; go on with: {resume_command(self.folder)}")
@@ -102,7 +102,7 @@ def outcome_of(
             exposure_for(v.target),
             rivals.get(v.name),
             v.weight,
-            v.held_out,
+            v.test_views,
             tuple(run.values[EXPOSURE][n].tolist()) if EXPOSURE in run.values else (),
         )
         for n, v in enumerate(problem.views)
@@ -122,8 +122,8 @@ def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Conte
     views = {view.name: view.as_dict() for view in outcome.views}
     files["views.json"] = (json.dumps(views, indent=2) + "\n").encode()
     files |= _run_files("", outcome.run.history, outcome.values)
-    if rival := outcome.run.rival:
-        files |= _run_files("rival/", rival.history, rival.values)
+    if baseline := outcome.run.baseline:
+        files |= _run_files("baseline/", baseline.history, baseline.values)
     for view in outcome.views:
         files[f"images/result-{view.name}.exr"] = made(exr_bytes, view.result)
         for kind in view.kinds():
@@ -152,7 +152,7 @@ def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
         errors={item.key: error for item in outcome.recovered if (error := item.error()) is not None},
         poses={item.pose.key: errors["error"] for item in outcome.poses if (errors := item.errors())},
         views={view.name: view.likenesses["result"] for view in outcome.views},
-        held_out=tuple(view.name for view in outcome.held_out()),
+        test_views=tuple(view.name for view in outcome.test_views()),
         verdict=outcome.verdict,
     )
 

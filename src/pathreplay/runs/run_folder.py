@@ -26,9 +26,9 @@ from pathreplay.runs.folder_lock import FolderLock
 
 PART = ".part"
 _CONFIGS = "config.toml", "config.yaml", "config.json"
-_FOLDERS = "images", "volumes", "rival", "previews"
+_FOLDERS = "images", "volumes", "baseline", "previews"
 CHECKPOINT = "checkpoint.safetensors"
-RIVAL_CHECKPOINT = "rival/checkpoint.safetensors"
+BASELINE_CHECKPOINT = "baseline/checkpoint.safetensors"
 
 
 @dataclass(frozen=True)

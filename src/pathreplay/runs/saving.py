@@ -18,7 +18,7 @@ from pathreplay.inverse.parameters.values import require_finite_array
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.platform.atomic_files import Content, made
 from pathreplay.platform.files import file_problem
-from pathreplay.runs.run_folder import CHECKPOINT, RIVAL_CHECKPOINT, RunFolder
+from pathreplay.runs.run_folder import BASELINE_CHECKPOINT, CHECKPOINT, RunFolder
 
 CAPTURE = "capture.sha256"
 """What tells the cameras of a run from those of a capture that was changed since."""
@@ -124,7 +124,7 @@ def _require_capture(path: Path, problem: Problem) -> None:
 
 
 def _runs(run: Run) -> dict[str, Run]:
-    return {CHECKPOINT: run} if run.rival is None else {CHECKPOINT: run, RIVAL_CHECKPOINT: run.rival}
+    return {CHECKPOINT: run} if run.baseline is None else {CHECKPOINT: run, BASELINE_CHECKPOINT: run.baseline}
 
 
 def _checkpoints(run: Run) -> dict[str, Content]:

@@ -85,7 +85,7 @@ def load_scene_for(
     """Load a scene in which the ``wanted`` keys and globs carry derivatives, as far as exchanging plugins brings it.
 
     Where a pattern that ends in ``eta`` matches the index of a ``dielectric``, the scene is loaded once more with
-    `smoothdielectric` in the place of every ``dielectric``; where one that ends in ``data`` matches a texture of 8
+    `dielectric_ad` in the place of every ``dielectric``; where one that ends in ``data`` matches a texture of 8
     bits, with its texels as floating-point numbers. ``cameras`` are added to those of the scene. Returns the scene and
     what is to be said about it, one line each. Patterns that match nothing are left for others to complain about.
     Raises what `load_scene` does.
@@ -93,8 +93,8 @@ def load_scene_for(
     scene, _ = load_scene_with(spec, {}, base, cameras, **parameters)
     params = traversed(scene)
     eta = _matching(params, wanted, "eta")
-    smooth = any(scene_parameters.owner_class(params, key) == "SmoothDielectric" for key in eta)
-    plugins, floats = {"dielectric": "smoothdielectric"} if smooth else {}, coarse_pictures(params, wanted)
+    smooth = any(scene_parameters.owner_class(params, key) == "DielectricAD" for key in eta)
+    plugins, floats = {"dielectric": "dielectric_ad"} if smooth else {}, coarse_pictures(params, wanted)
     if not plugins and not floats:
         return scene, ()
     # Dr.Jit traces calls through every instance alive, so the first scene has to go before the second one comes.
@@ -104,7 +104,7 @@ def load_scene_for(
     notes = [f"stored the texels of '{name}' as floating-point numbers: they carry derivatives" for name in floats]
     if exchanged:
         count = "one" if len(exchanged) == 1 else f"all {len(exchanged)}"
-        notes.append(f"replaced 'dielectric' by 'smoothdielectric' ({count} of them): its eta carries a derivative")
+        notes.append(f"replaced 'dielectric' by 'dielectric_ad' ({count} of them): its eta carries a derivative")
     return scene, tuple(notes)
 
 

@@ -30,7 +30,7 @@ def load_file_with(
 ) -> tuple[Any, list[str]]:
     """`mi.load_file(path, optimize=False, **parameters)` with plugins exchanged, included files' plugins too.
 
-    `plugins` maps the type named in the scene to the type to load in its place, {"dielectric": "smoothdielectric"} for
+    `plugins` maps the type named in the scene to the type to load in its place, {"dielectric": "dielectric_ad"} for
     one. The new plugin has to be registered and is given the properties and the id of the old one, so that parameter
     keys stay what they were. ``cameras`` are added to what the scene has. ``floats`` are names of picture files
     (without their folders) whose `bitmap` textures are stored as floating-point numbers, whatever the files have.

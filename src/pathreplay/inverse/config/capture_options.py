@@ -17,7 +17,7 @@ class Capture(Table):
     images: str | None = None
     masks: str | None = None
     width: Count | None = None
-    hold_out_every: Annotated[Whole, Field(ge=2, le=2**31 - 1)] | None = None
+    test_every: Annotated[Whole, Field(ge=2, le=2**31 - 1)] | None = None
 
     @property
     def source(self) -> str:
@@ -38,11 +38,11 @@ class Exposure(Table):
 
     white_balance: Switch = False
     reference: Whole | str | None = None
-    free: Switch = False
+    fix_scale: Switch = True
     learning_rate: Positive | None = None
 
     @model_validator(mode="after")
     def _one_scale(self) -> Exposure:
-        if self.free and self.reference is not None:
-            raise ValueError("exposure: 'free' and 'reference' exclude each other; leave one out")
+        if not self.fix_scale and self.reference is not None:
+            raise ValueError("exposure: fix_scale = false and 'reference' exclude each other; leave one out")
         return self

@@ -29,10 +29,37 @@ _KINDS = {
     "values": "a number, a list of numbers, the name of an image or volume file, or { image = ... }",
     "scene_parameters": "a number, true, false or a text in quotes",
     "sensors": "the names or numbers of sensors: [0, ...]",
-    "held_out": "the names or numbers of sensors: [0, ...]",
+    "test_views": "the names or numbers of sensors: [0, ...]",
     "reference": "the name or number of a sensor",
     "images": "file names, or a pattern such as 'photos/*.png'",
     "masks": "file names, or a pattern such as 'masks/*.png'",
+}
+
+# Keys of 0.1.0's first edition -> what they are called now.
+RENAMED = {
+    "rival": "baseline",
+    "learning_rate_decay": "final_learning_rate_ratio",
+    "warm_up": "warmup_steps",
+    "smooth": "large_steps_lambda",
+    "transform": "parameterization",
+    "prior": "l2_to_initial",
+    "penalty": "regularizer",
+    "laplacian": "laplacian_weight",
+    "start": "initial",
+    "distance": "error_scale",
+    "auto_spp": "adaptive_spp",
+    "ratio": "target_snr",
+    "lowest": "min",
+    "highest": "max",
+    "signal_to_noise": "measure_snr",
+    "non_finite_in_a_row": "max_consecutive_nonfinite",
+    "views_per_step": "view_batch_size",
+    "pixels_per_step": "pixel_batch_size",
+    "picture_spp": "eval_spp",
+    "hold_out_every": "test_every",
+    "held_out": "test_views",
+    "sample_ranges": "spp_shards",
+    "free": "fix_scale",
 }
 
 
@@ -48,6 +75,8 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
     if first["type"] == "extra_forbidden":
         key = str(first["loc"][-1])
         table = next((tables[str(part)] for part in reversed(first["loc"][:-1]) if part in tables), job)
+        if (new := _renamed(key, table)) is not None:
+            return f"unknown key '{where}'; it is called '{new}' now"
         close = difflib.get_close_matches(key, table.model_fields, n=1, cutoff=0.4)
         hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(table.model_fields)}"
         return f"unknown key '{where}'; {hint}"
@@ -65,11 +94,16 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
     return f"'{where}' is {shown(first['input'])}: {first['msg'].lower()}" + (f"; {instead}" if instead else "")
 
 
+def _renamed(key: str, table: type[BaseModel]) -> str | None:
+    """What a key of a table was renamed to."""
+    names = [RENAMED.get(key), "memory_limit" if key == "memory" else None, "history_size" if key == "memory" else None]
+    return next((name for name in names if name in table.model_fields), None)
+
+
+_ALTERNATIVES = ("int", "float", "bool", "str", "count", "Picture", "Value", "Displacement")
+
+
 def _path(loc: tuple[int | str, ...]) -> list[str]:
     """Where an error is, as a user would say it: without the names of the alternatives that were tried."""
     tried = ("list[", "function-", "constrained-", "nullable[")
-    return [
-        str(p)
-        for p in loc
-        if p not in ("int", "float", "bool", "str", "count", "Picture") and not str(p).startswith(tried)
-    ]
+    return [str(p) for p in loc if p not in _ALTERNATIVES and not str(p).startswith(tried)]

@@ -19,10 +19,12 @@ def bytes_of(text: str) -> int:
     """The bytes that a text such as '8 GiB' stands for. Raises ValueError for another."""
     found = re.match(PATTERN, text)
     if found is None:
-        raise ValueError(f"memory is {shown(text)}; write a number and a unit, as in '8 GiB' ({', '.join(UNITS)})")
+        raise ValueError(
+            f"memory_limit is {shown(text)}; write a number and a unit, as in '8 GiB' ({', '.join(UNITS)})"
+        )
     size = int(float(found[1]) * UNITS[found[2]])
     if size < LEAST:
-        raise ValueError(f"memory is '{text}'; give '512 MiB' or more, of which the program itself takes most")
+        raise ValueError(f"memory_limit is '{text}'; give '512 MiB' or more, of which the program itself takes most")
     return size
 
 

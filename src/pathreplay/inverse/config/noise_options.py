@@ -17,23 +17,23 @@ Spp = Annotated[
 ]
 
 
-class AutoSpp(Table):
+class AdaptiveSpp(Table):
     """With ``spp = "auto"``: the signal to noise that every gradient shall have, and between which samples per pixel.
 
     These are powers of two, and so are all between them: passes are recorded anew for each.
     """
 
-    ratio: Positive = 1.0
-    lowest: Count = 8
-    highest: Count = 256
+    target_snr: Positive = 1.0
+    min: Count = 8
+    max: Count = 256
 
     @model_validator(mode="after")
-    def _in_order(self) -> AutoSpp:
-        for name in ("lowest", "highest"):
+    def _in_order(self) -> AdaptiveSpp:
+        for name in ("min", "max"):
             value = getattr(self, name)
             if value < 2 or value & (value - 1):
                 near = max(2, 1 << (value.bit_length() - 1))
-                raise ValueError(f"auto_spp: {name} = {value} is no power of two from 2 on; take {near}")
-        if self.lowest > self.highest:
-            raise ValueError(f"auto_spp: lowest = {self.lowest} is above highest = {self.highest}; swap them")
+                raise ValueError(f"adaptive_spp: {name} = {value} is no power of two from 2 on; take {near}")
+        if self.min > self.max:
+            raise ValueError(f"adaptive_spp: min = {self.min} is above max = {self.max}; swap them")
         return self

@@ -26,7 +26,7 @@ class Optimizer(Table):
     momentum: Share | None = None
     nesterov: Switch | None = None
     alpha: Share | None = None
-    memory: Count | None = None
+    history_size: Count | None = None
     tolerance: Positive | None = None
 
     @model_validator(mode="after")
@@ -65,5 +65,5 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "sgd": {"momentum": 0.0, "nesterov": False},
     "rmsprop": {"alpha": 0.99, "epsilon": 1e-8},
     # The tolerance is a share of the first loss. Below, falls are lost in the rounding of single precision.
-    "l-bfgs-b": {"memory": 10, "tolerance": 1e-6},
+    "l-bfgs-b": {"history_size": 10, "tolerance": 1e-6},
 }

@@ -8,11 +8,11 @@ from typing import Literal
 Schedule = Literal["exponential", "linear", "cosine", "constant"]
 
 
-def rate(schedule: Schedule, position: int, iterations: int, decay: float, warm_up: int = 0) -> float:
+def rate(schedule: Schedule, position: int, iterations: int, decay: float, warmup_steps: int = 0) -> float:
     """The factor of iteration ``position`` of so many: 1 at the first, ``decay`` where one more would come.
 
     With x = position / iterations: decay^x, 1 - (1 - decay) x, decay + (1 - decay) (1 + cos πx) / 2, or 1. Through the
-    first ``warm_up`` iterations it grows besides, in equal steps.
+    first ``warmup_steps`` iterations it grows besides, in equal steps.
     """
     x = position / iterations
     if schedule == "exponential":
@@ -23,4 +23,4 @@ def rate(schedule: Schedule, position: int, iterations: int, decay: float, warm_
         factor = decay + (1 - decay) * (1 + math.cos(math.pi * x)) / 2
     else:
         factor = 1.0
-    return factor * min(1.0, (position + 1) / (warm_up + 1))
+    return factor * min(1.0, (position + 1) / (warmup_steps + 1))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config.capture_options import Capture, Exposure
@@ -17,7 +17,7 @@ from pathreplay.inverse.config.definitions import defined
 from pathreplay.inverse.config.errors import first_error
 from pathreplay.inverse.config.executor_options import ExecutorName, RayOptions
 from pathreplay.inverse.config.memory_options import Memory, bytes_of
-from pathreplay.inverse.config.noise_options import AUTO, AutoSpp, Spp
+from pathreplay.inverse.config.noise_options import AUTO, AdaptiveSpp, Spp
 from pathreplay.inverse.config.optimizer_options import Optimizer
 from pathreplay.inverse.config.parsing import YAML, most_bytes, parsed
 from pathreplay.inverse.config.preview_options import Preview
@@ -70,8 +70,21 @@ class Displacement(Table):
     rotation: Vector | None = None
 
 
+def _kind_of_initial(value: Any) -> str:
+    names = list(value) if isinstance(value, dict) else []
+    posed = any(difflib.get_close_matches(str(name), Displacement.model_fields, n=1) for name in names)
+    return "Displacement" if posed or isinstance(value, Displacement) else "Value"
+
+
+Initial = Annotated[
+    Annotated[Value, Tag("Value")] | Annotated[Displacement, Tag("Displacement")], Discriminator(_kind_of_initial)
+]
+"""Where a parameter starts: its value or, for a pose, how far from where the scene has it."""
+
+
 NOT_OF_A_POSE = frozenset(
-    "lower upper initial resolutions refine_at smooth transform total_variation prior laplacian penalty shape".split()
+    "lower upper resolutions refine_at large_steps_lambda parameterization total_variation l2_to_initial "
+    "laplacian_weight regularizer shape".split()
 )
 
 
@@ -82,34 +95,41 @@ class Parameter(Table):
     lower: Finite | None = None
     upper: Finite | None = None
     learning_rate: Positive | None = None
-    initial: Value | None = None
+    initial: Initial | None = None
     resolutions: Annotated[list[Count], Field(min_length=1)] | None = None
     refine_at: list[Count] | None = None
     pose: PoseKind | None = None
-    start: Displacement | None = None
     pivot: Vector | None = None
-    distance: Positive | None = None
+    error_scale: Positive | None = None
     rotation_learning_rate: Positive | None = None
-    smooth: Positive | None = None
-    transform: TransformKind | None = None
+    large_steps_lambda: Positive | None = None
+    parameterization: TransformKind | None = None
     total_variation: Positive | None = None
-    prior: Positive | None = None
-    laplacian: Positive | None = None
-    penalty: ImportPath | None = None
+    l2_to_initial: Positive | None = None
+    laplacian_weight: Positive | None = None
+    regularizer: ImportPath | None = None
     shape: Annotated[list[Count], Field(min_length=1, max_length=8)] | None = None
+
+    @property
+    def displacement(self) -> Displacement:
+        """Of a pose, from where the scene has it."""
+        return self.initial if isinstance(self.initial, Displacement) else Displacement()
 
     @model_validator(mode="after")
     def _of_one_kind(self) -> Parameter:
-        posed = {"start", "pivot", "distance", "rotation_learning_rate"} & self.model_fields_set
+        posed = {"pivot", "error_scale", "rotation_learning_rate"} & self.model_fields_set
         if self.pose is None:
+            if isinstance(self.initial, Displacement):
+                posed.add("initial")
             if posed:
                 self._refuse(f"'{min(posed)}' belongs to a pose; add pose = 'translation', 'rotation' or 'rigid'")
             return self
         if plain := NOT_OF_A_POSE & self.model_fields_set:
-            self._refuse(f"'{min(plain)}' does not go with a pose; displace its start with 'start'")
+            self._refuse(f"'{min(plain)}' does not go with a pose; displace it with 'initial'")
+        if not isinstance(self.initial, Displacement | None):
+            self._refuse("'initial' of a pose is a displacement; write { translation = [...], rotation = [...] }")
         parts = PARTS[self.pose]
-        given = [] if self.start is None else sorted(self.start.model_fields_set)
-        wrong = [f"start.{part}" for part in given if part not in parts]
+        wrong = [f"initial.{part}" for part in sorted(self.displacement.model_fields_set) if part not in parts]
         if self.rotation_learning_rate is not None and "rotation" not in parts:
             wrong.append("rotation_learning_rate")
         if wrong:
@@ -118,20 +138,28 @@ class Parameter(Table):
 
     @model_validator(mode="after")
     def _in_order(self) -> Parameter:
-        if self.smooth is not None and not (self.lower is None and self.upper is None):
-            self._refuse("'smooth' does not go with 'lower' and 'upper', which would tear the mesh; leave them out")
-        if self.smooth is not None and self.transform is not None:
-            self._refuse("'smooth' does not go with 'transform': both say where steps are taken; leave one out")
+        if self.large_steps_lambda is not None and not (self.lower is None and self.upper is None):
+            self._refuse(
+                "'large_steps_lambda' does not go with 'lower' and 'upper', which would tear the mesh; leave them out"
+            )
+        if self.large_steps_lambda is not None and self.parameterization is not None:
+            self._refuse(
+                "'large_steps_lambda' does not go with 'parameterization': both change the steps; leave one out"
+            )
         sizes, begins = self.resolutions or [], self.refine_at or []
         # Without refine_at each stage of the job may have one: see `Config`.
         if self.refine_at is not None and len(begins) != max(0, len(sizes) - 1):
             self._refuse_count()
         if sorted(set(begins)) != begins:
             self._refuse(f"refine_at {begins} does not increase; put it in order")
-        if self.transform == "log" and self.lower is not None and self.lower < 0:
-            self._refuse(f"transform = 'log' has values above 0 only, and lower = {self.lower:g}; take 'softplus'")
-        if self.transform == "logit" and (self.lower is None) != (self.upper is None):
-            self._refuse("transform = 'logit' goes between two bounds; give 'lower' and 'upper', or neither (0 and 1)")
+        if self.parameterization == "log" and self.lower is not None and self.lower < 0:
+            self._refuse(
+                f"parameterization = 'log' has values above 0 only, and lower = {self.lower:g}; take 'softplus'"
+            )
+        if self.parameterization == "logit" and (self.lower is None) != (self.upper is None):
+            self._refuse(
+                "parameterization = 'logit' goes between two bounds; give 'lower' and 'upper', or neither (0 and 1)"
+            )
         if self.lower is not None and self.upper is not None and self.upper <= self.lower:
             bounds = f"upper bound {self.upper:g} is not above lower bound {self.lower:g}"
             self._refuse(f"{bounds}; swap or widen them")
@@ -231,11 +259,11 @@ class Config(Table):
     scene: str
     scene_parameters: dict[str, Argument] = Field(default_factory=dict)
     sensors: list[Whole | str] | None = None
-    held_out: list[Whole | str] = Field(default_factory=list)
+    test_views: list[Whole | str] = Field(default_factory=list)
     variant: str | None = None
     integrator: Plugin = Plugin(type="pathreplay")
     """Where it is left out, with what the scene's own integrator says (see `completed`)."""
-    rival: Plugin | None = None
+    baseline: Plugin | None = None
     parameters: Annotated[list[Parameter], Field(min_length=1)]
     derived: list[Derivation] = Field(default_factory=list)
     capture: Capture | None = None
@@ -245,26 +273,26 @@ class Config(Table):
     loss: str = "l2"
     iterations: Count = 200
     spp: Spp = 16
-    auto_spp: AutoSpp = AutoSpp()
-    signal_to_noise: Switch = False
-    non_finite_in_a_row: Count = 10
-    views_per_step: Count | None = None
-    pixels_per_step: Count | None = None
-    picture_spp: Count = 128
+    adaptive_spp: AdaptiveSpp = AdaptiveSpp()
+    measure_snr: Switch = False
+    max_consecutive_nonfinite: Count = 10
+    view_batch_size: Count | None = None
+    pixel_batch_size: Count | None = None
+    eval_spp: Count = 128
     seed: Annotated[Whole, Field(ge=0, le=10**18)] = 0
     learning_rate: Positive = 0.02
-    learning_rate_decay: Annotated[Positive, Field(le=1)] = 0.1
+    final_learning_rate_ratio: Annotated[Positive, Field(le=1)] = 0.1
     learning_rate_schedule: Schedule = "constant"
     """With a decay, and left out: exponential."""
-    warm_up: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 0
+    warmup_steps: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 0
     optimizer: Optimizer = Optimizer()
     stages: Annotated[list[Stage], Field(min_length=1)] | None = None
     checkpoint_every: Count = 25
     preview: Preview = Preview()
     deterministic: Switch = False
-    memory: Memory | None = None
+    memory_limit: Memory | None = None
     executor: ExecutorName = "local"
-    sample_ranges: Count = 1
+    spp_shards: Count = 1
     ray: RayOptions = RayOptions()
     output: str | None = None
 
@@ -276,23 +304,23 @@ class Config(Table):
     @property
     def most_spp(self) -> int:
         """Samples per pixel that an iteration may have."""
-        most = self.spp if isinstance(self.spp, int) else self.auto_spp.highest
+        most = self.spp if isinstance(self.spp, int) else self.adaptive_spp.max
         return max([most, *(stage.spp for stage in self.stages or [] if stage.spp is not None)])
 
     @property
     def budget(self) -> int | None:
         """Bytes that the run may take; None: what there is."""
-        return None if self.memory is None else bytes_of(self.memory)
+        return None if self.memory_limit is None else bytes_of(self.memory_limit)
 
     @property
     def halves_samples(self) -> bool:
         """Whether iterations take their samples in two halves, which tell signal from noise."""
-        return self.signal_to_noise or self.spp == AUTO
+        return self.measure_snr or self.spp == AUTO
 
     @property
     def parts(self) -> int:
         """Shards of a view in an iteration: ranges of its samples, each in two halves where noise is measured."""
-        return self.sample_ranges * (2 if self.halves_samples else 1)
+        return self.spp_shards * (2 if self.halves_samples else 1)
 
     def refine_at(self, entry: Parameter) -> list[int]:
         """The iterations at which the resolutions of a parameter after the first begin."""
@@ -318,20 +346,20 @@ class Config(Table):
 
     @model_validator(mode="after")
     def _samples(self) -> Config:
-        if self.spp != AUTO and "auto_spp" in self.model_fields_set:
-            raise ValueError(f"auto_spp goes with spp = 'auto', and spp is {self.spp}; leave one out")
-        if self.signal_to_noise and self.spp != AUTO and self.spp % 2:
-            raise ValueError(f"signal_to_noise takes two halves of the samples, and spp is {self.spp}; make it even")
+        if self.spp != AUTO and "adaptive_spp" in self.model_fields_set:
+            raise ValueError(f"adaptive_spp goes with spp = 'auto', and spp is {self.spp}; leave one out")
+        if self.measure_snr and self.spp != AUTO and self.spp % 2:
+            raise ValueError(f"measure_snr takes two halves of the samples, and spp is {self.spp}; make it even")
         for stage in self.stages or []:
-            if self.signal_to_noise and stage.spp is not None and stage.spp % 2:
+            if self.measure_snr and stage.spp is not None and stage.spp % 2:
                 raise ValueError(
-                    f"signal_to_noise takes two halves of the samples, and a stage has spp = {stage.spp}; make it even"
+                    f"measure_snr takes two halves of the samples, and a stage has spp = {stage.spp}; make it even"
                 )
-        for spp in (self.auto_spp.lowest if self.spp == AUTO else self.spp, *(s.spp for s in self.stages or [])):
-            if spp is not None and self.sample_ranges > 1 and spp % self.parts:
+        for spp in (self.adaptive_spp.min if self.spp == AUTO else self.spp, *(s.spp for s in self.stages or [])):
+            if spp is not None and self.spp_shards > 1 and spp % self.parts:
                 halves = ", in two halves each" if self.halves_samples else ""
                 raise ValueError(
-                    f"sample_ranges = {self.sample_ranges} does not divide the {spp} samples per pixel{halves}; take "
+                    f"spp_shards = {self.spp_shards} does not divide the {spp} samples per pixel{halves}; take "
                     f"a multiple of {self.parts} for spp"
                 )
         return self
@@ -347,14 +375,19 @@ class Config(Table):
 
     @model_validator(mode="after")
     def _scheduled(self) -> Config:
-        if "learning_rate_decay" in self.model_fields_set and "learning_rate_schedule" not in self.model_fields_set:
+        if (
+            "final_learning_rate_ratio" in self.model_fields_set
+            and "learning_rate_schedule" not in self.model_fields_set
+        ):
             self.__dict__["learning_rate_schedule"] = "exponential"  # not to be written down as if it had been given
-        if self.learning_rate_schedule == "constant" and "learning_rate_decay" in self.model_fields_set:
-            raise ValueError("learning_rate_decay does not go with learning_rate_schedule = 'constant'; leave one out")
-        if self.warm_up >= self.iterations:
+        if self.learning_rate_schedule == "constant" and "final_learning_rate_ratio" in self.model_fields_set:
             raise ValueError(
-                f"warm_up {self.warm_up} is not before the end of the {self.iterations} iterations; shorten it, or "
-                "raise 'iterations'"
+                "final_learning_rate_ratio does not go with learning_rate_schedule = 'constant'; leave one out"
+            )
+        if self.warmup_steps >= self.iterations:
+            raise ValueError(
+                f"warmup_steps = {self.warmup_steps} is not before the end of the {self.iterations} iterations; "
+                "shorten it, or raise 'iterations'"
             )
         return self
 
@@ -391,19 +424,19 @@ class Config(Table):
 
     @model_validator(mode="after")
     def _in_batches(self) -> Config:
-        stages = [stage.pixels_per_step for stage in self.stages or []]
-        if self.pixels_per_step is None and not any(stages):
+        stages = [stage.pixel_batch_size for stage in self.stages or []]
+        if self.pixel_batch_size is None and not any(stages):
             return self
         if self.loss not in PIXELWISE:
             raise ValueError(
-                f"pixels_per_step: loss = '{self.loss}' wants whole pictures; take {' or '.join(PIXELWISE)}, or "
-                "leave 'pixels_per_step' out"
+                f"pixel_batch_size: loss = '{self.loss}' wants whole pictures; take {' or '.join(PIXELWISE)}, or "
+                "leave 'pixel_batch_size' out"
             )
         if self.exposure is not None:
-            raise ValueError("pixels_per_step: 'exposure' wants whole pictures; leave one of them out")
+            raise ValueError("pixel_batch_size: 'exposure' wants whole pictures; leave one of them out")
         if self.spp == AUTO:
             raise ValueError(
-                "pixels_per_step: spp = 'auto' cannot lessen the noise of choosing pixels; give a number of samples"
+                "pixel_batch_size: spp = 'auto' cannot lessen the noise of choosing pixels; give a number of samples"
             )
         return self
 
@@ -411,8 +444,8 @@ class Config(Table):
     def _searched(self) -> Config:
         if not self.optimizer.searches:
             return self
-        rates = {"learning_rate_schedule", "learning_rate_decay", "warm_up"} & self.model_fields_set
-        wrong = sorted(rates | ({"stages", "rival", "views_per_step", "pixels_per_step"} & self.model_fields_set))
+        rates = {"learning_rate_schedule", "final_learning_rate_ratio", "warmup_steps"} & self.model_fields_set
+        wrong = sorted(rates | ({"stages", "baseline", "view_batch_size", "pixel_batch_size"} & self.model_fields_set))
         if self.spp == AUTO:
             wrong.append("spp = 'auto'")
         wrong += ["refine_at" for entry in self.parameters if len(entry.resolutions or []) > 1]
@@ -434,11 +467,11 @@ _TABLES: dict[str, type[BaseModel]] = {
     "derived": Derivation,
     "target": Target,
     "Picture": Picture,
-    "start": Displacement,
+    "Displacement": Displacement,
     "optimizer": Optimizer,
     "preview": Preview,
     "capture": Capture,
-    "auto_spp": AutoSpp,
+    "adaptive_spp": AdaptiveSpp,
     "stages": Stage,
     "exposure": Exposure,
     "ray": RayOptions,

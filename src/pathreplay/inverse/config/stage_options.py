@@ -18,8 +18,8 @@ class Stage(Table):
     spp: Count | None = None
     max_depth: Count | None = None
     sensors: Annotated[list[Whole | str], Field(min_length=1)] | None = None
-    views_per_step: Count | None = None
-    pixels_per_step: Count | None = None
+    view_batch_size: Count | None = None
+    pixel_batch_size: Count | None = None
     parameters: Annotated[list[str], Field(min_length=1)] | None = None
     learning_rate_factor: Positive = 1.0
 

@@ -24,7 +24,7 @@ class View:
     target: Image
     weight: Image | None = None
     """How much pixels count (height x width x 1, with the mean 1); None: all the same."""
-    held_out: bool = False
+    test_views: bool = False
     """It is only looked at in the end, and never learned from."""
     share: float = 1.0
     """How much it counts; of the views that are learned from the mean is 1."""
@@ -62,12 +62,14 @@ def held_out_of(scene: mi.Scene, sensors: dict[str, int], config: Config, shots:
     """The names of the views that are not learned from: those that the job names, and every so many of ``shots``."""
     everywhere = sensors_of(scene, None)
     ids = [sensor.id() for sensor in scene.sensors()]
-    places = {_place(item, ids, list(everywhere)) for item in config.held_out}
+    places = {_place(item, ids, list(everywhere)) for item in config.test_views}
     found = {name for name, index in sensors.items() if index in places}
-    every = None if config.capture is None else config.capture.hold_out_every
+    every = None if config.capture is None else config.capture.test_every
     if len(found) < len(places):
         other = next(name for name, index in everywhere.items() if index in places and name not in found)
-        raise PathreplayError(f"held_out: sensor '{other}' is not among 'sensors'; add it there, or leave it out here")
+        raise PathreplayError(
+            f"test_views: sensor '{other}' is not among 'sensors'; add it there, or leave it out here"
+        )
     regular = set(shots[::every]) if every else set()
     found |= {name for name, index in sensors.items() if ids[index] in regular}
     if len(found) == len(sensors):
@@ -75,14 +77,14 @@ def held_out_of(scene: mi.Scene, sensors: dict[str, int], config: Config, shots:
     return found
 
 
-def shares_of(scene: mi.Scene, sensors: dict[str, int], config: Config, held_out: set[str]) -> dict[str, float]:
+def shares_of(scene: mi.Scene, sensors: dict[str, int], config: Config, test_views: set[str]) -> dict[str, float]:
     """How much each view counts, by name."""
     names = named_views(scene, sensors, list(config.view_weights), "view_weights")
-    if out := set(names) & held_out:
+    if out := set(names) & test_views:
         raise PathreplayError(f"view_weights: view '{min(out)}' is held out, and counts for nothing; leave it out here")
     given = dict(zip(names, config.view_weights.values(), strict=True))
     shares = {name: given.get(name, 1.0) for name in sensors}
-    mean = float(np.mean([share for name, share in shares.items() if name not in held_out]))
+    mean = float(np.mean([share for name, share in shares.items() if name not in test_views]))
     return {name: share / mean for name, share in shares.items()}
 
 

@@ -15,7 +15,7 @@ def batch(problem: Problem, config: Config, iteration: int) -> list[int]:
     iteration alone, so that a run that goes on takes the views that it would have taken.
     """
     views = list(problem.trained())
-    n, size = len(views), config.views_per_step
+    n, size = len(views), config.view_batch_size
     if size is None or size >= n:
         return views[::-1]  # what is learned of media depends on the order, and earlier versions had this one
     number, k = divmod(iteration, -(-n // size))

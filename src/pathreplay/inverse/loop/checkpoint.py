@@ -31,7 +31,7 @@ class Entry:
     and ``noise_norms`` how long the noise of a gradient is, where the job measures it (see `noise`). ``errors`` are
     the root mean square errors, after the step, of the variables whose truth is known, and how far poses are from
     theirs (see `PoseError.of`); ``picture_error`` is that of the pictures without their noise, in the iterations in
-    which it was measured (jobs with a rival). Neither costs ``seconds``. ``penalty`` is what values add to the loss.
+    which it was measured (jobs with a baseline). Neither costs ``seconds``. ``penalty`` is what values add to the loss.
     ``slopes`` are sums of each gradient over parts of its variable, and ``means`` those of its values after the step
     (see `movement`).
     """
@@ -64,7 +64,7 @@ class Run:
     learned: Arrays = field(default_factory=dict)
     """By the evaluations, from one to the next."""
     history: list[Entry] = field(default_factory=list)
-    rival: Run | None = None
+    baseline: Run | None = None
     """Solves the same problem from the same start by another integrator in the same time."""
     whole: bool = True
     """Not in the middle of a step, in which it cannot be saved."""

@@ -53,7 +53,7 @@ from pathreplay.inverse.problem.problem import Problem, errors_of, put_values, s
 from pathreplay.platform.interrupts import Stop
 from pathreplay.scenes.parameters import get_array, to_value
 
-# How often the pictures are judged in a job with a rival: enough for a curve, at some per cent of its time.
+# How often the pictures are judged in a job with a baseline: enough for a curve, at some per cent of its time.
 JUDGEMENTS = 10
 
 # Of a gradient's entries, that were not finite: with less, the others still lead the way.
@@ -105,10 +105,10 @@ def best_values(problem: Problem, run: Run) -> dict[str, Array]:
 def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
     """Take steps from ``len(run.history)`` to ``config.iterations``; yields what happens, for observers.
 
-    After each step the run's rival takes as many as bring it to the same number of seconds. Taking turns, both have the
+    After each step the run's baseline takes as many as bring it to the same number of seconds. In turns, both have the
     same share of a machine whose load changes. Its learning rate and resolutions are those of the job's iteration.
 
-    Raises PathreplayError where loss or values are no longer finite, and after `Config.non_finite_in_a_row`.
+    Raises PathreplayError where loss or values are no longer finite, and after `Config.max_consecutive_nonfinite`.
     """
     yield Started(len(run.history), config.iterations)
     faint: set[str] = set()
@@ -121,12 +121,12 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
             stage = place(stages, i)
             yield Entered(stage + 1, len(stages))
         yield from take_step(problem, config, run, i)
-        if rival := run.rival:
-            while rival.seconds() < run.seconds():
-                take_step(problem, config, rival, i)
+        if baseline := run.baseline:
+            while baseline.seconds() < run.seconds():
+                take_step(problem, config, baseline, i)
             # Due after the first iteration, and after those with which a tenth of them is done.
             if i == 0 or JUDGEMENTS * i // config.iterations < JUDGEMENTS * (i + 1) // config.iterations:
-                for each in (run, rival):
+                for each in (run, baseline):
                     error = judged(problem, config, each.values, i)
                     each.history[-1] = replace(each.history[-1], picture_error=error)
         for key, ratio in noise.ratios(run.history).items():
@@ -142,14 +142,14 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
 
 def _require_gradients(config: Config, run: Run) -> None:
     """Raise PathreplayError if half of a gradient and more was not finite in so many iterations in a row."""
-    last = run.history[-config.non_finite_in_a_row :]
-    if len(last) < config.non_finite_in_a_row:
+    last = run.history[-config.max_consecutive_nonfinite :]
+    if len(last) < config.max_consecutive_nonfinite:
         return
     for key in last[-1].dropped_shares:
         if all(entry.dropped_shares.get(key, 0) >= HALF for entry in last):
             raise PathreplayError(
                 f"The gradient of '{key}' was NaN or infinite, half of it or more, in iterations {last[0].iteration} "
-                f"to {last[-1].iteration}; bound it, start it elsewhere, or raise 'non_finite_in_a_row'"
+                f"to {last[-1].iteration}; bound it, start it elsewhere, or raise 'max_consecutive_nonfinite'"
             )
 
 
@@ -167,7 +167,7 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     part = part_at(problem, config, position)
     values, told = _refined(part, run.values, position)
     asked, halves = part.config.spp, part.config.halves_samples
-    spp = asked if isinstance(asked, int) else noise.next_spp(config.auto_spp, run.history)
+    spp = asked if isinstance(asked, int) else noise.next_spp(config.adaptive_spp, run.history)
     shards = _shards(part, i, spp)
     share = len(part.problem.trained()) / len({shard.views for shard in shards})
     evaluations = run.executor.run(values, shards, run.learned)
@@ -227,7 +227,7 @@ def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
     same = 0 if part.config.optimizer.searches else iteration
     config, views = part.config, part.problem.views
     return [
-        Shard((n,), spp // config.parts, (seed,), part.number, config.pixels_per_step)
+        Shard((n,), spp // config.parts, (seed,), part.number, config.pixel_batch_size)
         for n in batch(part.problem, config, iteration)
         for seed in config.seeds(ITERATION, views[n].sensor, same, config.parts)
     ]
@@ -261,8 +261,8 @@ def _summed(evaluations: Iterator[Evaluation], share: float, halves: bool) -> tu
 def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int, loss: float) -> dict[str, Array]:
     """The values after a step of the optimiser, taken in the coordinates of each variable, and held within bounds."""
     config = part.config
-    decay, iterations = config.learning_rate_decay, config.iterations
-    factor = part.factor * rate(config.learning_rate_schedule, position, iterations, decay, config.warm_up)
+    decay, iterations = config.final_learning_rate_ratio, config.iterations
+    factor = part.factor * rate(config.learning_rate_schedule, position, iterations, decay, config.warmup_steps)
     moving = [v for v in part.problem.variables if v.key in gradients]
     rates = {v.key: v.learning_rate * factor for v in moving}
     others = {v.key: v.coordinates for v in moving if v.coordinates}
@@ -291,7 +291,7 @@ def picture_of(problem: Problem, config: Config, values: Arrays, view: View, spp
     """One of them, with so many samples per pixel."""
     put_values(problem, values)
     at = next(n for n, each in enumerate(problem.views) if each.name == view.name)
-    return exposed(values, at, _plain(problem, config, view, config.picture_spp if spp is None else spp))
+    return exposed(values, at, _plain(problem, config, view, config.eval_spp if spp is None else spp))
 
 
 def _plain(problem: Problem, config: Config, view: View, spp: int) -> Image:
@@ -301,13 +301,13 @@ def _plain(problem: Problem, config: Config, view: View, spp: int) -> Image:
 
 def with_exposures(problem: Problem, config: Config, values: Arrays) -> Arrays:
     """The values, with the exposures of held-out views: nothing was learned from them, so that they are fitted now."""
-    if EXPOSURE not in values or not any(view.held_out for view in problem.views):
+    if EXPOSURE not in values or not any(view.test_views for view in problem.views):
         return values
     put_values(problem, values)
     pictures = {
-        n: (_plain(problem, config, view, config.picture_spp), view.target, view.weight)
+        n: (_plain(problem, config, view, config.eval_spp), view.target, view.weight)
         for n, view in enumerate(problem.views)
-        if view.held_out
+        if view.test_views
     }
     return with_held_out(values, pictures)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from pathreplay.inverse.config.noise_options import AutoSpp
+from pathreplay.inverse.config.noise_options import AdaptiveSpp
 from pathreplay.inverse.loop.checkpoint import Entry
 
 WINDOW = 16
@@ -36,20 +36,20 @@ def ratios(history: Sequence[Entry]) -> dict[str, float]:
     return found
 
 
-def next_spp(auto: AutoSpp, history: Sequence[Entry]) -> int:
+def next_spp(auto: AdaptiveSpp, history: Sequence[Entry]) -> int:
     """Samples per pixel of the next iteration: a function of the history alone.
 
     After every `WINDOW` iterations with as many: twice, where a variable has less than the wanted ratio; half, where
     all have more than twice of it (half the samples cost the ratio a half at most).
     """
     if not history:
-        return auto.lowest
-    spp = min(max(history[-1].spp, auto.lowest), auto.highest)
+        return auto.min
+    spp = min(max(history[-1].spp, auto.min), auto.max)
     row = next((n for n, entry in enumerate(reversed(history)) if entry.spp != spp), len(history))
     found = ratios(history) if row and row % WINDOW == 0 else {}
     if not found:
         return spp
     least = min(found.values())
-    if least < auto.ratio:
-        return min(2 * spp, auto.highest)
-    return max(spp // 2, auto.lowest) if least > 2 * auto.ratio else spp
+    if least < auto.target_snr:
+        return min(2 * spp, auto.max)
+    return max(spp // 2, auto.min) if least > 2 * auto.target_snr else spp

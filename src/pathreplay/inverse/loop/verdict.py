@@ -35,7 +35,7 @@ class Verdict:
             pairs = ", ".join(f"'{a}' against '{b}'" for a, b in self.trade_offs)
             parts.append(
                 f"not determined by the pictures: {pairs}, where one undoes what the other does: hold one of them, or "
-                "add a prior, or a view that tells them apart"
+                "add l2_to_initial, or a view that tells them apart"
             )
         if self.unseen:
             parts.append(f"not determined by the pictures, in which they change nothing: {_listed(self.unseen)}")
@@ -63,7 +63,7 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
     if stopped or not known:
         return Verdict(moving, arrived)
     pixels = np.mean([view.target[..., 0].size for view in problem.trained().values()])
-    views = problem.config.views_per_step or len(problem.trained())
+    views = problem.config.view_batch_size or len(problem.trained())
     taken = float(pixels) * views * sum(entry.spp for entry in run.history)
     try:
         columns, unseen = columns_of(problem, run.values, taken)

@@ -37,13 +37,13 @@ def require_reached(problem: Problem, config: Config) -> None:
 
 
 def _require_differentiated(part: Part, sensor: int, where: str) -> None:
-    """Raise PathreplayError where the integrator, or its rival, takes what moves for constant."""
+    """Raise PathreplayError where the integrator, or its baseline, takes what moves for constant."""
     problem = part.problem
     variables = variables_of(problem, {v.key: v.start for v in problem.variables})
     dr.enable_grad({key: value for key, value in variables.items() if key in part.moving})
     problem.params.update(scene_values(problem, variables))
     try:
-        for integrator in filter(None, (problem.integrator, problem.rival)):
+        for integrator in filter(None, (problem.integrator, problem.baseline)):
             if hasattr(integrator, "is_reached") and not integrator.is_reached(problem.scene, sensor):
                 nothing = dr.zeros(mi.TensorXf, picture_shape(problem.scene.sensors()[sensor]))
                 integrator.render_backward(problem.scene, problem.params, nothing, sensor, spp=1)

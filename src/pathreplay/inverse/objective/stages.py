@@ -44,10 +44,12 @@ def part_at(problem: Problem, config: Config, iteration: int) -> Part:
 
 
 def _part(problem: Problem, config: Config, number: int, stage: Stage) -> Part:
-    names = "spp", "views_per_step", "pixels_per_step"
+    names = "spp", "view_batch_size", "pixel_batch_size"
     given = {name: value for name in names if (value := getattr(stage, name)) is not None}
     seen = _views(problem, stage)
-    views = tuple(replace(v, held_out=v.held_out or (seen is not None and v.name not in seen)) for v in problem.views)
+    views = tuple(
+        replace(v, test_views=v.test_views or (seen is not None and v.name not in seen)) for v in problem.views
+    )
     moving = frozenset(_moving(problem, stage))
     changed = config.model_copy(update=given)
     return Part(number, changed, replace(problem, views=views), moving, stage.learning_rate_factor)
@@ -61,7 +63,7 @@ def _views(problem: Problem, stage: Stage) -> set[str] | None:
     found = set()
     for item in stage.sensors:
         named = [v for v in problem.views if item in (v.name, ids[v.name]) or item == v.sensor]
-        if not named or named[0].held_out:
+        if not named or named[0].test_views:
             why = "is held out" if named else "is none of the job's views"
             names = ", ".join(v.name for v in problem.trained().values())
             raise PathreplayError(f"stages: sensor {shown(item)} {why}; name some of {names}")
@@ -94,7 +96,7 @@ def require_stages(problem: Problem, config: Config) -> None:
         for view in part.problem.trained().values():
             _require_divisible(problem.scene.sensors()[view.sensor], view.name, stage.downscale)
         if stage.max_depth is not None:
-            for plugin in filter(None, (config.integrator, config.rival)):
+            for plugin in filter(None, (config.integrator, config.baseline)):
                 _integrator(plugin, stage.max_depth)
     for variable in problem.variables:
         if config.stages and not any(variable.key in _moving(problem, stage) for stage in config.stages):
@@ -106,9 +108,9 @@ def require_single_pixels(problem: Problem, config: Config) -> None:
     stages: list[Stage | None] = [*config.stages] if config.stages else [None]
     for number, stage in enumerate(stages):
         part = part_at(problem, config, 0) if stage is None else _part(problem, config, number, stage)
-        if part.config.pixels_per_step is None:
+        if part.config.pixel_batch_size is None:
             continue
-        for integrator, plugin in ((problem.integrator, config.integrator), (problem.rival, config.rival)):
+        for integrator, plugin in ((problem.integrator, config.integrator), (problem.baseline, config.baseline)):
             if integrator is not None and plugin is not None:
                 if stage is not None and stage.max_depth is not None:
                     integrator = _integrator(plugin, stage.max_depth)
@@ -192,5 +194,5 @@ class Staged:
             integrator = _integrator(self.plugin, stage.max_depth)
             if hasattr(integrator, "told"):  # what has been said need not be said again
                 integrator.told |= self.integrator.told
-        views = tuple(scaled(view, stage.downscale) if not view.held_out else view for view in part.problem.views)
+        views = tuple(scaled(view, stage.downscale) if not view.test_views else view for view in part.problem.views)
         return Evaluator(replace(part.problem, views=views), integrator, self.record, part.moving)

@@ -48,7 +48,7 @@ class LineSearch:
                 f"The parameters are {n} numbers, and type = '{options.type}' takes up to {MOST}; take 'adam'"
             )
         given = options.options()
-        self._memory, self._tolerance = given["memory"], given["tolerance"]
+        self._memory, self._tolerance = given["history_size"], given["tolerance"]
         ends = [np.broadcast_to(np.array(bounds[key], float), (value.size, 2)) for key, value in values.items()]
         self._bounds = np.concatenate(ends)
         self._start, self._scale, self._next = np.zeros(0), np.zeros(0), np.zeros(0)

@@ -11,7 +11,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.film.image import MOST_SAMPLES
-from pathreplay.inverse.config.schema import Displacement, Parameter
+from pathreplay.inverse.config.schema import Parameter
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.platform import memory
 
@@ -71,8 +71,8 @@ def require_near(scene: mi.Scene, key: str, value: Array, entry: Parameter) -> N
     corners = [np.array(box.min), np.array(box.max)] if box.valid() else []
     points = [*corners, value[:3, 3] if value.shape == (4, 4) else value]
     extent = max(float(np.abs(point).max(initial=0.0)) for point in points) or 1.0
-    start = entry.start or Displacement()
-    for name, vector in (("pivot", entry.pivot), ("start.translation", start.translation)):
+    start = entry.displacement
+    for name, vector in (("pivot", entry.pivot), ("initial.translation", start.translation)):
         largest = max(map(abs, vector or [0.0]))
         if largest > _FARTHEST * extent:
             raise PathreplayError(

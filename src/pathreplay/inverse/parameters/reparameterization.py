@@ -58,8 +58,8 @@ class Transform:
             if wrong.any():
                 bound = self.lower if what == "above" else self.upper
                 raise PathreplayError(
-                    f"Parameter '{key}' starts at {values[wrong].flat[0]:g}, and transform = '{self.kind}' wants "
-                    f"values {what} {bound:g}; start it elsewhere with 'initial', or leave the transform out"
+                    f"Parameter '{key}' starts at {values[wrong].flat[0]:g}, and parameterization = '{self.kind}' "
+                    f"wants values {what} {bound:g}; start elsewhere with 'initial', or leave it out"
                 )
 
     def latent(self, values: Array) -> Array:

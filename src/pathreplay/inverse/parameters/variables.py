@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.schema import Config, Derivation, Parameter
+from pathreplay.inverse.config.schema import Config, Derivation, Displacement, Parameter
 from pathreplay.inverse.config.user_functions import Modules
 from pathreplay.inverse.parameters import limits as parameter_limits
 from pathreplay.inverse.parameters.exposures import EXPOSURE
@@ -137,10 +137,10 @@ def make_variables(
             variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
             continue
         parameter_limits.require_near(scene, key, parameters.get_array(params[key]), entry)
-        pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.distance)
+        pose = make_pose(key, params[key], entry.pose, entry.pivot, entry.error_scale)
         poses.append(pose)
         for part, name in pose.parts().items():
-            start = np.array(getattr(entry.start, part, None) or [0.0, 0.0, 0.0], np.float32)
+            start = np.array(getattr(entry.displacement, part) or [0.0, 0.0, 0.0], np.float32)
             if part == "rotation":
                 # Users write degrees. A learning rate without unit is taken in radians, fit for a scene of size 1.
                 start = np.radians(start)
@@ -152,14 +152,16 @@ def make_variables(
 
 
 def _coordinates(params: mi.SceneParameters, key: str, entry: Parameter, start: Array) -> Coordinates | None:
-    if entry.transform is not None:
-        transform = Transform(entry.transform, *(-np.inf if x is None else x for x in (entry.lower, entry.upper)))
+    if entry.parameterization is not None:
+        transform = Transform(
+            entry.parameterization, *(-np.inf if x is None else x for x in (entry.lower, entry.upper))
+        )
         transform.require_inside(key, start)
         return transform
-    if entry.smooth is None:
+    if entry.large_steps_lambda is None:
         return None
-    faces = _faces(params, key, "smooth")
-    return Surface(parameters.get_array(params[key]), faces, entry.smooth)
+    faces = _faces(params, key, "large_steps_lambda")
+    return Surface(parameters.get_array(params[key]), faces, entry.large_steps_lambda)
 
 
 def _faces(params: mi.SceneParameters, key: str, option: str) -> NDArray[np.integer]:
@@ -181,13 +183,13 @@ def _penalty(
                 f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'total_variation' out"
             )
         terms.append(TotalVariation(entry.total_variation))
-    if entry.prior is not None:
-        terms.append(Prior(entry.prior, start))
-    if entry.laplacian is not None:
-        faces = _faces(params, key, "laplacian")
-        terms.append(Laplacian(entry.laplacian, parameters.get_array(params[key]), faces))
-    if entry.penalty is not None:
-        terms.append(Own(modules.function("Penalty", entry.penalty, "values")))
+    if entry.l2_to_initial is not None:
+        terms.append(Prior(entry.l2_to_initial, start))
+    if entry.laplacian_weight is not None:
+        faces = _faces(params, key, "laplacian_weight")
+        terms.append(Laplacian(entry.laplacian_weight, parameters.get_array(params[key]), faces))
+    if entry.regularizer is not None:
+        terms.append(Own(modules.function("Penalty", entry.regularizer, "values")))
         for shape in levels.shapes if levels else [start.shape]:
             terms[-1](resampled(start, shape))
     return Penalty(tuple(terms)) if terms else None
@@ -219,6 +221,7 @@ def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path) -> Arr
     if entry.initial is None:
         start = parameters.get_array(like)
     else:
+        assert not isinstance(entry.initial, Displacement)  # the schema wants a pose for one
         start = form.of_colours(key, make_value(key, like, entry.initial, base))
     for bound, name, wrong in ((entry.lower, "lower", np.less), (entry.upper, "upper", np.greater)):
         if bound is not None and wrong(start, np.float32(bound)).any():

@@ -84,7 +84,7 @@ class Problem:
     scene: mi.Scene
     params: mi.SceneParameters
     integrator: mi.Integrator
-    rival: mi.Integrator | None
+    baseline: mi.Integrator | None
     """Solves the same problem in the same time, for comparison."""
     judge: mi.Integrator
     """Renders the pictures by which both are compared: the one that made the targets, where it is known."""
@@ -118,7 +118,7 @@ class Problem:
 
     def trained(self) -> dict[int, View]:
         """The views that are learned from, by their place."""
-        return {n: view for n, view in enumerate(self.views) if not view.held_out}
+        return {n: view for n, view in enumerate(self.views) if not view.test_views}
 
 
 def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
@@ -186,19 +186,19 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     free = free_of(params, config)
     keys = [*named, *made]
     notes += _edges(params, keys, integrator)
-    rival = None if config.rival is None else _gradient_integrator(config.rival)
-    if rival is not None:
-        keys_of(params, config, rival)
-        _edges(params, keys, rival)  # for its log: one note is enough
+    baseline = None if config.baseline is None else _gradient_integrator(config.baseline)
+    if baseline is not None:
+        keys_of(params, config, baseline)
+        _edges(params, keys, baseline)  # for its log: one note is enough
     judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
     # Before any target is rendered: the cheap mistakes first.
     sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
     taken = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
-    held_out = held_out_of(scene, sensors, config, list(shots))
+    test_views = held_out_of(scene, sensors, config, list(shots))
     feasibility.require_visible(scene, params, keys)
     if config.target.alpha == "scene":
         require_known(scene, params, keys)
-    require_films(scene, sensors, {"spp": config.most_spp, "picture_spp": config.picture_spp})
+    require_films(scene, sensors, {"spp": config.most_spp, "eval_spp": config.eval_spp})
     unsolved, moved = make_variables(scene, params, named | free, config, base, modules)
     derived = make_derived(params, made, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
@@ -225,9 +225,9 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
         raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
     given = config.target.masks is not None or config.target.alpha == "mask"
     require_weights(targets, {n for n in sensors if given or (n in taken and (taken[n].mask or taken[n].lens))})
-    shares = shares_of(scene, sensors, config, held_out)
+    shares = shares_of(scene, sensors, config, test_views)
     views = tuple(
-        View(name, index, targets.images[name], targets.weights.get(name), name in held_out, shares[name])
+        View(name, index, targets.images[name], targets.weights.get(name), name in test_views, shares[name])
         for name, index in sensors.items()
     )
     unsolved += _exposures(scene, config, views)
@@ -242,7 +242,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     parameters.keep_only(params, keys)
     known = fingerprint(taken.values()) if taken else None
     return Problem(
-        config, scene, params, integrator, rival, judge, variables, poses, views, loss, notes, derived, known, album
+        config, scene, params, integrator, baseline, judge, variables, poses, views, loss, notes, derived, known, album
     )
 
 
@@ -266,16 +266,16 @@ def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list
     if (asked := config.exposure) is None:
         return []
     value = start_of_exposures(len(views), min(view.target.shape[2] for view in views), asked.white_balance)
-    trained = [n for n, view in enumerate(views) if not view.held_out]
+    trained = [n for n, view in enumerate(views) if not view.test_views]
     reference = None
     if asked.reference is not None:
         places = named_views(scene, {view.name: view.sensor for view in views}, [asked.reference], "exposure.reference")
         reference = places[0]
-        if views[[view.name for view in views].index(reference)].held_out:
+        if views[[view.name for view in views].index(reference)].test_views:
             raise PathreplayError(
                 f"exposure: the reference '{reference}' is held out; name a view that is learned from"
             )
-    fixed = fixed_rows([view.name for view in views], trained, reference, asked.free)
+    fixed = fixed_rows([view.name for view in views], trained, reference, not asked.fix_scale)
     rate = asked.learning_rate or config.learning_rate
     return [Variable(EXPOSURE, mi.TensorXf(value), (-np.inf, np.inf), rate, value, None, coordinates=Factors(fixed))]
 

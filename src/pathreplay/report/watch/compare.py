@@ -28,7 +28,7 @@ def table(runs: list[Past]) -> Table:
         Row("loss", tuple(_loss(run) for run in runs)),
     ]
     for kind, unit in (("psnr", " dB"), ("ssim", "")):
-        for name, views in (("views that are learned from", _learned), ("held-out views", Past.held_out)):
+        for name, views in (("views that are learned from", _learned), ("held-out views", Past.test_views)):
             cells = tuple(_mean([run.likeness(view, kind) for view in views(run)], unit) for run in runs)
             if any(cells):
                 rows.append(Row(f"{kind.upper()}, {name}", cells))
@@ -64,7 +64,7 @@ def _loss(run: Past) -> str:
 
 
 def _learned(run: Past) -> list[str]:
-    return [view for view in run.views if view not in run.held_out()]
+    return [view for view in run.views if view not in run.test_views()]
 
 
 def _mean(values: list[float | None], unit: str) -> str:
@@ -145,10 +145,10 @@ def _views(runs: list[Past]) -> tuple[View, ...]:
             psnr = run.likeness(name, "psnr")
             caption = run.name if psnr is None else f"{run.name}, {psnr:.2f} dB"
             pictures.append(_picture(run, run.name, caption, f"result-{name}", share))
-        held_out = any(name in run.held_out() for run in runs)
+        test_views = any(name in run.test_views() for run in runs)
         shown = tuple(picture for picture in pictures if picture is not None)
         if len(shown) > 1:
-            found.append(View(name, shown, held_out=held_out))
+            found.append(View(name, shown, test_views=test_views))
     return tuple(found)
 
 

@@ -55,8 +55,8 @@ class Past:
         value = result.get(kind) if isinstance(result, dict) else None
         return float(value) if isinstance(value, (int, float)) else None
 
-    def held_out(self) -> list[str]:
-        return [name for name, view in self.views.items() if view.get("held_out") is True]
+    def test_views(self) -> list[str]:
+        return [name for name, view in self.views.items() if view.get("test_views") is True]
 
     def _json(self, name: str) -> dict[str, Any]:
         try:

@@ -1,4 +1,4 @@
-"""`smoothdielectric` has the values of Mitsuba's `dielectric`, and derivatives that agree with float64 optics."""
+"""`dielectric_ad` has the values of Mitsuba's `dielectric`, and derivatives that agree with float64 optics."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 import pathreplay  # noqa: F401 (registers the plugin)
 from pathreplay.platform.threads import spare_thread
-from pathreplay.plugins.smoothdielectric import MAX_REFLECTION
+from pathreplay.plugins.dielectric_ad import MAX_REFLECTION
 
 N = 20000
 RADIANCE, IMPORTANCE = "Radiance", "Importance"
@@ -90,7 +90,7 @@ def test_samples_equal_those_of_dielectric(parameters, name, mode):
     active = mi.Mask(np.arange(N) % 7 != 0)
     (bs, weight), (bs_ref, weight_ref) = (
         mi.load_dict({"type": kind, **parameters}).sample(ctx, si, sample1, mi.Point2f(0.5), active)
-        for kind in ("smoothdielectric", "dielectric")
+        for kind in ("dielectric_ad", "dielectric")
     )
     critical = near_critical(si, parameters) if name == "both lobes" else mi.Mask(False)
     for field in ("wo", "pdf", "eta", "sampled_component", "sampled_type"):
@@ -102,14 +102,14 @@ def test_samples_equal_those_of_dielectric(parameters, name, mode):
 
 def near_critical(si, parameters):
     """Where the two plugins choose between the lobes with different probabilities."""
-    eta = mi.traverse(mi.load_dict({"type": "smoothdielectric", **parameters}))["eta"]
+    eta = mi.traverse(mi.load_dict({"type": "dielectric_ad", **parameters}))["eta"]
     F, _, η_it, _ = mi.fresnel(mi.Frame3f.cos_theta(si.wi), eta)
     return (η_it < 1) & (F > MAX_REFLECTION) & (F < 1)
 
 
 def test_transmission_is_likely_near_the_critical_angle():
     """A quarter of the samples or more, and the same mean weights as if each lobe were drawn by itself."""
-    bsdf = mi.load_dict({"type": "smoothdielectric", "int_ior": 1.5, "ext_ior": 1.0})
+    bsdf = mi.load_dict({"type": "dielectric_ad", "int_ior": 1.5, "ext_ior": 1.0})
     θ = np.arcsin(1 / 1.5) * 0.9999
     si = interaction(np.tile([np.sin(θ), 0, -np.cos(θ)], (N, 1)))
     bs, weight = bsdf.sample(context(), si, uniform(), mi.Point2f(0.5))
@@ -124,7 +124,7 @@ def test_transmission_is_likely_near_the_critical_angle():
 
 def test_flags_and_parameters_are_those_of_dielectric():
     tints = {"specular_reflectance": checkerboard(), "specular_transmittance": 0.5}
-    ours, stock = (mi.load_dict({"type": kind, **tints}) for kind in ("smoothdielectric", "dielectric"))
+    ours, stock = (mi.load_dict({"type": kind, **tints}) for kind in ("dielectric_ad", "dielectric"))
     assert ours.component_count() == 2 and ours.flags() == stock.flags()
     assert [ours.flags(i) for i in range(2)] == [stock.flags(i) for i in range(2)]
     params = mi.traverse(ours)
@@ -135,14 +135,14 @@ def test_flags_and_parameters_are_those_of_dielectric():
 
 
 def test_eval_and_pdf_are_zero():
-    bsdf, si, ctx = mi.load_dict({"type": "smoothdielectric"}), interaction(directions(16)), context()
+    bsdf, si, ctx = mi.load_dict({"type": "dielectric_ad"}), interaction(directions(16)), context()
     value, pdf = bsdf.eval_pdf(ctx, si, mi.reflect(si.wi))
     assert dr.all(value == 0, axis=None) and dr.all(pdf == 0)
     assert dr.all(bsdf.eval(ctx, si, mi.reflect(si.wi)) == 0, axis=None) and dr.all(bsdf.pdf(ctx, si, si.wi) == 0)
 
 
 def test_integers_are_indices_too():
-    assert mi.traverse(mi.load_dict({"type": "smoothdielectric", "int_ior": 2, "ext_ior": 1}))["eta"][0] == 2
+    assert mi.traverse(mi.load_dict({"type": "dielectric_ad", "int_ior": 2, "ext_ior": 1}))["eta"][0] == 2
 
 
 @pytest.mark.parametrize(
@@ -156,11 +156,11 @@ def test_integers_are_indices_too():
 )
 def test_bad_parameters_are_named(parameters, words):
     with pytest.raises(RuntimeError, match=words):
-        mi.load_dict({"type": "smoothdielectric", **parameters})
+        mi.load_dict({"type": "dielectric_ad", **parameters})
 
 
 def test_new_index_compiles_no_new_kernel():
-    bsdf, si = mi.load_dict({"type": "smoothdielectric", "int_ior": 1.5}), interaction(directions(64))
+    bsdf, si = mi.load_dict({"type": "dielectric_ad", "int_ior": 1.5}), interaction(directions(64))
     params = mi.traverse(bsdf)
     hashes, values = [], []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -232,7 +232,7 @@ def test_derivatives_against_float64_differences(eta, variable, components, mode
     wi = wi[(np.abs(cos_t_squared(wi, eta)) > 1e-2) & (np.abs(wi[:, 2]) > 1e-3)]
     v_wi, v_eta = (tangents(wi), 0.0) if variable == "wi" else (np.zeros_like(wi, float), 1.0)
     ctx = context(mode, component=None if components == "both" else int(components))
-    bsdf = mi.load_dict({"type": "smoothdielectric", "int_ior": eta, "ext_ior": 1.0, "specular_reflectance": 0.8})
+    bsdf = mi.load_dict({"type": "dielectric_ad", "int_ior": eta, "ext_ior": 1.0, "specular_reflectance": 0.8})
     d_wo, d_weight, bs = derivative(bsdf, wi, v_wi, v_eta, ctx, uniform(len(wi)))
 
     h, at = 1e-7, wi.astype(float)
@@ -273,7 +273,7 @@ def test_derivatives_are_finite_everywhere(eta, components):
     cosines = np.concatenate([cosines, -cosines])
     wi = np.stack([np.sqrt(1 - cosines**2), np.zeros_like(cosines), cosines], axis=1)
     wi = np.concatenate([wi, [[0, 0, 0]]])  # an interaction that is none
-    bsdf = mi.load_dict({"type": "smoothdielectric", "int_ior": eta, "ext_ior": 1.0})
+    bsdf = mi.load_dict({"type": "dielectric_ad", "int_ior": eta, "ext_ior": 1.0})
     ctx = context(component=components)
     for sample1 in (0.0, 0.5, np.float32(1 - 2**-24)):
         for v_wi, v_eta in ((tangents(wi + 1e-3), 0.0), (np.zeros_like(wi), 1.0)):
@@ -291,7 +291,7 @@ def test_derivatives_are_finite_everywhere(eta, components):
 def test_total_internal_reflection_is_that_of_a_mirror():
     wi = directions(1000)
     wi = wi[cos_t_squared(wi, 1.5) < -1e-3]
-    bsdf = mi.load_dict({"type": "smoothdielectric", "int_ior": 1.5, "ext_ior": 1.0})
+    bsdf = mi.load_dict({"type": "dielectric_ad", "int_ior": 1.5, "ext_ior": 1.0})
     for v_wi, v_eta in ((0 * wi, 1.0), (tangents(wi), 0.0)):
         d_wo, d_weight, bs = derivative(bsdf, wi, v_wi, v_eta, context(), uniform(len(wi)))
         assert len(wi) > 100 and dr.all(bs.sampled_component == 0)
@@ -299,7 +299,7 @@ def test_total_internal_reflection_is_that_of_a_mirror():
 
 
 def test_tints_are_differentiated_down_to_zero():
-    bsdf = mi.load_dict({"type": "smoothdielectric", "specular_reflectance": 0.0, "specular_transmittance": 0.0})
+    bsdf = mi.load_dict({"type": "dielectric_ad", "specular_reflectance": 0.0, "specular_transmittance": 0.0})
     params, si = mi.traverse(bsdf), interaction(directions(1000))
     tints = [params[f"{name}.value"] for name in ("specular_reflectance", "specular_transmittance")]
     dr.enable_grad(tints)
@@ -318,7 +318,7 @@ def test_tints_are_differentiated_down_to_zero():
 @pytest.mark.parametrize("from_inside", [False, True])
 def test_chi2_of_directions_under_diffuse_light(from_inside):
     """wi is cosine distributed, hence so is the reflected wo but for F, and the refracted one is by η² and 1 - F."""
-    bsdf = mi.load_dict({"type": "smoothdielectric", "int_ior": 1.5, "ext_ior": 1.0})
+    bsdf = mi.load_dict({"type": "dielectric_ad", "int_ior": 1.5, "ext_ior": 1.0})
     eta, side = mi.traverse(bsdf)["eta"], (-1 if from_inside else 1)
     relative = 1 / 1.5 if from_inside else 1.5
 
@@ -349,7 +349,7 @@ def test_chi2_of_directions_under_diffuse_light(from_inside):
 def test_lobes_are_drawn_as_often_as_the_fresnel_term_says(cos_theta):
     n = 100000
     wi = np.tile([np.sqrt(1 - cos_theta**2), 0, cos_theta], (n, 1))
-    bsdf = mi.load_dict({"type": "smoothdielectric", "int_ior": 1.5, "ext_ior": 1.0})
+    bsdf = mi.load_dict({"type": "dielectric_ad", "int_ior": 1.5, "ext_ior": 1.0})
     bs, _ = bsdf.sample(context(), interaction(wi), uniform(n, seed=11), mi.Point2f(0.5))
     F = optics(wi[:1], 1.5, 0, RADIANCE)[1][0]
     z = (np.sum(bs.sampled_component.numpy() == 0) - n * F) / np.sqrt(n * F * (1 - F))
@@ -382,7 +382,7 @@ def ball(kind: str, emitter: dict, **parameters):
 
 @pytest.mark.parametrize("indices", [("bk7", "air"), (1.0, 1.5), (1.4, 1.4)])
 def test_white_furnace(indices):
-    scene = ball("smoothdielectric", {"type": "constant"}, int_ior=indices[0], ext_ior=indices[1])
+    scene = ball("dielectric_ad", {"type": "constant"}, int_ior=indices[0], ext_ior=indices[1])
     image = mi.render(scene, spp=16, seed=3).numpy()
     # But for rays near the critical angle, which are rare here and have two weights, there is no noise.
     off = np.abs(image - 1)
@@ -397,7 +397,7 @@ def test_image_equals_that_of_dielectric():
             spp=16,
             seed=4,
         ).numpy()
-        for kind in ("smoothdielectric", "dielectric")
+        for kind in ("dielectric_ad", "dielectric")
     ]
     same = (images[0] == images[1]).all(-1)
     assert same.mean() > 0.9 and images[0].std() > 0.1  # the others have a ray near the critical angle
@@ -406,7 +406,7 @@ def test_image_equals_that_of_dielectric():
 
 def test_image_derivative_through_two_refractions():
     """Camera ray, into the ball, out of it, a smooth environment: derivative in η through Mitsuba's virtual calls."""
-    scene = ball("smoothdielectric", {"type": "constant"}, int_ior=1.5, ext_ior=1.0)
+    scene = ball("dielectric_ad", {"type": "constant"}, int_ior=1.5, ext_ior=1.0)
     params = mi.traverse(scene)
     i = mi.Float(np.linspace(-0.6, 0.6, 64, dtype=np.float32))
     origin, only_refraction = mi.Point3f(i, 0.3 * i + 0.1, 4), context(component=1)
@@ -443,12 +443,12 @@ for variant in ("llvm_ad_spectral", "llvm_ad_mono", "llvm_ad_rgb"):
     wi /= np.linalg.norm(wi, axis=0)
     tint = {"specular_reflectance": 0.5, "specular_transmittance": {"type": "rgb", "value": [0.2, 0.5, 0.8]}}
     samples = []
-    for kind in ("smoothdielectric", "dielectric"):
+    for kind in ("dielectric_ad", "dielectric"):
         si = dr.zeros(mi.SurfaceInteraction3f, 1000)
         si.wi = mi.Vector3f(wi)
         si.wavelengths = 550 if variant == "llvm_ad_spectral" else []
         bsdf = mi.load_dict({"type": kind, **tint})
-        if kind == "smoothdielectric":
+        if kind == "dielectric_ad":
             eta = mi.traverse(bsdf)["eta"]
             dr.enable_grad(eta)
         sample1 = mi.Float(np.linspace(0, 0.999, 1000))
@@ -461,7 +461,7 @@ for variant in ("llvm_ad_spectral", "llvm_ad_mono", "llvm_ad_rgb"):
     print(variant, "agrees")
 mi.set_variant("llvm_ad_rgb_polarized" if "llvm_ad_rgb_polarized" in mi.variants() else "llvm_ad_mono_polarized")
 try:
-    mi.load_dict({"type": "smoothdielectric"})
+    mi.load_dict({"type": "dielectric_ad"})
 except RuntimeError as error:
     print(error)
 """
@@ -471,4 +471,4 @@ def test_spectral_and_mono_variants_agree_and_polarised_ones_are_refused():
     done = subprocess.run([sys.executable, "-c", OTHER_VARIANTS], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert [f"{v} agrees" in done.stdout for v in ("llvm_ad_spectral", "llvm_ad_mono", "llvm_ad_rgb")] == [True] * 3
-    assert "smoothdielectric: the variant llvm_ad_mono_polarized is polarised, which it does not support" in done.stdout
+    assert "dielectric_ad: the variant llvm_ad_mono_polarized is polarised, which it does not support" in done.stdout

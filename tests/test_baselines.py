@@ -51,7 +51,7 @@ def colourful_fog_on_the_floor() -> dict:
 
 
 def glass_ball() -> dict:
-    return lit_room({"type": "smoothdielectric"})
+    return lit_room({"type": "dielectric_ad"})
 
 
 TEXTURE = Case("texture", textured, "object.bsdf.reflectance.data", random(), depth=5)

@@ -1,4 +1,4 @@
-"""`smoothdielectric`: Mitsuba's `dielectric` with an index of refraction that can be differentiated.
+"""`dielectric_ad`: Mitsuba's `dielectric` with an index of refraction that can be differentiated.
 
 With η the index inside over the index outside, θ_i and θ_t the angles of incidence and refraction, F(θ_i, η) the
 unpolarised Fresnel reflectance and η_ti = 1/η (from outside) or η (from inside):
@@ -40,15 +40,15 @@ def _index(props: Any, name: str, default: str) -> float:
             ior = float(mi.lookup_ior(props, name, default))
         except RuntimeError:
             raise PathreplayError(
-                f"smoothdielectric: {name} = {props[name]!r:.60} is no material that Mitsuba knows; give a number, "
+                f"dielectric_ad: {name} = {props[name]!r:.60} is no material that Mitsuba knows; give a number, "
                 "or a name such as 'bk7' or 'water'"
             ) from None
     if not 0 < ior < float("inf"):
-        raise PathreplayError(f"smoothdielectric: {name} is {ior:g}; give a finite index of refraction above 0")
+        raise PathreplayError(f"dielectric_ad: {name} is {ior:g}; give a finite index of refraction above 0")
     return ior
 
 
-class SmoothDielectric:
+class DielectricAD:
     specular_reflectance: mi.Texture | None  # None stands for one, at no cost
     specular_transmittance: mi.Texture | None
 
@@ -56,7 +56,7 @@ class SmoothDielectric:
         mi.BSDF.__init__(self, props)
         if mi.is_polarized:
             raise PathreplayError(
-                f"smoothdielectric: the variant {mi.variant()} is polarised, which it does not support; use "
+                f"dielectric_ad: the variant {mi.variant()} is polarised, which it does not support; use "
                 f"{mi.variant().replace('_polarized', '')}, or Mitsuba's dielectric without derivatives"
             )
         self.eta = mi.Float(_index(props, "int_ior", "bk7") / _index(props, "ext_ior", "air"))
@@ -87,7 +87,7 @@ class SmoothDielectric:
         for name in TINTS:
             if getattr(self, name) is not None:
                 lines.append(f"  {name} = {getattr(self, name)},".replace("\n", "\n  "))
-        return "\n".join(["SmoothDielectric[", *lines, "]"])
+        return "\n".join(["DielectricAD[", *lines, "]"])
 
     # -------------------------------------------- sampling, evaluation --------------------------------------------
 
