@@ -118,7 +118,7 @@ def test_a_job_takes_pictures_and_masks_of_a_model(folder: Path) -> None:
         capture = {"colmap": sub, "images": "images", "masks": "masks", "width": 24, "test_every": 3}
         job = {"scene": "room.xml", "capture": capture, "parameters": [{"key": "wall.bsdf.reflectance.value"}]}
         problem = build_problem(make_config(job), folder)
-        assert [view.test_views for view in problem.views] == [True, False, False] * 2 + [True]
+        assert [view.is_test for view in problem.views] == [True, False, False] * 2 + [True]
         for view in problem.views:
             assert view.target.shape == (16, 24, 3) and view.weight is not None
             assert view.weight[8, 8] > 1 and view.weight[8, 20] == 0

@@ -42,7 +42,7 @@ def a_run(folder: Path, losses: tuple[float, ...] = (1.0, 0.5, 0.25), **changes:
     metadata = {"history": _HISTORY.dump_json(history).decode()}
     (folder / "checkpoint.safetensors").write_bytes(safetensors.numpy.save({"x": np.zeros(1, np.float32)}, metadata))
     result = {"rmse": 0.1, "psnr": 20 + losses[-1], "ssim": 0.9}
-    views = {name: {"test_views": name == "right", "exposure": 1.0, "result": result} for name in ("left", "right")}
+    views = {name: {"is_test": name == "right", "exposure": 1.0, "result": result} for name in ("left", "right")}
     (folder / "views.json").write_text(json.dumps(views))
     for view in views:
         (folder / f"images/target-{view}.png").write_bytes(png((200, 0, 0)))
@@ -69,7 +69,7 @@ def test_a_table_has_what_runs_came_to_and_where_they_differ(tmp_path: Path) -> 
 
 def test_a_page_has_curves_of_both_and_pictures_that_can_be_wiped(tmp_path: Path) -> None:
     page = compare.page(pasts([a_run(tmp_path / "a"), a_run(tmp_path / "b", (1.0, 0.1), loss="l1")]))
-    assert [picture.kind for picture in page.views[0].pictures] == ["target", "a", "b"] and page.views[1].test_views
+    assert [picture.kind for picture in page.views[0].pictures] == ["target", "a", "b"] and page.views[1].is_test
     assert (page.left, page.right) == ("a", "b") and "different kinds (l1, l2)" in page.notices[0]
     by_seconds = page.plots[1]
     assert by_seconds.along == "second" and [s.x for s in by_seconds.series] == [(0.5, 1.0, 1.5), (0.5, 1.0)]

@@ -278,7 +278,7 @@ def test_a_run_keeps_its_page_and_a_bounded_number_of_frames(room: Path, monkeyp
     monkeypatch.setattr("pathreplay.report.live_page.time.perf_counter", iter(range(0, 10**9, 1000)).__next__)
     optimize(config(iterations=12, preview={"frames": 3, "share": 0.5}), progress=False)
     page = PAGES.validate_json((room / "run" / PAGE).read_bytes(), strict=True)
-    assert [view.name for view in page.views] == ["left", "right"] and page.views[1].test_views
+    assert [view.name for view in page.views] == ["left", "right"] and page.views[1].is_test
     assert page.facts[0][0] == "12 of 12" and page.plots[0].series[0].x == tuple(range(12))
     assert {f"{plot.title} {plot.code}" for plot in page.plots} >= {
         f"error of {TEXTURE}",

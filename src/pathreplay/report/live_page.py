@@ -278,7 +278,7 @@ class Previews:
             f"SSIM {likeness.ssim:.4f}, noise included."
         )
         film = shown.get(f"view-{view.name}", ())
-        return pages.View(view.name, pictures, stored, it.exposure, view.test_views, note, film)
+        return pages.View(view.name, pictures, stored, it.exposure, view.is_test, note, film)
 
     def _count(self) -> int:
         items = recovered_of(self.problem, self.run)
@@ -302,8 +302,8 @@ class Previews:
 
 def _chosen(problem: Problem, count: int) -> list[View]:
     """So many views, evenly among those that are learned from and those that are not; both, where there are both."""
-    out = [view for view in problem.views if view.test_views]
-    learned = [view for view in problem.views if not view.test_views]
+    out = [view for view in problem.views if view.is_test]
+    learned = [view for view in problem.views if not view.is_test]
     some = min(len(out), count // 2)
     chosen = {view.name for view in (*_evenly(learned, max(1, count - some)), *_evenly(out, some))}
     return [view for view in problem.views if view.name in chosen]
@@ -324,7 +324,7 @@ def _address(kind: str, item: Recovered) -> str:
 
 def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
     exposure = exposure_for(view.target)
-    return ViewPictures(view.name, view.target, before, now, exposure, None, view.weight, view.test_views)
+    return ViewPictures(view.name, view.target, before, now, exposure, None, view.weight, view.is_test)
 
 
 def _encoded(image: Image, exposure: float, side: int, kind: str) -> bytes:

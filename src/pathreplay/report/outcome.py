@@ -43,7 +43,7 @@ class ViewPictures:
     baseline: Image | None = None
     weight: Image | None = None
     """How much pixels count, if not all the same."""
-    test_views: bool = False
+    is_test: bool = False
     factors: tuple[float, ...] = ()
     """What the result is multiplied with, where exposures were recovered: one number, or one for each colour."""
 
@@ -57,14 +57,14 @@ class ViewPictures:
         """Of 'start', 'result' and 'baseline', where there is one: of what counts, at the exposure of the view."""
         images = {"result": self.result, "start": self.start, "baseline": self.baseline}
         return {
-            kind: Likeness.of(image, self.target, self.exposure, self.weight, flip=self.test_views)
+            kind: Likeness.of(image, self.target, self.exposure, self.weight, flip=self.is_test)
             for kind, image in images.items()
             if image is not None
         }
 
     def as_dict(self) -> dict[str, Any]:
         """For views.json."""
-        table: dict[str, Any] = {"test_views": self.test_views, "exposure": self.exposure}
+        table: dict[str, Any] = {"is_test": self.is_test, "exposure": self.exposure}
         if self.factors:
             table["recovered_exposure"] = list(self.factors)
         for kind, likeness in self.likenesses.items():
@@ -241,7 +241,7 @@ class Outcome:
 
     def test_views(self) -> list[ViewPictures]:
         """The views that were not learned from."""
-        return [view for view in self.views if view.test_views]
+        return [view for view in self.views if view.is_test]
 
     def has_flip(self) -> bool:
         """Whether there is FLIP to be told of."""

@@ -139,7 +139,7 @@ def _likeness(outcome: Outcome) -> Table:
             cells += ["" if each.flip is None else f"{each.flip:.4f}" for each in (before, after)]
         if exposed:
             cells.append("× " + ", ".join(f"{factor:.3f}" for factor in view.factors))
-        rows.append(Row(view.name + " (held out)" * view.test_views, tuple(cells)))
+        rows.append(Row(view.name + " (held out)" * view.is_test, tuple(cells)))
     return Table(tuple(Head(text) for text in heads), tuple(rows))
 
 
@@ -186,7 +186,7 @@ def _views(outcome: Outcome, exposure: float, films: Mapping[str, Film]) -> tupl
             f"{view.error(view.result):.4g} in the result, noise included{mask}. Shown at exposure {stored:.3g}."
         )
         film = films.get(f"view-{view.name}", ())
-        found.append(View(view.name, pictures, stored, view.exposure, view.test_views, note, film))
+        found.append(View(view.name, pictures, stored, view.exposure, view.is_test, note, film))
     return tuple(found)
 
 

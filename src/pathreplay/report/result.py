@@ -102,7 +102,7 @@ def outcome_of(
             exposure_for(v.target),
             rivals.get(v.name),
             v.weight,
-            v.test_views,
+            v.is_test,
             tuple(run.values[EXPOSURE][n].tolist()) if EXPOSURE in run.values else (),
         )
         for n, v in enumerate(problem.views)

@@ -24,7 +24,7 @@ class View:
     target: Image
     weight: Image | None = None
     """How much pixels count (height x width x 1, with the mean 1); None: all the same."""
-    test_views: bool = False
+    is_test: bool = False
     """It is only looked at in the end, and never learned from."""
     share: float = 1.0
     """How much it counts; of the views that are learned from the mean is 1."""

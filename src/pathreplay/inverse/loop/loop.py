@@ -301,13 +301,13 @@ def _plain(problem: Problem, config: Config, view: View, spp: int) -> Image:
 
 def with_exposures(problem: Problem, config: Config, values: Arrays) -> Arrays:
     """The values, with the exposures of held-out views: nothing was learned from them, so that they are fitted now."""
-    if EXPOSURE not in values or not any(view.test_views for view in problem.views):
+    if EXPOSURE not in values or not any(view.is_test for view in problem.views):
         return values
     put_values(problem, values)
     pictures = {
         n: (_plain(problem, config, view, config.eval_spp), view.target, view.weight)
         for n, view in enumerate(problem.views)
-        if view.test_views
+        if view.is_test
     }
     return with_held_out(values, pictures)
 

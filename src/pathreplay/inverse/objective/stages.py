@@ -48,7 +48,7 @@ def _part(problem: Problem, config: Config, number: int, stage: Stage) -> Part:
     given = {name: value for name in names if (value := getattr(stage, name)) is not None}
     seen = _views(problem, stage)
     views = tuple(
-        replace(v, test_views=v.test_views or (seen is not None and v.name not in seen)) for v in problem.views
+        replace(v, is_test=v.is_test or (seen is not None and v.name not in seen)) for v in problem.views
     )
     moving = frozenset(_moving(problem, stage))
     changed = config.model_copy(update=given)
@@ -63,7 +63,7 @@ def _views(problem: Problem, stage: Stage) -> set[str] | None:
     found = set()
     for item in stage.sensors:
         named = [v for v in problem.views if item in (v.name, ids[v.name]) or item == v.sensor]
-        if not named or named[0].test_views:
+        if not named or named[0].is_test:
             why = "is held out" if named else "is none of the job's views"
             names = ", ".join(v.name for v in problem.trained().values())
             raise PathreplayError(f"stages: sensor {shown(item)} {why}; name some of {names}")
@@ -194,5 +194,5 @@ class Staged:
             integrator = _integrator(self.plugin, stage.max_depth)
             if hasattr(integrator, "told"):  # what has been said need not be said again
                 integrator.told |= self.integrator.told
-        views = tuple(scaled(view, stage.downscale) if not view.test_views else view for view in part.problem.views)
+        views = tuple(scaled(view, stage.downscale) if not view.is_test else view for view in part.problem.views)
         return Evaluator(replace(part.problem, views=views), integrator, self.record, part.moving)

@@ -118,7 +118,7 @@ class Problem:
 
     def trained(self) -> dict[int, View]:
         """The views that are learned from, by their place."""
-        return {n: view for n, view in enumerate(self.views) if not view.test_views}
+        return {n: view for n, view in enumerate(self.views) if not view.is_test}
 
 
 def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
@@ -266,12 +266,12 @@ def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list
     if (asked := config.exposure) is None:
         return []
     value = start_of_exposures(len(views), min(view.target.shape[2] for view in views), asked.white_balance)
-    trained = [n for n, view in enumerate(views) if not view.test_views]
+    trained = [n for n, view in enumerate(views) if not view.is_test]
     reference = None
     if asked.reference is not None:
         places = named_views(scene, {view.name: view.sensor for view in views}, [asked.reference], "exposure.reference")
         reference = places[0]
-        if views[[view.name for view in views].index(reference)].test_views:
+        if views[[view.name for view in views].index(reference)].is_test:
             raise PathreplayError(
                 f"exposure: the reference '{reference}' is held out; name a view that is learned from"
             )

@@ -37,7 +37,7 @@ class View:
     pictures: tuple[Picture, ...]
     stored: float = 1.0
     own: float = 1.0
-    test_views: bool = False
+    is_test: bool = False
     note: str = ""
     film: tuple[Still, ...] = ()
 

@@ -145,10 +145,10 @@ def _views(runs: list[Past]) -> tuple[View, ...]:
             psnr = run.likeness(name, "psnr")
             caption = run.name if psnr is None else f"{run.name}, {psnr:.2f} dB"
             pictures.append(_picture(run, run.name, caption, f"result-{name}", share))
-        test_views = any(name in run.test_views() for run in runs)
+        is_test = any(name in run.test_views() for run in runs)
         shown = tuple(picture for picture in pictures if picture is not None)
         if len(shown) > 1:
-            found.append(View(name, shown, test_views=test_views))
+            found.append(View(name, shown, is_test=is_test))
     return tuple(found)
 
 

@@ -56,7 +56,7 @@ class Past:
         return float(value) if isinstance(value, (int, float)) else None
 
     def test_views(self) -> list[str]:
-        return [name for name, view in self.views.items() if view.get("test_views") is True]
+        return [name for name, view in self.views.items() if view.get("is_test") is True]
 
     def _json(self, name: str) -> dict[str, Any]:
         try:
