@@ -194,7 +194,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"parameters": [{"key": "a", "resolutions": [2, 4], "refine_at": [3]}]},
         "leave 'refine_at' out",
     ),
-    "option": ({"optimizer": {"type": "l-bfgs-b", "beta_1": 0.9}}, "which has memory, tolerance"),
+    "option": ({"optimizer": {"type": "l-bfgs-b", "beta_1": 0.9}}, "which has history_size, tolerance"),
 }
 
 

@@ -46,7 +46,7 @@ class ZMQInteractiveShell: pass
 import builtins
 builtins.get_ipython = ZMQInteractiveShell  # how rich tells a notebook; it then draws with ipywidgets, or nothing
 from rich.console import Console
-from pathreplay import backend
+from pathreplay.platform import backend
 backend.set_variant("llvm_ad_rgb")
 from pathreplay.report.progress import Progress
 print(Console().is_jupyter)

@@ -81,7 +81,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("line", REFUSED)
 def test_what_is_no_job_is_told_in_one_line(line: str) -> None:
-    text = TEXT if "given twice" in REFUSED[line] or not line.startswith("spp") else TEXT.replace("spp: 4\np", "p", 1)
+    text = TEXT if "given twice" in REFUSED[line] or not line.startswith("spp") else TEXT.replace("spp: 4\ne", "e", 1)
     Path("job.yaml").write_text(f"{text}{line}\n")
     with pytest.raises(PathreplayError) as told:
         load_config(Path("job.yaml"))

@@ -13,15 +13,41 @@ from pathreplay.errors import PathreplayError
 
 __version__ = "0.1.0"
 
-__all__ = ["PathreplayError", "__version__", "check_gradient", "exclusive", "iterate", "optimize"]
+__all__ = [
+    "Derived",
+    "Iteration",
+    "Parameter",
+    "PathreplayError",
+    "Problem",
+    "Result",
+    "View",
+    "__version__",
+    "check_gradient",
+    "exclusive",
+    "iterate",
+    "losses",
+    "minimize",
+    "optimize",
+    "value_and_grad",
+]
 
 #: Public names that live in rooms which need more time to import than `import pathreplay` should take.
 _LAZY = {
+    "Derived": "pathreplay.library",
+    "Iteration": "pathreplay.library",
+    "Parameter": "pathreplay.library",
+    "Problem": "pathreplay.library",
+    "Result": "pathreplay.library",
+    "View": "pathreplay.library",
     "check_gradient": "pathreplay.testing",
     "exclusive": "pathreplay.integrators.lifetimes",
     "iterate": "pathreplay.jobs",
+    "minimize": "pathreplay.library",
     "optimize": "pathreplay.jobs",
+    "value_and_grad": "pathreplay.library",
 }
+#: Modules that are called otherwise here.
+_MODULES = {"losses": "pathreplay.inverse.losses.pixelwise"}
 
 
 def _set_up() -> None:
@@ -52,15 +78,19 @@ del _set_up
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
+    if name in _LAZY or name in _MODULES:
         import importlib
 
         from pathreplay.platform import address_space
 
         address_space.require()
-        return getattr(importlib.import_module(_LAZY[name]), name)
+        return (
+            importlib.import_module(_MODULES[name])
+            if name in _MODULES
+            else getattr(importlib.import_module(_LAZY[name]), name)
+        )
     raise AttributeError(f"module 'pathreplay' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY})
+    return sorted({*globals(), *_LAZY, *_MODULES})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +18,7 @@ from pathreplay.inverse.loop.checkpoint import Entry, Run
 from pathreplay.inverse.loop.events import Event, Stepped
 from pathreplay.inverse.loop.loop import best_values, iterate, new_run, picture_of, render_views, with_exposures
 from pathreplay.inverse.loop.verdict import verdict_of
+from pathreplay.inverse.objective.evaluate import computing
 from pathreplay.inverse.objective.reached import require_reached
 from pathreplay.inverse.objective.stages import Staged, require_single_pixels, require_stages
 from pathreplay.inverse.parameters.values import Array
@@ -26,7 +27,6 @@ from pathreplay.inverse.problem.problem import Problem, build_problem
 from pathreplay.platform import backend, memory
 from pathreplay.platform.device import device_of
 from pathreplay.platform.interrupts import Stop, stopping, undisturbed
-from pathreplay.platform.threads import one_thread
 from pathreplay.report.live_page import Previews
 from pathreplay.report.notebook import NotebookPanel, in_notebook
 from pathreplay.report.outcome import resume_command
@@ -34,7 +34,6 @@ from pathreplay.report.progress import Progress
 from pathreplay.report.result import RunResult, outcome_of, result_files, result_of
 from pathreplay.runs.run_folder import Job, RunFolder, create_run_folder
 from pathreplay.runs.saving import Saving, first_files, go_on, saved_targets
-from pathreplay.scenes.descriptions import told
 
 
 @dataclass(frozen=True)
@@ -246,16 +245,6 @@ def _looker(problem: Problem, config: Config) -> Callable[[Mapping[str, Array], 
             return picture_of(problem, config, values, next(v for v in problem.views if v.name == view))
 
     return look
-
-
-@contextmanager
-def computing(config: Config) -> Iterator[None]:
-    """Around what the job's integrators do: in one thread if that is wanted, and their errors told."""
-    names = (
-        config.integrator.type if config.baseline is None else f"{config.integrator.type}' or '{config.baseline.type}"
-    )
-    with one_thread(config.deterministic), told(f"Integrator '{names}' cannot do this job"):
-        yield
 
 
 def _set_variant(config: Config) -> None:

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError, shown
@@ -39,7 +40,7 @@ def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any)
 
 
 def load_scene_with(
-    spec: str | Path,
+    spec: str | Path | SceneDict,
     plugins: Mapping[str, str],
     base: Path | None = None,
     cameras: Cameras | None = None,
@@ -49,10 +50,16 @@ def load_scene_with(
 ) -> tuple[mi.Scene, list[str]]:
     """`load_scene` with plugins exchanged (old type -> new type), and one line for each that was: id and place.
 
-    ``cameras`` are added to those of the scene. For ``floats`` see `load_file_with`.
+    ``spec`` may be a dictionary, too. ``cameras`` are added to those of the scene. For ``floats`` see `load_file_with`.
     """
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
+    if isinstance(spec, Mapping):
+        with told("The scene's dictionary cannot be loaded", (RuntimeError, ValueError, TypeError)):
+            scene, exchanged = load_dict_with(_copied(spec), plugins, cameras, floats)
+        if not isinstance(scene, mi.Scene):
+            raise PathreplayError(f"The dictionary describes no scene but a {type(scene).__name__}; give a 'scene'")
+        return scene, exchanged
     if str(spec) in BUILTINS:
         with told(f"Built-in scene '{spec}' cannot be made of {parameters}"):
             return load_dict_with(builtin_dict(str(spec), parameters), plugins, cameras, floats)
@@ -69,13 +76,21 @@ def load_scene_with(
     return scene, exchanged
 
 
+def _copied(description: Mapping[str, Any]) -> SceneDict:
+    """A dictionary with tensors of its own: Mitsuba moves those of a dictionary into what it loads."""
+    return {
+        name: _copied(value) if isinstance(value, Mapping) else type(value)(value) if dr.is_array_v(value) else value
+        for name, value in description.items()
+    }
+
+
 def as_xml_has_them(parameters: Mapping[str, Any]) -> dict[str, str]:
     """Scene parameters as texts: true and not True."""
     return {name: str(v).lower() if isinstance(v, bool) else str(v) for name, v in parameters.items()}
 
 
 def load_scene_for(
-    spec: str | Path,
+    spec: str | Path | SceneDict,
     wanted: Iterable[str],
     base: Path | None = None,
     cameras: Cameras | None = None,
@@ -93,7 +108,7 @@ def load_scene_for(
     scene, _ = load_scene_with(spec, {}, base, cameras, **parameters)
     params = traversed(scene)
     eta = _matching(params, wanted, "eta")
-    smooth = any(scene_parameters.owner_class(params, key) == "DielectricAD" for key in eta)
+    smooth = any(scene_parameters.owner_class(params, key) == "SmoothDielectric" for key in eta)
     plugins, floats = {"dielectric": "dielectric_ad"} if smooth else {}, coarse_pictures(params, wanted)
     if not plugins and not floats:
         return scene, ()

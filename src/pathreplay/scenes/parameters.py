@@ -21,7 +21,7 @@ from pathreplay.errors import PathreplayError
 
 # What to do instead, for values that Mitsuba 3.9 stores without derivative: (class of the owner, last part of the key).
 _WAY_OUT = {
-    ("DielectricAD", "eta"): (
+    ("SmoothDielectric", "eta"): (
         "BSDF 'dielectric' keeps it as a plain number; use BSDF 'dielectric_ad' of this package instead, "
         "its eta is differentiable"
     ),
@@ -80,7 +80,7 @@ def _no_match(known: list[str], pattern: str) -> str:
 
 
 def owner_class(params: Any, key: str) -> str:
-    """Name of the class (not of the plugin: 'DielectricAD', not 'dielectric') that owns a parameter."""
+    """Name of the class (not of the plugin: 'SmoothDielectric', not 'dielectric') that owns a parameter."""
     return str(params.properties[key][2].class_name())
 
 

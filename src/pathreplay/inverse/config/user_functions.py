@@ -1,4 +1,4 @@
-"""Functions of the user's own by their import path, ``module:function``: losses, penalties, derived parameters."""
+"""Functions of the user's own, by import path (``module:function``) or as objects: losses, regularizers and more."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import importlib
 import importlib.util
 import numbers
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,10 +52,13 @@ class Imported:
 
 
 class Modules:
-    """The modules that a job names: those of the folder ``base`` first, each run once, then installed ones."""
+    """The modules that a job names: those of the folder ``base`` first, each run once, then installed ones.
 
-    def __init__(self, base: Path | None = None) -> None:
-        self._base = base
+    ``given`` are callables by the name that stands for them in a job.
+    """
+
+    def __init__(self, base: Path | None = None, given: Mapping[str, Callable[..., Any]] | None = None) -> None:
+        self._base, self._given = base, dict(given or {})
         self._known: dict[str, Any] = {}
 
     def function(self, kind: str, name: str, takes: str) -> Imported:
@@ -63,6 +66,8 @@ class Modules:
 
         Its module is run. Raises PathreplayError if there is none, if it fails, or has no such function.
         """
+        if name in self._given:
+            return Imported(kind, getattr(self._given[name], "__qualname__", name), self._given[name])
         module, _, function = name.partition(":")
         try:
             if module not in self._known:

@@ -144,11 +144,11 @@ def read_targets(
                 raise PathreplayError(
                     f"{what} has nothing of what a pinhole would see in place of its lens; correct k1, k2, ..."
                 )
-            weights[name] = _weight(f"what the lens leaves of '{file}'", resized(there, *shape[:2]).clip(0, 1), name)
+            weights[name] = as_weight(f"what the lens leaves of '{file}'", resized(there, *shape[:2]).clip(0, 1), name)
         image = resized(image, *shape[:2])
         if alpha == "mask":
             opaque = image[:, :, -1:] * weights.get(name, np.float32(1))
-            weights[name] = _weight(f"the alpha of '{file}'", opaque, name)
+            weights[name] = as_weight(f"the alpha of '{file}'", opaque, name)
             image = unpremultiplied(image)
         elif alpha == "scene" and not hidden:
             image = over(image, background(scene, sensors[name]))
@@ -206,14 +206,14 @@ def read_masks(
         if name in lenses:
             mask, _ = lenses[name].undone(mask)
         mask = resized(mask, *shape[:2])
-        weights[name] = _weight(f"mask '{file}'", adapted_image(f"Mask '{file}'", mask, "a mask has", 1), name)
+        weights[name] = as_weight(f"mask '{file}'", adapted_image(f"Mask '{file}'", mask, "a mask has", 1), name)
     return weights
 
 
 def masked(targets: Targets, masks: Mapping[str, Image]) -> Targets:
     """The targets with these weights as well: what counts counts by all of them."""
     both = {
-        name: _weight("what mask and picture leave", mask * targets.weights[name], name)
+        name: as_weight("what mask and picture leave", mask * targets.weights[name], name)
         for name, mask in masks.items()
         if name in targets.weights
     }
@@ -253,7 +253,8 @@ def _read(what: str, path: Path, name: str, shape: tuple[int, int, int], resize:
     return read_image(path, raw=raw, pixels=max(MOST_PIXELS, prod(film)))
 
 
-def _weight(what: str, mask: Image, name: str) -> Image:
+def as_weight(what: str, mask: Image, name: str) -> Image:
+    """A mask, none of it negative, as a weight with the mean 1."""
     require_finite_array(what, mask)
     if mask.min() < 0 or not mask.any():
         wrong = "is black" if not mask.any() else f"has the value {mask.min():g}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,6 +16,7 @@ from pathreplay.errors import PathreplayError
 from pathreplay.integrators.film.image import make_ready
 from pathreplay.integrators.lifetimes import plain_errors
 from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.losses.pixelwise import ELSEWHERE
 from pathreplay.inverse.objective.frozen import NotRecordable, Recordings, differentiate, is_recordable
 from pathreplay.inverse.objective.pixel_batches import Batch, obstacle, refused
@@ -23,6 +25,8 @@ from pathreplay.inverse.parameters.exposures import gradient as exposure_gradien
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem, scene_values, sensor_of
 from pathreplay.platform import memory
+from pathreplay.platform.threads import one_thread
+from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.parameters import get_array
 
 LARGE = 2**22
@@ -277,3 +281,13 @@ class Evaluator:
         if deferred is not None:
             self.integrator.tell(deferred, target.shape[0] * target.shape[1] * spp)
         return float(value[0]) if dr.width(value) else float("nan"), by_factor
+
+
+@contextmanager
+def computing(config: Config) -> Iterator[None]:
+    """Around what the job's integrators do: in one thread if that is wanted, and their errors told."""
+    names = (
+        config.integrator.type if config.baseline is None else f"{config.integrator.type}' or '{config.baseline.type}"
+    )
+    with one_thread(config.deterministic), told(f"Integrator '{names}' cannot do this job"):
+        yield

@@ -99,7 +99,7 @@ def differentiate(
 
 def _inputs_to_freeze(integrator: Any, scene: mi.Scene) -> FrozenInputs | None:
     """What an integrator of ours is handed; others want nothing."""
-    return integrator.inputs_to_freeze(scene) if hasattr(integrator, "to_hand") else None
+    return integrator.inputs_to_freeze(scene) if hasattr(integrator, "inputs_to_freeze") else None
 
 
 def _differentiate(
@@ -144,7 +144,7 @@ def _differentiate(
                 other: Any = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(_OTHER))[0]
                 again = mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=other)
             by_factor = derivative(loss, image, again, factor, target, weight) * share
-    return dr.detach(value), integrator.take_deferred() if hasattr(integrator, "take_untold") else None, by_factor
+    return dr.detach(value), integrator.take_deferred() if hasattr(integrator, "take_deferred") else None, by_factor
 
 
 def _times(tensor: Any, factor: Any) -> Any:

@@ -55,5 +55,6 @@ def obstacle(problem: Problem, integrator: mi.Integrator, sensor: int, spp: int,
 def refused(view: str, why: str) -> PathreplayError:
     """The error where single pixels of a view cannot be rendered."""
     return PathreplayError(
-        f"pixel_batch_size: view '{view}' cannot be rendered pixel by pixel, since {why}, or leave the key out"
+        f"pixel_batch_size: view '{view}' cannot be rendered pixel by pixel, since {why}, "
+        "or leave 'pixel_batch_size' out"
     )

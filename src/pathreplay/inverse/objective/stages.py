@@ -47,9 +47,7 @@ def _part(problem: Problem, config: Config, number: int, stage: Stage) -> Part:
     names = "spp", "view_batch_size", "pixel_batch_size"
     given = {name: value for name in names if (value := getattr(stage, name)) is not None}
     seen = _views(problem, stage)
-    views = tuple(
-        replace(v, is_test=v.is_test or (seen is not None and v.name not in seen)) for v in problem.views
-    )
+    views = tuple(replace(v, is_test=v.is_test or (seen is not None and v.name not in seen)) for v in problem.views)
     moving = frozenset(_moving(problem, stage))
     changed = config.model_copy(update=given)
     return Part(number, changed, replace(problem, views=views), moving, stage.learning_rate_factor)

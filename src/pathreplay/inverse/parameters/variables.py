@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import drjit as dr
@@ -22,7 +24,7 @@ from pathreplay.inverse.parameters.mesh import Surface
 from pathreplay.inverse.parameters.pose import PART_NAMES, Pose, make_pose
 from pathreplay.inverse.parameters.regularizers import Laplacian, Own, Penalty, Prior, Term, TotalVariation
 from pathreplay.inverse.parameters.reparameterization import Coordinates, Transform
-from pathreplay.inverse.parameters.values import Array, make_value, seen
+from pathreplay.inverse.parameters.values import Array, make_value, require_finite_array, seen
 from pathreplay.scenes import parameters
 from pathreplay.scenes.stored import AS_STORED, Form, form_of
 
@@ -107,9 +109,11 @@ def make_variables(
     config: Config,
     base: Path,
     modules: Modules,
+    starts: Mapping[str, Array] = MappingProxyType({}),
 ) -> tuple[list[Variable], list[Pose]]:
     """Of each key a variable, or a pose with those of its parts; truths are not known yet.
 
+    ``starts`` are arrays by the key of an entry, in place of its ``initial``.
     Raises PathreplayError for starts, rates and options that do not fit what is there.
     """
     variables: list[Variable] = []
@@ -121,7 +125,7 @@ def make_variables(
         if entry.pose is None:
             form = AS_STORED if entry.shape else form_of(params, key)
             like = seen(params, key) if entry.shape is None else _numbers(key, entry.shape)
-            start = _start(key, like, form, entry, base)
+            start = _start(key, like, form, entry, base, starts.get(entry.key))
             bounds = -np.inf if entry.lower is None else entry.lower, np.inf if entry.upper is None else entry.upper
             coordinates = _coordinates(params, key, entry, start)
             if isinstance(coordinates, Transform):
@@ -212,13 +216,21 @@ def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> L
     return make_levels(start.shape, entry.resolutions, refine_at)
 
 
-def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path) -> Array:
+def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path, given: Array | None) -> Array:
     if not dr.is_array_v(like):
         raise PathreplayError(
             f"Parameter '{key}' is a matrix, whose 16 numbers do not stay a motion; give it "
             "pose = 'translation', 'rotation' or 'rigid'"
         )
-    if entry.initial is None:
+    if given is not None:
+        start = np.array(given, np.float32)
+        if start.shape != parameters.get_array(like).shape:
+            raise PathreplayError(
+                f"Parameter '{key}' starts at an array of shape {start.shape}, in the scene it has "
+                f"{parameters.get_array(like).shape}; reshape it"
+            )
+        require_finite_array(f"The start of '{key}'", start)
+    elif entry.initial is None:
         start = parameters.get_array(like)
     else:
         assert not isinstance(entry.initial, Displacement)  # the schema wants a pose for one

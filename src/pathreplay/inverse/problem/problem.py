@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import weakref
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -167,21 +167,37 @@ def errors_of(problem: Problem, values: Arrays) -> dict[str, float]:
     return found
 
 
-def build_problem(config: Config, base: Path, targets: Targets | None = None) -> Problem:
+@dataclass(frozen=True)
+class InMemory:
+    """What a problem is given as objects, where a job would name files."""
+
+    scene: mi.Scene | None = None
+    integrator: mi.Integrator | None = None
+    functions: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
+    """Callables, by the names that stand for them in the config."""
+    starts: Mapping[str, Array] = field(default_factory=dict)
+    """Arrays by key of the parameter, in place of its ``initial``."""
+
+
+def build_problem(
+    config: Config, base: Path, targets: Targets | None = None, memory: InMemory | None = None
+) -> Problem:
     """Load and check everything that the job names; relative paths start at ``base``.
 
-    ``targets`` are those of an earlier part of the same run; otherwise they are read or rendered.
+    ``targets`` are those of an earlier part of the same run, or arrays; otherwise they are read or rendered.
+    ``memory`` holds what is not named but there.
     Raises PathreplayError for whatever in the job cannot work.
     """
     album = Album.of(config.budget)
-    modules = Modules(base)
+    given = memory or InMemory()
+    modules = Modules(base, given.functions)
     loss = find_loss(config.loss, modules)
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
-    scene, config, notes = _loaded(config, base, shots)
+    scene, config, notes = _loaded(config, base, shots, given.scene)
     params = traversed(scene)
     parameters.require_finite(params)
-    integrator = _gradient_integrator(config.integrator)
+    integrator = given.integrator or _gradient_integrator(config.integrator)
     named, made = keys_of(params, config, integrator)
     free = free_of(params, config)
     keys = [*named, *made]
@@ -199,7 +215,7 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     if config.target.alpha == "scene":
         require_known(scene, params, keys)
     require_films(scene, sensors, {"spp": config.most_spp, "eval_spp": config.eval_spp})
-    unsolved, moved = make_variables(scene, params, named | free, config, base, modules)
+    unsolved, moved = make_variables(scene, params, named | free, config, base, modules, given.starts)
     derived = make_derived(params, made, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
@@ -223,8 +239,9 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
 
     if missing := set(sensors) - set(targets.images):
         raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
-    given = config.target.masks is not None or config.target.alpha == "mask"
-    require_weights(targets, {n for n in sensors if given or (n in taken and (taken[n].mask or taken[n].lens))})
+    masked_all = config.target.masks is not None or config.target.alpha == "mask"
+    weighted = {n for n in sensors if masked_all or (n in taken and (taken[n].mask or taken[n].lens))}
+    require_weights(targets, weighted if memory is None else set(targets.weights))
     shares = shares_of(scene, sensors, config, test_views)
     views = tuple(
         View(name, index, targets.images[name], targets.weights.get(name), name in test_views, shares[name])
@@ -246,8 +263,13 @@ def build_problem(config: Config, base: Path, targets: Targets | None = None) ->
     )
 
 
-def _loaded(config: Config, base: Path, shots: Mapping[str, Shot]) -> tuple[mi.Scene, Config, tuple[str, ...]]:
+def _loaded(
+    config: Config, base: Path, shots: Mapping[str, Shot], scene: mi.Scene | None
+) -> tuple[mi.Scene, Config, tuple[str, ...]]:
     """The scene, the job with what it leaves to the scene (see `completed`), and what is to be said about both."""
+    if scene is not None:
+        config, differences = completed(config, scene)
+        return scene, config, differences
     wanted = [entry.key for entry in config.parameters if entry.shape is None]
     wanted += [entry.key for entry in config.derived]
     cameras = {name: shot.camera for name, shot in shots.items()}

@@ -1,0 +1,310 @@
+"""The library: problems of objects and arrays, with the gradients and the bits of jobs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import pathreplay
+from pathreplay import Parameter, PathreplayError, Problem, View
+from pathreplay.inverse.images.io import exr_bytes
+from pathreplay.jobs import make_config, optimize
+from variant import VARIANT
+
+WALL, TEXTURE, BODY = "wall.bsdf.reflectance.value", "floor.bsdf.reflectance.data", "body.vertex_positions"
+SIDE = 16
+README = Path(__file__).parents[1] / "README.md"
+PAGE = Path(__file__).parents[1] / "docs" / "library.md"
+
+
+@pytest.fixture(autouse=True)
+def _variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mi.set_variant(VARIANT)
+    monkeypatch.chdir(tmp_path)
+
+
+def room() -> dict[str, Any]:
+    """A lit floor with a texture, a wall, and a body, seen by two cameras."""
+    T = mi.ScalarTransform4f
+    texels = np.random.default_rng(2).uniform(0.2, 0.8, (4, 4, 3)).astype(np.float32)
+
+    def sensor(x: float) -> dict[str, Any]:
+        film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}}
+        place = T().look_at([x, 2, 4], [0, 0, 0], [0, 1, 0])
+        return {"type": "perspective", "fov": 45, "to_world": place, "film": film}
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 3},
+        "left": sensor(-1.0),
+        "right": sensor(1.0),
+        "sky": {"type": "constant"},
+        "floor": {
+            "type": "rectangle",
+            "to_world": T().rotate([1, 0, 0], -90).scale(2),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "raw": True, "data": mi.TensorXf(texels)}},
+        },
+        "wall": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 1, -1]).scale(1.5),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.3, 0.2]}},
+        },
+        "body": {"type": "cube", "to_world": T().translate([0, 0.3, 0.3]).scale(0.3)},
+    }
+
+
+@pytest.fixture(scope="module")
+def photos() -> list[np.ndarray]:
+    mi.set_variant(VARIANT)
+    scene = mi.load_dict(room())
+    return [np.array(mi.render(scene, sensor=n, spp=256), np.float32) for n in (0, 1)]
+
+
+def views(photos: list[np.ndarray]) -> list[View]:
+    return [View("left", photos[0]), View("right", photos[1])]
+
+
+GREY = Parameter(initial=0.5, bounds=(0, 1))
+
+
+def test_the_script_of_the_readme_recovers_a_texture_and_a_colour() -> None:
+    script = re.search(r"<!-- begin library-example -->\n```python\n(.*?)```", README.read_text(), re.S)
+    assert script is not None
+    assert len([line for line in script[1].splitlines() if line.strip()]) <= 12
+    names: dict[str, Any] = {}
+    exec(script[1].replace('"llvm_ad_rgb"', repr(VARIANT)), names)
+    errors = np.abs(names["result"].values["back.bsdf.reflectance.data"] - names["texels"])
+    assert np.median(errors) < 0.04  # boxes hide some texels
+    np.testing.assert_allclose(names["result"].values["red.reflectance.value"], [0.57, 0.043, 0.044], atol=0.02)
+
+
+def test_the_page_runs_as_it_stands() -> None:
+    names: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S):
+        exec(block.replace('"llvm_ad_rgb"', repr(VARIANT)), names)
+    assert names["result"].history[-1].loss < names["result"].history[0].loss
+
+
+def test_a_job_and_the_library_give_the_same_bits(photos: list[np.ndarray], tmp_path: Path) -> None:
+    mi.save_dict = None  # type: ignore[attr-defined]  # nothing of this writes a scene
+    for name, photo in zip(("left", "right"), photos, strict=True):
+        (tmp_path / f"{name}.exr").write_bytes(exr_bytes(photo))
+    settings = {"spp": 4, "learning_rate": 0.05, "seed": 7, "deterministic": True}
+    wanted = {WALL: GREY, "light.emitter.radiance.value": Parameter(initial=3.0, bounds=(0, None), learning_rate=0.3)}
+    key = "red.reflectance.value"
+    arguments = {"resolution": SIDE}
+    tables = [{"key": key, "initial": 0.5, "lower": 0.0, "upper": 1.0}]
+    job = {
+        "scene": "cornell-box",
+        "scene_parameters": arguments,
+        "parameters": tables,
+        "target": {"images": ["left.exr"]},
+        "iterations": 5,
+        **settings,
+    }
+    of_job = optimize(make_config(job), output="run", progress=False)
+    from pathreplay.scenes.loading import load_scene
+
+    problem = Problem(load_scene("cornell-box", **arguments), {key: GREY}, View(0, photos[0]), **settings)
+    of_library = pathreplay.minimize(problem, steps=5, progress=False)
+    np.testing.assert_array_equal(of_library.values[key], of_job.values[key])
+    assert [entry.loss for entry in of_library.history] == [entry.loss for entry in of_job.run.history]
+    assert wanted
+
+
+def test_value_and_grad_is_the_gradient_of_the_loss(photos: list[np.ndarray]) -> None:
+    """By finite differences of the loss of images without noise, along a direction."""
+    problem = Problem(room(), {WALL: Parameter(initial=[0.4, 0.5, 0.6])}, views(photos), spp=64)
+    f = pathreplay.value_and_grad(problem)
+    found = np.array([f(seed=seed)[1][WALL] for seed in range(12)])
+    start = problem.initial[WALL]
+
+    def loss(value: np.ndarray) -> float:
+        """Independent halves: the variance of the images is not in it."""
+        total = 0.0
+        for n, photo in enumerate(photos):
+            a, b = (mi.render(problem.scene, sensor=n, integrator=problem.built.integrator, spp=1024, seed=s) for s in (
+                1, 2))  # fmt: skip
+            total += float(np.mean((np.array(a) - photo) * (np.array(b) - photo))) / 2
+        return total
+
+    def at(value: np.ndarray) -> float:
+        problem.assign(problem.complete({WALL: value}), problem.scene)
+        return loss(value)
+
+    h = 0.05
+    for k in range(3):
+        step = h * np.eye(3, dtype=np.float32)[k]
+        expected = (at(start + step) - at(start - step)) / (2 * h)
+        error = found[:, k].std(ddof=1) / np.sqrt(len(found))
+        assert abs(found[:, k].mean() - expected) < 4 * error + 0.01 * abs(expected), k
+
+
+def test_regularizers_are_in_loss_and_gradient(photos: list[np.ndarray]) -> None:
+    def narrow(values: Any) -> Any:
+        return 3 * dr.mean(dr.square(values - 0.25), axis=None)
+
+    plain = pathreplay.value_and_grad(Problem(room(), {WALL: GREY}, views(photos), deterministic=True))
+    entry = Parameter(initial=0.5, bounds=(0, 1), regularizer=narrow)
+    more = pathreplay.value_and_grad(Problem(room(), {WALL: entry}, views(photos), deterministic=True))
+    (loss, grads), (with_it, slopes) = plain(seed=3), more(seed=3)
+    assert with_it - loss == pytest.approx(3 * 0.25**2, rel=1e-5)
+    np.testing.assert_allclose(slopes[WALL] - grads[WALL], 3 * 2 * 0.25 / 3, rtol=1e-4)
+
+
+def test_arrays_tensors_bitmaps_and_files_are_targets(photos: list[np.ndarray], tmp_path: Path) -> None:
+    (tmp_path / "photo.exr").write_bytes(exr_bytes(photos[0]))
+    kinds = [photos[0], mi.TensorXf(photos[0]), mi.Bitmap(photos[0]), tmp_path / "photo.exr"]
+    for kind in kinds:
+        problem = Problem(room(), {WALL: GREY}, View(0, kind))
+        np.testing.assert_allclose(problem.built.views[0].target, photos[0], rtol=1e-6)
+
+
+def test_scenes_are_objects_dictionaries_and_files(photos: list[np.ndarray], tmp_path: Path) -> None:
+    description = room()
+    mi.xml.dict_to_xml(description, str(tmp_path / "room.xml"))
+    for scene in (mi.load_dict(room(), optimize=False), description, description, tmp_path / "room.xml"):
+        problem = Problem(scene, [WALL], View(0, photos[0]))
+        np.testing.assert_allclose(problem.initial[WALL], [0.7, 0.3, 0.2], rtol=1e-5)
+
+
+class Descent:
+    """An optimiser of the user's own."""
+
+    def step(self, values: Any, gradients: Any, learning_rates: Any, loss: float) -> dict[str, np.ndarray]:
+        return {key: value - 20 * learning_rates[key] * gradients[key] for key, value in values.items()}
+
+
+@pytest.mark.parametrize(
+    "optimizer",
+    ["adam", {"type": "sgd", "momentum": 0.5}, lambda: mi.ad.Adam(lr=0.03), Descent, "l-bfgs-b"],
+    ids=["name", "table", "mitsuba", "own", "scipy"],
+)
+def test_any_optimizer_lowers_the_loss(optimizer: Any, photos: list[np.ndarray]) -> None:
+    problem = Problem(room(), {WALL: GREY}, views(photos), learning_rate=0.03, spp=8)
+    made = optimizer() if callable(optimizer) else optimizer
+    result = pathreplay.minimize(problem, made, steps=12, progress=False)
+    assert result.history[-1].loss < 0.8 * result.history[0].loss
+
+
+def test_mitsubas_adam_takes_the_steps_of_ours(photos: list[np.ndarray]) -> None:
+    settings = {"learning_rate": 0.03, "spp": 4, "deterministic": True}
+    problem = Problem(room(), {WALL: GREY}, views(photos), **settings)
+    ours = pathreplay.minimize(problem, {"type": "adam", "beta_2": 0.999}, steps=4, progress=False)
+    theirs = pathreplay.minimize(problem, mi.ad.Adam(lr=0.03), steps=4, progress=False)
+    np.testing.assert_allclose(theirs.values[WALL], ours.values[WALL], rtol=1e-4)
+
+
+def test_losses_of_ones_own_and_by_name(photos: list[np.ndarray]) -> None:
+    def own(image: Any, target: Any) -> Any:
+        return dr.abs(image - target)
+
+    for loss in (own, "l1", pathreplay.losses.l1):
+        problem = Problem(room(), {WALL: GREY}, views(photos), loss=loss, learning_rate=0.03)
+        result = pathreplay.minimize(problem, steps=8, progress=False)
+        assert result.history[-1].loss < result.history[0].loss
+
+
+def test_a_pose_a_derived_parameter_and_arrays_as_starts(photos: list[np.ndarray]) -> None:
+    start = np.full((4, 4, 3), 0.4, np.float32)
+    start[0, 0] = [0.1, 0.2, 0.3]
+    wanted = {
+        BODY: Parameter(pose="translation", initial={"translation": [0.1, 0, 0]}),
+        TEXTURE: Parameter(initial=start),
+        "share": Parameter(initial=0.5, shape=[1]),
+    }
+
+    def grey(_: Any, share: Any) -> Any:
+        return mi.Color3f(share.array)
+
+    derived = {WALL: pathreplay.Derived(grey, of=["share"])}
+    problem = Problem(room(), wanted, views(photos), derived=derived)
+    assert set(problem.initial) == {f"{BODY}:translation", TEXTURE, "share"}
+    np.testing.assert_array_equal(problem.initial[TEXTURE], start)
+    result = pathreplay.minimize(problem, steps=2, progress=False)
+    assert {BODY, WALL, TEXTURE} <= set(result.values)
+    other = mi.load_dict(room())
+    result.apply(other)
+    np.testing.assert_allclose(np.array(mi.traverse(other)[BODY]), result.values[BODY].ravel(), atol=1e-6)
+
+
+def test_a_callback_ends_it_and_nothing_is_written(photos: list[np.ndarray], tmp_path: Path) -> None:
+    seen: list[tuple[int, float]] = []
+
+    def look(it: pathreplay.Iteration) -> bool:
+        seen.append((it.number, float(it.values[WALL][0])))
+        return it.number == 2
+
+    problem = Problem(room(), {WALL: GREY}, views(photos))
+    result = pathreplay.minimize(problem, steps=50, callbacks=[look], progress=False)
+    assert [number for number, _ in seen] == [0, 1, 2] and result.stopped == "a callback"
+    assert seen[-1][1] == pytest.approx(float(result.values[WALL][0]))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_weights_shares_and_test_views(photos: list[np.ndarray]) -> None:
+    mask = np.zeros((SIDE, SIDE))
+    mask[:8] = 1
+    pair = [View("left", photos[0], weight=mask, share=2.0), View("right", photos[1], test=True)]
+    problem = Problem(room(), {WALL: GREY}, pair)
+    left, right = problem.built.views
+    assert left.weight is not None and left.weight.mean() == pytest.approx(1) and not left.is_test
+    assert right.is_test and right.weight is None
+    assert problem.render(view=1).shape == (SIDE, SIDE, 3)
+
+
+def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
+    def make(photos: list[np.ndarray]) -> Any:
+        given = {"scene": room(), "parameters": {WALL: GREY}, "views": View(0, photos[0])} | changes
+        return Problem(given.pop("scene"), given.pop("parameters"), given.pop("views"), **given)
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (bad(parameters={"wal.reflectance": GREY}), "wal.reflectance"),
+        (bad(views=[]), "views: there is none"),
+        (bad(views=View(0)), "Target of sensor 'left' is missing"),
+        (bad(views=View(0, np.zeros((3, 4, 3)))), "is 4 x 3, and its film 16 x 16"),
+        (bad(views=View(0, "no.exr")), "No image file 'no.exr'"),
+        (bad(views=View("middle", np.zeros((16, 16, 3)))), "No sensor 'middle'"),
+        (bad(views=[View(0, np.zeros((16, 16, 3))), View("left", np.zeros((16, 16, 3)))]), "is named twice"),
+        (bad(views=View(0, np.full((16, 16, 3), np.nan))), "NaN"),
+        (bad(views=View(0, np.zeros((16, 16, 3)), weight=np.zeros((16, 16)))), "is black"),
+        (bad(loss="l3"), "No loss 'l3'"),
+        (bad(loss=lambda a, b: "much"), "cannot be computed|gives the str"),
+        (bad(integrator={"type": "path"}), "computes no gradients"),
+        (bad(spp=0), "'spp' is 0"),
+        (bad(parameters={WALL: Parameter(bounds=(1, 0))}), "is not above lower bound"),
+        (bad(parameters={WALL: Parameter(initial=np.zeros(5))}), "of shape \\(5,\\)"),
+        (bad(parameters={WALL: Parameter(parameterization="cube")}), "parameterization"),
+        (bad(scene={"type": "sphere"}), "describes no scene but a Sphere"),
+        (bad(scene="no-such-scene"), "No scene 'no-such-scene'"),
+    ],
+)  # fmt: skip
+def test_what_cannot_work_is_told_in_one_line(make: Callable[..., Any], words: str, photos: list[np.ndarray]) -> None:
+    with pytest.raises(PathreplayError, match=words) as told:
+        make(photos)
+    assert "\n" not in str(told.value)
+
+
+def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None:
+    problem = Problem(room(), {WALL: GREY}, views(photos))
+    held = mi.ad.Adam(lr=0.1)
+    held["x"] = mi.Float(1)
+    for optimizer, words in ((object(), "has no step"), (held, "holds variables already"), ("adem", "adem")):
+        with pytest.raises(PathreplayError, match=words):
+            pathreplay.minimize(problem, optimizer, progress=False)
+    with pytest.raises(PathreplayError, match="No parameter 'x'"):
+        problem.render({"x": 1.0})
+    with pytest.raises(PathreplayError, match="'iterations' is 0"):
+        pathreplay.minimize(problem, steps=0, progress=False)
