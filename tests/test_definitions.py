@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 from pathreplay.cli import app
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.definitions import defined
-from pathreplay.jobs import load_config, optimize
+from pathreplay.inverse.config.schema import Config
+from pathreplay.jobs import load_config, make_config, optimize
 from test_steps import JOB, SCENE
 
 TABLE: dict[str, Any] = {"scene": "a.xml", "spp": 16, "parameters": [{"key": "a"}, {"key": "b", "lower": 0.0}]}
@@ -96,3 +97,40 @@ def test_the_schema_says_what_a_job_may_be() -> None:
     optimizer = schema["$defs"]["Optimizer"]["properties"]
     assert optimizer["type"]["enum"] == ["adam", "adamw", "sgd", "rmsprop", "l-bfgs-b"]
     assert schema["additionalProperties"] is False
+
+
+def test_every_key_says_what_it_is() -> None:
+    schema = Config.model_json_schema()
+    tables = {"job": schema, **schema["$defs"]}
+    silent = [
+        f"{name}.{key}"
+        for name, table in tables.items()
+        for key, about in table.get("properties", {}).items()
+        if not about.get("description")
+    ]
+    assert not silent
+
+
+def test_the_page_of_keys_is_made_of_the_schema() -> None:
+    told = CliRunner().invoke(app, ["schema", "--markdown"])
+    page = Path(__file__).parents[1] / "docs" / "job-reference.md"
+    assert told.stdout == page.read_text(encoding="utf-8"), "write it with: pathreplay schema --markdown"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ({"rival": {"type": "prb"}}, "'rival'; it is called 'baseline' now"),
+        ({"picture_spp": 4}, "'picture_spp'; it is called 'eval_spp' now"),
+        ({"memory": "8 GB"}, "'memory'; it is called 'memory_limit' now"),
+        ({"optimizer": {"type": "l-bfgs-b", "memory": 3}}, "'optimizer.memory'; it is called 'history_size' now"),
+        ({"auto_spp": {"ratio": 1}}, "'auto_spp'; it is called 'adaptive_spp' now"),
+        ({"parameters": [{"key": "x", "smooth": 3.0}]}, "'parameters.0.smooth'; it is called 'large_steps_lambda' now"),
+        ({"parameters": [{"key": "x", "start": {}}]}, "'parameters.0.start'; it is called 'initial' now"),
+    ],
+)
+def test_an_old_name_leads_to_the_new_one(old: dict[str, object], new: str) -> None:
+    job = {"scene": "cornell-box", "parameters": [{"key": "x"}], "target": {"values": {"x": 1.0}}}
+    with pytest.raises(PathreplayError) as told:
+        make_config({**job, **old})
+    assert f"unknown key {new}" in str(told.value)

@@ -256,11 +256,18 @@ def export(
 
 
 @app.command(short_help="Print the JSON schema of a job.")
-def schema() -> None:
+def schema(
+    markdown: Annotated[bool, typer.Option("--markdown", help="A page of all keys instead, as Markdown.")] = False,
+) -> None:
     """Print the JSON schema of a job: editors complete and check configs with it."""
     import json
 
+    from pathreplay.inverse.config.reference import reference
     from pathreplay.inverse.config.schema import Config
+
+    if markdown:
+        typer.echo(reference(), nl=False)
+        return
 
     typer.echo(json.dumps(Config.model_json_schema(), indent=2))
 

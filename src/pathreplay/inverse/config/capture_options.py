@@ -13,11 +13,17 @@ class Capture(Table):
     """Pictures and their cameras, by the file or model that lists them; ``width`` in pixels is that of renderings."""
 
     transforms: str | None = None
+    """A transforms.json of NeRF, instant-ngp or Nerfstudio."""
     colmap: str | None = None
+    """Folder of a COLMAP model."""
     images: str | None = None
+    """Folder of the images of a COLMAP model; default: ../../images."""
     masks: str | None = None
+    """Folder of masks, named as the images with .png behind."""
     width: Count | None = None
+    """Width of renderings in pixels; default: that of the images."""
     test_every: Annotated[Whole, Field(ge=2, le=2**31 - 1)] | None = None
+    """Hold out the first view and every n-th after it."""
 
     @property
     def source(self) -> str:
@@ -37,9 +43,13 @@ class Exposure(Table):
     """Factors on the rendered picture of each view, which are recovered, too."""
 
     white_balance: Switch = False
+    """Recover a factor for each colour."""
     reference: Whole | str | None = None
+    """View whose factor stays 1; default: the geometric mean of all stays 1."""
     fix_scale: Switch = True
+    """Fix the common scale of all factors; false where the light is known."""
     learning_rate: Positive | None = None
+    """Learning rate of the logarithm of a factor; default: that of the job."""
 
     @model_validator(mode="after")
     def _one_scale(self) -> Exposure:

@@ -15,12 +15,12 @@ class RayOptions(Table):
     """With ``executor = "ray"``: the cluster, and its actors. None of it changes what comes out."""
 
     address: str | None = None
-    """Of a running cluster, ``HOST:PORT``, or ``auto`` for the one of this machine; None: one for this run alone."""
+    """Address of a running cluster, HOST:PORT or 'auto'; default: a cluster of this run alone."""
     actors: Count | None = None
-    """Default: as many as there is room for, and shards in an iteration."""
+    """Number of actors; default: as many as fit, and shards of an iteration."""
     threads: Count | None = None
     """Cores of each actor."""
     max_restarts: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 100
-    """How often an actor that is lost is started again."""
+    """How often a lost actor is restarted."""
     max_task_retries: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 4
-    """How often a shard is computed again whose actor is lost: what ends every actor is no accident."""
+    """How often a shard is computed again whose actor is lost."""

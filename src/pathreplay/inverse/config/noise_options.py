@@ -24,8 +24,11 @@ class AdaptiveSpp(Table):
     """
 
     target_snr: Positive = 1.0
+    """Signal-to-noise ratio that every gradient should have."""
     min: Count = 8
+    """Samples per pixel at first and at least; a power of two."""
     max: Count = 256
+    """Samples per pixel at most; a power of two."""
 
     @model_validator(mode="after")
     def _in_order(self) -> AdaptiveSpp:

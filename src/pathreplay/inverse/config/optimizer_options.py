@@ -17,17 +17,29 @@ class Optimizer(Table):
     """
 
     type: Literal["adam", "adamw", "sgd", "rmsprop", "l-bfgs-b"] = "adam"
+    """Optimiser of drjit.opt, or SciPy's L-BFGS-B."""
     beta_1: Share | None = None
+    """Decay of the mean of gradients (Adam, AdamW)."""
     beta_2: Share | None = None
+    """Decay of the mean of squared gradients (Adam, AdamW)."""
     epsilon: Positive | None = None
+    """Added to the root of the second moment (Adam, AdamW, RMSProp)."""
     uniform: Switch | None = None
+    """Scale all entries of a variable alike (UniformAdam)."""
     amsgrad: Switch | None = None
+    """Use the largest second moment so far."""
     weight_decay: Positive | None = None
+    """Pull towards zero in the space of the steps (AdamW)."""
     momentum: Share | None = None
+    """Momentum of SGD."""
     nesterov: Switch | None = None
+    """Nesterov's momentum (SGD)."""
     alpha: Share | None = None
+    """Decay of the mean of squared gradients (RMSProp)."""
     history_size: Count | None = None
+    """Corrections that L-BFGS keeps."""
     tolerance: Positive | None = None
+    """L-BFGS ends when the loss falls by less than this fraction of the first."""
 
     @model_validator(mode="after")
     def _of_its_type(self) -> Optimizer:

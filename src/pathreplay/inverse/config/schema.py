@@ -31,8 +31,11 @@ class Picture(Table):
     """An image as the value of a texture: file, how it meets the texture's shape, and its colour space."""
 
     image: str
+    """Image file, or 'matplotlib:NAME' for one of matplotlib's samples."""
     fit: Literal["stretch", "crop"] = "stretch"
+    """Resample the image to the texture's shape, or crop it first."""
     raw: Switch = False
+    """Values are taken as they are, not decoded from sRGB."""
 
 
 Value = Finite | list[Finite] | str | Picture
@@ -67,7 +70,9 @@ class Displacement(Table):
     """Where a pose starts, from where the scene has it: scene units, and a rotation vector in degrees."""
 
     translation: Vector | None = None
+    """Shift in scene units."""
     rotation: Vector | None = None
+    """Rotation vector in degrees."""
 
 
 def _kind_of_initial(value: Any) -> str:
@@ -92,23 +97,42 @@ class Parameter(Table):
     """One scene parameter to recover, or several by a glob."""
 
     key: str
+    """Key of mitsuba.traverse(scene), or a glob such as '*.reflectance.value'."""
     lower: Finite | None = None
+    """Lowest value, held by projection after each step."""
     upper: Finite | None = None
+    """Highest value, held by projection after each step."""
     learning_rate: Positive | None = None
+    """Learning rate of this parameter; default: that of the job."""
     initial: Initial | None = None
+    """Initial value: a number, a list (a colour), an image or volume file, or an image table; for a pose a
+    displacement. Default: the value in the scene."""
     resolutions: Annotated[list[Count], Field(min_length=1)] | None = None
+    """Sizes of a grid, coarse to fine: entries along its longest axis."""
     refine_at: list[Count] | None = None
+    """Iterations at which each resolution after the first begins."""
     pose: PoseKind | None = None
+    """The parameter moves rigidly: it is a to_world, or the vertex_positions of a mesh."""
     pivot: Vector | None = None
+    """Point about which a pose turns; default: the origin of the object (of a mesh, the mean of its vertices)."""
     error_scale: Positive | None = None
+    """Length with which errors in position are compared."""
     rotation_learning_rate: Positive | None = None
+    """Learning rate of the rotation in degrees; default: the learning rate, in radians."""
     large_steps_lambda: Positive | None = None
+    """Smoothness λ of Large Steps (Nicolet et al. 2021) for vertex_positions."""
     parameterization: TransformKind | None = None
+    """Steps are taken in this function of the value."""
     total_variation: Positive | None = None
+    """Weight of the total variation of a texture or volume."""
     l2_to_initial: Positive | None = None
+    """Weight of the mean squared difference from the initial value."""
     laplacian_weight: Positive | None = None
+    """Weight of the mean squared distance of vertices from the mean of their neighbours."""
     regularizer: ImportPath | None = None
+    """Function of the values that is added to the loss, as module:function."""
     shape: Annotated[list[Count], Field(min_length=1, max_length=8)] | None = None
+    """Shape of numbers that are no part of the scene, from which others are derived."""
 
     @property
     def displacement(self) -> Displacement:
@@ -179,16 +203,20 @@ class Derivation(Table):
     """A parameter of the scene, or several by a glob, made from others by a function of the user's."""
 
     key: str
+    """Scene parameter that the function makes, or a glob."""
     function: ImportPath
+    """module:function of the value in the scene and of the parameters in 'of'."""
     of: Annotated[list[str], Field(min_length=1)]
+    """Parameters of the job, in the order of the function's arguments."""
 
 
 class Plugin(BaseModel):
     """A Mitsuba plugin by ``type`` with its own options, which Mitsuba checks."""
 
-    model_config = ConfigDict(extra="allow", frozen=True)
+    model_config = ConfigDict(extra="allow", frozen=True, use_attribute_docstrings=True)
 
     type: str
+    """Name of the plugin; its other options stand beside it."""
 
     @model_validator(mode="after")
     def _has_edges(self) -> Plugin:
@@ -214,14 +242,21 @@ class Target(Table):
     """What the pictures should look like: image files, one per sensor, or a scene to render."""
 
     images: list[str] | str | None = None
+    """Image files, one per sensor in the order of the sensors, or a pattern."""
     masks: list[str] | str | None = None
+    """Mask files, one per sensor: white counts, black does not."""
     alpha: Literal["black", "mask", "scene", "compare"] = "black"
+    """What is behind transparent images."""
     scene: str | None = None
+    """Scene from which targets are rendered; default: the scene of the job."""
     scene_parameters: dict[str, Argument] | None = None
+    """Arguments of the target scene; default: those of the job."""
     values: dict[str, Value] = Field(default_factory=dict)
+    """Parameters of the target scene that differ from its file."""
     integrator: Plugin | None = None
-    """None: `path`, or `volpath`, with the limits of the job's integrator (see `completed`)."""
+    """Integrator of the targets; default: path, or volpath, with the limits of the job's."""
     spp: Count = 512
+    """Samples per pixel of the targets."""
 
     @model_validator(mode="after")
     def _one_source(self) -> Target:
@@ -257,44 +292,79 @@ class Config(Table):
     """One optimisation job. Every key is explained in docs/optimize.md."""
 
     scene: str
+    """Mitsuba XML file, or the name of a built-in scene."""
     scene_parameters: dict[str, Argument] = Field(default_factory=dict)
+    """Values of $name in the scene file, or arguments of the built-in."""
     sensors: list[Whole | str] | None = None
+    """Sensors of the views, by id or number; default: all."""
     test_views: list[Whole | str] = Field(default_factory=list)
+    """Sensors that are held out: rendered at the start and the end, never learned from."""
     variant: str | None = None
+    """Mitsuba variant; default: the best one that works on this machine."""
     integrator: Plugin = Plugin(type="pathreplay")
-    """Where it is left out, with what the scene's own integrator says (see `completed`)."""
+    """Integrator that renders and differentiates; default: pathreplay, with the options of the scene's own."""
     baseline: Plugin | None = None
+    """Integrator that solves the same problem in the same time, for comparison."""
     parameters: Annotated[list[Parameter], Field(min_length=1)]
+    """Parameters that are recovered."""
     derived: list[Derivation] = Field(default_factory=list)
+    """Scene parameters that functions make of others."""
     capture: Capture | None = None
+    """Images with their cameras, which join the scene."""
     exposure: Exposure | None = None
+    """Factors on the image of each view, which are recovered, too."""
     view_weights: dict[str, Positive] = Field(default_factory=dict)
+    """How much views count beside the others, by sensor."""
     target: Target = Target()
+    """What the images should look like."""
     loss: str = "l2"
+    """Loss by name, or module:function."""
     iterations: Count = 200
+    """Number of iterations."""
     spp: Spp = 16
+    """Samples per pixel of the image and of its derivative, or 'auto'."""
     adaptive_spp: AdaptiveSpp = AdaptiveSpp()
+    """Bounds of spp = 'auto'."""
     measure_snr: Switch = False
+    """Compute gradients in two halves, which separate signal from noise."""
     max_consecutive_nonfinite: Count = 10
+    """Iterations after which a gradient that is NaN or infinite ends the run."""
     view_batch_size: Count | None = None
+    """Views in an iteration, drawn by the seed; default: all."""
     pixel_batch_size: Count | None = None
+    """Pixels of each view in an iteration, drawn by the seed; default: all."""
     eval_spp: Count = 128
+    """Samples per pixel of the images at the start and the end."""
     seed: Annotated[Whole, Field(ge=0, le=10**18)] = 0
+    """Decides all random numbers."""
     learning_rate: Positive = 0.02
+    """Learning rate of parameters without one of their own: about the length of a step of Adam."""
     final_learning_rate_ratio: Annotated[Positive, Field(le=1)] = 0.1
+    """Learning rate at the end over that at the start."""
     learning_rate_schedule: Schedule = "constant"
-    """With a decay, and left out: exponential."""
+    """Schedule of the learning rate; default: constant, or exponential with a ratio."""
     warmup_steps: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 0
+    """Iterations in which the learning rate grows from nearly zero."""
     optimizer: Optimizer = Optimizer()
+    """Optimiser and its options; default: Adam."""
     stages: Annotated[list[Stage], Field(min_length=1)] | None = None
+    """Stages of the run, in which some settings differ."""
     checkpoint_every: Count = 25
+    """Iterations between checkpoints."""
     preview: Preview = Preview()
+    """Images that are rendered during the run."""
     deterministic: Switch = False
+    """Give the same bits every time, on one thread of an LLVM variant."""
     memory_limit: Memory | None = None
+    """Memory that the run may take, such as '8 GiB'; default: what there is."""
     executor: ExecutorName = "local"
+    """Where shards are evaluated: in this process, or by actors of Ray."""
     spp_shards: Count = 1
+    """Shards of each view by samples, where there are fewer views than actors."""
     ray: RayOptions = RayOptions()
+    """The cluster and its actors."""
     output: str | None = None
+    """Run folder; default: runs/NAME of the job."""
 
     @property
     def brings_pictures(self) -> bool:

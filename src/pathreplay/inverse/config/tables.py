@@ -44,7 +44,7 @@ Count = Annotated[Whole, Field(ge=1, le=2**31 - 1)]
 class Table(BaseModel):
     """A table of a job; it never changes."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     @model_validator(mode="before")
     @classmethod

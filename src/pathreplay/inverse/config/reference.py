@@ -1,0 +1,80 @@
+"""The reference of a job as Markdown: a table of keys for each table, made from the schema."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+from pathreplay.inverse.config.schema import Config
+
+HEAD = """# Keys of a job
+
+Every key that a config may have. This page is the output of `pathreplay schema --markdown`;
+[jobs](optimize.md) explains how keys work together.
+"""
+_TITLES = {
+    "Parameter": "[[parameters]]",
+    "Displacement": "initial = { ... } of a pose",
+    "Picture": "{ image = ... }",
+    "Derivation": "[[derived]]",
+    "Target": "[target]",
+    "Capture": "[capture]",
+    "Exposure": "[exposure]",
+    "Optimizer": "[optimizer]",
+    "Plugin": "[integrator], [baseline], [target] integrator",
+    "Stage": "[[stages]]",
+    "AdaptiveSpp": "[adaptive_spp]",
+    "Preview": "[preview]",
+    "RayOptions": "[ray]",
+}
+_NAMES = {
+    "integer": "whole number",
+    "number": "number",
+    "string": "text",
+    "boolean": "true or false",
+    "object": "table",
+}
+
+
+def reference() -> str:
+    """The page."""
+    schema = Config.model_json_schema()
+    tables = [_table("The job", schema)]
+    tables += [_table(f"`{title}`", schema["$defs"][name]) for name, title in _TITLES.items()]
+    return "\n".join([HEAD, *tables])
+
+
+def _table(title: str, of: dict[str, Any]) -> str:
+    needed = of.get("required", [])
+    lines = [f"## {title}", "", "| key | kind | default | meaning |", "| --- | --- | --- | --- |"]
+    for key, about in of["properties"].items():
+        default = "required" if key in needed else _default(about)
+        meaning = about["description"].replace("|", "\\|").replace("\n", " ")
+        lines.append(f"| `{key}` | {_kind(about)} | {default} | {meaning} |")
+    return "\n".join([*lines, ""])
+
+
+def _default(about: dict[str, Any]) -> str:
+    value = about.get("default")
+    return "" if value is None or isinstance(value, (dict, list)) else f"`{json.dumps(value)}`"
+
+
+def _kind(about: dict[str, Any]) -> str:
+    """What values a key takes; ranges are told where they are wrong."""
+    return " or ".join(dict.fromkeys(_kinds(about)))
+
+
+def _kinds(about: dict[str, Any]) -> Iterator[str]:
+    for one in about.get("anyOf") or about.get("oneOf") or []:
+        yield from _kinds(one)
+    if "$ref" in about:
+        name = about["$ref"].rpartition("/")[2]
+        yield "table" if name in _TITLES else name
+    elif "enum" in about or "const" in about:
+        values = about.get("enum", [about.get("const")])
+        yield ", ".join(f"`{json.dumps(value)}`" for value in values)
+    elif about.get("type") == "array":
+        yield f"list of {_kind(about.get('items', {})) or 'values'}"
+    elif about.get("type", "null") != "null":
+        yield _NAMES[about["type"]]
