@@ -219,24 +219,8 @@ def build_problem(
     derived = make_derived(params, made, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
-    truth: dict[str, Array] = {}
-    first = targets is None
-    if not config.brings_pictures:
-        other = target_scene(config, base)
-        truth = truth_of(other, params, keys)
-        if targets is None:
-            with one_thread(config.deterministic):
-                targets = Targets(rendered_targets(config, other, sensors, album), {})
-        # Dr.Jit traces calls through every instance alive: the target scene would be in all our kernels.
-        del other
-        gc.collect()
-    elif targets is None:
-        targets, said = _pictures(config, taken, scene, sensors, base, album)
-        notes += said
-    if first and config.target.masks is not None:
-        masks = by_view("masks", config.target.masks, sensors, base)
-        targets = masked(targets, read_masks(masks, scene, sensors, base))
-
+    targets, truth, said = _seen(config, targets, taken, scene, params, sensors, keys, base, album)
+    notes += said
     if missing := set(sensors) - set(targets.images):
         raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
     masked_all = config.target.masks is not None or config.target.alpha == "mask"
@@ -276,6 +260,38 @@ def _loaded(
     scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
     config, differences = completed(config, scene)
     return scene, config, notes + differences
+
+
+def _seen(
+    config: Config,
+    targets: Targets | None,
+    shots: Mapping[str, Shot],
+    scene: mi.Scene,
+    params: mi.SceneParameters,
+    sensors: dict[str, int],
+    keys: list[str],
+    base: Path,
+    album: Album,
+) -> tuple[Targets, dict[str, Array], tuple[str, ...]]:
+    """Targets, those that are there or new ones; true values by key, where they are known; and what is to be said."""
+    truth: dict[str, Array] = {}
+    notes: tuple[str, ...] = ()
+    first = targets is None
+    if not config.brings_pictures:
+        other = target_scene(config, base)
+        truth = truth_of(other, params, keys)
+        if targets is None:
+            with one_thread(config.deterministic):
+                targets = Targets(rendered_targets(config, other, sensors, album), {})
+        # Dr.Jit traces calls through every instance alive: the target scene would be in all our kernels.
+        del other
+        gc.collect()
+    elif targets is None:
+        targets, notes = _pictures(config, shots, scene, sensors, base, album)
+    if first and config.target.masks is not None:
+        masks = by_view("masks", config.target.masks, sensors, base)
+        targets = masked(targets, read_masks(masks, scene, sensors, base))
+    return targets, truth, notes
 
 
 def _kept(album: Album, variable: Variable) -> Variable:
