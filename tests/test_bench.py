@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -394,3 +395,10 @@ def test_saved_records_can_be_read_and_tabled() -> None:
     for name, kept in found.items():
         assert kept.task == name and TASKS[name].table(kept).startswith("| ")
         assert not kept.command.endswith("--quick")
+
+
+def test_the_numbers_of_the_readme_are_those_of_the_tables() -> None:
+    estimates = r"\d+\.\d+ \[\d+\.\d+, \d+\.\d+\]"
+    told = re.findall(estimates, (ROOT / "README.md").read_text(encoding="utf-8"))
+    measured = set(re.findall(estimates, (ROOT / "docs" / "evidence.md").read_text(encoding="utf-8")))
+    assert len(told) >= 5 and set(told) <= measured
