@@ -274,6 +274,27 @@ def test_a_callback_ends_it_and_nothing_is_written(photos: list[np.ndarray], tmp
     assert list(tmp_path.iterdir()) == []
 
 
+def test_stages_take_the_place_of_steps(photos: list[np.ndarray]) -> None:
+    problem = Problem(room(), {WALL: GREY, TEXTURE: Parameter(resolutions=[2, 4], refine_at=[2])}, views(photos))
+    stages = [{"iterations": 2, "downscale": 2, "parameters": [WALL]}, {"iterations": 3, "max_depth": 2}]
+    result = pathreplay.minimize(problem, stages=stages, progress=False)
+    assert len(result.history) == 5
+    assert set(result.history[0].gradient_norms) == {WALL} < set(result.history[-1].gradient_norms)
+    assert result.values[TEXTURE].shape == (4, 4, 3)
+    again = pathreplay.minimize(problem, steps=3, progress=False)  # the problem is as it was
+    assert len(again.history) == 3 and "3 iterations" in repr(again) and WALL in repr(problem)
+
+
+def test_a_problem_is_left_as_it_was(photos: list[np.ndarray]) -> None:
+    problem = Problem(room(), {WALL: GREY}, views(photos), deterministic=True)
+    f = pathreplay.value_and_grad(problem)
+    before = f(seed=5)
+    first, second = (pathreplay.minimize(problem, steps=3, progress=False) for _ in range(2))
+    np.testing.assert_array_equal(first.values[WALL], second.values[WALL])
+    after = f(seed=5)
+    assert after[0] == before[0] and np.array_equal(after[1][WALL], before[1][WALL])
+
+
 def test_weights_shares_and_test_views(photos: list[np.ndarray]) -> None:
     mask = np.zeros((SIDE, SIDE))
     mask[:8] = 1
@@ -308,10 +329,11 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
         (bad(loss="l3"), "No loss 'l3'"),
         (bad(loss=lambda a, b: "much"), "cannot be computed|gives the str"),
         (bad(integrator={"type": "path"}), "computes no gradients"),
-        (bad(spp=0), "'spp' is 0"),
+        (bad(spp=0), "problem: 'spp' is 0"),
         (bad(parameters={WALL: Parameter(bounds=(1, 0))}), "is not above lower bound"),
         (bad(parameters={WALL: Parameter(initial=np.zeros(5))}), "of shape \\(5,\\)"),
         (bad(parameters={WALL: Parameter(parameterization="cube")}), "parameterization"),
+        (bad(parameters={BODY: Parameter(pose="rigid", initial=np.eye(4))}), "'initial' of a pose is a displacement"),
         (bad(scene={"type": "sphere"}), "describes no scene but a Shape"),
         (bad(scene="no-such-scene"), "No scene 'no-such-scene'"),
     ],

@@ -52,7 +52,7 @@ class Iteration:
         return self._problem.render(self.values, view, spp)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Result:
     """What a minimisation came to."""
 
@@ -63,6 +63,11 @@ class Result:
     stopped: str | None
     """Who ended it early: a callback, 'Ctrl-C', or the optimiser, and why."""
     problem: Problem
+
+    def __repr__(self) -> str:
+        """Short: a notebook prints it."""
+        stopped = "" if self.stopped is None else f", ended by {self.stopped}"
+        return f"<Result: {len(self.history)} iterations, loss {self.loss:.4g}{stopped}; {', '.join(self.values)}>"
 
     @property
     def loss(self) -> float:

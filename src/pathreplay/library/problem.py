@@ -25,6 +25,7 @@ from pathreplay.inverse.objective.reached import require_reached
 from pathreplay.inverse.parameters.values import Array, Arrays, adapted_image
 from pathreplay.inverse.problem import problem as inner
 from pathreplay.platform import backend
+from pathreplay.platform.device import device_of
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.loading import load_scene_for
 
@@ -186,11 +187,20 @@ class Problem:
                 f"Integrator {type(integrator).__name__} computes no gradients; use {{'type': 'pathreplay'}}"
             )
         own_integrator = integrator if isinstance(integrator, mi.Integrator) else None
+        if deterministic and not device_of(mi.variant()).keeps_order:
+            raise PathreplayError(
+                f"deterministic = True needs an LLVM variant, this is '{mi.variant()}': on a GPU additions "
+                "have a random order; set 'llvm_ad_rgb', or leave it out"
+            )
         memory = inner.InMemory(scene, own_integrator, functions, starts)
-        config = make_config({**self.job, "iterations": MOST_ITERATIONS})
+        config = make_config({**self.job, "iterations": MOST_ITERATIONS}, "problem")
         self.built = inner.build_problem(config, _HERE, _targets(scene, by_name), memory)
         with computing(self.built.config):
             require_reached(self.built, self.built.config)
+
+    def __repr__(self) -> str:
+        """Short: for notebooks."""
+        return f"<Problem: {', '.join(self.initial)}; {len(self.built.views)} views, loss {self.job['loss']}>"
 
     @property
     def scene(self) -> mi.Scene:
@@ -224,8 +234,8 @@ class Problem:
 
     def configured(self, changes: Mapping[str, Any]) -> tuple[inner.Problem, Config]:
         """The problem and its settings with some of them changed, checked as those of a job."""
-        checked = make_config({**self.job, **changes})
-        config = self.built.config.model_copy(update={key: getattr(checked, key) for key in changes})
+        checked = make_config({**self.job, **changes}, "minimize")
+        config = self.built.config.model_copy(update={key: getattr(checked, key) for key in {*changes, "iterations"}})
         config.model_fields_set.update(changes)
         config.__dict__["learning_rate_schedule"] = checked.learning_rate_schedule
         return replace(self.built, config=config), config
@@ -251,6 +261,11 @@ def _table(key: str, entry: Parameter, named: Callable[[str, Any], str], starts:
     if isinstance(entry.initial, np.ndarray) or dr.is_array_v(entry.initial):
         starts[key] = np.array(entry.initial, np.float32)
         table["initial"] = None
+        if entry.pose is not None:
+            raise PathreplayError(
+                f"Parameter '{key}': 'initial' of a pose is a displacement; write {{'translation': [...], 'rotation': "
+                "[...]}}, and set the scene's own value in the scene"
+            )
     return {name: _plain(value) for name, value in table.items() if value is not None}
 
 

@@ -569,9 +569,9 @@ def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
     return _checked(str(path), defined(parsed(path, text), changes))
 
 
-def make_config(values: dict[str, Any]) -> Config:
-    """A job from a dictionary, with the same checks and messages as a file."""
-    return _checked("config", values)
+def make_config(values: dict[str, Any], name: str = "config") -> Config:
+    """A job from a dictionary, with the same checks and messages as a file; ``name`` is what messages call it."""
+    return _checked(name, values)
 
 
 def _checked(name: str, job: Any) -> Config:
