@@ -44,6 +44,7 @@ demo: $(READY)
 
 lint: $(READY)
 	$(BIN)/ruff check
+	$(BIN)/ruff format --check --quiet
 	$(BIN)/mypy
 
 # Most kernels of these run for less time than LLVM takes to optimise them; test-all runs them as users have them.

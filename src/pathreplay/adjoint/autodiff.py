@@ -44,8 +44,11 @@ class NonFiniteCounter:
         self.count = dr.zeros(mi.UInt32, 1)
 
     def add(self, lost: mi.Bool) -> None:
-        """Count lanes. Inside the loop, where it is a side effect like the gradients: a mask that leaves a loop and
-        is evaluated by itself would run the whole kernel once more."""
+        """Count lanes, inside the loop.
+
+        There it is a side effect, like the gradients. A mask that left the loop and were evaluated by itself would run
+        the whole kernel once more.
+        """
         dr.scatter_add(self.count, mi.UInt32(1), mi.UInt32(0), lost)
 
 

@@ -27,8 +27,10 @@ def first_walk(
     first: mi.UInt32,
     lost: NonFiniteCounter,
 ) -> tuple[Any, mi.UInt32, mi.Spectrum, mi.Spectrum, Branch]:
-    """Record a path from ``first`` on; gives the records, their number, the radiance, what comes of it from beyond the
-    records (relative to the throughput there), and the branch.
+    """Record a path from ``first`` on.
+
+    Returns the records, their number, the radiance, its part from beyond the records (relative to the throughput
+    there), and the branch.
 
     All lanes of a packet write to the same place: elsewhere writes to local memory get lost (Dr.Jit 1.5).
     """

@@ -37,8 +37,11 @@ class Render(SceneFunction):
         return {}
 
     def start(self) -> dict[str, jax.Array]:
-        """The values that the scene had: textures (height, width, channels), grids (z, y, x, channels), colours (3,),
-        numbers (n,), vertices (3 n,), transforms (4, 4)."""
+        """The values that the scene had.
+
+        Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices
+        (3 n,), transforms (4, 4).
+        """
         return {key: jnp.asarray(value) for key, value in self._start.items()}
 
     def __call__(

@@ -33,8 +33,11 @@ class Render(SceneFunction):
         return torch.device("cuda" if backend_of(mi.variant()) == "cuda" else "cpu")
 
     def start(self) -> dict[str, torch.Tensor]:
-        """The values that the scene had: textures (height, width, channels), grids (z, y, x, channels), colours (3,),
-        numbers (n,), vertices (3 n,), transforms (4, 4)."""
+        """The values that the scene had.
+
+        Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices
+        (3 n,), transforms (4, 4).
+        """
         return {key: torch.tensor(value, device=self.device) for key, value in self._start.items()}
 
     def __call__(self, values: Tensors, sensor: int = 0, *, seed: int = 0, spp: int | None = None) -> torch.Tensor:

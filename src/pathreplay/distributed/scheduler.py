@@ -42,6 +42,7 @@ Kind = tuple[tuple[int, ...], int, int]
 
 
 def kind_of(shard: Shard) -> Kind:
+    """What decides how long a shard takes: its views, samples and stage."""
     return shard.views, shard.samples, shard.stage
 
 

@@ -261,8 +261,10 @@ class PathReplayIntegrator(PathIntegrator):
         self.baseline = ref(facts_of(scene)), baseline
 
     def _told(self, view: Pass, trace: TraceConfig, found: TermResult) -> None:
-        """Tell what went wrong, and keep what was learned. In a frozen function nobody can look: see
-        `take_deferred`, which tells of the passes before, too."""
+        """Report what went wrong, and keep what was learned.
+
+        A frozen function defers both: see `take_deferred`.
+        """
         if found.moves:
             self._tell_edges(trace, view.sensor)
         frozen = is_recording()

@@ -65,7 +65,7 @@ def iterate(
     define: Sequence[str] = (),
     executor: str | None = None,
 ) -> Session:
-    """The same, iteration by iteration: ``for state in iterate("job.toml"): ...`` gives a `State` after each.
+    """Optimise a job iteration by iteration: a loop over the session gives a `State` after each.
 
     Arguments, signals and errors are those of `optimize`; the config is checked now, the rest when the first state is
     asked for. See `Session` for how it ends.

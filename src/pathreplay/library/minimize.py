@@ -110,8 +110,11 @@ def minimize(
         progress: show a bar on a terminal, and lines elsewhere.
         stages: tables of settings that differ for some iterations, as ``[[stages]]`` of jobs; their ``iterations`` take
             the place of ``steps``.
-        learning_rate_schedule, final_learning_rate_ratio, warmup_steps: as in jobs; constant by default.
-        view_batch_size, pixel_batch_size: views, and pixels of each, in an iteration; all by default.
+        learning_rate_schedule: ``"constant"`` (the default), ``"exponential"``, ``"linear"`` or ``"cosine"``.
+        final_learning_rate_ratio: learning rate at the end over that at the start.
+        warmup_steps: iterations in which the learning rate grows from nearly zero.
+        view_batch_size: views in an iteration; all by default.
+        pixel_batch_size: pixels of each view in an iteration; all by default.
 
     Returns:
         Values, history, and who ended it. A first Ctrl-C ends it after the iteration that is under way.

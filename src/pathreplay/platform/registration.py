@@ -52,8 +52,11 @@ def mitsuba_integrator() -> Any:
 
 
 def on_base(template: type, base: type) -> type:
-    """The class that a template describes, on a base class of Mitsuba's. Each variant has its own, so that a template,
-    which is there before any of them, cannot have it; its methods call those of the base by their class."""
+    """The class that a template describes, on a base class of Mitsuba's.
+
+    Each variant has a base class of its own. A template exists before any of them and cannot inherit from one; its
+    methods call those of the base by their class.
+    """
     parts = [vars(part) for part in reversed(template.__mro__[:-1])]
     body = {name: value for part in parts for name, value in part.items() if name not in ("__dict__", "__weakref__")}
     return type(base)(template.__name__, (base,), body)  # type: ignore[no-any-return]

@@ -49,6 +49,8 @@ def _index(props: Any, name: str, default: str) -> float:
 
 
 class DielectricAD:
+    """A smooth dielectric whose index of refraction is differentiable; a template, see `on_base`."""
+
     specular_reflectance: mi.Texture | None  # None stands for one, at no cost
     specular_transmittance: mi.Texture | None
 

@@ -37,6 +37,8 @@ FAR = 1e6
 
 
 class GridMedium:
+    """A heterogeneous medium on grids, with local majorants; a template, see `on_base`."""
+
     phase_function: Callable[[], mi.PhaseFunction]  # Mitsuba's
 
     def __init__(self, props: Any) -> None:

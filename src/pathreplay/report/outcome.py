@@ -114,8 +114,7 @@ class Recovered:
         return {kind: value for kind in kinds if (value := getattr(self, kind)) is not None}
 
     def textures(self) -> dict[str, Image]:
-        """Start, result and truth as images to look at (see `shown`); empty for what is no texture of one to four
-        channels."""
+        """Start, result and truth as images (see `shown`); empty unless it is a texture of one to four channels."""
         if self.result.ndim != 3 or self.result.shape[2] > 4:
             return {}
         return {kind: shown(image) for kind, image in self.known("start", "result", "truth").items()}

@@ -39,6 +39,7 @@ def lead(config: Config, parameters: int, learned: int, test_views: int) -> tupl
 
 
 def dropped_notice(history: Sequence[Entry]) -> tuple[str, ...]:
+    """A line on gradient entries that were not finite, if there were any."""
     dropped = sum(entry.dropped for entry in history)
     return (f"{dropped} gradient entries were NaN or infinite and were taken as zero.",) if dropped else ()
 
@@ -128,10 +129,12 @@ def about(item: Recovered, baseline: str = "") -> str:
 
 
 def pose_rows(item: RecoveredPose) -> tuple[Row, ...]:
+    """A pose as rows of a table."""
     return tuple(Row(name, (text,)) for name, text in item.rows().items())
 
 
 def pose_note(item: RecoveredPose) -> str:
+    """What the numbers of a pose are relative to."""
     pose = item.pose
     compared = "" if pose.distance is None else f"; distances are compared with {pose.distance:.4g}"
     pivot = ", ".join(f"{x:.4g}" for x in pose.pivot)
@@ -146,6 +149,7 @@ def swatch(values: list[float]) -> str:
 
 
 def integrator_row(config: Config) -> Row:
+    """The integrator of the job and its options."""
     return Row("integrator", (", ".join(f"{k} = {v}" for k, v in config.integrator.model_dump().items()),))
 
 

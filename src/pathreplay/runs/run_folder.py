@@ -261,8 +261,9 @@ def _job(path: Path, copy: Path) -> Job:
 
 
 def new_output(output: str | Path | None, source: Path | None) -> Path:
-    """Where a new folder shall be: ``output``; else in ``runs``, by the name of the config file, or of its folder where
-    it is just called config. Raises PathreplayError if no folder can be there, and says why.
+    """The path of a new run folder: ``output``, or one in ``runs`` with the name of the config file.
+
+    A file that is called config gives the name of its folder. Raises PathreplayError if no folder can be there.
     """
     if output is None:
         named = "optimize" if source is None else source.stem

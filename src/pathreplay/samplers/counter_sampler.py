@@ -51,8 +51,7 @@ def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
 
 
 def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32, dimensions: int = 2) -> list[mi.Float]:
-    """The i-th of n points that fill the unit square (or cube) evenly, from left to right: Kronecker's rank-1 lattice,
-    randomly shifted."""
+    """The i-th of n points of a randomly shifted Kronecker lattice in the unit square or cube, from left to right."""
     steps = [dr.opaque(mi.UInt32, 2**32 // n % 2**32), *map(mi.UInt32, STEPS)][:dimensions]
     shifts = [mi.sample_tea_32(seed, mi.UInt32(k + 1), ROUNDS)[0] for k in range(dimensions)]
     return [_in_unit(i * step + shift) for step, shift in zip(steps, shifts, strict=True)]

@@ -96,8 +96,9 @@ def check_gradient(
         max_depth: path length, where ``integrator`` is None or a name.
         sensor: index of the sensor; its film gives the resolution.
         seeds: number n of independent seeds, for the gradient and, others, for the reference.
-        spp, fd_spp: samples per pixel of one gradient and of one image of the reference (None: the same). Each
-            reference seed costs four images, at ±h and ±h/2 with common random numbers.
+        spp: samples per pixel of one gradient.
+        fd_spp: samples per pixel of one image of the reference (None: the same). Each reference seed costs four images,
+            at ±h and ±h/2 with common random numbers.
         step: h; None for a hundredth of max(1, largest absolute entry).
         direction: array of the parameter's shape, taken as it is; None for 1 (scalars), a random translation
             (``to_world``; a rotation for sun and sky), or random positive entries, the largest being 1.

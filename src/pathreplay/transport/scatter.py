@@ -231,8 +231,10 @@ def _delta_weight(
 def _at_particle(
     trace: TraceConfig, v: Vertex, again: VertexRecord, attached: bool, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
-    """The direction is held as on surfaces, towards the next surface point, but only where that matters: where the
-    surface scatters or emits, and so may have seams and edges. Otherwise it is fixed in space, which is less noisy.
+    """Hold the direction of a particle towards the next surface point, as on surfaces.
+
+    Only if that surface scatters or emits, and so may have seams and edges. Otherwise the direction is fixed in space,
+    which is less noisy.
     """
     kept, hit_next = again.kept, again.hit_next
     d, J = kept.d, mi.Float(1)

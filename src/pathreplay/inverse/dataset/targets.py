@@ -63,6 +63,7 @@ class Targets:
 
 
 def target_scene(config: Config, base: Path) -> mi.Scene:
+    """The scene from which targets are rendered, with the values that the job gives it."""
     target = config.target
     spec = config.scene if target.scene is None else target.scene
     arguments = config.scene_parameters if target.scene_parameters is None else target.scene_parameters
@@ -89,6 +90,7 @@ def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> d
 
 
 def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], album: Album) -> dict[str, Image]:
+    """Render the targets of all views. Raises PathreplayError where the target scene lacks a sensor."""
     plugin = config.target.integrator
     assert plugin is not None  # `completed`
     integrator = load_integrator(plugin.model_dump())

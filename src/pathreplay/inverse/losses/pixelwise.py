@@ -44,7 +44,7 @@ def relative_l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 def log(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """(log(1 + I) - log(1 + T))^2, for pictures with very bright spots. Gradient biased by noise in I."""
+    """Squared difference of logarithms of 1 + I and 1 + T, for very bright spots. Gradient biased by noise in I."""
     positive = dr.maximum(image, 0)
     return dr.square(dr.log(1 + positive) - dr.log(1 + dr.maximum(target, 0)))
 
