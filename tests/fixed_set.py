@@ -122,10 +122,10 @@ class Opened:
         found: Arrays = {}
         sensor, spp = self.loaded.sensors()[case.sensor], self.scene.spp
         if case.driver == "pixels":
-            assert integrator.sweeps_pixels(self.loaded, sensor, spp)
+            assert integrator.supports_pixel_sweep(self.loaded, sensor, spp)
             slope = numbers(1, (SIZE, SIZE, 3))
             loss = mi.TensorXf(-0.2 * slope), mi.TensorXf(slope)
-            image = integrator.render_and_backward(self.loaded, *loss, sensor, seed, spp)
+            image = integrator.render_value_and_grad(self.loaded, *loss, sensor, seed, spp)
             found["image"] = np.array(image)
         else:
             film = sensor.film()

@@ -118,8 +118,8 @@ def test_what_must_be_recorded_is_refused_before_anything_is_launched(pretend: A
 
 def test_pixels_are_swept_where_a_lane_holds_their_paths(pretend: Any) -> None:
     scene, ours = room(), mi.load_dict({"type": "pathreplay", "max_depth": 8})
-    assert ours.sweeps_pixels(scene, 0, 128)
+    assert ours.supports_pixel_sweep(scene, 0, 128)
     pretend(LAPTOP)
     most = LAPTOP.most_records(LARGEST_RECORD, record.MAX_DEPTH) // device.FEWEST_RECORDS
-    assert ours.sweeps_pixels(scene, 0, most) and not ours.sweeps_pixels(scene, 0, most + 1)
+    assert ours.supports_pixel_sweep(scene, 0, most) and not ours.supports_pixel_sweep(scene, 0, most + 1)
     assert 1 < most < 128

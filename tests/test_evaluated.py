@@ -53,7 +53,7 @@ def _results(way: str, key: str, **options: object) -> np.ndarray:
         params.update()
     if way == "pixels":
         slope = dr.full(mi.TensorXf, 0.01, (4, 4, 3))
-        image = integrator.render_and_backward(scene, slope, slope, 0, 1, 4)
+        image = integrator.render_value_and_grad(scene, slope, slope, 0, 1, 4)
     else:
         image = mi.render(scene, params, integrator=integrator, spp=4, seed=1)
         if way == "forward":

@@ -208,7 +208,7 @@ def judged(method: str, made: mi.Scene, spp: int, seeds: range) -> np.ndarray:
     for seed in seeds:
         dr.enable_grad(params[COLOUR])
         params.update()
-        integrator.render_and_backward(made, offset, slope, 0, seed, spp)
+        integrator.render_value_and_grad(made, offset, slope, 0, seed, spp)
         found.append(np.array(dr.grad(params[COLOUR]), np.float64).ravel())
         dr.disable_grad(params[COLOUR])
     return np.array(found)

@@ -51,7 +51,7 @@ def steps(scene: mi.Scene, key: str, integrator: dict, recorded: bool) -> np.nda
         seed = dr.opaque(mi.UInt32, i)
         loss, deferred, _ = step(params, scene, 0, made, target, None, seed, SPP, l2, 1.0, False)
         made.tell(deferred, 16 * 16 * SPP)
-        parts = [loss, dr.grad(value).array if dr.is_tensor_v(value) else dr.grad(value), *made.learned().values()]
+        parts = [loss, dr.grad(value).array if dr.is_tensor_v(value) else dr.grad(value), *made.state_dict().values()]
         found.append(np.concatenate([np.ravel(part) for part in parts]))
     assert {each.n_recordings for each in recordings._frozen.values()} == ({1} if recorded else set())
     params[key] = start

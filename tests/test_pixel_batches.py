@@ -56,7 +56,7 @@ def swept(bench: Bench, integrator: mi.Integrator, seed: int, count: int, offset
     each = RES**2 / count
     pixels = np.sort(np.random.default_rng(seed).choice(RES**2, count, replace=False))
     loss = (mi.TensorXf((each * term.reshape(-1, 1, 3)[pixels]).astype(np.float32)) for term in (offset, slope))
-    rows = integrator.render_and_backward(
+    rows = integrator.render_value_and_grad(
         bench.scene, *loss, 0, seed, bench.case.spp, mi.UInt32(pixels.astype(np.uint32))
     )
     return np.array(rows)[:, 0], pixels, bench.collect(t)
@@ -71,7 +71,7 @@ def test_some_pixels_stand_for_all(film: str, opened) -> None:
     slope = 2 * bench.weights
     offset = -slope * 0.8 * expected
     ours = bench.integrator(rr_depth=bench.case.rr_depth)
-    assert ours.sweeps_pixels(bench.scene, 0, 4, some=True)
+    assert ours.supports_pixel_sweep(bench.scene, 0, 4, some=True)
 
     sums, counts, gradients = np.zeros((RES**2, 3)), np.zeros((RES**2, 1)), []
     for seed in range(1, bench.case.seeds + 1):
@@ -124,8 +124,8 @@ def test_whole_pictures_are_splatted_unless_the_filter_is_a_box(opened) -> None:
     """Which is much less noisy."""
     bench = opened(Case("gaussian", lambda: room(**FILMS["gaussian"]), FLOOR, random(1.0)))
     ours = bench.integrator()
-    assert not ours.sweeps_pixels(bench.scene, 0, 4)
-    assert not ours.sweeps_pixels(bench.scene, 0, 1, some=True)
+    assert not ours.supports_pixel_sweep(bench.scene, 0, 4)
+    assert not ours.supports_pixel_sweep(bench.scene, 0, 1, some=True)
 
 
 RED = "red.reflectance.value"
@@ -249,9 +249,9 @@ def test_pixels_that_are_none_are_refused(opened) -> None:
     rows = mi.TensorXf(np.ones((2, 1, 3), np.float32))
     for pixels in ([3, 3], [3, RES**2]):
         with pytest.raises(PathreplayError, match=f"one twice, or one beyond the {RES} x {RES}"):
-            bench.integrator().render_and_backward(bench.scene, rows, rows, spp=4, pixels=mi.UInt32(pixels))
+            bench.integrator().render_value_and_grad(bench.scene, rows, rows, spp=4, pixels=mi.UInt32(pixels))
     with pytest.raises(PathreplayError, match=r"shape \(2, 1, 3\): use \(3, 1, 3\)"):
-        bench.integrator().render_and_backward(bench.scene, rows, rows, spp=4, pixels=mi.UInt32([1, 2, 3]))
+        bench.integrator().render_value_and_grad(bench.scene, rows, rows, spp=4, pixels=mi.UInt32([1, 2, 3]))
 
 
 MOVED = {

@@ -68,7 +68,7 @@ def swept(bench: Bench, integrator: mi.Integrator, seed: int, offset: np.ndarray
     bench.put(t)
     loss = (mi.TensorXf(offset.astype(np.float32)), mi.TensorXf(slope.astype(np.float32)))
     sensor = bench.scene.sensors()[0]
-    image = integrator.render_and_backward(bench.scene, *loss, sensor, seed, bench.case.spp)
+    image = integrator.render_value_and_grad(bench.scene, *loss, sensor, seed, bench.case.spp)
     return np.array(image), bench.collect(t)
 
 
@@ -85,7 +85,7 @@ def test_image_and_gradient_are_those_of_a_quadratic_loss(case: Case, opened) ->
     adjoint = offset + slope * expected
 
     ours = bench.integrator(rr_depth=case.rr_depth, **case.options)
-    assert ours.sweeps_pixels(bench.scene, bench.scene.sensors()[0], case.spp)
+    assert ours.supports_pixel_sweep(bench.scene, bench.scene.sensors()[0], case.spp)
     seeds = range(1, case.seeds + 1)
     found = [swept(bench, ours, seed, offset, slope) for seed in seeds]
     differences = (bench.difference(plain, CENTRAL, case.step, 1000 + seed, 1024) for seed in range(8))
@@ -138,7 +138,7 @@ def test_what_cannot_be_swept_by_pixels_is_told(why: str, opened) -> None:
     t = dr.opaque(mi.Float, 0)
     dr.enable_grad(t)
     bench.put(t)
-    assert not integrator.sweeps_pixels(bench.scene, bench.scene.sensors()[0], 1 if why == "one sample" else 4)
+    assert not integrator.supports_pixel_sweep(bench.scene, bench.scene.sensors()[0], 1 if why == "one sample" else 4)
 
 
 def test_what_cannot_be_swept_by_pixels_is_refused(opened) -> None:
@@ -146,11 +146,11 @@ def test_what_cannot_be_swept_by_pixels_is_refused(opened) -> None:
     integrator, adjoint = bench.integrator(), mi.TensorXf(bench.weights)
     for spp, message in ((1, "1 samples per pixel"), (1024, "at most 2048 vertices")):
         with pytest.raises(PathreplayError, match=message):
-            integrator.render_and_backward(bench.scene, adjoint, adjoint, spp=spp)
+            integrator.render_value_and_grad(bench.scene, adjoint, adjoint, spp=spp)
     with pytest.raises(PathreplayError, match="shape"):
-        integrator.render_and_backward(bench.scene, adjoint[:, :, :1], adjoint, spp=4)
+        integrator.render_value_and_grad(bench.scene, adjoint[:, :, :1], adjoint, spp=4)
     with pytest.raises(PathreplayError, match="none has gradients: check that the key"):
-        integrator.render_and_backward(bench.scene, adjoint, adjoint, spp=4)
+        integrator.render_value_and_grad(bench.scene, adjoint, adjoint, spp=4)
 
 
 def test_the_derivative_of_a_quadratic_loss_is_found_at_any_brightness() -> None:
@@ -240,9 +240,9 @@ def test_steps_that_were_recorded_are_those_that_are_traced(
     config = make_config(JOB | changes)
     problem = build_problem(config, tmp_path)
     calls = []
-    if hasattr(problem.integrator, "render_and_backward"):
-        inner = problem.integrator.render_and_backward
-        monkeypatch.setattr(problem.integrator, "render_and_backward", lambda *a: calls.append(1) or inner(*a))
+    if hasattr(problem.integrator, "render_value_and_grad"):
+        inner = problem.integrator.render_value_and_grad
+        monkeypatch.setattr(problem.integrator, "render_value_and_grad", lambda *a: calls.append(1) or inner(*a))
     recorded, traced = steps(problem, config, "recorded"), steps(problem, config, "traced")
     np.testing.assert_allclose(recorded, traced, rtol=1e-4)
     # Every step has seeds and values of its own: one that was launched with those of another would show.

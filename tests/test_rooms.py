@@ -265,7 +265,7 @@ def through_media(integrator: mi.Integrator) -> np.ndarray:
 def of_pixels(integrator: mi.Integrator) -> np.ndarray:
     scene = world()
     with attached(scene, FLOOR) as params:
-        integrator.render_and_backward(scene, weights(scene), weights(scene), seed=1, spp=4)
+        integrator.render_value_and_grad(scene, weights(scene), weights(scene), seed=1, spp=4)
         return get_array(dr.grad(params[FLOOR]))
 
 

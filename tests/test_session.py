@@ -42,8 +42,8 @@ def test_a_loop_that_looks_comes_where_optimize_comes(changes: dict[str, Any]) -
     seen: list[State] = []
     session = pathreplay.iterate(job(**changes))
     for state in session:
-        picture = state.picture()
-        assert picture.shape == state.picture(state.views[0]).shape and np.isfinite(picture).all()
+        picture = state.render()
+        assert picture.shape == state.render(state.views[0]).shape and np.isfinite(picture).all()
         seen.append(state)
     assert isinstance(session.result, RunResult) and session.result.folder.name == "run-2"
     assert [state.iteration for state in seen] == [entry.iteration for entry in whole.history]
@@ -54,8 +54,8 @@ def test_a_loop_that_looks_comes_where_optimize_comes(changes: dict[str, Any]) -
         assert seen[0].gradient_norms[key] > 0
     assert saved("run-2") == saved("run")
     # A state keeps its values, and so its picture, after the run has gone on.
-    assert np.abs(seen[0].picture() - seen[-1].picture()).max() > 0
-    assert (seen[-1].picture() == picture).all()
+    assert np.abs(seen[0].render() - seen[-1].render()).max() > 0
+    assert (seen[-1].render() == picture).all()
 
 
 def test_who_leaves_the_loop_leaves_a_checkpoint_that_goes_on() -> None:
@@ -77,10 +77,10 @@ def test_a_loop_can_be_resumed_and_finished_early() -> None:
     with iterate(resume="run") as session:
         state = next(session)
         assert state.iteration == 1
-        result = session.finish()
-    assert result.stopped and result.stopped_by == "finish()" and result.iterations == 2
-    assert result.report.is_file() and session.finish() is result
-    assert "stopped early by finish()" in result.describe()
+        result = session.stop()
+    assert result.stopped and result.stopped_by == "stop()" and result.iterations == 2
+    assert result.report.is_file() and session.stop() is result
+    assert "stopped early by stop()" in result.describe()
 
 
 def test_an_error_in_the_loop_leaves_a_checkpoint() -> None:
@@ -97,7 +97,7 @@ def test_nothing_is_done_before_the_first_state() -> None:
     session.close()
     assert not Path("run").exists()
     with pytest.raises(PathreplayError, match="was closed"):
-        session.finish()
+        session.stop()
     with pytest.raises(PathreplayError, match="did you mean"):
         iterate(Path("jab.toml")) if Path("job.toml").write_text("") == 0 else None
 
@@ -105,7 +105,7 @@ def test_nothing_is_done_before_the_first_state() -> None:
 def test_a_view_that_is_not_there_is_told() -> None:
     with iterate(job()) as session:
         with pytest.raises(PathreplayError, match="No view 'left'; there are view-0"):
-            next(session).picture("left")
+            next(session).render("left")
 
 
 def test_threads_are_the_callers_between_iterations() -> None:

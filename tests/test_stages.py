@@ -88,7 +88,7 @@ def test_a_job_goes_through_its_stages() -> None:
     for state in session:
         values.append({key: value.copy() for key, value in state.values.items()})
         batches.append(set(state.gradient_norms))
-        assert state.picture().shape == (10, 12, 3)
+        assert state.render().shape == (10, 12, 3)
     assert batches == [{FLOOR}] * 2 + [{TEXTURE}] * 2 + [{FLOOR, TEXTURE}] * 3
     for k in (0, 1):
         assert (values[k][TEXTURE] == 0.5).all() and (values[k][FLOOR] != 0.5).all()

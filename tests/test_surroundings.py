@@ -90,7 +90,7 @@ def test_a_run_stays_in_its_folder_wherever_the_user_goes(room: Path) -> None:
     os.chdir(room)
     going_on = pathreplay.iterate(resume="runs/mine-2")
     os.chdir(room / "elsewhere")
-    assert going_on.finish().iterations == 2
+    assert going_on.stop().iterations == 2
     assert (room / "runs/mine-2/report.html").is_file() and not list((room / "elsewhere").iterdir())
 
 

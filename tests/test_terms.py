@@ -123,7 +123,7 @@ def test_sample_gives_what_it_says(load) -> None:
     assert aovs == []
     with pytest.raises(PathreplayError, match=r"use mi\.render, or render_backward"):
         integrator.sample(dr.ADMode.Backward, scene, rays.sampler, rays.ray, δL=mi.Spectrum(1))
-    assert integrator.learned() == {}
+    assert integrator.state_dict() == {}
 
 
 def test_what_was_learned_outlives_another_scene_between(load) -> None:
@@ -134,7 +134,7 @@ def test_what_was_learned_outlives_another_scene_between(load) -> None:
     known = []
     for seed in range(2):
         integrator.render_backward(scene, params, adjoint, seed=seed, spp=SPP)
-        known.append(integrator.learned()["sums"].sum())
+        known.append(integrator.state_dict()["sums"].sum())
         integrator.render(still, seed=seed, spp=1)
     assert known[1] > 1.5 * known[0] > 0
 
@@ -159,9 +159,9 @@ def test_what_shards_have_seen_can_be_added(load) -> None:
         np.testing.assert_allclose(np.array(getattr(both, name)), sum(parts), rtol=1e-6)
     after, again = nothing.after(both), nothing.after(other + one)
     assert after.passes == again.passes and len(after.passes) == 2
-    for name, value in after.learned().items():
-        np.testing.assert_allclose(again.learned()[name], value, rtol=1e-5)
-    restored = BaselineState.restored(scene.bbox(), after.learned())
+    for name, value in after.state_dict().items():
+        np.testing.assert_allclose(again.state_dict()[name], value, rtol=1e-5)
+    restored = BaselineState.restored(scene.bbox(), after.state_dict())
     np.testing.assert_allclose(np.array(restored.guess.known), np.array(after.guess.known))
 
 

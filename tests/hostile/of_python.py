@@ -157,8 +157,8 @@ for _call in (
 RENDER = LOADED + "integrator = mi.load_dict({'type': 'pathreplay'})\n"
 for _call in (
     "mi.render(scene, integrator=integrator, spp=2**31)",
-    "integrator.render_and_backward(scene, 0, 0, scene.sensors()[0], 0, 1)",
-    "integrator.render_and_backward(scene, *2 * [mi.TensorXf(0, (1, 1, 1))], scene.sensors()[0], 0, 1)",
+    "integrator.render_value_and_grad(scene, 0, 0, scene.sensors()[0], 0, 1)",
+    "integrator.render_value_and_grad(scene, *2 * [mi.TensorXf(0, (1, 1, 1))], scene.sensors()[0], 0, 1)",
 ):
     _code(_call[:80], RENDER + _call)
 _code(

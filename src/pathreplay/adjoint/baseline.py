@@ -158,13 +158,13 @@ class BaselineState:
         sums, passes = MEMORY * self.sums + seen.sums, self.passes | seen.passes
         return BaselineState(self.cells, sums, branching, passes)
 
-    def learned(self) -> dict[str, np.ndarray]:
+    def state_dict(self) -> dict[str, np.ndarray]:
         """All that it knows, as float32 arrays by name, from which `restored` makes the same again."""
         return {"sums": self.sums.numpy(), "branching": self.branching.numpy()}
 
     @staticmethod
     def restored(box: mi.ScalarBoundingBox3f, learned: Mapping[str, np.ndarray]) -> BaselineState:
-        """One that knows what `learned` told of another. Raises PathreplayError if that cannot be."""
+        """One that knows what `state_dict` told of another. Raises PathreplayError if that cannot be."""
         shapes = {name: np.shape(value) for name, value in learned.items()}
         wanted = {"sums": (4 * AVERAGES,), "branching": (1,)}
         if shapes != wanted or not 0 < learned["branching"][0] <= 1:

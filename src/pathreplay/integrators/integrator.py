@@ -166,11 +166,11 @@ class PathReplayIntegrator(PathIntegrator):
             self._tell_once(COST_OF_EDGES)
         return not why
 
-    def sweeps_pixels(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
-        """Whether `render_and_backward` can be used, for all pixels or for ``some``: see `pixel_obstacle`."""
-        return not self.pixel_obstacle(scene, sensor, spp, some)
+    def supports_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
+        """Whether `render_value_and_grad` can be used, for all pixels or for ``some``: see `pixel_obstacle`."""
+        return not self.why_no_pixel_sweep(scene, sensor, spp, some)
 
-    def pixel_obstacle(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
+    def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
         """Why it cannot be used, with the way out: see `obstacle`. It needs the sweep driver, too, and no media."""
         view = Pass.of(scene, sensor, 0, spp)
         if self.driver != "sweep":
@@ -188,7 +188,7 @@ class PathReplayIntegrator(PathIntegrator):
             follows = Boundary.move(view, trace) and not Boundary.obstacle(view) and self._may_follow(view, trace)
         return "the film follows what moves; take edges = 'none'" if follows else ""
 
-    def render_and_backward(
+    def render_value_and_grad(
         self,
         scene: mi.Scene,
         offset: mi.TensorXf,
@@ -204,7 +204,7 @@ class PathReplayIntegrator(PathIntegrator):
         Each path is judged by the others of its pixel: see `pixel_sweep`; edges, by the image. With ``pixels`` (their
         numbers, row by row, none twice) only these are rendered, and add to the loss: the tensors and what is returned
         have a row for each of them (n x 1 x 3). What is not differentiated: see `sweep`.
-        Warns as `render_backward` does. Use it where `sweeps_pixels` allows it; raises PathreplayError where the
+        Warns as `render_backward` does. Use it where `supports_pixel_sweep` allows it; raises PathreplayError where the
         number of samples does not, a tensor has another shape, there are no such pixels, or no parameter with gradients
         reaches the paths.
         """
@@ -250,11 +250,11 @@ class PathReplayIntegrator(PathIntegrator):
         frozen_inputs = PathIntegrator.inputs_to_freeze(self, scene)
         return frozen_inputs if self.baseline is None else replace(frozen_inputs, guess=self.baseline[1].guess)
 
-    def learned(self) -> dict[str, np.ndarray]:
+    def state_dict(self) -> dict[str, np.ndarray]:
         """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
-        return {} if self.baseline is None else self.baseline[1].learned()
+        return {} if self.baseline is None else self.baseline[1].state_dict()
 
-    def restore_learned(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
+    def load_state_dict(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
         """Go on with what `learned` told of the same scene; where that is nothing, anew. Raises PathreplayError."""
         box = scene.bbox()
         baseline = BaselineState.restored(box, learned) if learned else BaselineState.fresh(box)

@@ -11,7 +11,7 @@ from typing import get_args
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config.executor_options import ExecutorName
 from pathreplay.inverse.config.schema import Config, load_config
-from pathreplay.jobs.session import Session
+from pathreplay.jobs.session import Optimization
 from pathreplay.report.result import RunResult
 from pathreplay.runs.run_folder import Job, RunFolder, new_output, open_run_folder
 
@@ -50,7 +50,7 @@ def optimize(
         ) as session:
             for _ in session:
                 pass
-            return session.finish()
+            return session.stop()
     finally:
         # Python finds the scene only by its collector, and Dr.Jit traces calls through every scene that is alive.
         gc.collect()
@@ -64,18 +64,18 @@ def iterate(
     progress: bool = False,
     define: Sequence[str] = (),
     executor: str | None = None,
-) -> Session:
-    """Optimise a job iteration by iteration: a loop over the session gives a `State` after each.
+) -> Optimization:
+    """Optimise a job iteration by iteration: a loop over it gives a `State` after each.
 
     Arguments, signals and errors are those of `optimize`; the config is checked now, the rest when the first state is
-    asked for. See `Session` for how it ends.
+    asked for. See `Optimization` for how it ends.
     """
     if executor is not None and executor not in get_args(ExecutorName):
         raise PathreplayError(f"executor is {shown(executor)}; give one of {', '.join(get_args(ExecutorName))}")
     job, path, resumed = _started(config, resume, output, tuple(define))
     if executor is not None:
         job = replace(job, config=job.config.model_copy(update={"executor": executor}))
-    return Session(job, path, resumed, progress)
+    return Optimization(job, path, resumed, progress)
 
 
 def _started(

@@ -46,7 +46,7 @@ class State:
     """Of the variables after the step, by key, as people see them; of poses ``KEY:translation``, ``KEY:rotation``."""
     views: tuple[str, ...]
     folder: Path
-    _picture: Callable[[Mapping[str, Array], str], Image] = field(repr=False)
+    _rendered: Callable[[Mapping[str, Array], str], Image] = field(repr=False)
 
     @property
     def iteration(self) -> int:
@@ -68,7 +68,7 @@ class State:
         """Root mean square errors after the step, where the truth is known."""
         return self.entry.errors
 
-    def picture(self, view: str | None = None) -> Image:
+    def render(self, view: str | None = None) -> Image:
         """A rendering of a view (default: the first) with these values: linear, height x width x channels.
 
         It has ``eval_spp`` samples per pixel. Takes time, and changes nothing of what comes after. Raises
@@ -77,15 +77,15 @@ class State:
         name = self.views[0] if view is None else view
         if name not in self.views:
             raise PathreplayError(f"No view {name!r}; there are {', '.join(self.views)}")
-        return self._picture(self.values, name)
+        return self._rendered(self.values, name)
 
 
-class Session:
+class Optimization:
     """A run under way, to be looped over: each iteration gives its `State`.
 
     The scene is loaded when the first one is asked for, and all is written when the loop has come to its end, which
     makes ``result``. Who leaves the loop before leaves a checkpoint to go on from; so does `close`, which is also the
-    end of a ``with``. `finish` ends the run here, with everything written. While it runs, signals ask it to end: see
+    end of a ``with``. `stop` ends the run here, with everything written. While it runs, signals ask it to end: see
     `pathreplay.optimize`.
     """
 
@@ -106,7 +106,7 @@ class Session:
             self.result = end.value or self.result
             raise
 
-    def __enter__(self) -> Session:
+    def __enter__(self) -> Optimization:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
@@ -118,16 +118,16 @@ class Session:
         if self._resumed is not None:  # which nobody has begun to go on with
             self._resumed.lock.close()
 
-    def finish(self) -> RunResult:
+    def stop(self) -> RunResult:
         """End it here (after one iteration, if there was none) with everything written.
 
         Raises PathreplayError as the loop does, and where the run was closed before.
         """
-        self._stop.by = self._stop.by or "finish()"
+        self._stop.by = self._stop.by or "stop()"
         for _ in self:
             pass
         if self.result is None:
-            raise PathreplayError("The session was closed; go on with its run folder: iterate(resume=...)")
+            raise PathreplayError("The optimization was closed; go on with its run folder: iterate(resume=...)")
         return self.result
 
 

@@ -38,7 +38,7 @@ class RunResult:
     stopped: bool
     """True when a signal ended the run early; it can be resumed."""
     stopped_by: str | None
-    """'Ctrl-C', 'SIGTERM', 'SIGHUP', 'the stop button' or 'finish()'."""
+    """'Ctrl-C', 'SIGTERM', 'SIGHUP', 'the stop button' or 'stop()'."""
     history: tuple[Entry, ...]
     parameters: dict[str, Array]
     errors: dict[str, float]

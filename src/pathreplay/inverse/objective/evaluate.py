@@ -213,12 +213,12 @@ class Evaluator:
         """Go on with what an evaluation has learned. Raises PathreplayError if it is none of this integrator's."""
         if learned is self._learned or not (learned or self._learned):
             return
-        if not hasattr(self.integrator, "restore_learned"):
+        if not hasattr(self.integrator, "load_state_dict"):
             raise PathreplayError(
                 "The checkpoint holds what another integrator has learned of media; set the config's 'integrator' "
                 "back, or start a new run"
             )
-        self.integrator.restore_learned(self.problem.scene, learned)
+        self.integrator.load_state_dict(self.problem.scene, learned)
         self._learned = learned
 
     def _view(self, values: Arrays, view: int, seed: int, spp: int, pixels: int | None) -> Evaluation:
@@ -250,8 +250,8 @@ class Evaluator:
         dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
         for key in broken:
             gradients[key] = np.where(np.isfinite(gradients[key]), gradients[key], 0)
-        if hasattr(self.integrator, "learned"):
-            self._learned = self.integrator.learned()
+        if hasattr(self.integrator, "state_dict"):
+            self._learned = self.integrator.state_dict()
         return Evaluation(loss, gradients, dropped, self._learned)
 
     def _differentiated(self, view: int, seed: int, spp: int, factor: Any, batch: Batch | None) -> tuple[float, Any]:

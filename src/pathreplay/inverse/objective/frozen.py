@@ -131,7 +131,7 @@ def _differentiate(
             offset, slope = (term * share for term in linear_derivative(loss, target, weight))
             # By the chain rule, of what is linear in the factor times the image.
             offset, slope = _times(offset, factor), _times(_times(slope, factor), factor)
-            image = integrator.render_and_backward(scene, offset, slope, scene.sensors()[sensor], seed, spp, pixels)
+            image = integrator.render_value_and_grad(scene, offset, slope, scene.sensors()[sensor], seed, spp, pixels)
             value = mean_loss(loss, _times(image, factor), target, weight).array * share
         else:
             image = mi.render(scene, params, sensor=sensor, integrator=integrator, spp=spp, seed=seed)

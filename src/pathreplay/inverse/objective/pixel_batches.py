@@ -47,9 +47,9 @@ def obstacle(problem: Problem, integrator: mi.Integrator, sensor: int, spp: int,
     """Why paths cannot be walked once for picture and gradient, of all pixels or of ``some``; "" where they can."""
     if problem.loss not in QUADRATIC:
         return "its loss is none of l2 and relative-l2; take one of these"
-    if not hasattr(integrator, "pixel_obstacle"):
+    if not hasattr(integrator, "why_no_pixel_sweep"):
         return f"{type(integrator).__name__} renders whole pictures; take the integrator 'pathreplay'"
-    return str(integrator.pixel_obstacle(problem.scene, problem.scene.sensors()[sensor], spp, some))
+    return str(integrator.why_no_pixel_sweep(problem.scene, problem.scene.sensors()[sensor], spp, some))
 
 
 def refused(view: str, why: str) -> PathreplayError:
