@@ -1,4 +1,4 @@
-"""What `-D KEY=VALUE` does to a job, and the schema by which editors know one."""
+"""What `--set KEY=VALUE` does to a job, and the schema by which editors know one."""
 
 from __future__ import annotations
 
@@ -84,8 +84,8 @@ def test_a_run_remembers_its_changes(job: Path) -> None:
     result = optimize(job, output="run", progress=False, define=["iterations=2", "loss=l1"])
     assert result.iterations == 2
     assert load_config(result.folder / "config.json").loss == "l1"
-    assert "job.json -D iterations=2 -D loss=l1" in result.report.read_text()
-    with pytest.raises(PathreplayError, match="leave CONFIG, --output and -D out"):
+    assert "job.json --set iterations=2 --set loss=l1" in result.report.read_text()
+    with pytest.raises(PathreplayError, match="leave CONFIG, --output and --set out"):
         optimize(resume=result.folder, progress=False, define=["iterations=4"])
 
 
@@ -134,3 +134,9 @@ def test_an_old_name_leads_to_the_new_one(old: dict[str, object], new: str) -> N
     with pytest.raises(PathreplayError) as told:
         make_config({**job, **old})
     assert f"unknown key {new}" in str(told.value)
+
+
+def test_d_is_for_scene_parameters() -> None:
+    told = CliRunner().invoke(app, ["optimize", "job.toml", "-D", "spp=32"])
+    assert isinstance(told.exception, PathreplayError)
+    assert str(told.exception) == "-D is for scene parameters; change a job with: --set spp=32"

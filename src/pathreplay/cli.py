@@ -160,10 +160,11 @@ def optimize(
         Path | None, typer.Option(metavar="RUN_FOLDER", help="Go on with an unfinished run instead.")
     ] = None,
     output: Annotated[Path | None, typer.Option(help="Run folder to make; default: runs/<name of the config>.")] = None,
-    define: Annotated[
+    changes: Annotated[
         list[str] | None,
-        typer.Option("--define", "-D", metavar="KEY=VALUE", help="Change the job, as in -D spp=32; may be repeated."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Change the job, as in --set spp=32; may be repeated."),
     ] = None,
+    define: Annotated[list[str] | None, typer.Option("--define", "-D", hidden=True)] = None,
     executor: Annotated[
         Literal["local", "ray"] | None,
         typer.Option(help="Who computes: this process, or actors of Ray (default: as the job says)."),
@@ -171,10 +172,12 @@ def optimize(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on the screen.")] = False,
 ) -> None:
     """Recover scene parameters from pictures; Ctrl-C or SIGTERM ends early with everything written."""
+    if define:
+        raise PathreplayError(f"-D is for scene parameters; change a job with: --set {define[0]}")
     with interrupts.undisturbed():  # what is half imported can bring the process down at its end
         from pathreplay.jobs import optimize as run_job
 
-    result = run_job(config, resume=resume, output=output, progress=not quiet, define=define or (), executor=executor)
+    result = run_job(config, resume=resume, output=output, progress=not quiet, define=changes or (), executor=executor)
     typer.echo(result.describe())
 
 

@@ -85,7 +85,7 @@ def _started(
     if resume is not None:
         if config is not None or output is not None or changes:
             raise PathreplayError(
-                "--resume takes config and output from the run folder; leave CONFIG, --output and -D out"
+                "--resume takes config and output from the run folder; leave CONFIG, --output and --set out"
             )
         job, folder = open_run_folder(Path(resume))
         return job, folder.given, folder

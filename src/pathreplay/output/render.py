@@ -71,7 +71,7 @@ def render_to_file(
 
 def _flat(option: str, table: dict[str, Any], changes: Sequence[str]) -> dict[str, Any]:
     """The table with each NAME=VALUE put into it."""
-    found: dict[str, Any] = defined(table, changes)
+    found: dict[str, Any] = defined(table, changes, option)
     for name, value in found.items():
         if isinstance(value, (dict, list)):
             raise PathreplayError(f"{option} {name} is {shown(value)}; give a number, a text, true or false")

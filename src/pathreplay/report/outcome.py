@@ -251,7 +251,7 @@ class Outcome:
         if not self.complete:
             return resume_command(self.folder)
         job = self.folder / "config.json" if self.source is None else self.source
-        changes = "".join(f" -D {shlex.quote(change)}" for change in self.changes)
+        changes = "".join(f" --set {shlex.quote(change)}" for change in self.changes)
         return f"pathreplay optimize {shlex.quote(str(job))}{changes if self.source else ''}"
 
     def names(self) -> tuple[str, str]:

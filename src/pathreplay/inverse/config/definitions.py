@@ -1,4 +1,4 @@
-"""What ``-D KEY=VALUE`` changes in a job, before it is checked."""
+"""What ``--set KEY=VALUE`` changes in a job, before it is checked."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ DEEPEST = 16
 _VALUES = (bool, int, float, str, list, dict)
 
 
-def defined(job: Any, changes: Sequence[str]) -> Any:
-    """The job with these changes, as TOML has it: nothing of ``job`` is changed itself.
+def defined(job: Any, changes: Sequence[str], option: str = "--set") -> Any:
+    """The job with these changes, as TOML has it; ``job`` itself is not changed. ``option`` is where they were given.
 
     A key is one of TOML's, where a number leads into a list: ``parameters.0.learning_rate``. A value that is no TOML is
     a text, so that names need no quotes. Raises PathreplayError for what is no change, or leads nowhere.
@@ -22,12 +22,12 @@ def defined(job: Any, changes: Sequence[str]) -> Any:
     for change in changes:
         key, equals, text = change.partition("=")
         if not equals:
-            raise PathreplayError(f"-D {shown(change)} has no '='; write KEY=VALUE, as in -D spp=32")
-        job = _put(job, _path(key, change), _value(text), f"-D {shown(change)}")
+            raise PathreplayError(f"{option} {shown(change)} has no '='; write KEY=VALUE, as in {option} spp=32")
+        job = _put(job, _path(key, f"{option} {shown(change)}"), _value(text), f"{option} {shown(change)}")
     return job
 
 
-def _path(key: str, change: str) -> list[str]:
+def _path(key: str, told: str) -> list[str]:
     try:
         found = from_toml(f"{key} = 0")
     except (ValueError, RecursionError):
@@ -38,8 +38,8 @@ def _path(key: str, change: str) -> list[str]:
         path.append(name)
     if found != 0 or not 0 < len(path) <= DEEPEST:
         raise PathreplayError(
-            f"-D {shown(change)} names no key; write it as in TOML, such as integrator.max_depth, and quote what has "
-            "dots in its name"
+            f"{told} names no key; write it as in TOML, such as integrator.max_depth, and quote what has dots in "
+            "its name"
         )
     return path
 
