@@ -318,6 +318,9 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
     ("make", "words"),
     [
         (bad(parameters={"wal.reflectance": GREY}), "wal.reflectance"),
+        (bad(parameters={WALL: 0.5}), "parameters: 0.5 is no Parameter"),
+        (bad(views=np.zeros((16, 16, 3))), "is no View; write View"),
+        (bad(derived={WALL: len}), "is no Derived"),
         (bad(views=[]), "views: there is none"),
         (bad(views=View(0)), "Target of sensor 'left' is missing"),
         (bad(views=View(0, np.zeros((3, 4, 3)))), "is 4 x 3, and its film 16 x 16"),

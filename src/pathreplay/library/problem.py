@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pathreplay.errors import PathreplayError
+from pathreplay.errors import PathreplayError, shown
 from pathreplay.integrators.film.image import picture_shape
 from pathreplay.inverse.config.schema import Config, make_config
 from pathreplay.inverse.dataset.targets import Targets, as_weight
@@ -111,7 +111,7 @@ class Problem:
         scene: a scene, a dictionary for `mi.load_dict`, an XML file, or the name of a built-in scene. Of the last three
             a ``dielectric`` whose index is sought, and 8-bit textures that are sought, are exchanged for plugins that
             can be differentiated.
-        parameters: by key of ``mi.traverse(scene)`` or by glob; a list of keys takes each as it is.
+        parameters: by key of ``mi.traverse(scene)`` or by glob; keys alone take each as it is.
         views: what should be seen.
         loss: a name (``"l2"``, ``"relative-l2"``, ...; see `pathreplay.losses`) or ``loss(image, target)`` on tensors
             of shape (height, width, channels) that gives such a tensor, or one number.
@@ -129,7 +129,7 @@ class Problem:
     def __init__(
         self,
         scene: mi.Scene | Mapping[str, Any] | str | Path,
-        parameters: Mapping[str, Parameter | None] | Sequence[str],
+        parameters: Mapping[str, Parameter | None] | Sequence[str] | str,
         views: View | Sequence[View],
         *,
         loss: str | Callable[[Any, Any], Any] = "l2",
@@ -142,8 +142,15 @@ class Problem:
     ) -> None:
         if mi.variant() is None:
             backend.set_variant(None)
-        wanted = parameters if isinstance(parameters, Mapping) else dict.fromkeys(parameters)
-        made = derived or {}
+        wanted, made = _wanted(parameters), derived or {}
+        looked_at = [views] if isinstance(views, View) else list(views)
+        for what, kind, things in (
+            ("parameters", Parameter, [each for each in wanted.values() if each is not None]),
+            ("views", View, looked_at),
+            ("derived", Derived, list(made.values())),
+        ):
+            if wrong := [each for each in things if not isinstance(each, kind)]:
+                raise PathreplayError(f"{what}: {shown(wrong[0])} is no {kind.__name__}; write {kind.__name__}(...)")
         if not isinstance(scene, mi.Scene):
             own = [key for key, entry in wanted.items() if entry is None or entry.shape is None]
             spec = dict(scene) if isinstance(scene, Mapping) else scene
@@ -161,7 +168,7 @@ class Problem:
             return name
 
         tables = [_table(key, entry or Parameter(), named, starts) for key, entry in wanted.items()]
-        by_name = _by_name(scene, [views] if isinstance(views, View) else views)
+        by_name = _by_name(scene, looked_at)
         known = next((name for name, function in LOSSES.items() if function is loss), None)
         self.job: dict[str, Any] = {
             "scene": "memory",
@@ -249,6 +256,13 @@ class Problem:
                 raise PathreplayError(f"The scene has no parameter '{key}'; give one that is built alike")
             params[key] = value
         params.update()
+
+
+def _wanted(parameters: Mapping[str, Parameter | None] | Sequence[str] | str) -> dict[str, Parameter | None]:
+    """By key or glob; a name stands for a parameter as it is."""
+    if isinstance(parameters, Mapping):
+        return dict(parameters)
+    return dict.fromkeys([parameters] if isinstance(parameters, str) else parameters)
 
 
 def _table(key: str, entry: Parameter, named: Callable[[str, Any], str], starts: dict[str, Array]) -> dict[str, Any]:
