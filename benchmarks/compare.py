@@ -18,8 +18,9 @@ from .measures.job import Machine, Point, Record
 from .measures.methods import STOCK, parts
 from .tables import markdown, pooled
 
-# Two runs of the same code differ by more than each of them tells: kernels lie elsewhere in memory, rivals meet other
-# loads. In ratios to a baseline that takes turns it is a few per cent; seconds alone drift with the machine's clock.
+# Two runs of the same code differ by more than each of them tells: kernels lie elsewhere in memory, baselines meet
+# other loads. In ratios to a baseline that takes turns it is a few per cent; seconds alone drift with the machine's
+# clock.
 MARGIN = 0.05
 ALONE_MARGIN = 0.15
 
@@ -97,21 +98,21 @@ def _place(machines: Sequence[Machine]) -> set[tuple[str, int, int]]:
 
 def _yardstick(key: Key, before: dict[Key, Point], now: dict[Key, Point]) -> tuple[Point, Point] | None:
     """Mitsuba's method of the same job in both records: that of the same stage ('prb, import') if there are stages."""
-    rivals = [
+    baselines = [
         other
         for other in before
         if other[:-1] == key[:-1] and _is_stock(str(other[-1])) and _timed(before[other]) and _timed(now.get(other))
     ]
     stage = parts(str(key[-1]))[1]
-    rivals.sort(key=lambda other: parts(str(other[-1]))[1] != stage)
-    return (before[rivals[0]], now[rivals[0]]) if rivals else None
+    baselines.sort(key=lambda other: parts(str(other[-1]))[1] != stage)
+    return (before[baselines[0]], now[baselines[0]]) if baselines else None
 
 
 def _timed(point: Point | None) -> bool:
     return point is not None and point.error is None and len(point.seconds) > 1
 
 
-def _rows(a: Point, b: Point, rivals: tuple[Point, Point] | None, same_machine: bool) -> list[Row]:
+def _rows(a: Point, b: Point, baselines: tuple[Point, Point] | None, same_machine: bool) -> list[Row]:
     if a.error or b.error:
         if a.error and b.error:
             return [_row(b, "all", "same", b.error)]
@@ -124,7 +125,7 @@ def _rows(a: Point, b: Point, rivals: tuple[Point, Point] | None, same_machine: 
     lost = len(b.not_finite) > len(a.not_finite)
     if lost:
         rows.append(_row(b, "finite", "worse", f"{len(b.not_finite)} gradients are not, were {len(a.not_finite)}"))
-    rows.append(_time(a, b, rivals, same_machine))
+    rows.append(_time(a, b, baselines, same_machine))
     if len(a.squared_errors) > 1 and len(b.squared_errors) > 1:
         noise = unpaired_ratio(b.squared_errors, a.squared_errors, np.mean)
         rows.append(_judged(b, "variance", noise, MARGIN))
@@ -136,9 +137,9 @@ def _rows(a: Point, b: Point, rivals: tuple[Point, Point] | None, same_machine: 
     return rows
 
 
-def _time(a: Point, b: Point, rivals: tuple[Point, Point] | None, same_machine: bool) -> Row:
-    if rivals is not None and _timed(a) and _timed(b):
-        return _judged(b, f"time / {rivals[0].method}", _relative_time(a, b, *rivals), MARGIN)
+def _time(a: Point, b: Point, baselines: tuple[Point, Point] | None, same_machine: bool) -> Row:
+    if baselines is not None and _timed(a) and _timed(b):
+        return _judged(b, f"time / {baselines[0].method}", _relative_time(a, b, *baselines), MARGIN)
     if not (same_machine and _timed(a) and _timed(b)):
         return _row(b, "time", "not comparable", "another machine and no baseline in both, or a single round")
     return _judged(b, "time", unpaired_ratio(b.seconds, a.seconds, np.median), ALONE_MARGIN)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -140,3 +141,18 @@ def test_d_is_for_scene_parameters() -> None:
     told = CliRunner().invoke(app, ["optimize", "job.toml", "-D", "spp=32"])
     assert isinstance(told.exception, PathreplayError)
     assert str(told.exception) == "-D is for scene parameters; change a job with: --set spp=32"
+
+
+OLD = (
+    "learning_rate_decay warm_up views_per_step pixels_per_step picture_spp hold_out_every sample_ranges rival "
+    "non_finite_in_a_row signal_to_noise auto_spp smoothdielectric sweeps_pixels render_and_backward restore_learned"
+).split()
+
+
+def test_no_old_name_is_left() -> None:
+    root = Path(__file__).parents[1]
+    files = [root / "README.md", *(root / "docs").glob("*.md"), *(root / "examples").rglob("*.[tm][od]*")]
+    files += [path for path in (root / "src").rglob("*.py") if path.name != "errors.py"]
+    words = re.compile(r"\b(" + "|".join(OLD) + r")\b")
+    found = [f"{file.name}: {word[0]}" for file in files for word in words.finditer(file.read_text(encoding="utf-8"))]
+    assert len(files) > 250 and not found

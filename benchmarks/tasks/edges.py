@@ -55,7 +55,7 @@ MOVING = {
 
 
 def jobs(quick: bool) -> list[Job]:
-    """Inner edges, edges on the film, recorded steps; guided rivals and large films have jobs of their own."""
+    """Inner edges, edges on the film, recorded steps; guided baselines and large films have jobs of their own."""
     inner = ("prb", "inner edges alone", "film edges alone", "edges alone", "unguided inner")
     film = ("prb", "film edges alone", "edge list")
     wanted = [(scene, inner, 0.0, SMALL) for scene in INNER] + [(scene, film, 0.0, SMALL) for scene in FILM]
@@ -147,7 +147,7 @@ def by_job(points: list[Point]) -> list[dict[str, Point]]:
 
 
 def costs(found: list[dict[str, Point]]) -> str:
-    """A row for each scene: times next to `prb`, and time x variance next to rivals."""
+    """A row for each scene: times next to `prb`, and time x variance next to baselines."""
     timed = ("film edges alone", "inner edges alone", "edges alone", "projective inner")
     header = ["scene", *(f"{name} / prb" for name in timed), f"edges alone / prb, {LARGE} x {LARGE}"]
     header += [f"time x variance of {a} / {b}" for a, b in VERSUS]

@@ -89,10 +89,10 @@ def outcome_of(
     run: Run,
     before: dict[str, Image],
     after: dict[str, Image],
-    rivals: dict[str, Image],
+    baselines: dict[str, Image],
     verdict: Verdict,
 ) -> Outcome:
-    """All that is told of a run; ``before``, ``after`` and the ``rivals`` are pictures by view."""
+    """All that is told of a run; ``before``, ``after`` and the ``baselines`` are pictures by view."""
     views = tuple(
         ViewPictures(
             v.name,
@@ -100,7 +100,7 @@ def outcome_of(
             before[v.name],
             after[v.name],
             exposure_for(v.target),
-            rivals.get(v.name),
+            baselines.get(v.name),
             v.weight,
             v.is_test,
             tuple(run.values[EXPOSURE][n].tolist()) if EXPOSURE in run.values else (),
