@@ -337,6 +337,7 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
         (bad(parameters={WALL: Parameter(initial=np.zeros(5))}), "of shape \\(5,\\)"),
         (bad(parameters={WALL: Parameter(parameterization="cube")}), "parameterization"),
         (bad(parameters={BODY: Parameter(pose="rigid", initial=np.eye(4))}), "'initial' of a pose is a displacement"),
+        (bad(scene=5), "scene: 'int' is no scene of the active variant"),
         (bad(scene={"type": "sphere"}), "describes no scene but a Shape"),
         (bad(scene="no-such-scene"), "No scene 'no-such-scene'"),
     ],
@@ -356,6 +357,12 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
             pathreplay.minimize(problem, optimizer, progress=False)
     with pytest.raises(PathreplayError, match="No parameter 'x'"):
         problem.render({"x": 1.0})
+    with pytest.raises(PathreplayError, match=r"has the shape \(2,\), the parameter \(3,\); reshape it"):
+        pathreplay.value_and_grad(problem)({WALL: [1.0, 2.0]})
+    textured = Problem(room(), [TEXTURE], views(photos))
+    with pytest.raises(PathreplayError, match=r"has the shape \(4, 4\), the parameter \(4, 4, 3\)"):
+        textured.render({TEXTURE: np.zeros((4, 4))})
+    assert textured.render({TEXTURE: np.zeros((8, 8, 3))}, spp=1).shape == (SIDE, SIDE, 3)
     with pytest.raises(PathreplayError, match="'iterations' is 0"):
         pathreplay.minimize(problem, steps=0, progress=False)
 

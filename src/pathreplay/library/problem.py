@@ -151,6 +151,11 @@ class Problem:
         ):
             if wrong := [each for each in things if not isinstance(each, kind)]:
                 raise PathreplayError(f"{what}: {shown(wrong[0])} is no {kind.__name__}; write {kind.__name__}(...)")
+        if not isinstance(scene, (mi.Scene, Mapping, str, Path)):
+            raise PathreplayError(
+                f"scene: {shown(type(scene).__name__)} is no scene of the active variant, {mi.variant()}; load it in "
+                "this variant, or give a dictionary, a file or the name of a built-in scene"
+            )
         if not isinstance(scene, mi.Scene):
             own = [key for key, entry in wanted.items() if entry is None or entry.shape is None]
             spec = dict(scene) if isinstance(scene, Mapping) else scene
@@ -234,8 +239,12 @@ class Problem:
             array = np.array(value, np.float32)
             if array.size == found[key].size and found[key].ndim == 1:
                 array = array.reshape(found[key].shape)
-            if array.shape != found[key].shape and found[key].ndim < 3:
-                raise PathreplayError(f"Value of '{key}' has the shape {array.shape}, not {found[key].shape}")
+            wanted = found[key].shape
+            resized = len(wanted) >= 3 and array.ndim == len(wanted) and array.shape[-1] == wanted[-1]
+            if array.shape != wanted and not resized:
+                raise PathreplayError(
+                    f"Value of '{key}' has the shape {array.shape}, the parameter {wanted}; reshape it"
+                )
             found[key] = array
         return found
 
