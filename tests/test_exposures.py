@@ -139,7 +139,7 @@ def test_exposures_and_scene_are_recovered_up_to_the_scale_that_is_fixed() -> No
     assert result.parameters[KEY] == pytest.approx([0.4] * 3, abs=0.01)
     assert result.parameters[EXPOSURE].ravel() == pytest.approx([2, 1, 0.5, 1.5], abs=0.03)
     views = json.loads((result.folder / "views.json").read_text())
-    assert views["eye-3"]["recovered_exposure"] == pytest.approx([1.5], abs=0.03) and views["eye-3"]["test_views"]
+    assert views["eye-3"]["recovered_exposure"] == pytest.approx([1.5], abs=0.03) and views["eye-3"]["is_test"]
     assert all(view["result"]["psnr"] > 35 for view in views.values())
     assert "exposure found" in result.report.read_text()
 

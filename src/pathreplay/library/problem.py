@@ -144,24 +144,9 @@ class Problem:
             backend.set_variant(None)
         wanted, made = _wanted(parameters), derived or {}
         looked_at = [views] if isinstance(views, View) else list(views)
-        for what, kind, things in (
-            ("parameters", Parameter, [each for each in wanted.values() if each is not None]),
-            ("views", View, looked_at),
-            ("derived", Derived, list(made.values())),
-        ):
-            if wrong := [each for each in things if not isinstance(each, kind)]:
-                raise PathreplayError(f"{what}: {shown(wrong[0])} is no {kind.__name__}; write {kind.__name__}(...)")
-        if not isinstance(scene, (mi.Scene, Mapping, str, Path)):
-            raise PathreplayError(
-                f"scene: {shown(type(scene).__name__)} is no scene of the active variant, {mi.variant()}; load it in "
-                "this variant, or give a dictionary, a file or the name of a built-in scene"
-            )
-        if not isinstance(scene, mi.Scene):
-            own = [key for key, entry in wanted.items() if entry is None or entry.shape is None]
-            spec = dict(scene) if isinstance(scene, Mapping) else scene
-            scene, self.notes = load_scene_for(spec, [*own, *made])
-        else:
-            self.notes = ()
+        _require_kinds(wanted, looked_at, made)
+        own = [key for key, entry in wanted.items() if entry is None or entry.shape is None]
+        scene, self.notes = _loaded(scene, [*own, *made])
         functions: dict[str, Callable[..., Any]] = {}
         starts: dict[str, Array] = {}
 
@@ -199,11 +184,8 @@ class Problem:
                 f"Integrator {type(integrator).__name__} computes no gradients; use {{'type': 'pathreplay'}}"
             )
         own_integrator = integrator if isinstance(integrator, mi.Integrator) else None
-        if deterministic and not device_of(mi.variant()).keeps_order:
-            raise PathreplayError(
-                f"deterministic = True needs an LLVM variant, this is '{mi.variant()}': on a GPU additions "
-                "have a random order; set 'llvm_ad_rgb', or leave it out"
-            )
+        if deterministic:
+            _require_order()
         memory = inner.InMemory(scene, own_integrator, functions, starts)
         config = make_config({**self.job, "iterations": MOST_ITERATIONS}, "problem")
         self.built = inner.build_problem(config, _HERE, _targets(scene, by_name), memory)
@@ -265,6 +247,38 @@ class Problem:
                 raise PathreplayError(f"The scene has no parameter '{key}'; give one that is built alike")
             params[key] = value
         params.update()
+
+
+def _require_kinds(wanted: Mapping[str, Parameter | None], views: Sequence[View], made: Mapping[str, Derived]) -> None:
+    """Raise PathreplayError for a number in the place of a Parameter, and the like."""
+    for what, kind, things in (
+        ("parameters", Parameter, [each for each in wanted.values() if each is not None]),
+        ("views", View, list(views)),
+        ("derived", Derived, list(made.values())),
+    ):
+        if wrong := [each for each in things if not isinstance(each, kind)]:
+            raise PathreplayError(f"{what}: {shown(wrong[0])} is no {kind.__name__}; write {kind.__name__}(...)")
+
+
+def _require_order() -> None:
+    """Raise PathreplayError where additions have a random order."""
+    if not device_of(mi.variant()).keeps_order:
+        raise PathreplayError(
+            f"deterministic = True needs an LLVM variant, this is '{mi.variant()}': on a GPU additions "
+            "have a random order; set 'llvm_ad_rgb', or leave it out"
+        )
+
+
+def _loaded(scene: Any, wanted: list[str]) -> tuple[mi.Scene, tuple[str, ...]]:
+    """The scene, in which these keys carry derivatives as far as exchanging plugins brings it, and notes on that."""
+    if isinstance(scene, mi.Scene):
+        return scene, ()
+    if not isinstance(scene, (Mapping, str, Path)):
+        raise PathreplayError(
+            f"scene: {shown(type(scene).__name__)} is no scene of the active variant, {mi.variant()}; load it in "
+            "this variant, or give a dictionary, a file or the name of a built-in scene"
+        )
+    return load_scene_for(dict(scene) if isinstance(scene, Mapping) else scene, wanted)
 
 
 def _wanted(parameters: Mapping[str, Parameter | None] | Sequence[str] | str) -> dict[str, Parameter | None]:
