@@ -295,6 +295,13 @@ def test_a_problem_is_left_as_it_was(photos: list[np.ndarray]) -> None:
     assert after[0] == before[0] and np.array_equal(after[1][WALL], before[1][WALL])
 
 
+def test_an_iteration_that_is_kept_stays_as_it_was(photos: list[np.ndarray]) -> None:
+    kept: list[pathreplay.Iteration] = []
+    problem = Problem(room(), {WALL: GREY}, views(photos))
+    pathreplay.minimize(problem, steps=4, callbacks=[kept.append], progress=False)
+    assert len({float(it.values[WALL][0]) for it in kept}) == 4
+
+
 def test_weights_shares_and_test_views(photos: list[np.ndarray]) -> None:
     mask = np.zeros((SIDE, SIDE))
     mask[:8] = 1

@@ -15,8 +15,8 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.schema import Config, Plugin
 from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.loop.checkpoint import Entry, Run
-from pathreplay.inverse.loop.events import Event, Stepped
-from pathreplay.inverse.loop.loop import best_values, iterate, new_run, picture_of, render_views, with_exposures
+from pathreplay.inverse.loop.events import Stepped
+from pathreplay.inverse.loop.loop import best_values, computed, new_run, picture_of, render_views, with_exposures
 from pathreplay.inverse.loop.verdict import verdict_of
 from pathreplay.inverse.objective.evaluate import computing
 from pathreplay.inverse.objective.reached import require_reached
@@ -25,7 +25,7 @@ from pathreplay.inverse.parameters.values import Array
 from pathreplay.inverse.problem.feasibility import require_finite_loss
 from pathreplay.inverse.problem.problem import Problem, build_problem
 from pathreplay.platform import backend, memory
-from pathreplay.platform.device import device_of
+from pathreplay.platform.device import require_order
 from pathreplay.platform.interrupts import Stop, stopping, undisturbed
 from pathreplay.report.live_page import Previews
 from pathreplay.report.notebook import NotebookPanel, in_notebook
@@ -171,7 +171,7 @@ def _states(
             bar.follow(previews)
         look = _looker(problem, config)
         try:
-            for event in _events(problem, config, run, stop):
+            for event in computed(problem, config, run, stop):
                 bar.observe(event)
                 saving.observe(event)
                 with computing(config):
@@ -228,17 +228,6 @@ def _run(
     return new_run(problem, integrator, record, config.optimizer, staged)
 
 
-def _events(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
-    """What happens, computed as the job wants it, while whoever looks on is free to compute as they want."""
-    events = iterate(problem, config, run, stop)
-    while True:
-        with computing(config):
-            event = next(events, None)
-        if event is None:
-            return
-        yield event
-
-
 def _looker(problem: Problem, config: Config) -> Callable[[Mapping[str, Array], str], Image]:
     def look(values: Mapping[str, Array], view: str) -> Image:
         with computing(config):
@@ -250,11 +239,8 @@ def _looker(problem: Problem, config: Config) -> Callable[[Mapping[str, Array], 
 def _set_variant(config: Config) -> None:
     with undisturbed():
         variant = backend.set_variant(config.variant)
-    if config.deterministic and not device_of(variant).keeps_order:
-        raise PathreplayError(
-            f"deterministic = true needs an LLVM variant, this is '{variant}': on a GPU the order of additions "
-            "is random; set variant = 'llvm_ad_rgb', or leave 'deterministic' out"
-        )
+    if config.deterministic:
+        require_order(variant)
 
 
 def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tuple[RunFolder, dict[str, Image]]:

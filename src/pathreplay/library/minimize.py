@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import Any
 
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.loop.checkpoint import Entry, Run
+from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.inverse.loop.events import Stepped
-from pathreplay.inverse.loop.loop import best_values, iterate, new_run
+from pathreplay.inverse.loop.loop import best_values, computed, new_run
 from pathreplay.inverse.objective.evaluate import computing
 from pathreplay.inverse.objective.stages import Staged, require_single_pixels, require_stages
 from pathreplay.inverse.parameters.values import Array
@@ -25,12 +24,15 @@ from pathreplay.report.progress import Progress
 from pathreplay.report.recovered import with_scene
 
 
+@dataclass(frozen=True)
 class Iteration:
-    """One iteration, as callbacks see it."""
+    """One iteration, as callbacks see it. Nothing in it changes when the minimisation goes on."""
 
-    def __init__(self, problem: Problem, run: Run, entry: Entry) -> None:
-        self.entry = entry
-        self._problem, self._run = problem, run
+    entry: Entry
+    """What the history says of it."""
+    values: Mapping[str, Array]
+    """After the step, by name."""
+    _problem: Problem = field(repr=False)
 
     @property
     def number(self) -> int:
@@ -41,11 +43,6 @@ class Iteration:
     def loss(self) -> float:
         """Before the step."""
         return self.entry.loss
-
-    @cached_property
-    def values(self) -> dict[str, Array]:
-        """After the step, by name."""
-        return {key: value.copy() for key, value in best_values(self._problem.built, self._run).items()}
 
     def render(self, view: int = 0, spp: int | None = None) -> Array:
         """The image of a view with these values."""
@@ -147,15 +144,10 @@ def minimize(
         stack.enter_context(stopping(bar.say, "aborted", stop))
         for note in problem.notes + built.notes:
             bar.remark(note)
-        events = iterate(built, config, run, stop)
-        while True:
-            with computing(config):
-                event = next(events, None)
-            if event is None:
-                break
+        for event in computed(built, config, run, stop):
             bar.observe(event)
             if isinstance(event, Stepped):
-                about = Iteration(problem, run, event.entry)
+                about = Iteration(event.entry, best_values(built, run), problem)
                 if any([callback(about) is True for callback in callbacks]):
                     stop.by = stop.by or "a callback"
     values = best_values(built, run)

@@ -25,7 +25,7 @@ from pathreplay.inverse.objective.reached import require_reached
 from pathreplay.inverse.parameters.values import Array, Arrays, adapted_image
 from pathreplay.inverse.problem import problem as inner
 from pathreplay.platform import backend
-from pathreplay.platform.device import device_of
+from pathreplay.platform.device import require_order
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.loading import load_scene_for
 
@@ -179,13 +179,9 @@ class Problem:
         }
         if isinstance(integrator, Mapping):
             self.job["integrator"] = dict(integrator)
-        elif integrator is not None and not isinstance(integrator, mi.CppADIntegrator):
-            raise PathreplayError(
-                f"Integrator {type(integrator).__name__} computes no gradients; use {{'type': 'pathreplay'}}"
-            )
-        own_integrator = integrator if isinstance(integrator, mi.Integrator) else None
+        own_integrator = None if isinstance(integrator, Mapping) else integrator
         if deterministic:
-            _require_order()
+            require_order(mi.variant())
         memory = inner.InMemory(scene, own_integrator, functions, starts)
         config = make_config({**self.job, "iterations": MOST_ITERATIONS}, "problem")
         self.built = inner.build_problem(config, _HERE, _targets(scene, by_name), memory)
@@ -214,21 +210,13 @@ class Problem:
 
     def complete(self, values: Mapping[str, ArrayLike] | None) -> dict[str, Array]:
         """Values of all parameters: those given, else initial ones. Raises PathreplayError for what does not fit."""
-        found = self.initial
-        for key, value in (values or {}).items():
-            if key not in found:
-                raise PathreplayError(f"No parameter '{key}' in the problem; it has {', '.join(found)}")
-            array = np.array(value, np.float32)
-            if array.size == found[key].size and found[key].ndim == 1:
-                array = array.reshape(found[key].shape)
-            wanted = found[key].shape
-            resized = len(wanted) >= 3 and array.ndim == len(wanted) and array.shape[-1] == wanted[-1]
-            if array.shape != wanted and not resized:
-                raise PathreplayError(
-                    f"Value of '{key}' has the shape {array.shape}, the parameter {wanted}; reshape it"
-                )
-            found[key] = array
-        return found
+        given, starts = values or {}, {v.key: v.start for v in self.built.variables}
+        if unknown := set(given) - set(starts):
+            raise PathreplayError(f"No parameter '{min(unknown)}' in the problem; it has {', '.join(starts)}")
+        return {
+            key: _fitted(key, given[key], start.shape) if key in given else np.array(start, np.float32)
+            for key, start in starts.items()
+        }
 
     def configured(self, changes: Mapping[str, Any]) -> tuple[inner.Problem, Config]:
         """The problem and its settings with some of them changed, checked as those of a job."""
@@ -249,6 +237,15 @@ class Problem:
         params.update()
 
 
+def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
+    """A value of a parameter; textures and grids may have other sizes."""
+    array = np.array(value, np.float32)
+    resized = len(wanted) >= 3 and array.ndim == len(wanted) and array.shape[-1] == wanted[-1]
+    if array.shape != wanted and not resized and not (len(wanted) == 1 and array.size == wanted[0]):
+        raise PathreplayError(f"Value of '{key}' has the shape {array.shape}, the parameter {wanted}; reshape it")
+    return array if resized else array.reshape(wanted)
+
+
 def _require_kinds(wanted: Mapping[str, Parameter | None], views: Sequence[View], made: Mapping[str, Derived]) -> None:
     """Raise PathreplayError for a number in the place of a Parameter, and the like."""
     for what, kind, things in (
@@ -258,15 +255,6 @@ def _require_kinds(wanted: Mapping[str, Parameter | None], views: Sequence[View]
     ):
         if wrong := [each for each in things if not isinstance(each, kind)]:
             raise PathreplayError(f"{what}: {shown(wrong[0])} is no {kind.__name__}; write {kind.__name__}(...)")
-
-
-def _require_order() -> None:
-    """Raise PathreplayError where additions have a random order."""
-    if not device_of(mi.variant()).keeps_order:
-        raise PathreplayError(
-            f"deterministic = True needs an LLVM variant, this is '{mi.variant()}': on a GPU additions "
-            "have a random order; set 'llvm_ad_rgb', or leave it out"
-        )
 
 
 def _loaded(scene: Any, wanted: list[str]) -> tuple[mi.Scene, tuple[str, ...]]:
@@ -330,8 +318,9 @@ def _by_name(scene: mi.Scene, views: Sequence[View]) -> dict[str, View]:
 def _targets(scene: mi.Scene, views: Mapping[str, View]) -> Targets:
     """The arrays of all views, checked against their films."""
     images, weights = {}, {}
+    sensors = sensors_of(scene, list(views))
     for name, view in views.items():
-        height, width, channels = picture_shape(scene.sensors()[sensors_of(scene, [name])[name]])
+        height, width, channels = picture_shape(scene.sensors()[sensors[name]])
         what = f"Target of sensor '{name}'"
         image = _pixels(what, view.target)
         if image.shape[:2] != (height, width):

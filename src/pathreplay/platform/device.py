@@ -14,6 +14,7 @@ import ctypes
 from dataclasses import dataclass
 from functools import cache
 
+from pathreplay.errors import PathreplayError
 from pathreplay.platform import memory
 
 SHARE = 0.25
@@ -105,3 +106,12 @@ def available(variant: str) -> int:
     """Bytes that renderings can still get: of the machine, and on a GPU no more than it has."""
     device, left = device_of(variant), memory.available()
     return min(left, device.memory) if device.memory else left
+
+
+def require_order(variant: str) -> None:
+    """Raise PathreplayError where the additions of a variant have a random order."""
+    if not device_of(variant).keeps_order:
+        raise PathreplayError(
+            f"deterministic = true needs an LLVM variant, this is '{variant}': on a GPU the order of additions "
+            "is random; set variant = 'llvm_ad_rgb', or leave 'deterministic' out"
+        )

@@ -35,7 +35,7 @@ _KINDS = {
     "masks": "file names, or a pattern such as 'masks/*.png'",
 }
 
-# Keys of 0.1.0's first edition -> what they are called now.
+# Keys of 0.1.0's first edition -> what they are called now, in one table or another.
 RENAMED = {
     "rival": "baseline",
     "learning_rate_decay": "final_learning_rate_ratio",
@@ -60,6 +60,7 @@ RENAMED = {
     "held_out": "test_views",
     "sample_ranges": "spp_shards",
     "free": "fix_scale",
+    "memory": "memory_limit history_size",
 }
 
 
@@ -96,8 +97,7 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
 
 def _renamed(key: str, table: type[BaseModel]) -> str | None:
     """What a key of a table was renamed to."""
-    names = [RENAMED.get(key), "memory_limit" if key == "memory" else None, "history_size" if key == "memory" else None]
-    return next((name for name in names if name in table.model_fields), None)
+    return next((name for name in RENAMED.get(key, "").split() if name in table.model_fields), None)
 
 
 _ALTERNATIVES = ("int", "float", "bool", "str", "count", "Picture", "Value", "Displacement")

@@ -40,6 +40,7 @@ from pathreplay.inverse.objective.evaluate import (
     Local,
     Shard,
     Total,
+    computing,
     release,
     total,
 )
@@ -138,6 +139,17 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
         if stop.by is not None:
             break
     yield Stopped(len(run.history))
+
+
+def computed(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
+    """The events of `iterate`, computed as the job wants it, while whoever looks on is free to compute as they want."""
+    events = iterate(problem, config, run, stop)
+    while True:
+        with computing(config):
+            event = next(events, None)
+        if event is None:
+            return
+        yield event
 
 
 def _require_gradients(config: Config, run: Run) -> None:

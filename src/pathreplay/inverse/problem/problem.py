@@ -197,7 +197,11 @@ def build_problem(
     scene, config, notes = _loaded(config, base, shots, given.scene)
     params = traversed(scene)
     parameters.require_finite(params)
-    integrator = given.integrator or _gradient_integrator(config.integrator)
+    integrator = given.integrator
+    if integrator is None:
+        integrator = _gradient_integrator(config.integrator)
+    else:
+        _require_gradients(integrator, type(integrator).__name__)
     named, made = keys_of(params, config, integrator)
     free = free_of(params, config)
     keys = [*named, *made]
@@ -341,11 +345,13 @@ def _pictures(
 
 def _gradient_integrator(plugin: Plugin) -> mi.Integrator:
     integrator = load_integrator(plugin.model_dump())
-    if not isinstance(integrator, mi.CppADIntegrator):
-        raise PathreplayError(
-            f"Integrator '{plugin.type}' computes no gradients; use 'pathreplay' or another AD integrator"
-        )
+    _require_gradients(integrator, plugin.type)
     return integrator
+
+
+def _require_gradients(integrator: mi.Integrator, name: str) -> None:
+    if not isinstance(integrator, mi.CppADIntegrator):
+        raise PathreplayError(f"Integrator '{name}' computes no gradients; use 'pathreplay' or another AD integrator")
 
 
 def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
