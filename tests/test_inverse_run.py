@@ -16,7 +16,8 @@ import safetensors.numpy
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.io import read_image
-from pathreplay.jobs import RunResult, make_config, optimize, session
+from pathreplay.inverse.loop import loop
+from pathreplay.jobs import RunResult, make_config, optimize
 from pathreplay.platform.atomic_files import Content, chunks
 from pathreplay.report.progress import Progress
 from pathreplay.runs import run_folder as folders
@@ -231,11 +232,11 @@ def test_a_folder_that_is_resumed_stays_even_where_no_iteration_can_be_done(monk
     def failing(*_: object) -> None:
         raise PathreplayError("no iteration can be done")
 
-    monkeypatch.setattr(session, "iterate", aborted)
+    monkeypatch.setattr(loop, "iterate", aborted)
     with pytest.raises(KeyboardInterrupt):
         run()
     (folder,) = Path("runs").iterdir()
-    monkeypatch.setattr(session, "iterate", failing)
+    monkeypatch.setattr(loop, "iterate", failing)
     with pytest.raises(PathreplayError, match="no iteration"):
         optimize(resume=folder, progress=False)
     assert (folder / "checkpoint.safetensors").is_file()
