@@ -28,7 +28,7 @@ from pathreplay.testing.stencil import CENTRAL
 from .plots import BLUE, GREY, IMAGES, ORANGE, RED
 
 RESOLUTION = 96
-COLUMNS = ("picture", "finite differences", "edges='all'", "edges='none'")
+COLUMNS = ("picture", "finite differences", "boundary='all'", "boundary='none'")
 BRIGHTEST = 98.5
 """Percentile of the differences at which the colours end."""
 
@@ -45,7 +45,7 @@ class Motion(NamedTuple):
     step: float
     depth: int
     spp: int  # of differences
-    edge_spp: int
+    boundary_spp: int
 
 
 def shift(x: float, y: float, z: float) -> Callable[[Any, Any], Any]:
@@ -108,7 +108,7 @@ def derivatives(motion: Motion) -> list[np.ndarray]:
         objective.image(plain, 1, motion.spp),
         objective.difference(plain, CENTRAL, motion.step, 2, motion.spp),
         *(
-            objective.forward(mi.load_dict({"type": "pathreplay", "edges": edges} | limits), 3, motion.edge_spp)
+            objective.forward(mi.load_dict({"type": "pathreplay", "boundary": edges} | limits), 3, motion.boundary_spp)
             for edges in ("all", "none")
         ),
     ]

@@ -33,7 +33,7 @@ REFERENCE_SEEDS, REFERENCE_SPP = 8, 8192
 TOLERANCE = 0.03
 """Of the derivative: differences have an error of second order in their step."""
 METHODS = {
-    "pathreplay": {"type": "pathreplay", "edges": "all", "numbers": "scene"},
+    "pathreplay": {"type": "pathreplay", "boundary": "all", "sampling": "scene"},
     "prb_projective": {"type": "prb_projective", "guiding": "none"},
 }
 

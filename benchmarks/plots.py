@@ -39,9 +39,9 @@ LOOKS = {
     "prb": (RED, "^"),
     "prbvolpath": (RED, "^"),
     "prb_basic": (ORANGE, "v"),
-    "tape": (PINK, "P"),
-    "rb": (BLACK, "X"),
-    "rb linear": (GREY, "d"),
+    "naive AD": (PINK, "P"),
+    "RB": (BLACK, "X"),
+    "linear RB": (GREY, "d"),
 }
 TITLES = {depth.SURFACES: "surfaces: a closed box", depth.MEDIA: "media: a sealed room of fog"}
 LABEL_SIZE = 9

@@ -14,11 +14,11 @@ from .tasks import attached, depth, edges, iteration, media, surface, truth
 def _surface(record: Record) -> str:
     """The sweep next to `prb`, and what is done where only lights have gradients; then the same with even numbers."""
     rows = [
-        [f"{key.scene}, {surface.what(key.parameters)}", numbers, str(v.time()), str(v.variance())]
-        for numbers, ours in (("scene", "sweep"), ("scene", "auto"), ("even", "even"))
+        [f"{key.scene}, {surface.what(key.parameters)}", sampling, str(v.time()), str(v.variance())]
+        for sampling, ours in (("scene", "sweep"), ("scene", "auto"), ("sobol", "sobol"))
         for key, v in _pairs(record, ours, "prb")
     ]
-    return markdown(["gradient, pathreplay / prb", "`numbers`", "time", "variance"], rows)
+    return markdown(["gradient, pathreplay / prb", "`sampling`", "time", "variance"], rows)
 
 
 def _attached(record: Record) -> str:
@@ -34,12 +34,12 @@ def _attached(record: Record) -> str:
 def _iteration(record: Record) -> str:
     """Our own loop, with the random numbers of the scene and with even ones, next to the usual one with Mitsuba's."""
     rows = [
-        [key.scene, numbers, str(versus.time()), str(versus.cost())]
-        for (theirs, *_, own, even) in (iteration.SURFACE, iteration.MEDIA)
-        for numbers, method in (("scene", own), ("even", even))
+        [key.scene, sampling, str(versus.time()), str(versus.cost())]
+        for (theirs, *_, own, sobol) in (iteration.SURFACE, iteration.MEDIA)
+        for sampling, method in (("scene", own), ("sobol", sobol))
         for key, versus in _pairs(record, method, theirs)
     ]
-    return markdown(["optimisation step, relative to Mitsuba's", "`numbers`", "time", "time at equal variance"], rows)
+    return markdown(["optimisation step, relative to Mitsuba's", "`sampling`", "time", "time at equal variance"], rows)
 
 
 def _media(record: Record) -> str:

@@ -27,6 +27,7 @@ import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np  # isort: skip
 
+from pathreplay import baselines  # isort: skip
 from pathreplay.report import report  # isort: skip
 from pathreplay.inverse.images.io import png_bytes  # isort: skip
 from variant import VARIANT  # isort: skip
@@ -49,6 +50,7 @@ LONGEST = ("test_truth_edges_inner", "test_truth_edges", "test_truth_media", "te
 def pytest_configure() -> None:
     """Set the variant before test modules are imported, so that module-level `mi.<Type>` works in them."""
     set_variant(VARIANT)
+    baselines.register()
     if unoptimised.is_asked_for() and VARIANT.startswith("llvm"):
         unoptimised.leave_unoptimised()
 

@@ -82,7 +82,7 @@ def measured(moving: Moving, folder: Path, seeds: int = 8, **options: Any) -> Me
     """Interior and edges, by reverse mode, and finite differences of Mitsuba's `path`; ``options`` are for ours."""
     objective = loaded(moving, folder)
     common = {"max_depth": moving.depth, "rr_depth": NEVER, **moving.options}
-    ours = mi.load_dict({"type": "pathreplay", "edges": "all", **common, **options})
+    ours = mi.load_dict({"type": "pathreplay", "boundary": "all", **common, **options})
     plain = mi.load_dict({"type": "path", **common, "rr_depth": NEVER})
     numbers = range(1, seeds + 1)
     try:

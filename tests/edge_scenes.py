@@ -346,8 +346,8 @@ SEVERAL = ("wall.to_world", "lamp.to_world", "object.to_world")
 def cell(name: str, make: Callable[[], dict], key: str, move: Move, depth: int = 2, **more: Any) -> Case:
     """A case of everything moving but what paths choose at random; roulette would depend on the parameter."""
     settings: dict[str, Any] = dict(
-        step=0.05, spp=256, seeds=12, reference_spp=1024, rr_depth=1000, options={"edges": "all"}, drivers=("sweep",),
-        lanes=None,
+        step=0.05, spp=256, seeds=12, reference_spp=1024, rr_depth=1000, options={"boundary": "all"},
+        drivers=("recorded",), lanes=None,
     )  # fmt: skip
     return Case(name, make, key, move, depth, **{**settings, **more})
 

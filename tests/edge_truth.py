@@ -63,7 +63,7 @@ def measured(name: str) -> Measured:
     with loaded(case) as bench:
         g = backwards(bench)
         transpose = bench.transpose_error(ours(bench), ours(bench), 1, case.spp)
-        return Measured(g, backwards(bench, edges="none"), differences, transpose)
+        return Measured(g, backwards(bench, boundary="none"), differences, transpose)
 
 
 def backwards(bench: Bench, seeds: int = 0, first: int = 0, **options: Any) -> np.ndarray:
@@ -102,7 +102,7 @@ def hold_gradients(name: str) -> None:
 def hold_agreement(name: str, g: np.ndarray, d: np.ndarray, transpose: float) -> None:
     """Gradients of seeds to differences of seeds; adds a row to the table of truth."""
     difference = gap(g, d)
-    row = Row(f"edges: {name}", "sweep", g.mean(), d.mean(), difference.error, difference.z, np.nan, transpose)
+    row = Row(f"edges: {name}", "recorded", g.mean(), d.mean(), difference.error, difference.z, np.nan, transpose)
     ROWS.append(row)
     assert abs(row.z) < Z_LIMIT, row
     assert row.error < RESOLUTION * max(abs(row.gradient), abs(row.reference)), row

@@ -419,7 +419,8 @@ SCENES = (
         case("forward", attach="all"),
     ), seed=8),
     Scene("mirror", mirror, ("object.vertex_positions", "object.bsdf.k.value", "sky.to_world", FLOOR), (
-        case("primal"), case("sweep"), case("replay", noise=0.1), case("forward"), case("pixels"), case("tape"),
+        case("primal"), case("sweep"), case("replay", jacobian_noise=0.1), case("forward"), case("pixels"),
+        case("tape"),
     )),
     Scene("turning", turning, ("metal.to_world", "metal.bsdf.brdf_0.alpha.value", "block.vertex_positions", FLOOR), (
         case("primal"), case("sweep", attach="all"), case("sweep", sensor=GAUSSIAN), case("replay", attach="all"),
@@ -446,8 +447,8 @@ SCENES = (
         case("tape"), case("tape-forward"), case("rb"),
     )),
     Scene("cloud", cloud, (*CLOUD, "kernel.bsdf.reflectance.value", "sky.data"), (
-        case("primal"), case("sweep"), case("sweep", *STEADY, passes=3), case("sweep", passes=2, branch=False),
-        case("replay", branch=True), case("forward"), case("listing", *LISTED), case("tape"),
+        case("primal"), case("sweep"), case("sweep", *STEADY, passes=3), case("sweep", passes=2, null_branching=False),
+        case("replay", null_branching=True), case("forward"), case("listing", *LISTED), case("tape"),
     )),
     Scene("rainbow", rainbow, (*RAINBOW, "beside.interior_medium.sigma_t.data"), (
         case("primal"), case("sweep", passes=2), case("replay"), case("forward"),

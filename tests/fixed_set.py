@@ -22,6 +22,7 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
+from pathreplay import baselines
 from pathreplay.platform.backend import set_variant  # before drjit and mitsuba
 
 import drjit as dr  # isort: skip
@@ -34,15 +35,15 @@ VARIANT = "llvm_ad_rgb"
 LIMIT = 1e-5
 """Of the relative L1 error of an array: float32 sums in another order stay well below."""
 PLUGINS: dict[str, tuple[str, dict[str, Any]]] = {
-    "primal": ("pathreplay", {"edges": "none"}),
-    "sweep": ("pathreplay", {"driver": "sweep", "edges": "none"}),
-    "replay": ("pathreplay", {"driver": "replay", "edges": "none"}),
-    "forward": ("pathreplay", {"edges": "none"}),
-    "pixels": ("pathreplay", {"driver": "sweep", "edges": "none"}),
-    "tape": ("pathreplay_tape", {}),
-    "tape-forward": ("pathreplay_tape", {}),
-    "rb": ("pathreplay_rb", {}),
-    "listing": ("pathreplay_listing", {}),
+    "primal": ("pathreplay", {"boundary": "none"}),
+    "sweep": ("pathreplay", {"adjoint": "recorded", "boundary": "none"}),
+    "replay": ("pathreplay", {"adjoint": "replay", "boundary": "none"}),
+    "forward": ("pathreplay", {"boundary": "none"}),
+    "pixels": ("pathreplay", {"adjoint": "recorded", "boundary": "none"}),
+    "tape": ("naive_ad", {}),
+    "tape-forward": ("naive_ad", {}),
+    "rb": ("radiative_backprop", {}),
+    "listing": ("prb_volume_listing", {}),
 }
 Arrays = dict[str, np.ndarray]
 
@@ -221,6 +222,7 @@ def main() -> int:
     parser.add_argument("--save", action="store_true")
     options = parser.parse_args()
     set_variant(VARIANT)
+    baselines.register()
     mi.set_log_level(mi.LogLevel.Error)
     if options.save:
         save()

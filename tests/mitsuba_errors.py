@@ -4,7 +4,7 @@ There an integrator passes with its picture, its forward derivative value by val
 derivative against their sum: 24 configurations, 72 tests. References are made as there, by `path` with 12 000 samples
 per pixel and common random numbers on both sides. Steps may be larger, since derivatives are taken all along a step.
 
-    python tests/mitsuba_errors.py [--full] [--edges none] [NAME ...]
+    python tests/mitsuba_errors.py [--full] [--boundary none] [NAME ...]
 
 prints what is found. Films are small, which is stricter: edges take a larger share of their pixels. `--full` takes
 Mitsuba's films, and half an hour.
@@ -112,12 +112,12 @@ class Setup(Objective):
         return np.array([picture(seed + k, spp // passes) for k in range(passes)])
 
 
-def measure(config: Config, full: bool = False, edges: str = "all") -> Found:
+def measure(config: Config, full: bool = False, boundary: str = "all") -> Found:
     """Errors of pathreplay's picture, forward and reverse derivative."""
     size = config.res if full else min(SMALL, config.res)
     setup = Setup(config, size)
     plain = mi.load_dict({"type": "path", "max_depth": config.depth})
-    ours = mi.load_dict({"type": "pathreplay", "max_depth": config.depth, "edges": edges})
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": config.depth, "boundary": boundary})
 
     wide = config.res // size
     reference_spp, spp = REFERENCE_SPP * wide ** min(config.rise, 1), config.spp * wide**config.rise
@@ -177,14 +177,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Errors on Mitsuba's own configurations, and its limits.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of a configuration: {', '.join(CONFIGS)}")
     parser.add_argument("--full", action="store_true", help="films of Mitsuba's size")
-    parser.add_argument("--edges", default="all", help="which edges: all, film or none")
+    parser.add_argument("--boundary", default="all", help="which boundary terms: all, primary or none")
     given = parser.parse_args()
     set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     print(HEAD)
     for name in given.names or CONFIGS:
         begun = time.time()
-        found = measure(CONFIGS[name], given.full, edges=given.edges)
+        found = measure(CONFIGS[name], given.full, boundary=given.boundary)
         print(f"{row(name, found, CONFIGS[name].limits)} ({time.time() - begun:.0f} s)", flush=True)
 
 

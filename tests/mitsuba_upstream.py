@@ -1,6 +1,6 @@
 """Mitsuba's own test of its derivatives, with its scenes, its references and its thresholds, for one integrator more.
 
-    python tests/mitsuba_upstream.py CHECKOUT [--plugin prb] [--edges none] [--seed 100] [NAME ...]
+    python tests/mitsuba_upstream.py CHECKOUT [--plugin prb] [--boundary none] [--seed 100] [NAME ...]
 
 takes `src/integrators/tests/test_ad_integrators.py` out of a checkout of Mitsuba 3.9.1 with its data, and prints for
 each of the 24 configurations how far picture, forward and reverse derivative are off: 72 tests. The tests in
@@ -139,8 +139,8 @@ def main() -> None:
     parser.add_argument("checkout", type=Path, help="folder of Mitsuba 3.9.1 with resources/data")
     parser.add_argument("names", nargs="*", metavar="NAME", help="of a configuration, such as 'crop_window'")
     parser.add_argument("--plugin", default="pathreplay", help="the integrator")
-    parser.add_argument("--edges", default="all", help="of pathreplay: all, film or none")
-    parser.add_argument("--edge-spp", type=int, default=0, help="of pathreplay: lines per pixel")
+    parser.add_argument("--boundary", default="all", help="of pathreplay: all, primary or none")
+    parser.add_argument("--boundary-spp", type=int, default=0, help="of pathreplay: lines per pixel")
     parser.add_argument("--share", type=float, default=1.0, help="of Mitsuba's samples: fewer are harder to pass with")
     parser.add_argument("--seed", type=int, default=0, help="the first of the passes' seeds")
     parser.add_argument("--again", type=int, default=0, metavar="N", help="only make references again, with N seeds")
@@ -148,7 +148,7 @@ def main() -> None:
     set_variant(VARIANT)
     mi.set_log_level(mi.LogLevel.Error)
     tests = upstream(given.checkout.resolve())
-    ours = {"edges": given.edges, "edge_spp": given.edge_spp} if given.plugin == "pathreplay" else {}
+    ours = {"boundary": given.boundary, "boundary_spp": given.boundary_spp} if given.plugin == "pathreplay" else {}
     options = {"type": given.plugin, **ours}
     kinds = (
         tests.BASIC_CONFIGS_LIST + tests.CONTINUOUS_BUT_NON_STATIC_GEOM_CONFIGS_LIST + tests.DISCONTINUOUS_CONFIGS_LIST

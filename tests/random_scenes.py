@@ -169,10 +169,10 @@ def run(count: int, first: int, collects: bool) -> None:
             set_variant(variant)
         scene = mi.load_dict(draw.scene(), optimize=False)
         if integrator is None or draw.rng.random() < 0.6:
-            options = {"max_depth": int(draw.rng.integers(2, 4)), "edges": draw.one("none", "film", "all")}
+            options = {"max_depth": int(draw.rng.integers(2, 4)), "boundary": draw.one("none", "primary", "all")}
             integrator = mi.load_dict({"type": "pathreplay", **options})
         key = draw.one(*keys_of(scene))
-        print(n, variant, integrator.edges, key, end=" ", flush=True)
+        print(n, variant, integrator.boundary, key, end=" ", flush=True)
         try:
             print([differentiate(scene, integrator, key, k) for k in range(2)], flush=True)
         except pathreplay.PathreplayError as error:

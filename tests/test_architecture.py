@@ -155,7 +155,7 @@ def picture(scene: mi.Scene, integrator: mi.Integrator) -> np.ndarray:
 
 
 def ours(max_depth: int = 4) -> mi.Integrator:
-    return mi.load_dict({"type": "pathreplay", "max_depth": max_depth, "numbers": "scene"})
+    return mi.load_dict({"type": "pathreplay", "max_depth": max_depth, "sampling": "scene"})
 
 
 def close(found: Any, expected: Any) -> None:

@@ -86,24 +86,24 @@ LISTED = [
 ]  # fmt: skip
 # Sums of some thousand float32 terms in another order.
 ROUNDING = 1e-4
-OWN = {"numbers": "scene"}  # rivals draw no others
+OWN = {"sampling": "scene"}  # baselines use no other sampler
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_the_tape_has_the_gradient_of_the_sweep(case: Case, opened) -> None:
     """With the same seed, while roulette plays."""
     b = opened(case)
-    sweep = b.backward(b.integrator(rr_depth=2, branch=False, **OWN), 1, 16)
+    sweep = b.backward(b.integrator(rr_depth=2, null_branching=False, **OWN), 1, 16)
     assert sweep != 0
-    assert b.backward(b.integrator("pathreplay_tape", rr_depth=2), 1, 16) == pytest.approx(sweep, rel=ROUNDING)
+    assert b.backward(b.integrator("naive_ad", rr_depth=2), 1, 16) == pytest.approx(sweep, rel=ROUNDING)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [TEXTURE, VERTICES, DENSITY, *SLOW], ids=lambda case: case.name)
 def test_the_tape_has_the_tangent_of_the_forward_driver(case: Case, opened) -> None:
     b = opened(case)
-    ours = b.forward(b.integrator(rr_depth=2, branch=False, **OWN), 1, 16)
-    tape = b.forward(b.integrator("pathreplay_tape", rr_depth=2), 1, 16)
+    ours = b.forward(b.integrator(rr_depth=2, null_branching=False, **OWN), 1, 16)
+    tape = b.forward(b.integrator("naive_ad", rr_depth=2), 1, 16)
     assert 0 < np.abs(ours).sum() and np.abs(tape - ours).sum() < ROUNDING * np.abs(ours).sum()
 
 
@@ -114,7 +114,7 @@ def test_radiative_backpropagation_is_right_and_its_linear_variant_is_not(case: 
     """Light that comes back from other surfaces or from the fog is not one."""
     b = opened(case)
     reference = b.reference(case.seeds)
-    variants = [b.integrator("pathreplay_rb", rr_depth=case.rr_depth, linear=linear) for linear in (False, True)]
+    variants = [b.integrator("radiative_backprop", rr_depth=case.rr_depth, linear=linear) for linear in (False, True)]
     right, wrong = (gap(b.backwards(variant), reference) for variant in variants)
     assert max(right.error, wrong.error) < RESOLUTION * abs(reference.mean())
     assert abs(right.z) < Z_LIMIT
@@ -126,18 +126,18 @@ def test_delta_tracking_as_listed_is_right_where_collisions_are_drawn(case: Case
     """By the density its transmittance is another estimate; all else is that of the forward driver, path by path."""
     b = opened(case)
     reference = b.reference(case.seeds)
-    listing = b.integrator("pathreplay_listing", rr_depth=case.rr_depth)
+    listing = b.integrator("prb_volume_listing", rr_depth=case.rr_depth)
     found = gap(b.backwards(listing), reference)
     assert found.error < RESOLUTION * abs(reference.mean())
     assert abs(found.z) < Z_LIMIT
     if case.name != "listed density":
         steady = {"rr_depth": 1000}
         tangent = b.dot(b.forward(b.integrator(**steady, **OWN), 1, 16))
-        again = b.backward(b.integrator("pathreplay_listing", **steady), 1, 16)
+        again = b.backward(b.integrator("prb_volume_listing", **steady), 1, 16)
         assert again == pytest.approx(tangent, rel=ROUNDING)
 
 
-@pytest.mark.parametrize("plugin", ["pathreplay_tape", "pathreplay_rb", "pathreplay_listing"])
+@pytest.mark.parametrize("plugin", ["naive_ad", "radiative_backprop", "prb_volume_listing"])
 def test_images_are_those_of_pathreplay(plugin: str, opened) -> None:
     b = opened(TEXTURE)
     assert np.array_equal(b.image(b.integrator(plugin), 1, 4), b.image(b.integrator(**OWN), 1, 4))
@@ -146,10 +146,9 @@ def test_images_are_those_of_pathreplay(plugin: str, opened) -> None:
 @pytest.mark.parametrize(
     ("plugin", "properties", "words"),
     [
-        ("pathreplay_tape", {"max_depth": -2}, ["pathreplay_tape", "max_depth = -2", "-1"]),
-        ("pathreplay_rb", {"rr_depth": 0}, ["pathreplay_rb", "rr_depth = 0"]),
-        ("pathreplay_tape", {"attach": "all"}, ["attach = 'all'", "'delta'"]),
-        ("pathreplay", {"volume_gradient": "listing"}, ["volume_gradient", "'pathreplay_listing'"]),
+        ("naive_ad", {"max_depth": -2}, ["naive_ad", "max_depth = -2", "-1"]),
+        ("radiative_backprop", {"rr_depth": 0}, ["radiative_backprop", "rr_depth = 0"]),
+        ("naive_ad", {"attach": "all"}, ["attach = 'all'", "'delta'"]),
     ],
 )
 def test_bad_properties_are_named_with_the_way_out(plugin: str, properties: dict, words: list[str]) -> None:
@@ -160,8 +159,18 @@ def test_bad_properties_are_named_with_the_way_out(plugin: str, properties: dict
 
 def test_radiative_backpropagation_says_what_it_cannot_do(opened) -> None:
     b = opened(VERTICES)
-    rb = b.integrator("pathreplay_rb")
+    rb = b.integrator("radiative_backprop")
     with pytest.raises(PathreplayError, match="no forward mode"):
         b.forward(rb, 1, 1)
     with pytest.raises(PathreplayError, match="no parameter with gradients reaches"):
         b.backward(rb, 1, 1)
+
+
+def test_they_are_registered_on_request(run_python) -> None:
+    load = "mi.load_dict({'type': 'naive_ad'})"
+    result = run_python(
+        "import pathreplay, mitsuba as mi; mi.set_variant('llvm_ad_rgb')\n"
+        f"try: {load}\nexcept Exception as error: print('naive_ad' in str(error))\n"
+        f"pathreplay.baselines.register(); {load}; mi.set_variant('llvm_ad_mono'); {load}; print('registered')\n"
+    )
+    assert result.stdout.split() == ["True", "registered"], result

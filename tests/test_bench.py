@@ -278,7 +278,7 @@ def test_plots_are_drawn_from_records(tmp_path: Path) -> None:
     by_depth = [
         point(method, n / 4, scene=scene, max_depth=n, peak_mib=100.0 + n)
         for scene in (depth.SURFACES, depth.MEDIA)
-        for method in ("sweep", "prb", "rb")
+        for method in ("sweep", "prb", "RB")
         for n in sizes
     ]
     clouds = [point(m, 0.5 if m == "score" else 1, scene="cloud", parameters=(media.DENSITY,)) for m in media.METHODS]
@@ -288,7 +288,7 @@ def test_plots_are_drawn_from_records(tmp_path: Path) -> None:
         for n in (3, 6)
     ]
     known = {
-        "depth": record(*by_depth, replace(by_depth[0], method="tape", error="died: SIGKILL"), task="depth"),
+        "depth": record(*by_depth, replace(by_depth[0], method="naive AD", error="died: SIGKILL"), task="depth"),
         "media": record(*clouds, task="media"),
         "noise": record(*errors, task="noise"),
     }

@@ -119,7 +119,7 @@ def test_a_pinhole_that_turns_leaves_no_rest(pose: str, rest: bool, tmp_path: Pa
 @pytest.mark.slow
 def test_the_rest_of_a_camera_that_turns_is_rounding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     objective = loaded(POSES["turns"](tmp_path), tmp_path)
-    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": "film"})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "boundary": "primary"})
     monkeypatch.setattr(film_flow, "_is_carried", lambda sensor: True)
     whole = objective.backward(integrator, 1, 64)
     monkeypatch.setattr(FilmMotion, "backward", lambda *_: TermResult(moves=True))

@@ -77,7 +77,7 @@ UNRESOLVED = {"pinhole.principal_point_offset_y", "lens.aperture_radius", "lens.
 def test_the_gradient_agrees_with_finite_differences(scene: Any, key: str, sensor: int) -> None:
     # What the lens blurs averages out over a picture: little gradient, many samples.
     spp = 8192 if key in ("lens.aperture_radius", "lens.focus_distance") else 512
-    interior = {"type": "pathreplay", "max_depth": 2, "edges": "none"}  # nothing else is in view
+    interior = {"type": "pathreplay", "max_depth": 2, "boundary": "none"}  # nothing else is in view
     result = check_gradient(scene, key, integrator=interior, sensor=sensor, seeds=6, spp=spp)
     assert result.verdict == "pass", str(result)
     if key in ("sun.to_world", "sky.to_world"):

@@ -77,7 +77,7 @@ def test_nothing_is_cast_where_nothing_is_known_to_move() -> None:
     params.update()
     with dr.suspend_grad():
         assert not casters(informed(scene)[1])
-    ours = mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": "all"})
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": 3, "boundary": "all"})
     dr.backward(dr.sum(mi.render(scene, params, integrator=ours, spp=4), axis=None))
     assert np.isfinite(np.array(dr.grad(place).matrix)).all()
 

@@ -53,9 +53,9 @@ def test_a_job_without_integrator_has_the_depth_and_options_of_the_scenes() -> N
     found = problem()
     assert type(found.integrator).__name__ == "PathReplayIntegrator"
     assert read_limits(found.integrator) == Limits(2, 5, True)
-    options = '<string name="edges" value="film"/><string name="driver" value="replay"/>'
+    options = '<string name="boundary" value="primary"/><string name="adjoint" value="replay"/>'
     ours = problem("pathreplay", options).integrator
-    assert (ours.edges, ours.driver, read_limits(ours)) == ("film", "replay", Limits(2, 5, True))
+    assert (ours.boundary, ours.adjoint, read_limits(ours)) == ("primary", "replay", Limits(2, 5, True))
     assert read_limits(problem(integrator={"type": "pathreplay"}).integrator) == Limits(6, 5, False)
 
 

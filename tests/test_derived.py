@@ -144,7 +144,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def config(parameters: list[dict[str, Any]], derived: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
     return {
         "scene": "room.xml",
-        "integrator": {"type": "pathreplay", "max_depth": 3, "edges": "none"},
+        "integrator": {"type": "pathreplay", "max_depth": 3, "boundary": "none"},
         "spp": 8,
         "eval_spp": 16,
         "iterations": 4,
@@ -230,7 +230,7 @@ MOTIONS = {
 @pytest.mark.parametrize("name", MOTIONS)
 def test_motions_are_differentiated_through_the_function(name: str) -> None:
     parameter, derived, entry, h = MOTIONS[name]
-    edges = {"type": "pathreplay", "max_depth": 3, "edges": "all"}
+    edges = {"type": "pathreplay", "max_depth": 3, "boundary": "all"}
     problem = problem_of([parameter], [derived], integrator=edges)
     expected = difference(problem, parameter["key"], entry, h, 4096)
     found = [gradients(problem, seed)[parameter["key"]].flat[entry] for seed in range(48)]

@@ -113,7 +113,7 @@ def test_what_must_be_recorded_is_refused_before_anything_is_launched(pretend: A
     pretend(LAPTOP)
     most = deepest(walk_of(room()), LAPTOP)
     with pytest.raises(PathreplayError, match=rf"more than the sweep driver can hold \({most}\)"):
-        gradient(mi.load_dict({"type": "pathreplay", "max_depth": 1500, "driver": "sweep"}))
+        gradient(mi.load_dict({"type": "pathreplay", "max_depth": 1500, "adjoint": "recorded"}))
 
 
 def test_pixels_are_swept_where_a_lane_holds_their_paths(pretend: Any) -> None:

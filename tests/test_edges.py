@@ -232,8 +232,8 @@ def test_one_line_of_one_pixel_finds_its_place() -> None:
 
 @pytest.mark.parametrize("attach", ["all", "none"])
 def test_edges_of_what_follows_its_samples_are_refused(attach: str) -> None:
-    with pytest.raises(RuntimeError, match=f"edges = 'film' with attach = '{attach}'"):
-        mi.load_dict({"type": "pathreplay", "edges": "film", "attach": attach})
+    with pytest.raises(RuntimeError, match=f"boundary = 'primary' with attach = '{attach}'"):
+        mi.load_dict({"type": "pathreplay", "boundary": "primary", "attach": attach})
 
 
 def test_where_nothing_moves_nothing_is_added() -> None:
@@ -242,7 +242,7 @@ def test_where_nothing_moves_nothing_is_added() -> None:
     for edges in ("none", "all", "auto"):
         scene = world()
         params = mi.traverse(scene)
-        integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": edges})
+        integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "boundary": edges})
         key = "square.bsdf.reflectance.value"
         dr.enable_grad(params[key])
         params.update()

@@ -127,24 +127,24 @@ def test_all_edges_are_differentiated_where_one_moves(log: list[str]) -> None:
     scene = mi.load_dict({"type": "scene", "cam": ROOM["cam"], "card": {"type": "rectangle"}, "sky": sky})
     by_itself, told = ours(), ours()
     told.told.add(EDGES)  # as in a job, which says it in its report
-    ways = by_itself, by_itself, told, ours(edges="all"), ours(edges="none")
+    ways = by_itself, by_itself, told, ours(boundary="all"), ours(boundary="none")
     default, again, quiet, every, none = (gradient(scene, "card.to_world", way)[0] for way in ways)
     assert all(np.array_equal(default, same) for same in (again, quiet, every))
     assert not np.allclose(default, none, rtol=1e-2)
-    assert len([line for line in log if "edges = 'none' of the integrator leaves them out" in line]) == 1
+    assert len([line for line in log if "boundary = 'none' of the integrator leaves them out" in line]) == 1
 
 
 def test_nothing_is_traced_where_only_paint_moves(room: mi.Scene) -> None:
     """The same bits from as many kernels, for texture coordinates too, with which paths do move."""
     for key in ("wall.bsdf.reflectance.value", "card.vertex_texcoords"):
-        (default, few), (none, as_few) = (gradient(room, key, way) for way in (ours(), ours(edges="none")))
+        (default, few), (none, as_few) = (gradient(room, key, way) for way in (ours(), ours(boundary="none")))
         assert np.array_equal(default, none) and few == as_few
 
 
 @pytest.mark.parametrize("attach", ["all", "none"])
 def test_other_ways_to_attach_have_no_edges(attach: str) -> None:
     integrator = mi.load_dict({"type": "pathreplay", "attach": attach})
-    assert integrator.edges == "none" and len(integrator.terms) == 1
+    assert integrator.boundary == "none" and len(integrator.terms) == 1
 
 
 def test_a_batch_of_sensors_goes_without_and_that_is_told_once(log: list[str]) -> None:
@@ -152,7 +152,7 @@ def test_a_batch_of_sensors_goes_without_and_that_is_told_once(log: list[str]) -
     batch = {"type": "batch", "film": {**FILM, "width": 16}, **cameras}
     scene = mi.load_dict({**ROOM, "cam": batch}, optimize=False)
     found = []
-    for integrator in (ours(), ours(edges="none")):
+    for integrator in (ours(), ours(boundary="none")):
         with attached(scene, "card.vertex_positions") as value, one_thread(True):
             for _ in range(2):
                 dr.clear_grad(value)
@@ -180,6 +180,6 @@ def test_a_sky_that_turns_moves_edges() -> None:
         optimize=False,
     )
     options = {"seeds": 8, "spp": 512, "fd_spp": 4096}
-    ways = ours(), ours(edges="none")
+    ways = ours(), ours(boundary="none")
     found, without = (check_gradient(scene, "sky.to_world", integrator=way, **options) for way in ways)
     assert found.verdict == "pass" and without.verdict == "fail", (str(found), str(without))

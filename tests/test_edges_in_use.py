@@ -37,7 +37,7 @@ BODY = {
 JOB: dict[str, Any] = {
     "scene": "silhouettes",
     "scene_parameters": {"resolution": 16},
-    "integrator": {"type": "pathreplay", "max_depth": 2, "edges": "film"},
+    "integrator": {"type": "pathreplay", "max_depth": 2, "boundary": "primary"},
     "iterations": 2,
     "spp": 8,
     "eval_spp": 16,
@@ -54,18 +54,24 @@ def run(**changes: Any) -> Any:
 
 
 BAD = {
-    "of another integrator": ({"type": "prb", "edges": "all"}, "'edges' is an option of the integrator 'pathreplay'"),
-    "unknown": ({"type": "pathreplay", "edges": "outline"}, "edges = 'outline' is unknown: use one of 'auto', 'none'"),
+    "of another integrator": (
+        {"type": "prb", "boundary": "all"},
+        "'boundary' is an option of the integrator 'pathreplay'",
+    ),
+    "unknown": (
+        {"type": "pathreplay", "boundary": "outline"},
+        "boundary = 'outline' is unknown: use one of 'auto', 'none'",
+    ),
     "below zero": (
-        {"type": "pathreplay", "edges": "all", "edge_spp": -1},
-        "edge_spp = -1: use a number of lines per pixel >= 0",
+        {"type": "pathreplay", "boundary": "all", "boundary_spp": -1},
+        "boundary_spp = -1: use a number of segments per pixel >= 0",
     ),
     "half a line": (
-        {"type": "pathreplay", "edges": "all", "edge_spp": 1.5},
-        "edge_spp = 1.5: use a number of lines per pixel >= 0",
+        {"type": "pathreplay", "boundary": "all", "boundary_spp": 1.5},
+        "boundary_spp = 1.5: use a number of segments per pixel >= 0",
     ),
     "attached": (
-        {"type": "pathreplay", "edges": "all", "attach": "all"},
+        {"type": "pathreplay", "boundary": "all", "attach": "all"},
         "edges know what moves with attach = 'delta'",
     ),
 }
@@ -82,22 +88,22 @@ def test_what_does_not_fit_is_refused_in_one_line(case: str) -> None:
 
 def test_a_check_has_the_edges_that_one_asks_for() -> None:
     scene = load_scene("silhouettes", resolution=4)
-    asked = integrator_under_test(None, scene, edges={"edges": "film", "edge_spp": 3})
-    assert (asked.edges, asked.edge_spp, asked.max_depth) == ("film", 3, 2)
-    assert integrator_name(asked) == "pathreplay, edges film"
+    asked = integrator_under_test(None, scene, boundary={"boundary": "primary", "boundary_spp": 3})
+    assert (asked.boundary, asked.boundary_spp, asked.max_depth) == ("primary", 3, 2)
+    assert integrator_name(asked) == "pathreplay, boundary primary"
     assert integrator_name(integrator_under_test(None, scene)) == "pathreplay"
-    with pytest.raises(PathreplayError, match="'edges' is a property of 'pathreplay', and the integrator is 'prb'"):
-        integrator_under_test("prb", scene, edges={"edges": "all"})
-    with pytest.raises(PathreplayError, match="edges cannot be given along with a finished integrator"):
-        integrator_under_test(asked, scene, edges={"edges": "all"})
+    with pytest.raises(PathreplayError, match="'boundary' is a property of 'pathreplay', and the integrator is 'prb'"):
+        integrator_under_test("prb", scene, boundary={"boundary": "all"})
+    with pytest.raises(PathreplayError, match="boundary cannot be given along with a finished integrator"):
+        integrator_under_test(asked, scene, boundary={"boundary": "all"})
 
 
 def test_the_depth_of_a_check_leaves_the_edges_of_the_scene() -> None:
-    own = {"type": "pathreplay", "max_depth": 3, "edges": "all", "edge_spp": 5}
+    own = {"type": "pathreplay", "max_depth": 3, "boundary": "all", "boundary_spp": 5}
     scene = mi.load_dict({"type": "scene", "integrator": own})
     asked = integrator_under_test(None, scene, max_depth=2)
-    assert (asked.edges, asked.edge_spp, asked.max_depth) == ("all", 5, 2)
-    assert integrator_under_test(None, scene, edges={"edges": "none"}).edges == "none"
+    assert (asked.boundary, asked.boundary_spp, asked.max_depth) == ("all", 5, 2)
+    assert integrator_under_test(None, scene, boundary={"boundary": "none"}).boundary == "none"
 
 
 @pytest.mark.slow
@@ -105,7 +111,7 @@ def test_a_check_of_an_outline_passes_with_edges_and_fails_without() -> None:
     scene = ["check", "silhouettes", "--param", KEY, "--seeds", "6", "--spp", "256", "--fd-spp", "2048"]
     passed = CliRunner().invoke(app, scene)
     assert passed.exit_code == 0 and "pathreplay (backward)" in passed.output
-    failed = CliRunner().invoke(app, [*scene, "--edges", "none"])
+    failed = CliRunner().invoke(app, [*scene, "--boundary", "none"])
     assert failed.exit_code == 1 and "pathreplay, edges none (backward)" in failed.output
 
 
@@ -113,17 +119,17 @@ def test_a_check_of_an_outline_passes_with_edges_and_fails_without() -> None:
 
 
 @pytest.mark.parametrize(("edges", "told"), [
-    ("none", "silhouettes, shadows"), ("film", "soft shadows"), ("all", ""), ("auto", "several times as long"),
+    ("none", "silhouettes, shadows"), ("primary", "soft shadows"), ("all", ""), ("auto", "several times as long"),
 ])  # fmt: skip
 def test_a_job_says_what_its_edges_leave_out_or_cost(edges: str, told: str) -> None:
-    job = {**JOB, "integrator": {**JOB["integrator"], "edges": edges}}
+    job = {**JOB, "integrator": {**JOB["integrator"], "boundary": edges}}
     notes = " ".join(build_problem(make_config(job), Path.cwd()).notes)
     assert notes.count("docs/edges.md") == bool(told) and told in notes
 
 
 @pytest.mark.slow
 def test_errors_of_poses_are_in_the_history_and_beside_a_rivals() -> None:
-    result = run(baseline={**JOB["integrator"], "edges": "all"})
+    result = run(baseline={**JOB["integrator"], "boundary": "all"})
     lines = [json.loads(line) for line in (result.folder / "history.jsonl").read_text().splitlines()]
     error = result.poses[KEY]
     assert lines[-1]["errors"] == pytest.approx({f"{KEY}:position": error.position, f"{KEY}:degrees": error.degrees})

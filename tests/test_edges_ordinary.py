@@ -36,7 +36,7 @@ def hold_refusal(description: dict, edges: str, message: str) -> None:
     params = mi.traverse(scene)
     dr.enable_grad(params["square.to_world"])
     params.update()
-    integrator = mi.load_dict({"type": "pathreplay", "edges": edges, "max_depth": 2})
+    integrator = mi.load_dict({"type": "pathreplay", "boundary": edges, "max_depth": 2})
     with pytest.raises(PathreplayError, match=message):
         integrator.render_backward(scene, params, dr.ones(mi.TensorXf, (1, 2, 3)), spp=1)
 

@@ -45,7 +45,7 @@ def test_steps_with_edges_that_were_recorded_are_those_that_are_traced(way: str,
     (tmp_path / "scene.xml").write_text(SCENE.format(filter=FILTERS[way]))
     found = {}
     for edges, passes in (("auto", "recorded"), ("all", "traced"), ("none", "traced")):
-        config = make_config({**JOB, "integrator": {"type": "pathreplay", "max_depth": 2, "edges": edges}})
+        config = make_config({**JOB, "integrator": {"type": "pathreplay", "max_depth": 2, "boundary": edges}})
         found[edges, passes] = steps(build_problem(config, tmp_path), config, passes)
     recorded = found["auto", "recorded"]
     np.testing.assert_allclose(recorded, found["all", "traced"], rtol=1e-3)

@@ -71,7 +71,7 @@ def log() -> Any:
 @pytest.mark.parametrize("key", ["cube.vertex_positions", "lamp.position", "sky.to_world", "sky.data"])
 def test_a_script_is_told_once(key: str, log: Any) -> None:
     scene = make_scene()
-    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2, "edges": "none"})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2, "boundary": "none"})
     params = mi.traverse(scene)
     value = type(params[key])(params[key])
     dr.enable_grad(value)
@@ -108,7 +108,7 @@ def run(parameter: dict[str, Any], integrator: dict[str, Any] | None = None, **t
 
 
 @pytest.mark.parametrize(("integrator", "parameter", "told"), [
-    ({"type": "pathreplay", "edges": "none"}, MOVED, True), ({"type": "prb"}, MOVED, True),
+    ({"type": "pathreplay", "boundary": "none"}, MOVED, True), ({"type": "prb"}, MOVED, True),
     ({"type": "pathreplay"}, PAINTED, False),
 ])  # fmt: skip
 def test_a_job_is_told_in_its_report_and_not_in_the_log_too(

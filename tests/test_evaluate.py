@@ -20,7 +20,7 @@ from pathreplay.platform.threads import one_thread
 from test_deterministic import CLOUD
 from test_inverse_run import JOB, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
 
-SWEEP = {"integrator": {"type": "pathreplay", "max_depth": 3, "edges": "none"}}
+SWEEP = {"integrator": {"type": "pathreplay", "max_depth": 3, "boundary": "none"}}
 POSE = {
     "parameters": [{"key": "wall.to_world", "pose": "rigid", "initial": {"translation": [0.1, 0, 0]}}],
     "target": {"values": {}, "scene": "room.xml", "spp": 8},

@@ -64,13 +64,13 @@ def _results(way: str, key: str, **options: object) -> np.ndarray:
 
 WAYS = {
     "sweep": ("backward", WALL, {}),
-    "replay": ("backward", WALL, {"driver": "replay"}),
+    "replay": ("backward", WALL, {"adjoint": "replay"}),
     "forward": ("forward", WALL, {}),
     "pixels": ("pixels", WALL, {}),
     "what moves": ("backward", LIGHT, {}),
     "medium": ("backward", DENSITY, {}),
     "medium, forward": ("forward", DENSITY, {}),
-    "medium, replay": ("backward", DENSITY, {"driver": "replay"}),
+    "medium, replay": ("backward", DENSITY, {"adjoint": "replay"}),
 }
 ALL = ("loops", "calls", "conditionals")
 QUICK = ("sweep",)

@@ -17,9 +17,9 @@ from pathreplay.samplers.owen_sobol import OwenSobolSampler, in_order, key_of
 from pathreplay.samplers.pixel_samples import SETS
 
 METHODS: dict[str, dict[str, Any]] = {
-    "even": {"type": "pathreplay"},
-    "scene": {"type": "pathreplay", "numbers": "scene"},
-    "replay": {"type": "pathreplay", "driver": "replay"},
+    "sobol": {"type": "pathreplay"},
+    "scene": {"type": "pathreplay", "sampling": "scene"},
+    "replay": {"type": "pathreplay", "adjoint": "replay"},
     "path": {"type": "path"},
 }
 POINTS = 256
@@ -125,7 +125,7 @@ def means(method: str, spp: int, seeds: int, sampler: str = "independent") -> np
 
 @pytest.mark.parametrize("spp", [1, 5, 8])
 def test_pictures_are_those_of_path_with_less_noise(spp: int) -> None:
-    ours, theirs = means("even", spp, 64), means("path", spp, 64)
+    ours, theirs = means("sobol", spp, 64), means("path", spp, 64)
     variances = [pictures.var(axis=0, ddof=1) for pictures in (ours, theirs)]
     error = np.sqrt((variances[0] + variances[1]) / 64)
     z = (ours.mean(axis=0) - theirs.mean(axis=0))[error > 0] / error[error > 0]
@@ -138,7 +138,7 @@ def test_pictures_are_those_of_path_with_less_noise(spp: int) -> None:
 
 @pytest.mark.parametrize("sampler", ["stratified", "multijitter", "ldsampler"])
 def test_other_samplers_are_taken_as_they_are(sampler: str) -> None:
-    ours, theirs = means("even", 16, 1, sampler), means("path", 16, 1, sampler)
+    ours, theirs = means("sobol", 16, 1, sampler), means("path", 16, 1, sampler)
     assert ours == pytest.approx(theirs, rel=1e-3, abs=1e-4)
 
 
@@ -183,16 +183,16 @@ def require_same_mean(a: np.ndarray, b: np.ndarray) -> None:
 
 
 def test_gradients_have_less_noise() -> None:
-    even, plain = (gradients(method, scene(16), COLOUR, range(SEEDS)) for method in ("even", "scene"))
+    even, plain = (gradients(method, scene(16), COLOUR, range(SEEDS)) for method in ("sobol", "scene"))
     assert even.var(axis=0, ddof=1).max() < 0.4 * plain.var(axis=0, ddof=1).min()
     require_same_mean(even, plain)
 
 
 def test_both_drivers_and_forward_mode_see_the_same_paths() -> None:
     made = scene(16)
-    sweep, replay = (gradients(method, made, COLOUR, range(2)) for method in ("even", "replay"))
+    sweep, replay = (gradients(method, made, COLOUR, range(2)) for method in ("sobol", "replay"))
     assert replay == pytest.approx(sweep, rel=1e-4)
-    params, integrator = mi.traverse(made), mi.load_dict({**METHODS["even"], "max_depth": 3})
+    params, integrator = mi.traverse(made), mi.load_dict({**METHODS["sobol"], "max_depth": 3})
     dr.enable_grad(params[COLOUR])
     dr.set_grad(params[COLOUR], 1)
     params.update()
@@ -218,7 +218,7 @@ def judged(method: str, made: mi.Scene, spp: int, seeds: range) -> np.ndarray:
 def test_pixels_that_are_swept_are_judged_by_others(spp: int) -> None:
     """A path that were judged by its own set would count its own noise: with few samples far above that of the mean."""
     made = scene(spp)
-    even, plain = judged("even", made, spp, range(80)), judged("scene", made, spp, range(80))
+    even, plain = judged("sobol", made, spp, range(80)), judged("scene", made, spp, range(80))
     require_same_mean(even, plain)
     assert even.var(axis=0).mean() < 0.7 * plain.var(axis=0).mean()
 
@@ -240,7 +240,7 @@ def test_media_have_the_same_means(depth: int) -> None:
         }
     )  # fmt: skip
     key = "cloud.interior_medium.sigma_t.data"
-    even, plain = (gradients(m, made, key, range(SEEDS), max_depth=depth) for m in ("even", "scene"))
+    even, plain = (gradients(m, made, key, range(SEEDS), max_depth=depth) for m in ("sobol", "scene"))
     require_same_mean(even, plain)
 
 
@@ -260,14 +260,14 @@ def test_jobs_have_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_another_word_is_refused() -> None:
-    with pytest.raises(Exception, match="numbers = 'odd' is unknown: use one of 'scene', 'even'"):
-        mi.load_dict({"type": "pathreplay", "numbers": "odd"})
+    with pytest.raises(Exception, match="sampling = 'odd' is unknown: use one of 'scene', 'sobol'"):
+        mi.load_dict({"type": "pathreplay", "sampling": "odd"})
 
 
 @pytest.mark.parametrize("seed", [int, mi.UInt32])
 def test_another_seed_is_no_other_kernel(seed: type) -> None:
     gc.collect()  # Dr.Jit traces calls through all scenes alive: one that goes between the two makes another kernel
-    made, integrator = scene(4), mi.load_dict({**METHODS["even"], "max_depth": 3})
+    made, integrator = scene(4), mi.load_dict({**METHODS["sobol"], "max_depth": 3})
     dr.eval(mi.render(made, integrator=integrator, spp=4, seed=seed(1)))
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()

@@ -203,7 +203,7 @@ def test_a_value_that_does_not_come_back_is_told(tmp_path: Path) -> None:
     ("wanted", "plain"),
     [
         ({"type": "pathreplay"}, {"type": "path", "max_depth": 6}),
-        ({"type": "pathreplay", "max_depth": 3, "edges": "all"}, {"type": "path", "max_depth": 3}),
+        ({"type": "pathreplay", "max_depth": 3, "boundary": "all"}, {"type": "path", "max_depth": 3}),
         ({"type": "direct_projective", "sppi": 0}, {"type": "path", "max_depth": 2}),
         ({"type": "direct", "emitter_samples": 2}, {"type": "direct", "emitter_samples": 2}),
         (None, {"type": "path", "max_depth": 8}),
@@ -328,7 +328,7 @@ def test_a_volume_and_a_mesh_of_runs_come_out(tmp_path: Path, monkeypatch: pytes
     for name, (arguments, parameter, plain) in jobs.items():
         job = {
             "scene": name, "scene_parameters": {"resolution": 8, **arguments}, "parameters": [parameter], "spp": 4,
-            "iterations": 1, "eval_spp": 4, "integrator": {"type": "pathreplay", "max_depth": 4, "edges": "none"},
+            "iterations": 1, "eval_spp": 4, "integrator": {"type": "pathreplay", "max_depth": 4, "boundary": "none"},
             "target": {"scene": name, "scene_parameters": {"resolution": 8, **arguments}, "spp": 4},
         }  # fmt: skip
         job["target"]["integrator"] = {"type": plain, "max_depth": 4}

@@ -57,4 +57,8 @@ def test_items_run_in_processes_of_their_own(tmp_path: Path) -> None:
 
 def test_all_kinds_of_scenes_and_all_drivers_are_there() -> None:
     assert {scene for scene, *_ in TRUTHS.values()} >= {"cornell-box", "glass-pane", "cloud"}
-    assert {options.get("driver", options["type"]) for options, *_ in TIMINGS.values()} == {"prb", "sweep", "replay"}
+    assert {options.get("adjoint", options["type"]) for options, *_ in TIMINGS.values()} == {
+        "prb",
+        "recorded",
+        "replay",
+    }

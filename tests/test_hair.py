@@ -49,7 +49,7 @@ def test_its_pigments_can_be_optimised_and_exported(edges: str) -> None:
     parameters = [{"key": KEY, "initial": 0.5}, *([pose] if edges == "all" else [])]
     job = {
         "scene": "hair.xml", "parameters": parameters, "iterations": 2, "spp": 2, "eval_spp": 2, "output": "run",
-        "integrator": {"type": "pathreplay", "max_depth": 2, "edges": edges},
+        "integrator": {"type": "pathreplay", "max_depth": 2, "boundary": edges},
         "target": {"values": {KEY: 0.3}, "spp": 4},
     }  # fmt: skip
     optimize(make_config(job), progress=False)

@@ -29,17 +29,19 @@ def plugin(**properties):
     [
         ({"max_depth": -2}, ["max_depth = -2", "-1"]),
         ({"rr_depth": 0}, ["rr_depth = 0"]),
-        ({"driver": "swep"}, ["driver = 'swep'", "'sweep'"]),
+        ({"adjoint": "recordedd"}, ["adjoint = 'recordedd'", "'recorded'"]),
+        ({"driver": "replay"}, ["'driver'", "it is called 'adjoint' now"]),
+        ({"edges": "film"}, ["'edges'", "it is called 'boundary' now"]),
         ({"attach": "some"}, ["attach = 'some'", "'delta'"]),
-        ({"driver": "sweep", "max_depth": 5000}, ["max_depth = 5000", "2048", "'replay'"]),
-        ({"driver": "sweep", "max_depth": -1}, ["unbounded", "'replay'"]),
-        ({"noise": -1.0}, ["noise = -1"]),
-        ({"noise": math.nan}, ["noise = nan", "finite"]),
-        ({"noise": "0.1"}, ["noise = '0.1'", ">= 0"]),
-        ({"noise": True}, ["noise = True", ">= 0"]),
+        ({"adjoint": "recorded", "max_depth": 5000}, ["max_depth = 5000", "2048", "'replay'"]),
+        ({"adjoint": "recorded", "max_depth": -1}, ["unbounded", "'replay'"]),
+        ({"jacobian_noise": -1.0}, ["jacobian_noise = -1"]),
+        ({"jacobian_noise": math.nan}, ["jacobian_noise = nan", "finite"]),
+        ({"jacobian_noise": "0.1"}, ["jacobian_noise = '0.1'", ">= 0"]),
+        ({"jacobian_noise": True}, ["jacobian_noise = True", ">= 0"]),
         ({"hide_emitters": 1}, ["hide_emitters = 1", "true or false"]),
         ({"hide_emitters": "yes"}, ["hide_emitters = 'yes'", "true or false"]),
-        ({"branch": 1}, ["branch = 1", "'auto'"]),
+        ({"null_branching": 1}, ["null_branching = 1", "'auto'"]),
         *(
             ({name: value}, [f"pathreplay: {name} = {shown}: use ", "whole number"])
             for name in ("max_depth", "rr_depth")
@@ -67,7 +69,7 @@ def test_bad_properties_are_named_with_the_way_out(properties, words) -> None:
         ('<float name="max_depth" value="6"/>', "max_depth = 6.0: use -1 (unbounded) or a depth >= 0"),
         ('<boolean name="rr_depth" value="true"/>', "rr_depth = True: use a depth >= 1"),
         ('<string name="hide_emitters" value="no"/>', "hide_emitters = 'no': use true or false"),
-        ('<rgb name="noise" value="1, 2, 3"/>', "noise = "),
+        ('<rgb name="jacobian_noise" value="1, 2, 3"/>', "jacobian_noise = "),
     ],
 )
 def test_properties_of_wrong_types_in_a_file_are_named(line: str, words: str) -> None:
@@ -89,10 +91,10 @@ def test_none_is_told_where_mitsuba_would_die() -> None:
 
 
 def test_auto_sweeps_where_the_record_fits() -> None:
-    assert plugin().driver == "sweep"
-    assert plugin(max_depth=2048).driver == "sweep"
-    assert plugin(max_depth=2049).driver == "replay"
-    assert plugin(max_depth=-1).driver == "replay"
+    assert plugin().adjoint == "recorded"
+    assert plugin(max_depth=2048).adjoint == "recorded"
+    assert plugin(max_depth=2049).adjoint == "replay"
+    assert plugin(max_depth=-1).adjoint == "replay"
 
 
 def lamp_in_view(shape: str, near_clip: float = 0.01) -> mi.Scene:
@@ -175,10 +177,10 @@ def _gradient(scene, params, key, integrator, seed=3):
 ROUNDING = 1e-5
 
 
-@pytest.mark.parametrize("driver", ["sweep", "replay"])
-def test_one_thread_and_many_agree_and_a_seed_repeats(driver: str) -> None:
+@pytest.mark.parametrize("adjoint", ["recorded", "replay"])
+def test_one_thread_and_many_agree_and_a_seed_repeats(adjoint: str) -> None:
     scene, params, key = _textured()
-    integrator = plugin(driver=driver)
+    integrator = plugin(adjoint=adjoint)
     threads = dr.thread_count()
     try:
         dr.set_thread_count(max(2, threads))
@@ -222,10 +224,10 @@ def test_render_and_dr_backward_and_forward() -> None:
 def test_it_loads_from_xml() -> None:
     scene = mi.load_string(
         """<scene version="3.0.0"><integrator type="pathreplay"><integer name="max_depth" value="3"/>
-        <string name="driver" value="replay"/></integrator></scene>"""
+        <string name="adjoint" value="replay"/></integrator></scene>"""
     )
     assert scene.integrator().max_depth == 3
-    assert scene.integrator().driver == "replay"
+    assert scene.integrator().adjoint == "replay"
 
 
 def test_a_gradient_that_nothing_reaches_is_an_error() -> None:
@@ -282,8 +284,8 @@ import pathreplay, mitsuba as mi, drjit as dr, numpy as np
 mi.set_variant({variant!r})
 scene = mi.load_dict(mi.cornell_box()); params = mi.traverse(scene)
 key = next(k for k in params.keys() if k.startswith("red.reflectance"))
-for driver in ("sweep", "replay"):
-    integrator = mi.load_dict({{"type": "pathreplay", "driver": driver}})
+for adjoint in ("recorded", "replay"):
+    integrator = mi.load_dict({{"type": "pathreplay", "adjoint": adjoint}})
     sensor = scene.sensors()[0]
     dr.enable_grad(params[key]); params.update(); dr.set_grad(params[key], 1)
     f = np.array(integrator.render_forward(scene, params, seed=1, spp=1)).sum()
@@ -344,7 +346,7 @@ def _differentiate(scene, key, integrator, forward=False):
 def test_edges_behind_mirrors_are_told_once(log, forward: bool) -> None:
     scene = mi.load_dict(lit_room({"type": "dielectric_ad"}), optimize=False)
     for key, words in (("object.bsdf.eta", "edge of a light"), ("object.to_world", "moving edges")):
-        integrator = plugin(edges="none")
+        integrator = plugin(boundary="none")
         log.clear()
         for _ in range(2):
             _differentiate(scene, key, integrator, forward)

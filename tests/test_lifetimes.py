@@ -153,7 +153,7 @@ def test_a_frozen_step_of_a_user_in_any_order(order: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rendered", "edges"), [(False, "none"), (True, "none"), pytest.param(False, "film", marks=pytest.mark.slow)]
+    ("rendered", "edges"), [(False, "none"), (True, "none"), pytest.param(False, "primary", marks=pytest.mark.slow)]
 )
 def test_a_frozen_step_of_a_user_in_which_geometry_moves(rendered: bool, edges: str) -> None:
     """Parameters are set outside, as with `prb`; the same gradients as without a recording."""
@@ -165,7 +165,7 @@ def test_a_frozen_step_of_a_user_in_which_geometry_moves(rendered: bool, edges: 
         return dr.grad(params[key])
 
     def gradients(run: Any, first: bool) -> list[np.ndarray]:
-        scene, by = mi.load_dict(lit_box(cube8)(), optimize=False), integrator(edges=edges, max_depth=2)
+        scene, by = mi.load_dict(lit_box(cube8)(), optimize=False), integrator(boundary=edges, max_depth=2)
         params = mi.traverse(scene)
         params.keep(key)
         start, found = mi.Float(params[key]), []
@@ -251,7 +251,7 @@ from edge_scenes import BY_NAME
 for name in sys.argv[2:]:
     case = BY_NAME[name]
     scene = mi.load_dict(case.scene(), optimize=False)
-    integrator = mi.load_dict({"type": "pathreplay", "max_depth": case.depth, "edges": "all"})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": case.depth, "boundary": "all"})
     params, key = mi.traverse(scene), case.key
     for seed in range(3):
         t = mi.Float(0)

@@ -104,7 +104,7 @@ def test_it_sees_a_texture_that_a_lamp_shares_with_paint() -> None:
 def test_it_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     used = []
     monkeypatch.setattr(module, "emission_only", lambda *args: used.append(args) or emission_only(*args))
-    scene, named = world(), mi.load_dict({"type": "pathreplay", "max_depth": 2, "driver": "sweep"})
+    scene, named = world(), mi.load_dict({"type": "pathreplay", "max_depth": 2, "adjoint": "recorded"})
     for integrator, *keys in ((ours(2), LAMP), (ours(2), LAMP, FLOOR), (named, LAMP)):
         with attached(scene, *keys) as params:
             integrator.render_backward(scene, params, even(), seed=SEED, spp=SPP)

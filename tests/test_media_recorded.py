@@ -74,7 +74,7 @@ def test_recorded_steps_are_those_that_are_traced(name: str) -> None:
     hold(cloud(medium()), key)
 
 
-@pytest.mark.parametrize("options", [{"driver": "replay"}, {"branch": False}, {"edges": "all"}], ids=str)
+@pytest.mark.parametrize("options", [{"adjoint": "replay"}, {"null_branching": False}, {"boundary": "all"}], ids=str)
 def test_however_they_are_differentiated(options: dict[str, Any]) -> None:
     medium, key = MEDIA["grid"]
     hold(lit_floor(medium()), key, **options)

@@ -16,7 +16,7 @@ TRANSPOSE_MAX = 1e-5
 @pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in CONFIGS])
 def test_errors_are_below_the_limits(name: str) -> None:
     config = CONFIGS[name]
-    found = measure(config, edges="all")
+    found = measure(config, boundary="all")
     told = row(name, found, config.limits)
     assert not found.misses(config.limits), told
     # The limits allow much where the image is mostly dark.
@@ -27,5 +27,5 @@ def test_errors_are_below_the_limits(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EDGES)
 def test_without_edges_the_sum_is_wrong(name: str) -> None:
-    found = measure(CONFIGS[name], edges="none")
+    found = measure(CONFIGS[name], boundary="none")
     assert abs(found.z) > Z_LIMIT, row(name, found, CONFIGS[name].limits)

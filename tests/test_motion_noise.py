@@ -42,7 +42,7 @@ MANY = 192
 LARGEST = 0.5
 # The standard deviation of 48 normal numbers is within a factor of 1.6 of that of 192; rare large ones take it to 2.
 FEW, GROWTH = 48, 2.0
-INDEPENDENT = {"numbers": "scene"}  # where ways to take a derivative are compared, and nothing else
+INDEPENDENT = {"sampling": "scene"}  # where ways to take a derivative are compared, and nothing else
 
 
 # ------------------------------ Scenes that people have ------------------------------
@@ -226,7 +226,7 @@ def room_corner() -> dict:
     }  # fmt: skip
 
 
-MOVES = {"key": "camera.to_world", "move": translate(0.6, 0, 1), "depth": 2, "drivers": ("sweep",), "lanes": None}
+MOVES = {"key": "camera.to_world", "move": translate(0.6, 0, 1), "depth": 2, "drivers": ("recorded",), "lanes": None}
 NO_EDGES = [
     Case("wall without edges", glowing_wall, **MOVES, spp=512),
     Case("dome around the floor", glowing_dome, **MOVES, spp=256),
@@ -294,7 +294,7 @@ def test_narrow_lobes_follow_their_samples(lobe: str) -> None:
 def test_narrow_lobes_are_right(lobe: str, alpha: float) -> None:
     make, key, move = LOBES[lobe]
     hold(Case(f"{lobe}, roughness {alpha}", lambda: make(alpha), key, move, step=3e-3, spp=256, lanes=None,
-              drivers=("sweep",)))  # fmt: skip
+              drivers=("recorded",)))  # fmt: skip
 
 
 def outlines(scene: dict) -> bool:

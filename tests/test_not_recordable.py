@@ -39,7 +39,7 @@ POSE = {
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_what_cannot_be_recorded_is_traced(sensor: str, job: dict, tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text(SCENE.format(sensor=sensor, options=SENSORS[sensor]))
-    interior = {"type": "pathreplay", "edges": "none"}
+    interior = {"type": "pathreplay", "boundary": "none"}
     config = make_config({"scene": "scene.xml", "iterations": 4, "spp": 8, "integrator": interior, **job})
     problem = build_problem(config, tmp_path)
     np.testing.assert_allclose(steps(problem, config, "recorded"), steps(problem, config, "traced"), rtol=1e-4)

@@ -165,7 +165,7 @@ BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "unknown integrator option": (replace("max_depth", "max_dept"), ["max_dept"]),
     "integrator without gradients": (replace('"prb"', '"path"'), ["'path' computes no gradients", "pathreplay"]),
     "depth beyond the sweep": (
-        replace('{ type = "prb", max_depth = 3 }', '{ type = "pathreplay", max_depth = 100000, driver = "sweep" }'),
+        replace('{ type = "prb", max_depth = 3 }', '{ type = "pathreplay", max_depth = 100000, adjoint = "recorded" }'),
         ["100000", "replay"],
     ),
     "unknown sensor": (replace("spp = 1\ne", 'sensors = ["ear"]\ne'), ["'ear'", "eye"]),

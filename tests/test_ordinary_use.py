@@ -146,7 +146,7 @@ def test_numbers_of_the_scene(write: Write, tmp_path: Path, monkeypatch: pytest.
     use = write(tmp_path)
     (tmp_path / "scene.xml").write_text(use.xml, encoding="utf-8")
     job = job_of(use)
-    job["integrator"] = {**job["integrator"], "numbers": "scene"}
+    job["integrator"] = {**job["integrator"], "sampling": "scene"}
     (tmp_path / "job.toml").write_text(toml(job), encoding="utf-8")
     status, words = command(use.variant, "optimize", "job.toml", "--quiet")
     assert status == 0, words

@@ -32,7 +32,7 @@ def room(side: int = 4, sampler: str = "independent", rfilter: str = "box", move
 
 
 def integrator(**options: Any) -> Any:
-    return mi.load_dict({"type": "pathreplay", "max_depth": 3, "edges": "none", **options})
+    return mi.load_dict({"type": "pathreplay", "max_depth": 3, "boundary": "none", **options})
 
 
 def gradient(scene: mi.Scene, key: str, seed: Any, spp: int, grad_in: np.ndarray, **options: Any) -> np.ndarray:
@@ -167,8 +167,10 @@ def test_what_cannot_be_counted_is_told_before_anything_is_launched() -> None:
     with pytest.raises(PathreplayError, match=r"65536 x 65536 pixels, beyond the 4294967295 samples.*make it smaller"):
         integrator().render(scene, seed=1, spp=1)
     scene = mi.load_dict(room(moves=True) | {"light": {"type": "point", "position": [0, 0, 6], "intensity": 9.0}})
-    with pytest.raises(PathreplayError, match=r"edge_spp = 300000000 .* take edge_spp up to 268435455, or 0"):
-        gradient(scene, "ball.to_world", 1, 1, np.ones((4, 4, 3), np.float32), edges="film", edge_spp=300_000_000)
+    with pytest.raises(PathreplayError, match=r"boundary_spp = 300000000 .* take boundary_spp up to 268435455, or 0"):
+        gradient(
+            scene, "ball.to_world", 1, 1, np.ones((4, 4, 3), np.float32), boundary="primary", boundary_spp=300_000_000
+        )
 
 
 def test_what_would_take_hours_is_refused_before_anything_is_launched(monkeypatch: pytest.MonkeyPatch) -> None:

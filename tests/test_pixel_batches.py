@@ -136,7 +136,7 @@ JOB: dict[str, Any] = {
     "spp": 4,
     "iterations": 3,
     "scene_parameters": {"resolution": 16},
-    "integrator": {"type": "pathreplay", "max_depth": 3, "edges": "none"},
+    "integrator": {"type": "pathreplay", "max_depth": 3, "boundary": "none"},
     "pixel_batch_size": 40,
 }
 
@@ -198,7 +198,7 @@ def test_the_mean_of_batches_is_the_whole_where_all_is_rendered_alike(
     boxed = {"scene": "cornell-box-photo", "scene_parameters": {"resolution": 16, "texture": 8}, "sensors": [0]}
     target = {**boxed, "spp": 16}
     del target["sensors"]
-    integrator = {"type": "pathreplay", "max_depth": 3, "edges": edges}
+    integrator = {"type": "pathreplay", "max_depth": 3, "boundary": edges}
     changed, told = ([pose], 1) if edges == "all" else ([colour], slice(None))
     config = make_config({**JOB, **boxed, "parameters": changed, "target": target, "integrator": integrator})
     problem = build_problem(config, tmp_path)
@@ -269,7 +269,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "auto": ({"spp": "auto"}, "spp = 'auto' cannot lessen"),
     "integrator": ({"integrator": PRB}, "PRBIntegrator renders whole pictures; take the integrator 'pathreplay'"),
     "baseline": ({"baseline": PRB}, "PRBIntegrator renders whole pictures"),
-    "replay": ({"integrator": {"type": "pathreplay", "driver": "replay"}}, "driver = 'replay'.*; take 'sweep'"),
+    "replay": ({"integrator": {"type": "pathreplay", "adjoint": "replay"}}, "adjoint = 'replay' .*; use 'recorded'"),
     "one sample": ({"spp": 1}, "1 samples a pixel cannot judge each other; take 2 or more"),
     "one sample of a half": ({"spp": 2, "measure_snr": True}, "1 samples a pixel"),
     "too many": ({"spp": 1024}, "1024 samples a pixel of 3 vertices are more than the 682 that are held; take fewer"),

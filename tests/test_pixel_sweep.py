@@ -169,7 +169,7 @@ JOB = {
     "target": {"values": {"red.reflectance.value": 0.7}, "spp": 16},
     "spp": 8,
     "iterations": 4,
-    "integrator": {"type": "pathreplay", "max_depth": 3, "edges": "none"},
+    "integrator": {"type": "pathreplay", "max_depth": 3, "boundary": "none"},
 }
 
 
@@ -221,7 +221,7 @@ def test_two_swept_views_add_up(changes: dict, tmp_path) -> None:
     [
         pytest.param({}, False, id="gaussian filter"),
         pytest.param({"loss": "l1", "learning_rate": 0.1}, False, id="l1", marks=SLOW),
-        pytest.param({"integrator": {"type": "pathreplay", "driver": "replay"}}, False, id="replay", marks=SLOW),
+        pytest.param({"integrator": {"type": "pathreplay", "adjoint": "replay"}}, False, id="replay", marks=SLOW),
         pytest.param({"integrator": {"type": "prb", "max_depth": 3}}, False, id="prb", marks=SLOW),
         pytest.param({"integrator": {"type": "prb_basic", "max_depth": 3}}, False, id="prb_basic", marks=SLOW),
         pytest.param(POSE, False, id="moving", marks=SLOW),

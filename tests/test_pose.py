@@ -130,7 +130,7 @@ EYE = {
 }
 JOB = {
     "scene": "sheet.xml",
-    "integrator": {"type": "pathreplay", "max_depth": 2, "edges": "none"},  # paint shows it
+    "integrator": {"type": "pathreplay", "max_depth": 2, "boundary": "none"},  # paint shows it
     "iterations": 4,
     "spp": 8,
     "eval_spp": 16,

@@ -112,9 +112,9 @@ def gradient(
             "type": "pathreplay",
             "max_depth": depth,
             "rr_depth": 1000,
-            "driver": driver,
+            "adjoint": driver,
             "attach": attach,
-            "edges": "none",
+            "boundary": "none",
         }
     )
     if recovery is not None:
@@ -192,10 +192,10 @@ def test_noise_only_where_the_matrix_is_ill_conditioned() -> None:
 
 def test_a_chain_of_sixteen_delta_lobes_agrees_with_the_sweep() -> None:
     scene, keys = panes(12), ("obj.to_world", "pane0.to_world", "camera.to_world")
-    expected = gradient(scene, "sweep", 16, *keys)
+    expected = gradient(scene, "recorded", 16, *keys)
     found = gradient(scene, "replay", 16, *keys, recovery=Recovery(noise=0))
     single = gradient(scene, "replay", 16, *keys, recovery=OtherRecovery(noise=0, double=False))
-    shorter = gradient(scene, "sweep", 15, *keys)
+    shorter = gradient(scene, "recorded", 15, *keys)
     for k in range(len(keys)):
         assert error(found[k], expected[k]) < 1e-5
         assert error(single[k], expected[k]) < 1e-5
@@ -218,7 +218,7 @@ def test_noise_leaves_the_gradient_unbiased(scene: Any, depth: int, recovery: Re
     seeds = range(1, 17)
     differences = np.array(
         [
-            gradient(scene, "replay", depth, recovery=recovery, seed=k) - gradient(scene, "sweep", depth, seed=k)
+            gradient(scene, "replay", depth, recovery=recovery, seed=k) - gradient(scene, "recorded", depth, seed=k)
             for k in seeds
         ]
     )
@@ -240,14 +240,14 @@ def test_noise_leaves_the_gradient_unbiased(scene: Any, depth: int, recovery: Re
 def test_density_and_distance_reach_the_mis_weight_of_the_next_emission(attach: str, bsdf: Any, key: str) -> None:
     scene = lit_room(bsdf)
     found = gradient(scene, "replay", 4, key, recovery=Recovery(noise=1e-3), attach=attach)
-    assert error(found, gradient(scene, "sweep", 4, key, attach=attach)) < 1e-3
+    assert error(found, gradient(scene, "recorded", 4, key, attach=attach)) < 1e-3
 
 
 @pytest.mark.slow
 def test_float64_books_reach_further_than_float32() -> None:
     """What is left: rounding that the inverses magnify. With float32 it beats the gradient after a few bounces."""
     scene = valley(DIFFUSE)
-    expected = gradient(scene, "sweep", 8)
+    expected = gradient(scene, "recorded", 8)
     books = {double: OtherRecovery(double=double) for double in (True, False)}
     by_double = {d: error(gradient(scene, "replay", 8, recovery=books[d]), expected) for d in books}
     assert by_double[True] < 0.01
@@ -257,7 +257,7 @@ def test_float64_books_reach_further_than_float32() -> None:
 @pytest.mark.slow
 def test_rough_metal_sampled_attached_needs_noise_at_few_vertices() -> None:
     scene = valley(ROUGH)
-    expected = gradient(scene, "sweep", 6, attach="all")
+    expected = gradient(scene, "recorded", 6, attach="all")
     places = {place: OtherRecovery(noise=0.1, place=place) for place in ("directions", "smooth")}
     noisy = {p: error(gradient(scene, "replay", 6, recovery=places[p], attach="all"), expected) for p in places}
     assert noisy["directions"] < 0.01 * noisy["smooth"]
@@ -277,10 +277,10 @@ def test_smooth_lobes_on_moving_paths_are_warned_of_once(capfd: pytest.CaptureFi
     gradient(scene, "replay", 2)
     gradient(scene, "replay", 2)
     told = capfd.readouterr()
-    assert (told.out + told.err).count("driver = 'sweep' has no such limit") == 1
+    assert (told.out + told.err).count("adjoint = 'recorded' has no such limit") == 1
 
 
 def test_negative_noise_is_refused() -> None:
     # Mitsuba's loader wraps what a plugin raises into an error of its own.
     with pytest.raises(Exception, match=r"noise = -0\.1: use a finite standard deviation >= 0"):
-        mi.load_dict({"type": "pathreplay", "noise": -0.1})
+        mi.load_dict({"type": "pathreplay", "jacobian_noise": -0.1})

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from bridges import PLAIN, SMALL, TEXTURE, WALL, hold, mitsubas
-from pathreplay.bridge.scene_function import SceneFunction, View
 from pathreplay.errors import PathreplayError
 from pathreplay.scenes.loading import load_scene
+from pathreplay.scenes.scene_function import SceneFunction, View
 
 FEW, MANY = View(1, 4, 16), View(1, 4, 2048)
 
@@ -76,7 +76,7 @@ sys.modules["{module}"] = None
 import mitsuba as mi, pathreplay
 mi.set_variant("llvm_ad_rgb")
 try:
-    import pathreplay.bridge.{module}
+    import pathreplay.{module}
 except pathreplay.PathreplayError as error:
     print(error)
 """

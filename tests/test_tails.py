@@ -101,7 +101,7 @@ def test_nor_does_one_in_ordinary_scenes(name: str, tmp_path: Path) -> None:
     objective = edge_ordinary.loaded(moving, tmp_path)
     options = {"max_depth": moving.depth, "rr_depth": edge_ordinary.NEVER, **moving.options}
     try:
-        hold_tail(passes(objective, mi.load_dict({"type": "pathreplay", "edges": "all", **options})))
+        hold_tail(passes(objective, mi.load_dict({"type": "pathreplay", "boundary": "all", **options})))
     finally:
         objective.put(dr.opaque(mi.Float, 0))
 

@@ -27,7 +27,7 @@ COLOUR, DENSITY = "object.bsdf.reflectance.value", "object.interior_medium.sigma
 SPP = 4
 METHODS = ("forward", "backward", "note")
 # Every plugin's terms, in a scene for which all of them are.
-PLUGINS = ("pathreplay", "pathreplay_tape", "pathreplay_rb", "pathreplay_listing")
+PLUGINS = ("pathreplay", "naive_ad", "radiative_backprop", "prb_volume_listing")
 
 
 def foggy() -> dict:
@@ -76,7 +76,7 @@ def test_a_term_has_the_methods_of_the_protocol_and_gives_what_it_says(plugin: s
         assert np.abs(np.array(dr.grad(params[DENSITY]))).max() > 0
         dr.set_grad(params[DENSITY], 1)
         with dr.suspend_grad():
-            if plugin == "pathreplay_rb":
+            if plugin == "radiative_backprop":
                 with pytest.raises(PathreplayError, match="no forward mode"):
                     term.forward(view, trace, None)
             else:
@@ -115,7 +115,7 @@ def test_terms_add_up(load, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_sample_gives_what_it_says(load) -> None:
     """As Mitsuba's `aov` asks for it, it is the radiance of the image; nothing is learned, and it is no pass."""
     scene, _ = load(foggy(), DENSITY)
-    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "numbers": "scene"})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "sampling": "scene"})
     rays = Pass.of(scene, 0, 3, SPP).rays()
     L, _, aovs, _ = integrator.sample(dr.ADMode.Primal, scene, rays.sampler, rays.ray)
     image = np.array(integrator.render(scene, seed=3, spp=SPP))
@@ -141,7 +141,7 @@ def test_what_was_learned_outlives_another_scene_between(load) -> None:
 
 def test_what_shards_have_seen_can_be_added(load) -> None:
     scene, _ = load(foggy(), DENSITY)
-    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "branch": True})
+    integrator = mi.load_dict({"type": "pathreplay", "max_depth": 3, "null_branching": True})
     trace = integrator._walk(scene, scene.sensors()[0])
     nothing = BaselineState.fresh(scene.bbox())
 

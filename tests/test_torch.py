@@ -20,25 +20,25 @@ from pathreplay.scenes.parameters import get_array
 torch = pytest.importorskip("torch")
 
 from bridges import PLAIN, SMALL, TEXTURE, WALL, hold, mitsubas  # noqa: E402
-from pathreplay.bridge.torch import Render  # noqa: E402
+from pathreplay.torch import RenderFunction  # noqa: E402
 
 
 @pytest.fixture
 def render() -> Any:
-    return Render("cornell-box-photo", [TEXTURE, WALL], integrator=PLAIN, spp=16, arguments=SMALL)
+    return RenderFunction("cornell-box-photo", [TEXTURE, WALL], integrator=PLAIN, spp=16, arguments=SMALL)
 
 
 def test_the_picture_is_that_of_mitsuba(render: Any) -> None:
     scene = load_scene("cornell-box-photo", **SMALL)
     expected = np.array(mi.render(scene, sensor=1, integrator=mi.load_dict(PLAIN), spp=16, seed=4))
-    image = render(render.start(), 1, seed=4)
+    image = render(render.initial_values(), 1, seed=4)
     assert image.shape == (6, 6, 3) and image.dtype == torch.float32
     np.testing.assert_allclose(image.cpu().numpy(), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_gradients_of_several_calls_are_each_their_own(render: Any) -> None:
     """Two views with different values before one backward: the sum of both gradients, by Mitsuba alone."""
-    first, second = render.start(), render.start()
+    first, second = render.initial_values(), render.initial_values()
     second = {TEXTURE: second[TEXTURE] * 0.2, WALL: second[WALL] * 0 + 0.9}
     for values in (first, second):
         for tensor in values.values():
@@ -56,8 +56,10 @@ def test_gradients_of_several_calls_are_each_their_own(render: Any) -> None:
 
 def test_transforms_vectors_and_numbers_have_gradients() -> None:
     """That of the camera's shift against the same by Mitsuba: x of `camera.to_world` is entry (0, 3)."""
-    render = Render("mirror-camera", ["camera.to_world"], integrator=PLAIN, spp=512, arguments={"resolution": 8})
-    values = render.start()
+    render = RenderFunction(
+        "mirror-camera", ["camera.to_world"], integrator=PLAIN, spp=512, arguments={"resolution": 8}
+    )
+    values = render.initial_values()
     values["camera.to_world"].requires_grad_()
     assert values["camera.to_world"].shape == (4, 4)
     ramp = np.broadcast_to(np.linspace(-1, 1, 8, dtype=np.float32)[:, None], (8, 8, 3)).copy()  # else shifts cancel
@@ -74,19 +76,19 @@ def test_transforms_vectors_and_numbers_have_gradients() -> None:
 
 
 def test_colours_keep_their_order() -> None:
-    render = Render("cornell-box", WALL, integrator=PLAIN, arguments={"resolution": 4})
+    render = RenderFunction("cornell-box", WALL, integrator=PLAIN, arguments={"resolution": 4})
     render({WALL: torch.tensor([0.1, 0.2, 0.3])})
     np.testing.assert_allclose(get_array(mi.traverse(render.scene)[WALL]), [0.1, 0.2, 0.3], rtol=1e-6)
 
 
 def test_a_texture_may_have_another_size(render: Any) -> None:
-    values = {**render.start(), TEXTURE: torch.full((5, 7, 3), 0.5, requires_grad=True)}
+    values = {**render.initial_values(), TEXTURE: torch.full((5, 7, 3), 0.5, requires_grad=True)}
     render(values).sum().backward()
     assert values[TEXTURE].grad.shape == (5, 7, 3) and values[TEXTURE].grad.abs().sum() > 0
 
 
 def test_what_does_not_fit_is_told(render: Any) -> None:
-    values = render.start()
+    values = render.initial_values()
     with pytest.raises(PathreplayError, match=r"there is a difference: 'red\.reflectance\.value'"):
         render({TEXTURE: values[TEXTURE]})
     with pytest.raises(PathreplayError, match="there is a difference: 'blue'"):
@@ -94,16 +96,16 @@ def test_what_does_not_fit_is_told(render: Any) -> None:
     with pytest.raises(PathreplayError, match=r"shape \(4,\) given for the parameter 'red.*' of shape \(3,\)"):
         render({**values, WALL: torch.zeros(4)})
     with pytest.raises(PathreplayError, match="Integrator 'path' computes no gradients"):
-        Render("cornell-box", WALL, integrator={"type": "path"})
+        RenderFunction("cornell-box", WALL, integrator={"type": "path"})
     with pytest.raises(PathreplayError, match="No parameter 'blue'"):
-        Render("cornell-box", "blue")
+        RenderFunction("cornell-box", "blue")
 
 
 @pytest.mark.slow
 def test_five_hundred_iterations_leave_nothing_behind() -> None:
     """Neither memory of the process nor variables of Dr.Jit's."""
-    render = Render("cornell-box-photo", [TEXTURE, WALL], integrator=PLAIN, spp=1, arguments=SMALL)
-    values = {key: torch.nn.Parameter(value) for key, value in render.start().items()}
+    render = RenderFunction("cornell-box-photo", [TEXTURE, WALL], integrator=PLAIN, spp=1, arguments=SMALL)
+    values = {key: torch.nn.Parameter(value) for key, value in render.initial_values().items()}
     optimiser = torch.optim.Adam(values.values(), lr=1e-3)
     marks = []
     for i in range(500):
@@ -122,4 +124,4 @@ def test_five_hundred_iterations_leave_nothing_behind() -> None:
 def test_the_example_recovers_a_small_texture_by_a_network(tmp_path: Path) -> None:
     example = Path(__file__).parents[1] / "examples/torch-network/recover.py"
     found = runpy.run_path(str(example))["recover"](resolution=12, texture=8, steps=60, picture=tmp_path / "found.png")
-    assert found.error < 0.5 * found.start and (tmp_path / "found.png").is_file()
+    assert found.error < 0.5 * found.initial_values and (tmp_path / "found.png").is_file()

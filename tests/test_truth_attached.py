@@ -103,7 +103,7 @@ METAL = {"type": "roughconductor", "alpha": 0.2}
 DIFFUSE = {"type": "diffuse", "reflectance": rgb(0.5, 0.6, 0.7)}
 ALL = {"attach": "all"}
 WALLPAPER = np.stack([*_waves(128, 1), _waves(128, 2)[0]], -1)
-ONCE = {"drivers": ("sweep",), "step": 4e-3, "spp": 32}
+ONCE = {"drivers": ("recorded",), "step": 4e-3, "spp": 32}
 ETA, NORMAL, BUMP = "object.bsdf.eta", "object.bsdf.normalmap.data", "object.bsdf.nested_texture.data"
 WORLD, VERTICES = "object.to_world", "object.vertex_positions"
 TINY = {**ONCE, "step": 1e-3}
@@ -140,7 +140,7 @@ LANES = [
     Case("camera turns, mirror ball", lambda: under_sky(MIRROR), "camera.to_world", rotate(1, 0, 0), **FINE),
 ]  # fmt: skip
 
-BOTH = {"drivers": ("sweep",), "lanes": None, "spp": 256}
+BOTH = {"drivers": ("recorded",), "lanes": None, "spp": 256}
 
 
 def lamp_over_floor(emitter, shape="rectangle"):

@@ -93,9 +93,9 @@ def test_lines_may_be_shorter_and_no_pass_says_it_all(name: str, monkeypatch: py
 def test_points_may_be_held_closer_to_a_surface(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the interior gives up, edges take over: also at the sides of the triangles that it gives up."""
     with loaded(BY_NAME["indirect_can"]) as bench:
-        near, near_inside = (backwards(bench, MANY, edges=edges) for edges in ("all", "none"))
+        near, near_inside = (backwards(bench, MANY, boundary=edges) for edges in ("all", "none"))
         monkeypatch.setattr(velocity, "BLEND", velocity.BLEND * 20)
-        far, far_inside = (backwards(bench, MANY, edges=edges) for edges in ("all", "none"))
+        far, far_inside = (backwards(bench, MANY, boundary=edges) for edges in ("all", "none"))
     found = gap(far - near)
     assert abs(found.z) < Z_LIMIT, found
     assert found.error < RESOLUTION * abs(near.mean()), found

@@ -42,7 +42,7 @@ def test_gradients_with_edges_agree(name: str) -> None:
         g = bench.backwards(integrator)
         transpose = bench.transpose_error(integrator, integrator, 1, case.spp)
     found = gap(g, reference)
-    row = Row(f"edges: {name}", "sweep", g.mean(), reference.mean(), found.error, found.z, np.nan, transpose)
+    row = Row(f"edges: {name}", "recorded", g.mean(), reference.mean(), found.error, found.z, np.nan, transpose)
     ROWS.append(row)
     assert abs(row.z) < Z_LIMIT, row
     assert row.error < RESOLUTION * max(abs(row.gradient), abs(row.reference)), row

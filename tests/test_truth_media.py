@@ -92,9 +92,9 @@ GLASS = {"type": "dielectric_ad"}
 ROUGH = {"type": "roughdielectric", "alpha": 0.3}
 ETA = "object.bsdf.eta"
 DENSE = {"depth": 512, "rr_depth": 1000, "spp": 4, "reference_spp": 8, "step": 0.4}
-MOVES = {"step": 0.08, "drivers": ("sweep",)}  # the replay driver refuses paths that move through media
+MOVES = {"step": 0.08, "drivers": ("recorded",)}  # the replay driver refuses paths that move through media
 GLASSY = {**MOVES, "step": 0.04, "spp": 768, "reference_spp": 1024}  # dF has no bound near the critical angle
-BLACK = {"stencil": UPWARD, "step": 0.1, "drivers": ("sweep",)}  # the replay driver divides by the weight
+BLACK = {"stencil": UPWARD, "step": 0.1, "drivers": ("recorded",)}  # the replay driver divides by the weight
 UP = {"stencil": UPWARD, "step": 0.1}
 
 GRIDS = [
@@ -158,7 +158,7 @@ PLACES = [
          **{**GLASSY, "spp": 1536}),
     # Where a sample of the rough glass fails, the replay driver ends the path, and its branch draws other numbers.
     cell("in rough glass, density", lambda: cloud(heterogeneous(smooth(0.4, 2.0), constant(0.8)), "sphere", ROUGH),
-         DENSITY, random(1.0), drivers=("sweep",)),
+         DENSITY, random(1.0), drivers=("recorded",)),
     cell("in rough glass, homogeneous density", lambda: cloud(homogeneous(1.0), "sphere", ROUGH),
          MEDIUM + "sigma_t.value.value", add()),
     cell("behind a pane, its index", lambda: behind_glass(GLASS, uniform()), "pane.bsdf.eta", add(), **MOVES),
@@ -252,7 +252,7 @@ def test_any_baseline_leaves_the_mean_alone(name: str, σ_t: np.ndarray, keys: t
     adjoint = dr.full(mi.TensorXf, 1 / 1024, (16, 16, 3))
     found = []
     for b in (0.0, 2.0):
-        integrator = mi.load_dict({"type": "pathreplay", "max_depth": 4, "branch": True})
+        integrator = mi.load_dict({"type": "pathreplay", "max_depth": 4, "null_branching": True})
         integrator._learned = lambda view, trace, b=b: Fixed(scene, b)
         sums = []
         for seed in range(1, 17):

@@ -44,6 +44,7 @@ def derivative(scene, integrator, key):
     dr.backward(dr.mean(image, axis=None))
     return float(np.mean(np.array(image))), float(np.sum(np.array(dr.grad(params[key])))) - before
 
+pathreplay.baselines.register()
 alive = []
 for variant in sys.argv[1:]:
     mi.set_variant(variant)
@@ -60,9 +61,9 @@ for variant in sys.argv[1:]:
     density = "cloud.interior_medium.sigma_t.data"
     for plugin, made, key in [
         ("pathreplay", glassy_scene, eta), ("pathreplay", cloudy_scene, density), ("pathreplay", glassy_scene, paint),
-        ("pathreplay_tape", glassy_scene, eta), ("pathreplay_rb", glassy_scene, paint), ("prb", glassy_scene, paint),
+        ("naive_ad", glassy_scene, eta), ("radiative_backprop", glassy_scene, paint), ("prb", glassy_scene, paint),
     ]:
-        options = {"numbers": "scene", "edges": "none"} if plugin == "pathreplay" else {}  # as the others have it
+        options = {"sampling": "scene", "boundary": "none"} if plugin == "pathreplay" else {}  # as the others have it
         integrator = mi.load_dict({"type": plugin, "max_depth": 4, **options})
         assert isinstance(integrator, mi.Integrator), (variant, plugin)
         print()  # ends what Mitsuba's log may have begun
@@ -97,7 +98,7 @@ def test_plugins_work_in_every_order_of_variants(run_python, name: str) -> None:
     for variant, of in found.items():
         for key in ("glass.bsdf.eta", "ball.bsdf.reflectance.value"):
             same = [values for (_, k), values in of.items() if k == key]
-            # On the same random numbers, but `pathreplay_rb` walks paths of its own, too.
+            # On the same random numbers, but `radiative_backprop` walks paths of its own, too.
             assert len(same) > 1 and all(v == pytest.approx(same[0], rel=5e-3) for v in same), (variant, key, same)
         assert of["pathreplay", "cloud.interior_medium.sigma_t.data"][1] < 0
 
@@ -217,7 +218,7 @@ scene = mi.load_dict({
     "sky": {"type": "constant", "radiance": colour(0.1, 0.2, 0.4)},
 }, optimize=False)
 for edges in ("all", "none"):
-    tested = {"type": "pathreplay", "max_depth": 3, "edges": edges}
+    tested = {"type": "pathreplay", "max_depth": 3, "boundary": edges}
     check = pathreplay.check_gradient(scene, "ball.to_world", integrator=tested, seeds=16, spp=2048, step=0.02)
     print()
     print(json.dumps([edges, check.verdict, str(check)]))

@@ -144,7 +144,7 @@ def test_what_moves_together_is_told_apart_by_what_stands_still(
     start = {"translation": [0.1, 0.1, 0.1]}
     job = {
         "scene": "scene.xml", "target": {"scene": "scene.xml", "spp": 1},
-        "integrator": {"type": "pathreplay", "max_depth": 2, "edges": "none"},
+        "integrator": {"type": "pathreplay", "max_depth": 2, "boundary": "none"},
         "parameters": [{"key": key, "pose": "translation", "initial": start} for key in keys],
     }  # fmt: skip
     problem = build_problem(make_config(job), tmp_path)

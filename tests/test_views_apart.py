@@ -159,7 +159,7 @@ def widening() -> Iterator[tuple[mi.Scene, Any, mi.Float]]:
 def test_a_script_gets_zero_in_the_view_of_another_camera() -> None:
     with widening() as (scene, params, x):
         for edges in ("none", "all"):
-            integrator = mi.load_dict({"type": "pathreplay", "edges": edges})
+            integrator = mi.load_dict({"type": "pathreplay", "boundary": edges})
             dr.backward(dr.sum(mi.render(scene, params, sensor=1, integrator=integrator, spp=4), axis=None))
             assert dr.grad(x) == 0
 
@@ -168,7 +168,7 @@ def test_a_view_in_parts_keeps_what_another_view_gave(monkeypatch: pytest.Monkey
     """A pass of many samples adds up its parts apart, and gives back what was there, also where it adds nothing."""
     for name, value in (("MOST_AT_ONCE", 20), ("A_PART", 16), ("LEAST_A_PIXEL", 1)):
         monkeypatch.setattr(parts, name, value)
-    integrator = mi.load_dict({"type": "pathreplay", "edges": "none"})
+    integrator = mi.load_dict({"type": "pathreplay", "boundary": "none"})
     found = []
     with widening() as (scene, params, x):
         for sensor in (0, 1):

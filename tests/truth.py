@@ -37,7 +37,7 @@ class Case:
     spp: int = 64
     seeds: int = 12
     options: dict = field(default_factory=dict)  # of the integrator
-    drivers: tuple[str, ...] = ("sweep", "replay")
+    drivers: tuple[str, ...] = ("recorded", "replay")
     reference: str = "path"  # the plugin whose images are differenced
     reference_spp: int = 0  # of the reference; 0: spp
     stencil: Stencil = CENTRAL
@@ -147,7 +147,7 @@ class Bench(Objective):
         self.weigh(np.random.default_rng(0).uniform(0, 1, (RES, RES, 3)).astype(np.float32) / RES**2)
 
     def integrator(self, plugin: str = "pathreplay", **options: Any) -> mi.Integrator:
-        held = {"edges": "none"} if plugin == "pathreplay" else {}  # most cases are about the interior alone
+        held = {"boundary": "none"} if plugin == "pathreplay" else {}  # most cases are about the interior alone
         made = mi.load_dict({"type": plugin, "max_depth": self.case.depth, **held, **options})
         if plugin.startswith("pathreplay"):
             made.rr_depth = dr.opaque(mi.UInt32, made.rr_depth)  # with roulette and without it: the same kernels
@@ -201,7 +201,7 @@ def measure(case: Case) -> list[Row]:
         lanes = np.nan if case.lanes is None else bench.lane_error(steady, case.step, 1, case.spp)
         rows = []
         for driver in ("forward", *case.drivers):
-            props = case.options if driver == "forward" else {"driver": driver, **case.options}
+            props = case.options if driver == "forward" else {"adjoint": driver, **case.options}
             integrator, transpose = bench.integrator(rr_depth=case.rr_depth, **props), np.nan
             if driver == "forward":
                 images = (bench.forward(integrator, seed, case.spp) for seed in range(1, case.seeds + 1))

@@ -105,7 +105,7 @@ class EdgePass:
         if name not in self.integrators:
             alone = name in PARTS or name == ALL  # something takes the interior's place
             plugin = METHODS["auto" if alone else name]
-            edges = {"edges": "all" if name == ALL else "none"} if alone else {}
+            edges = {"boundary": "all" if name == ALL else "none"} if alone else {}
             self.integrators[name] = mi.load_dict(plugin | self.job.limits | edges)
             if alone:
                 self.integrators[name].interior = Nothing() if name == ALL else Boundary(**PARTS[name])

@@ -4,29 +4,29 @@ A method is the name of an integrator, or that and a way: `sweep`, `prb, own loo
 """
 
 #: What `mi.load_dict` makes of it. One that does not load is a row that says so. Ours draw the numbers that Mitsuba's
-#: draw, so that estimators are compared and nothing else, but for `even`: that is what people get who choose nothing.
+#: draw, so that estimators are compared and nothing else, but for `sobol`: that is what people get who choose nothing.
 METHODS: dict[str, dict[str, object]] = {
     "prb": {"type": "prb"},
     "prb_basic": {"type": "prb_basic"},
-    "tape": {"type": "pathreplay_tape"},
-    "rb": {"type": "pathreplay_rb"},
-    "rb linear": {"type": "pathreplay_rb", "linear": True},
-    "sweep": {"type": "pathreplay", "driver": "sweep", "numbers": "scene", "edges": "none"},
-    "replay": {"type": "pathreplay", "driver": "replay", "numbers": "scene", "edges": "none"},
-    "edges and interior": {"type": "pathreplay", "edges": "all"},
-    "film edges": {"type": "pathreplay", "edges": "film", "numbers": "scene"},
-    "all edges": {"type": "pathreplay", "edges": "all", "numbers": "scene"},
+    "naive AD": {"type": "naive_ad"},
+    "RB": {"type": "radiative_backprop"},
+    "linear RB": {"type": "radiative_backprop", "linear": True},
+    "sweep": {"type": "pathreplay", "adjoint": "recorded", "sampling": "scene", "boundary": "none"},
+    "replay": {"type": "pathreplay", "adjoint": "replay", "sampling": "scene", "boundary": "none"},
+    "edges and interior": {"type": "pathreplay", "boundary": "all"},
+    "film edges": {"type": "pathreplay", "boundary": "primary", "sampling": "scene"},
+    "all edges": {"type": "pathreplay", "boundary": "all", "sampling": "scene"},
     "prb_projective": {"type": "prb_projective"},
     "edge list": {"type": "prb_projective", "sppc": 0, "sppi": 0},
     "projective inner": {"type": "prb_projective", "sppc": 0, "sppp": 0},
     "unguided inner": {"type": "prb_projective", "sppc": 0, "sppp": 0, "guiding": "none"},
     "volpath": {"type": "volpath"},
     "prbvolpath": {"type": "prbvolpath"},
-    "score": {"type": "pathreplay", "numbers": "scene"},
-    "auto": {"type": "pathreplay", "numbers": "scene"},
-    "even": {"type": "pathreplay"},
-    "no branch": {"type": "pathreplay", "branch": False, "numbers": "scene"},
-    "listing": {"type": "pathreplay_listing"},
+    "score": {"type": "pathreplay", "sampling": "scene"},
+    "auto": {"type": "pathreplay", "sampling": "scene"},
+    "sobol": {"type": "pathreplay"},
+    "no branch": {"type": "pathreplay", "null_branching": False, "sampling": "scene"},
+    "listing": {"type": "prb_volume_listing"},
 }
 
 #: Mitsuba's own: what ours is compared with, and not held to anything when two records are compared.

@@ -19,7 +19,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from pathreplay import __version__
+from pathreplay import __version__, baselines
 from pathreplay.platform import backend
 
 from .job import Job, Kind, Machine, Measure
@@ -125,6 +125,7 @@ def run(job: Job) -> None:
     """Run a job; events are `machine`, `start`, `sample`, `error`, `facts` (fields of `Point`), `peak`."""
     limit_memory()
     variant = backend.set_variant(None)
+    baselines.register()
 
     import drjit as dr
 

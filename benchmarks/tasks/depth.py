@@ -25,9 +25,9 @@ ROWS: dict[str, tuple[tuple[str, ...], dict[str, tuple[int, int]]]] = {
             "replay": (4096, 4),
             "prb": (1024, 2),
             "prb_basic": (1024, 4),
-            "tape": (512, 2),
-            "rb": (256, 2),
-            "rb linear": (1024, 4),
+            "naive AD": (512, 2),
+            "RB": (256, 2),
+            "linear RB": (1024, 4),
         },
     ),
     MEDIA: (
@@ -35,13 +35,13 @@ ROWS: dict[str, tuple[tuple[str, ...], dict[str, tuple[int, int]]]] = {
         {
             "score": (1024, 4),
             "prbvolpath": (1024, 4),
-            "tape": (128, 2),
-            "rb": (64, 2),
-            "rb linear": (1024, 4),
+            "naive AD": (128, 2),
+            "RB": (64, 2),
+            "linear RB": (1024, 4),
         },
     ),
 }
-QUICK = {"sweep": (256, 64), "prb": (256, 64), "tape": (32, 8), "rb": (32, 8)}
+QUICK = {"sweep": (256, 64), "prb": (256, 64), "naive AD": (32, 8), "RB": (32, 8)}
 SHALLOWEST = 4
 # One pass beyond it is enough to know how slow a method is.
 PATIENCE_S = 10

@@ -11,8 +11,8 @@ from .surface import BACK_WALL, FLOOR
 TITLE = "iteration"
 TAKES = (12, 165)
 
-SURFACE = (f"prb, {USUAL}", f"prb, {OWN}", f"sweep, {USUAL}", f"sweep, {OWN}", f"even, {OWN}")
-MEDIA = (f"prbvolpath, {USUAL}", f"score, {USUAL}", f"score, {OWN}", f"even, {OWN}")
+SURFACE = (f"prb, {USUAL}", f"prb, {OWN}", f"sweep, {USUAL}", f"sweep, {OWN}", f"sobol, {OWN}")
+MEDIA = (f"prbvolpath, {USUAL}", f"score, {USUAL}", f"score, {OWN}", f"sobol, {OWN}")
 
 #: Scene, parameter, methods, depth, largest resolution, rounds (more where the gradient has heavy tails).
 ROWS = (

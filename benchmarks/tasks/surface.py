@@ -9,10 +9,10 @@ TITLE = "surface"
 TAKES = (18, 55)  # seconds on two quiet cores: quick, full
 BACK_WALL = ("back.bsdf.reflectance.data",)
 FLOOR = ("floor.bsdf.base_color.data",)
-METHODS = ("prb", "sweep", "replay", "even")
+METHODS = ("prb", "sweep", "replay", "sobol")
 SKY = ("environment.data",)
 LAMP = ("light.emitter.radiance.value",)
-LIGHTS = ("prb", "auto", "even")  # no driver is chosen: where only lights have gradients, one of their own is
+LIGHTS = ("prb", "auto", "sobol")  # no driver is chosen: where only lights have gradients, one of their own is
 
 
 def jobs(quick: bool) -> list[Job]:

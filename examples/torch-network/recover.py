@@ -22,9 +22,9 @@ set_variant()
 import mitsuba as mi  # noqa: E402
 import torch  # noqa: E402
 
-from pathreplay.bridge.torch import Render  # noqa: E402
 from pathreplay.inverse.images.io import find_image, png_bytes, read_image, resized  # noqa: E402
 from pathreplay.scenes.loading import load_scene  # noqa: E402
+from pathreplay.torch import RenderFunction  # noqa: E402
 
 SCENE, TEXTURE, CLOSEUP = "cornell-box-photo", "back.bsdf.reflectance.data", 1
 DEPTH = 4
@@ -59,7 +59,7 @@ def recover(
     path = mi.load_dict({"type": "path", "max_depth": DEPTH})
     target = torch.tensor(np.array(mi.render(scene, sensor=CLOSEUP, integrator=path, spp=1024)))
 
-    render = Render(SCENE, TEXTURE, integrator={"type": "pathreplay", "max_depth": DEPTH}, arguments=arguments)
+    render = RenderFunction(SCENE, TEXTURE, integrator={"type": "pathreplay", "max_depth": DEPTH}, arguments=arguments)
     network = torch.nn.Sequential(
         torch.nn.Linear(4 * WAVES, 64), torch.nn.ReLU(), torch.nn.Linear(64, 64), torch.nn.ReLU(),
         torch.nn.Linear(64, 3), torch.nn.Sigmoid(),

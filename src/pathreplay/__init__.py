@@ -22,6 +22,7 @@ __all__ = [
     "Result",
     "View",
     "__version__",
+    "baselines",
     "check_gradient",
     "exclusive",
     "iterate",
@@ -47,7 +48,7 @@ _LAZY = {
     "value_and_grad": "pathreplay.library",
 }
 #: Modules that are called otherwise here.
-_MODULES = {"losses": "pathreplay.inverse.losses.pixelwise"}
+_MODULES = {"baselines": "pathreplay.baselines", "losses": "pathreplay.inverse.losses.pixelwise"}
 
 
 def _set_up() -> None:

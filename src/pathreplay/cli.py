@@ -114,13 +114,11 @@ def check(
     fd_spp: Annotated[int | None, typer.Option(help="Samples per pixel of a difference (default: --spp).")] = None,
     step: Annotated[float | None, typer.Option(help="Step of the differences (default: 1 % of the parameter).")] = None,
     max_depth: Annotated[int | None, typer.Option(help="Path length (default: the scene's).")] = None,
-    edges: Annotated[
-        Literal["auto", "none", "film", "all"] | None,
-        typer.Option(
-            help="Which edges 'pathreplay' differentiates (default: the scene's, else auto: where they move)."
-        ),
+    boundary: Annotated[
+        Literal["auto", "none", "primary", "all"] | None,
+        typer.Option(help="Boundary terms of 'pathreplay' (default: the scene's, else auto: where edges move)."),
     ] = None,
-    edge_spp: Annotated[int | None, typer.Option(help="Lines per pixel that look for edges (default: --spp).")] = None,
+    boundary_spp: Annotated[int | None, typer.Option(help="Boundary segments per pixel (default: --spp).")] = None,
     mode: Annotated[
         Literal["backward", "forward"], typer.Option(help="Derivative of the loss, or of the picture.")
     ] = "backward",
@@ -142,10 +140,11 @@ def check(
     loaded, notes = load_scene_for(scene, param)
     for note in notes:
         typer.echo(f"pathreplay: {plain_line(note)}", err=True)
-    asked = {name: value for name, value in (("edges", edges), ("edge_spp", edge_spp)) if value is not None}
+    asked = {"boundary": boundary, "boundary_spp": boundary_spp}
+    asked = {name: value for name, value in asked.items() if value is not None}
     checks = command.check_all(
         loaded, param, integrator=integrator, seeds=seeds, spp=spp, fd_spp=fd_spp, step=step,
-        max_depth=max_depth, edges=asked, mode=mode, sensor=sensor, seed=seed,
+        max_depth=max_depth, boundary=asked, mode=mode, sensor=sensor, seed=seed,
     )  # fmt: skip
     results = command.print_checks(checks)
     if json is not None:

@@ -25,8 +25,8 @@ KEYS: dict[str, Mapping[str, Any]] = {
     **dict.fromkeys(
         (
             "scene scene_parameters sensors variant integrator integrator.type integrator.max_depth "
-            "integrator.rr_depth integrator.hide_emitters integrator.driver integrator.noise integrator.numbers "
-            "baseline "
+            "integrator.rr_depth integrator.hide_emitters integrator.adjoint integrator.jacobian_noise "
+            "integrator.sampling baseline "
             "parameters parameters.0 parameters.0.key parameters.0.lower parameters.0.upper parameters.0.learning_rate "
             "parameters.0.initial parameters.0.initial.image parameters.0.resolutions parameters.0.refine_at "
             "parameters.0.pose target target.images loss spp eval_spp seed learning_rate final_learning_rate_ratio "

@@ -51,7 +51,17 @@ def _code(name: str, code: str, *, refused: bool = True, variant: str = "llvm_ad
 # ------------------------------------------------------------------------------
 
 OPTIONS = {
-    "pathreplay": ("max_depth", "rr_depth", "hide_emitters", "driver", "attach", "noise", "branch"),
+    "pathreplay": (
+        "max_depth",
+        "rr_depth",
+        "hide_emitters",
+        "adjoint",
+        "attach",
+        "jacobian_noise",
+        "null_branching",
+        "boundary",
+        "sampling",
+    ),
     "dielectric_ad": ("int_ior", "ext_ior", "specular_reflectance", "specular_transmittance"),
     "gridmedium": ("sigma_t", "albedo", "scale", "emission", "supergrid"),
 }

@@ -244,7 +244,7 @@ PIECES = {
     ),
     "our integrator with too deep a sweep": (
         '<integrator type="pathreplay"><integer name="max_depth" value="99999999"/>'
-        '<string name="driver" value="sweep"/></integrator>'
+        '<string name="adjoint" value="recorded"/></integrator>'
     ),
     "our integrator of no depth": '<integrator type="pathreplay"><integer name="max_depth" value="-7"/></integrator>',
     "our integrator of a text": '<integrator type="pathreplay"><string name="max_depth" value="6"/></integrator>',

@@ -120,8 +120,8 @@ KEYS: dict[str, list[Mapping[str, Any]]] = {
     "eval_spp": [{"eval_spp": 3}],
     "spp": [{"spp": 8}, {"spp": "auto"}],
     "integrator": [
-        {"integrator.edges": "all"},
-        {"integrator.driver": "replay"},
+        {"integrator.boundary": "all"},
+        {"integrator.adjoint": "replay"},
         {"integrator.attach": "none"},
         {"integrator.hide_emitters": True},
         {"integrator": {"type": "prb", "max_depth": 3}},

@@ -46,7 +46,7 @@ def replay(
         _replay_still(trace, start, path, δL)
     elif trace.media is not None:
         raise PathreplayError(
-            "driver = 'replay' cannot follow paths that move through media: use driver = 'sweep', "
+            "adjoint = 'replay' cannot follow paths that move through media: use adjoint = 'recorded', "
             f"with max_depth of at most {MAX_DEPTH_MEDIA}"
         )
     else:
@@ -61,9 +61,9 @@ def _warn_of_smooth_lobes() -> None:
     """Said once per process: the driver is at the edge of what it can do."""
     mi.Log(
         mi.LogLevel.Warn,
-        "pathreplay: driver = 'replay' follows moving paths over smooth BSDFs, where the Jacobian of the ray is "
+        "pathreplay: adjoint = 'replay' follows moving paths over smooth BSDFs, where the Jacobian of the ray is "
         "singular: noise makes the gradient unbiased, but it gets worse with every such bounce. "
-        "driver = 'sweep' has no such limit, and is faster",
+        "adjoint = 'recorded' has no such limit, and is faster",
     )
 
 

@@ -35,7 +35,7 @@ def sweep(
     if trace.max_depth > deepest(trace):
         raise PathreplayError(
             f"max_depth = {trace.max_depth} is more than the sweep driver can hold ({deepest(trace)}): "
-            "use driver = 'replay', which has no limit"
+            "use adjoint = 'replay', which has no limit"
         )
     path = PathState.begin(trace, start, sustained=True)
     ray0 = path.at.ray

@@ -109,7 +109,7 @@ class Boundary:
     def _searches(self, view: Pass, trace: TraceConfig, places: FilmPlaces) -> Iterator[Edges]:
         """The edges of each search."""
         if why := self.obstacle(view):
-            raise PathreplayError(f"{why}, or use edges = 'none'")
+            raise PathreplayError(f"{why}, or use boundary = 'none'")
         trace = self.informed(view, trace)
         lines = lines_of(view, places, self.spp)
         seed = view.opaque_seed
@@ -127,8 +127,8 @@ def lines_of(view: Pass, places: FilmPlaces, spp: int) -> int:
     lines = pixels * (math.ceil(spp * view.share) if spp else view.spp)
     if lines > MOST_SAMPLES:
         raise PathreplayError(
-            f"edge_spp = {spp} with a film of {pixels} pixels are {lines} lines, beyond the {MOST_SAMPLES} that Dr.Jit "
-            f"takes at once; take edge_spp up to {MOST_SAMPLES // pixels}, or 0"
+            f"boundary_spp = {spp} with a film of {pixels} pixels are {lines} segments, beyond the {MOST_SAMPLES} that "
+            f"Dr.Jit takes at once; take boundary_spp up to {MOST_SAMPLES // pixels}, or 0"
         )
     return max(lines, 1)
 

@@ -12,8 +12,8 @@ from pathreplay.transport.vertex import TraceConfig
 
 COST_OF_EDGES = (
     "edges move with the parameters (silhouettes, shadows, borders of lights) and are differentiated in a pass of "
-    "their own, which may take several times as long as the rest: edges = 'none' of the integrator leaves them out, "
-    "edges = 'film' those that only surfaces see; see docs/edges.md"
+    "their own, which may take several times as long as the rest: boundary = 'none' of the integrator leaves them out, "
+    "boundary = 'primary' those that only surfaces see; see docs/edges.md"
 )
 """One line that tells what edges cost, where nobody asked for them."""
 

@@ -37,13 +37,13 @@ def edges_note(keys: Iterable[str], edges: str = "none") -> str:
     """One line that tells of parameters with which edges move, and what can be done; ``edges`` are looked at."""
     first, *others = keys
     more = f" (and {len(others)} more)" if others else ""
-    if edges == "film":
+    if edges == "primary":
         return (
-            f"'{first}'{more} moves, and edges = 'film' leaves out what surfaces see of moving edges (soft shadows, "
-            "indirect light): use edges = 'all' where that matters; see docs/edges.md"
+            f"'{first}'{more} moves, and boundary = 'primary' leaves out what surfaces see of moving edges (soft "
+            "shadows, indirect light): use boundary = 'all' where that matters; see docs/edges.md"
         )
     return (
         f"'{first}'{more} moves, and the gradient leaves out what moving edges do (silhouettes, shadows, borders of "
-        "lights): use edges = 'all' of the integrator 'pathreplay', or let paint or shading show the motion rather "
+        "lights): use boundary = 'all' of the integrator 'pathreplay', or let paint or shading show the motion rather "
         "than outlines, and measure what is missing with 'pathreplay check'; see docs/edges.md"
     )

@@ -32,35 +32,42 @@ from pathreplay.integrators.scene_facts import SceneFacts, facts_of
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.transport.vertex import TraceConfig
 
-DRIVERS = ("auto", "sweep", "replay")
+ADJOINTS = ("auto", "recorded", "replay")
+#: Properties of 0.1.0's first edition -> what they are called now.
+RENAMED = {
+    "branch": "null_branching",
+    "driver": "adjoint",
+    "edge_spp": "boundary_spp",
+    "edges": "boundary",
+    "noise": "jacobian_noise",
+    "numbers": "sampling",
+}
 ATTACH = ("delta", "all", "none")
-BRANCH = ("auto", True, False)
-NUMBERS = ("scene", "even")
-EDGE_TERMS = ("auto", "none", "film", "all")
+NULL_BRANCHING = ("auto", True, False)
+SAMPLING = ("scene", "sobol")
+BOUNDARIES = ("auto", "none", "primary", "all")
 EDGES = "edges"
 """In `told`: what there is to say of edges that move has been said."""
 
 
 def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
-    """The term that the properties ask for. Raises PathreplayError for what cannot be."""
-    if "volume_gradient" in props:
-        raise PathreplayError(
-            f"{name}: there is no volume_gradient: leave it out for what was 'score', and use the integrator "
-            "'pathreplay_listing' for 'listing'"
-        )
-    driver = choice(props, name, "driver", "auto", DRIVERS)
-    if driver == "sweep" and max_depth > MAX_DEPTH:
+    """The interior term that the properties describe. Raises PathreplayError for unusable properties."""
+    for old, new in RENAMED.items():
+        if old in props:
+            raise PathreplayError(f"{name}: there is no property '{old}': it is called '{new}' now")
+    adjoint = choice(props, name, "adjoint", "auto", ADJOINTS)
+    if adjoint == "recorded" and max_depth > MAX_DEPTH:
         depth = "-1 (unbounded)" if max_depth == UNBOUNDED else max_depth
         raise PathreplayError(
-            f"{name}: max_depth = {depth} is more than the sweep driver can hold ({MAX_DEPTH}): "
-            "use driver = 'replay', which has no limit"
+            f"{name}: max_depth = {depth} is more than adjoint = 'recorded' can hold ({MAX_DEPTH}): "
+            "use adjoint = 'replay', which has no limit"
         )
-    branch = choice(props, name, "branch", "auto", BRANCH)
-    recovery = Recovery(noise=deviation(props, name, "noise", Recovery.noise))
-    auto = driver == "auto"
+    branch = choice(props, name, "null_branching", "auto", NULL_BRANCHING)
+    recovery = Recovery(noise=deviation(props, name, "jacobian_noise", Recovery.noise))
+    auto = adjoint == "auto"
     if auto:
-        driver = "sweep" if max_depth <= MAX_DEPTH else "replay"
-    return PathReplay(driver, auto, branch, recovery)
+        adjoint = "recorded" if max_depth <= MAX_DEPTH else "replay"
+    return PathReplay(adjoint, auto, branch, recovery)
 
 
 @dataclass
@@ -75,26 +82,27 @@ class DeferredDiagnostics:
 class PathReplayIntegrator(PathIntegrator):
     """Differentiable path tracer for surfaces and media.
 
-    Properties: ``max_depth`` (6; -1 = unbounded, with the replay driver), ``rr_depth`` (5), ``hide_emitters``
-    (False), ``driver`` (``auto``, ``sweep``, ``replay``), ``attach`` (``delta``, ``all``, ``none``), ``noise``
-    (0.01; of ray adjoints with the replay driver: see `Recovery`), ``branch`` (``auto``, True, False), ``edges``
-    (``auto``, ``none``, ``film``, ``all``: see `Boundary`), ``edge_spp`` (0: the samples of the pass) and ``numbers``
-    (``even``: `OwenSobolSampler` instead of independent numbers; ``scene``: those of its sampler). ``auto`` drivers
-    sweep unless ``max_depth`` is more than the sweep can hold, or only lights have gradients (see `emission_only`).
-    Forward mode is the same whatever the driver.
+    Properties: ``max_depth`` (6; -1 = unbounded, with ``adjoint='replay'``), ``rr_depth`` (5), ``hide_emitters``
+    (False), ``adjoint`` (``auto``, ``recorded``, ``replay``: how reverse mode visits a path again), ``attach``
+    (``delta``, ``all``, ``none``), ``jacobian_noise`` (0.01: standard deviation of the perturbation of ray Jacobians in
+    replay, see `Recovery`), ``null_branching`` (``auto``, True, False), ``boundary`` (``auto``, ``none``, ``primary``,
+    ``all``: see `Boundary`), ``boundary_spp`` (0: the samples of the pass) and ``sampling`` (``sobol``:
+    `OwenSobolSampler` in place of an independent sampler; ``scene``: the scene's own sampler). ``adjoint = 'auto'``
+    records paths unless ``max_depth`` exceeds what a record holds, or only emitters have gradients (see
+    `emission_only`). Forward mode does not depend on ``adjoint``.
 
-    ``auto`` edges are ``all`` where something moves that can hide light (see `edges_move`) and edges can be
-    differentiated, else ``none``: with another ``attach`` than ``delta`` always, and for sensors of type ``batch``,
-    which is told. Without motion no edges are traced, whatever ``edges`` is.
+    ``boundary = 'auto'`` means ``all`` where something that can occlude light moves (see `edges_move`) and its boundary
+    term can be computed. Otherwise it means ``none``: with an ``attach`` other than ``delta``, and, with a message, for
+    sensors of type ``batch``. Without motion no boundary term is computed, whatever ``boundary`` is.
 
-    Media are differentiated where paths went, less a baseline that is learned from earlier gradient passes of this
-    integrator (with other seeds). ``branch`` walks one more path from where a medium might have scattered and did
-    not, without which a gradient by extinction is wrong where it is zero; ``auto`` does so where extinction with
-    gradients varies in space or is zero, which mostly takes less time for the same noise, too.
+    Gradients of media use a control variate that this integrator learns from earlier gradient passes (with other
+    seeds). ``null_branching`` traces one more path from a null collision, where the medium could have scattered.
+    Without it a gradient by extinction is wrong where extinction is zero. ``auto`` branches where extinction with
+    gradients varies in space or is zero; at equal noise that mostly takes less time, too.
 
-    Not differentiated: visibility, as far as ``edges`` leaves it out; with ``attach='none'`` all motion of shapes,
-    cameras and directions; by extinction where it is zero if ``branch`` is off; with the replay driver, by weights
-    that are exactly zero.
+    Not differentiated: visibility, as far as ``boundary`` leaves it out; all motion of shapes, cameras and directions
+    with ``attach='none'``; extinction where it is zero without ``null_branching``; weights that are exactly zero with
+    ``adjoint='replay'``.
     Raises PathreplayError for unknown or unusable properties and in polarised variants.
     """
 
@@ -107,16 +115,18 @@ class PathReplayIntegrator(PathIntegrator):
         self.attach = choice(props, self.name, "attach", "delta", ATTACH)
         self.moves_rays = self.attach != "none"  # gradients reach cameras, and lights that move
         self.interior = _interior(self.name, props, self.max_depth)
-        self.driver, self.branch = self.interior.driver, self.interior.branch
-        self.even = choice(props, self.name, "numbers", "even", NUMBERS) == "even"
-        self.edges = choice(props, self.name, "edges", "auto", EDGE_TERMS)
-        self.edge_spp = whole_number(props, self.name, "edge_spp", 0, lowest=0, kind="number of lines per pixel")
-        if self.edges == "auto" and self.attach != "delta":
-            self.edges = "none"
-        if self.edges != "none" and self.attach != "delta":
+        self.adjoint, self.null_branching = self.interior.adjoint, self.interior.branch
+        self.even = choice(props, self.name, "sampling", "sobol", SAMPLING) == "sobol"
+        self.boundary = choice(props, self.name, "boundary", "auto", BOUNDARIES)
+        self.boundary_spp = whole_number(
+            props, self.name, "boundary_spp", 0, lowest=0, kind="number of segments per pixel"
+        )
+        if self.boundary == "auto" and self.attach != "delta":
+            self.boundary = "none"
+        if self.boundary != "none" and self.attach != "delta":
             raise PathreplayError(
-                f"{self.name}: edges = '{self.edges}' with attach = '{self.attach}': edges know what moves with "
-                "attach = 'delta' only: use that, or edges = 'none'"
+                f"{self.name}: boundary = '{self.boundary}' with attach = '{self.attach}': edges know what moves with "
+                "attach = 'delta' only: use that, or boundary = 'none'"
             )
         self.told: set[str] = set()  # what has been said in the log
         self.deferred = TermResult()  # of passes whose lost paths have not been told
@@ -125,9 +135,9 @@ class PathReplayIntegrator(PathIntegrator):
     @property
     def terms(self) -> tuple[Term, ...]:
         """The interior, and edges unless they are switched off; `_planned` adds that of a camera that moves."""
-        if self.edges == "none":
+        if self.boundary == "none":
             return (self.interior,)
-        return self.interior, Boundary(inner=self.edges != "film", spp=self.edge_spp)
+        return self.interior, Boundary(inner=self.boundary != "primary", spp=self.boundary_spp)
 
     def _planned(self, view: Pass, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
         """See `PathIntegrator`. What moves over the film has a term of its own, and the others what that leaves.
@@ -136,7 +146,7 @@ class PathReplayIntegrator(PathIntegrator):
         `auto` finds that they cannot be done; the interior, where the film's term is all.
         """
         view, trace, terms = PathIntegrator._planned(self, view)
-        if self.edges == "none":
+        if self.boundary == "none":
             return view, trace, terms
         view = replace(view, flow=CameraFlow.of(view.scene, view.sensor))
         needs_edges = self._needs_edges(view, trace)
@@ -149,20 +159,20 @@ class PathReplayIntegrator(PathIntegrator):
             return view, trace, motion if view.flow is not None and view.flow.is_all else (*terms, *motion)
         if is_recording():
             trace = replace(trace, traits=replace(trace.traits, tables=self._tables(facts_of(view.scene), edges=True)))
-        return view, replace(trace, edges=self.edges != "film" and trace.media is None), (*terms, *motion)
+        return view, replace(trace, edges=self.boundary != "primary" and trace.media is None), (*terms, *motion)
 
     def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:
         """Whether the film may follow what it sees: all edges are found of what then slides under it."""
-        return self.edges != "film" and can_follow(trace, view.sensor) and not facts_of(view.scene).has_seams
+        return self.boundary != "primary" and can_follow(trace, view.sensor) and not facts_of(view.scene).has_seams
 
     def _needs_edges(self, view: Pass, trace: TraceConfig) -> bool:
         """Whether edges move, and can be differentiated where that is left to ``auto``; says what they cost."""
         if not Boundary.move(view, trace):
             return False
-        why = Boundary.obstacle(view) if self.edges == "auto" else ""
+        why = Boundary.obstacle(view) if self.boundary == "auto" else ""
         if why:
             self._tell_once(f"{why}; they are left out here")
-        elif self.edges == "auto" and EDGES not in self.told:
+        elif self.boundary == "auto" and EDGES not in self.told:
             self._tell_once(COST_OF_EDGES)
         return not why
 
@@ -173,20 +183,20 @@ class PathReplayIntegrator(PathIntegrator):
     def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
         """Why it cannot be used, with the way out: see `obstacle`. It needs the sweep driver, too, and no media."""
         view = Pass.of(scene, sensor, 0, spp)
-        if self.driver != "sweep":
-            return f"driver = '{self.driver}' walks paths one by one; take 'sweep'"
+        if self.adjoint != "recorded":
+            return f"adjoint = '{self.adjoint}' records no paths; use 'recorded'"
         if facts_of(scene).has_media:
             return "the scene has media; leave them out"
         return obstacle(view.sensor, self.max_depth, view.spp, some) or ("" if some else self._loss_of_sweep(view))
 
     def _loss_of_sweep(self, view: Pass) -> str:
         """Why whole pictures are better rendered than swept: the film follows what moves, which no sweep of it does."""
-        if self.edges in ("none", "film"):
+        if self.boundary in ("none", "primary"):
             return ""
         with self._passing():
             trace = self._walk(view.scene, view.sensor)
             follows = Boundary.move(view, trace) and not Boundary.obstacle(view) and self._may_follow(view, trace)
-        return "the film follows what moves; take edges = 'none'" if follows else ""
+        return "the film follows what moves; take boundary = 'none'" if follows else ""
 
     def render_value_and_grad(
         self,
@@ -279,9 +289,9 @@ class PathReplayIntegrator(PathIntegrator):
             self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
 
     def _tell_edges(self, trace: TraceConfig, sensor: mi.Sensor) -> None:
-        if EDGES in self.told or self.edges in ("auto", "all"):
+        if EDGES in self.told or self.boundary in ("auto", "all"):
             return
-        note, named = missing_edges(trace, sensor, self.edges)
+        note, named = missing_edges(trace, sensor, self.boundary)
         if named:
             self.told.add(EDGES)
         if note:
@@ -312,21 +322,21 @@ class PathReplayIntegrator(PathIntegrator):
     def options(self) -> dict[str, Any]:
         """The properties that this one was made of, beside those that all integrators of paths share."""
         return {
-            "driver": "auto" if self.interior.auto else self.driver,
+            "adjoint": "auto" if self.interior.auto else self.adjoint,
             "attach": self.attach,
-            "noise": self.interior.recovery.noise,
-            "branch": self.branch,
-            "numbers": NUMBERS[self.even],
-            "edges": self.edges,
-            "edge_spp": self.edge_spp,
+            "jacobian_noise": self.interior.recovery.noise,
+            "null_branching": self.null_branching,
+            "sampling": SAMPLING[self.even],
+            "boundary": self.boundary,
+            "boundary_spp": self.boundary_spp,
         }
 
     def to_string(self) -> str:
         return self._described(
             hide_emitters=self.hide_emitters,
-            driver=self.driver,
+            adjoint=self.adjoint,
             attach=self.attach,
-            branch=self.branch,
-            numbers=NUMBERS[self.even],
-            edges=self.edges,
+            null_branching=self.null_branching,
+            sampling=SAMPLING[self.even],
+            boundary=self.boundary,
         )

@@ -61,7 +61,7 @@ class PathReplay:
     Not differentiated: see `sweep`, `replay` and `forward`; weights that are exactly zero with the replay driver.
     """
 
-    driver: str  # sweep or replay
+    adjoint: str  # recorded or replay
     auto: bool  # replay where the sweep cannot hold the paths, and lights where nothing else has gradients
     branch: str | bool  # whether a null collision of each path is kept (auto: where it is needed)
     recovery: Recovery  # of the replay driver
@@ -101,16 +101,16 @@ class PathReplay:
     def note(self, trace: TraceConfig) -> str:
         """What is to be said of the driver that was chosen; "" if it is nothing."""
         device = device_of(mi.variant())
-        if self._sweeps(trace) or self.driver == "replay" or not device.is_gpu:
+        if self._sweeps(trace) or self.adjoint == "replay" or not device.is_gpu:
             return ""
         return (
             f"records of {trace.max_depth} vertices are more than {device.name or 'the GPU'} can hold for each of its "
-            f"threads: paths are walked twice instead (driver = 'replay'); up to max_depth = {deepest(trace, device)} "
+            f"threads: paths are walked twice instead (adjoint = 'replay'); up to max_depth = {deepest(trace, device)} "
             "they are recorded"
         )
 
     def _sweeps(self, trace: TraceConfig) -> bool:
-        return self.driver == "sweep" and not (self.auto and trace.max_depth > deepest(trace))
+        return self.adjoint == "recorded" and not (self.auto and trace.max_depth > deepest(trace))
 
     def _informed(self, trace: TraceConfig, learned: Baseline | None) -> TraceConfig:
         """The walk, with what earlier passes found out about media."""

@@ -8,6 +8,7 @@ the variant to use. Polarised variants get the plugins themselves, which say tha
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -17,27 +18,31 @@ from pathreplay.platform.device import backend_of
 #: Each by name: what it is to Mitsuba, and the template of its class (see `on_base`).
 PLUGINS = {
     "pathreplay": ("integrator", "pathreplay.integrators.integrator", "PathReplayIntegrator"),
-    "pathreplay_tape": ("integrator", "pathreplay.integrators.baselines.plugins", "TapeIntegrator"),
-    "pathreplay_rb": ("integrator", "pathreplay.integrators.baselines.plugins", "RadiativeIntegrator"),
-    "pathreplay_listing": ("integrator", "pathreplay.integrators.baselines.plugins", "ListingIntegrator"),
     "dielectric_ad": ("bsdf", "pathreplay.plugins.dielectric_ad", "DielectricAD"),
     "gridmedium": ("medium", "pathreplay.plugins.gridmedium", "GridMedium"),
 }
+#: Integrators to compare with, which `pathreplay.baselines` registers on request.
+BASELINES = {
+    "naive_ad": ("integrator", "pathreplay.integrators.baselines.plugins", "NaiveIntegrator"),
+    "radiative_backprop": ("integrator", "pathreplay.integrators.baselines.plugins", "RadiativeIntegrator"),
+    "prb_volume_listing": ("integrator", "pathreplay.integrators.baselines.plugins", "ListingIntegrator"),
+}
+Plugins = Mapping[str, tuple[str, str, str]]
 
 
-def register(variant: str) -> None:
-    """Register all plugins for the active variant, whose name is `variant`; stand-ins where it has no derivatives."""
+def register(variant: str, plugins: Plugins = PLUGINS) -> None:
+    """Register ``plugins`` for the active variant, named ``variant``; stand-ins where it has no derivatives."""
     import mitsuba as mi
 
     if "_ad_" not in variant:
-        _register_stand_ins(variant)
+        _register_stand_ins(variant, plugins)
         return
     if backend_of(variant) == "llvm":
         from pathreplay.platform.backend import warn_of_bad_llvm
 
         warn_of_bad_llvm()
     bases = {"integrator": mitsuba_integrator(), "bsdf": mi.BSDF, "medium": mi.Medium}
-    for name, (kind, module, template) in PLUGINS.items():
+    for name, (kind, module, template) in plugins.items():
         plugin = on_base(getattr(importlib.import_module(module), template), bases[kind])
         getattr(mi, f"register_{kind}")(name, plugin)
 
@@ -62,7 +67,7 @@ def on_base(template: type, base: type) -> type:
     return type(base)(template.__name__, (base,), body)  # type: ignore[no-any-return]
 
 
-def _register_stand_ins(variant: str) -> None:
+def _register_stand_ins(variant: str, plugins: Plugins) -> None:
     import mitsuba as mi
 
     from pathreplay.platform.backend import is_usable_variant
@@ -74,14 +79,14 @@ def _register_stand_ins(variant: str) -> None:
     def refuse(plugin: str, props: Any) -> Any:
         raise PathreplayError(f"{plugin}: variant {variant!r} has no derivatives: use {' or '.join(alike)}")
 
-    for plugin, (kind, *_) in PLUGINS.items():
+    for plugin, (kind, *_) in plugins.items():
         getattr(mi, f"register_{kind}")(plugin, partial(refuse, plugin))
 
 
-def install() -> None:
-    """Register for the active variant, if any, and from now on for each one that is set. Sets no variant."""
+def install(plugins: Plugins = PLUGINS) -> None:
+    """Register ``plugins`` for the active variant, if any, and for each one set later. Sets no variant."""
     import mitsuba as mi
 
-    mi.detail.add_variant_callback(lambda _old, new: register(new))
+    mi.detail.add_variant_callback(lambda _old, new: register(new, plugins))
     if (active := mi.variant()) is not None:
-        register(active)
+        register(active, plugins)

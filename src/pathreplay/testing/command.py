@@ -37,15 +37,15 @@ def check_all(
     *,
     integrator: Spec = None,
     max_depth: int | None = None,
-    edges: Mapping[str, Any] | None = None,
+    boundary: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Iterator[GradientCheck]:
     """``check_gradient(scene, key, **options)`` of each key that the patterns name, as soon as it is there.
 
-    Standard error tells how far it is. ``edges`` are further properties of `pathreplay`. Raises what
+    Standard error tells how far it is. ``boundary`` holds further properties of `pathreplay`. Raises what
     :func:`check_gradient` and :func:`resolve_differentiable` do.
     """
-    tested = integrator_under_test(integrator, scene, max_depth, edges)
+    tested = integrator_under_test(integrator, scene, max_depth, boundary)
     keys = resolve_differentiable(traversed(scene), patterns, tested)
     for i, key in enumerate(keys):
         with _told(f"{key} ({i + 1}/{len(keys)})") as progress:

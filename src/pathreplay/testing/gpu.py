@@ -46,14 +46,14 @@ TIMINGS: dict[str, tuple[dict[str, Any], int, int, int]] = {
     for depth in (8, 64)
     for name, kind, more in (
         ("prb", "prb", {}),
-        ("sweep", "pathreplay", {"driver": "sweep"}),
-        ("replay", "pathreplay", {"driver": "replay"}),
+        ("recorded", "pathreplay", {"adjoint": "recorded"}),
+        ("replay", "pathreplay", {"adjoint": "replay"}),
     )
 }
 # What `auto` is to decide: what records of so many vertices cost, and where there are none.
 TIMINGS |= {
-    f"{driver}, 512 x 512, depth {depth}": ({"type": "pathreplay", "driver": driver}, 512, 16, depth)
-    for driver, depth in (("sweep", 256), ("sweep", 448), ("replay", 448), ("replay", 2048))
+    f"{adjoint}, 512 x 512, depth {depth}": ({"type": "pathreplay", "adjoint": adjoint}, 512, 16, depth)
+    for adjoint, depth in (("recorded", 256), ("recorded", 448), ("replay", 448), ("replay", 2048))
 }
 
 

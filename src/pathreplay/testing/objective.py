@@ -177,9 +177,9 @@ def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
 
 
 def integrator_name(integrator: mi.Integrator) -> str:
-    """The integrator as its user writes it, from its class: 'PRBIntegrator' is 'prb'; and edges that are asked for."""
+    """Name of the integrator as a user writes it, and its boundary terms; a PRBIntegrator is called 'prb'."""
     # For Python plugins Mitsuba's class_name() is that of the C++ base.
     name = type(integrator).__name__ if isinstance(integrator, mi.CppADIntegrator) else str(integrator.class_name())
     name = name.removesuffix("Integrator").replace("VolumetricPath", "Volpath").lower()
-    edges = getattr(integrator, "edges", "auto")
-    return name if edges == "auto" else f"{name}, edges {edges}"
+    edges = getattr(integrator, "boundary", "auto")
+    return name if edges == "auto" else f"{name}, boundary {edges}"

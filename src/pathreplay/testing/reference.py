@@ -27,25 +27,25 @@ LONGEST_WITHOUT_ROULETTE = 64
 
 
 def integrator_under_test(
-    spec: Spec, scene: mi.Scene, max_depth: int | None = None, edges: Mapping[str, Any] | None = None
+    spec: Spec, scene: mi.Scene, max_depth: int | None = None, boundary: Mapping[str, Any] | None = None
 ) -> mi.Integrator:
     """The integrator that ``spec`` means: an object (taken as it is), a dictionary, a plugin name, or None.
 
     None is the scene's own integrator if that one is made for differentiation, else ``pathreplay``. A plugin given by
     name, or chosen by None, gets the path limits of the scene's own integrator; ``max_depth`` overrides them, and
-    ``edges`` are properties of `pathreplay` that are added (``edges``, ``edge_spp``).
+    ``boundary`` holds properties of `pathreplay` to add (``boundary``, ``boundary_spp``).
 
     Raises PathreplayError where Mitsuba cannot make it, ``max_depth`` is no depth or given with a finished one, or
-    edges are asked of another integrator than `pathreplay`.
+    boundary terms are asked of another integrator than `pathreplay`.
     """
     if max_depth is not None and (type(max_depth) is not int or (max_depth < 1 and max_depth != -1)):
         raise PathreplayError(f"max_depth is {max_depth!r}; give a path length of at least 1, or -1 for no bound")
     own = scene.integrator()
-    if spec is None and max_depth is None and not edges and isinstance(own, mi.CppADIntegrator):
+    if spec is None and max_depth is None and not boundary and isinstance(own, mi.CppADIntegrator):
         return own
     if isinstance(spec, mi.Integrator):
-        if max_depth is not None or edges:
-            what = "max_depth" if max_depth is not None else "edges"
+        if max_depth is not None or boundary:
+            what = "max_depth" if max_depth is not None else "boundary"
             raise PathreplayError(f"{what} cannot be given along with a finished integrator; set it there")
         return spec
     if isinstance(spec, Mapping):
@@ -53,16 +53,16 @@ def integrator_under_test(
     else:
         limits = None if own is None else read_limits(own)
         description = {"type": spec or "pathreplay", **({} if limits is None else vars(limits))}
-        if description["type"] == "pathreplay" and hasattr(own, "edge_spp"):
-            description |= {"edges": own.edges, "edge_spp": own.edge_spp}
+        if description["type"] == "pathreplay" and hasattr(own, "boundary_spp"):
+            description |= {"boundary": own.boundary, "boundary_spp": own.boundary_spp}
     if max_depth is not None:
         description["max_depth"] = max_depth
-    if edges and description.get("type") != "pathreplay":
+    if boundary and description.get("type") != "pathreplay":
         raise PathreplayError(
-            f"'{min(edges)}' is a property of 'pathreplay', and the integrator is '{description.get('type')}'; test "
+            f"'{min(boundary)}' is a property of 'pathreplay', and the integrator is '{description.get('type')}'; test "
             "'pathreplay', or leave it out"
         )
-    return load_integrator(description | dict(edges or {}))
+    return load_integrator(description | dict(boundary or {}))
 
 
 def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> mi.Integrator:

@@ -35,12 +35,12 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
     without media.
     """
     if dr.hint(trace.media is None, mode="scalar"):
-        raise PathreplayError("pathreplay_listing differentiates media, and the scene has none: use 'pathreplay'")
+        raise PathreplayError("prb_volume_listing differentiates media, and the scene has none: use 'pathreplay'")
     # Nobody else's tracking is used, so that every collision is one that can be differentiated.
     trace = replace(trace, media=replace(trace.media, grids=(), plain=True))
     sampler, path = start.sampler, PathState.begin(trace, start)
     if dr.hint(path_moves(trace, start, path.at), mode="scalar"):
-        raise PathreplayError("pathreplay_listing cannot follow what moves: use 'pathreplay'")
+        raise PathreplayError("prb_volume_listing cannot follow what moves: use 'pathreplay'")
     L = walk_on(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, peeled on the way
     ctx = mi.BSDFContext()
 

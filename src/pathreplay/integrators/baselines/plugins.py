@@ -1,8 +1,4 @@
-"""Integrators to compare `pathreplay` with, on the same steps: `pathreplay_tape`, `_rb` and `_listing`.
-
-They show what memory, time and noise the other ways of differentiating a path tracer take. Nothing else is a reason to
-use them: `pathreplay` gives the same gradients for less.
-"""
+"""The plugin classes of `pathreplay.baselines`, on the same light-transport step as `pathreplay`."""
 
 from __future__ import annotations
 
@@ -50,14 +46,14 @@ class OtherInterior:
         return ""
 
 
-class TapeIntegrator(PathIntegrator):
+class NaiveIntegrator(PathIntegrator):
     """Plain AD of a wavefront path tracer: for comparison only, since memory grows with the depth (see `tape`).
 
     Properties: those of `PathIntegrator` and ``attach`` (``delta``, ``none``), which means what it does for
     `pathreplay`.
     """
 
-    name = "pathreplay_tape"
+    name = "naive_ad"
     interior = OtherInterior(tape_backward, tape_forward)
 
     def __init__(self, props: mi.Properties) -> None:
@@ -72,7 +68,7 @@ class RadiativeIntegrator(PathIntegrator):
     time), see `radiative`. Nothing that moves is differentiated, and there is no forward mode.
     """
 
-    name = "pathreplay_rb"
+    name = "radiative_backprop"
 
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
@@ -87,6 +83,6 @@ class ListingIntegrator(PathIntegrator):
     those of the forward driver, without baseline and branch.
     """
 
-    name = "pathreplay_listing"
+    name = "prb_volume_listing"
     attach = "delta"  # so that it is noticed
     interior = OtherInterior(listing, forward)

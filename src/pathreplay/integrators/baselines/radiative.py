@@ -23,7 +23,7 @@ from pathreplay.transport.vertex import TraceConfig
 
 def no_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
     """There is none. Raises PathreplayError."""
-    raise PathreplayError("pathreplay_rb has no forward mode: use the integrator 'pathreplay'")
+    raise PathreplayError("radiative_backprop has no forward mode: use the integrator 'pathreplay'")
 
 
 @dr.syntax

@@ -357,7 +357,7 @@ def _require_gradients(integrator: mi.Integrator, name: str) -> None:
 def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
     """What is to be said of edges that move. An integrator of ours need not say it once more."""
     moving = [key for key in keys if moves_edges(params, key)]
-    edges = getattr(integrator, "edges", "none")
+    edges = getattr(integrator, "boundary", "none")
     # By name: Mitsuba's projective integrators sample edges. Ours tells itself what it leaves out.
     if not moving or "Projective" in type(integrator).__name__ or edges == "all":
         return ()

@@ -32,7 +32,7 @@ class View(NamedTuple):
 
 
 class SceneFunction:
-    """What all bridges share: values go in and come out as Dr.Jit's tensors, in the order of ``keys``.
+    """Rendering as a pure function of Dr.Jit tensors, in the order of ``keys``, which PyTorch and JAX functions call.
 
     Args:
         scene: a scene, or the path of an XML file or the name of a built-in, with ``arguments`` for it.

@@ -8,9 +8,9 @@ from typing import Any
 
 import mitsuba as mi
 
-from pathreplay.bridge.scene_function import SceneFunction, View
 from pathreplay.errors import PathreplayError
 from pathreplay.platform.device import backend_of
+from pathreplay.scenes.scene_function import SceneFunction, View
 
 try:
     import torch
@@ -18,10 +18,10 @@ except ImportError:
     raise PathreplayError("PyTorch is not installed: pip install torch, or 'pathreplay[torch]'") from None
 
 Tensors = Mapping[str, torch.Tensor]
-"""By key of the parameter: what people see of it, in the shapes of `Render.start`."""
+"""By key of the parameter: what people see of it, in the shapes of `RenderFunction.initial_values`."""
 
 
-class Render(SceneFunction):
+class RenderFunction(SceneFunction):
     """Pictures of a scene as a function of some of its parameters: see `SceneFunction`.
 
     Tensors are float32 on ``device``: the CPU, or the GPU in variants with CUDA; others are brought there.
@@ -32,7 +32,7 @@ class Render(SceneFunction):
         """Where pictures and gradients are."""
         return torch.device("cuda" if backend_of(mi.variant()) == "cuda" else "cpu")
 
-    def start(self) -> dict[str, torch.Tensor]:
+    def initial_values(self) -> dict[str, torch.Tensor]:
         """The values that the scene had.
 
         Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices
@@ -54,10 +54,10 @@ class Render(SceneFunction):
 
 
 class _Rendering(torch.autograd.Function):
-    """The picture of a `Render` with some view, and its derivative by the values."""
+    """The picture of a `RenderFunction` with some view, and its derivative by the values."""
 
     @staticmethod
-    def forward(ctx: Any, render: Render, view: View, *tensors: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, render: RenderFunction, view: View, *tensors: torch.Tensor) -> torch.Tensor:
         ctx.render, ctx.view = render, view
         ctx.save_for_backward(*tensors)
         return _to_torch(render.picture(_to_drjit(tensors), view), render.device)

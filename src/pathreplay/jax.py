@@ -12,8 +12,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.bridge.scene_function import SceneFunction, View
 from pathreplay.errors import PathreplayError
+from pathreplay.scenes.scene_function import SceneFunction, View
 
 try:
     import jax
@@ -22,10 +22,10 @@ except ImportError:
     raise PathreplayError("JAX is not installed: pip install jax, or 'pathreplay[jax]'") from None
 
 Arrays = Mapping[str, jax.Array]
-"""By key of the parameter: what people see of it, in the shapes of `Render.start`."""
+"""By key of the parameter: what people see of it, in the shapes of `RenderFunction.initial_values`."""
 
 
-class Render(SceneFunction):
+class RenderFunction(SceneFunction):
     """Pictures of a scene as a function of some of its parameters: see `SceneFunction`.
 
     Arrays are float32, and go by way of the host.
@@ -36,7 +36,7 @@ class Render(SceneFunction):
         """What JAX differentiates, by sensor and samples per pixel."""
         return {}
 
-    def start(self) -> dict[str, jax.Array]:
+    def initial_values(self) -> dict[str, jax.Array]:
         """The values that the scene had.
 
         Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices
@@ -63,7 +63,7 @@ class Render(SceneFunction):
         return image
 
 
-def _function(render: Render, sensor: int, spp: int) -> Any:
+def _function(render: RenderFunction, sensor: int, spp: int) -> Any:
     """The picture as a function of seed and values, with its derivative."""
     size = _size(render, sensor)
 
@@ -92,7 +92,7 @@ def _function(render: Render, sensor: int, spp: int) -> Any:
     return function
 
 
-def _size(render: Render, sensor: int) -> tuple[int, ...]:
+def _size(render: RenderFunction, sensor: int) -> tuple[int, ...]:
     """Height, width and channels of a sensor's pictures, by the cheapest one."""
     start = [mi.TensorXf(render._start[key]) for key in render.keys]
     return tuple(render.picture(start, View(sensor, 0, 1)).shape)
