@@ -117,7 +117,7 @@ def compare(a: np.ndarray, b: np.ndarray) -> Difference:
 
 def pictures(scene: Any, plugin: str, first_seed: int, **options: Any) -> np.ndarray:
     if plugin == "pathreplay":
-        options["numbers"] = "scene"  # with even ones the errors of pixels know of each other
+        options["sampling"] = "scene"  # with Sobol samples the errors of pixels know of each other
     integrator = mi.load_dict({"type": plugin, **options})
     seeds = range(first_seed, first_seed + SEEDS)
     return np.array([np.array(mi.render(scene, integrator=integrator, seed=s, spp=SPP), np.float64) for s in seeds])

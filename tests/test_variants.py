@@ -49,7 +49,7 @@ alive = []
 for variant in sys.argv[1:]:
     mi.set_variant(variant)
     if variant.startswith("scalar"):
-        for plugin in pathreplay.platform.registration.PLUGINS:
+        for plugin in [*pathreplay.platform.registration.PLUGINS, *pathreplay.platform.registration.BASELINES]:
             try:
                 mi.load_dict({"type": plugin})
             except Exception as error:
