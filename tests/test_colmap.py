@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.capture_options import Capture
+from pathreplay.inverse.config.target_options import Capture
 from pathreplay.inverse.dataset.capture import Shot, read_capture
 from pathreplay.inverse.dataset.undistortion import Lens
 from pathreplay.inverse.images.io import exr_bytes, picture_size, png_bytes

@@ -51,10 +51,10 @@ REFUSED = {
     "=3": "names no key",
     "a b=3": "names no key",
     "a\nb=2": "names no key",
-    "parameters.2.key=c": "no place in a list of 2",
-    "parameters.first.key=c": "no place in a list of 2",
-    "spp.x=1": "no table",
-    f"parameters.{'9' * 5000}.key=c": "no place in a list of 2",
+    "parameters.2.key=c": "not an index into a list of 2",
+    "parameters.first.key=c": "not an index into a list of 2",
+    "spp.x=1": "is not a table",
+    f"parameters.{'9' * 5000}.key=c": "not an index into a list of 2",
     f"{'.'.join('a' * 3000)}=1": "names no key",
 }
 

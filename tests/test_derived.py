@@ -319,7 +319,7 @@ def test_exports_render_to_the_same_picture() -> None:
 SHARE = free("share", 1)
 # Of each: what is recovered, what is derived, and what the message says.
 REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any] | None, str]] = {
-    "unused": (SHARE, None, "'shape' is of numbers that others are derived from; name it in 'of'"),
+    "unused": (SHARE, None, "has a 'shape', but nothing is derived from it; name it in 'of'"),
     "of the scene": (free(WALL, 3), made(FLOOR, "dark", WALL), "is one of the scene; leave 'shape' out"),
     "both": ({"key": WALL}, made(WALL, "dark", WALL), f"'{WALL}' is named twice, by '{WALL}' and '{WALL}'"),
     "nothing": (
@@ -351,13 +351,13 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any] | None, str]] = {
     ),
     "no such key": (SHARE, made("Wal.reflectance.value", "grey", "share"), f"nearest: {WALL}"),
     "no such function": (SHARE, made(WALL, "gray", "share"), "cannot be imported"),
-    "no function": (SHARE, made(WALL, "number", "share"), "is no function of values, but 3; name another"),
+    "no function": (SHARE, made(WALL, "number", "share"), "is not a function of values, but 3; name another"),
     "no path": (
         SHARE,
         {**made(WALL, "grey", "share"), "function": "grey"},
-        "'grey' is no import path; write module:function",
+        "'grey' is not an import path; write module:function",
     ),
-    "fails": (SHARE, made(WALL, "broken", "share"), "Derivation 'own:broken' cannot be computed (no luck); mend it"),
+    "fails": (SHARE, made(WALL, "broken", "share"), "Derivation 'own:broken' cannot be computed (no luck); fix it"),
     "another kind": (SHARE, made(WALL, "as_list", "share"), "cannot be computed"),
     "another shape": (
         SHARE,
@@ -368,9 +368,9 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any] | None, str]] = {
     "too many": (
         free("share", 10**5, 10**5, 10),
         made(WALL, "grey", "share"),
-        "has 100000000000 numbers, and arrays up to",
+        "has 100000000000 entries, but arrays hold up to",
     ),
-    "a pose": ({**SHARE, "pose": "rigid"}, made(WALL, "grey", "share"), "'shape' does not go with a pose"),
+    "a pose": ({**SHARE, "pose": "rigid"}, made(WALL, "grey", "share"), "'shape' does not apply to a pose"),
     "smooth": (
         {**SHARE, "large_steps_lambda": 2.0},
         made(WALL, "grey", "share"),

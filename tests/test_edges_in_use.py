@@ -170,9 +170,9 @@ def test_copies_of_a_vertex_stay_together() -> None:
 SMOOTH_REFUSED = {
     "bounds": (
         {"key": KEY, "large_steps_lambda": 5, "lower": 0},
-        "'large_steps_lambda' does not go with 'lower' and 'upper'",
+        "'large_steps_lambda' excludes 'lower' and 'upper'",
     ),
-    "pose": ({**BODY, "large_steps_lambda": 5}, "'large_steps_lambda' does not go with a pose"),
+    "pose": ({**BODY, "large_steps_lambda": 5}, "'large_steps_lambda' does not apply to a pose"),
     "colour": ({"key": "body.bsdf.reflectance.value", "large_steps_lambda": 5}, "no mesh's vertex_positions"),
     "zero": ({"key": KEY, "large_steps_lambda": 0}, "'parameters.0.large_steps_lambda' is 0"),
 }

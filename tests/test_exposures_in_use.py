@@ -87,5 +87,5 @@ def test_a_gradient_is_that_of_the_steps_that_are_taken(fixed: list[int]) -> Non
 
 
 def test_a_loss_up_to_a_factor_leaves_no_exposure_to_be_found() -> None:
-    with pytest.raises(PathreplayError, match="loss = 'scale-invariant' has a factor of its own for each view"):
+    with pytest.raises(PathreplayError, match="loss = 'scale-invariant' already fits a factor to each view"):
         make_config({**JOB, "loss": "scale-invariant"})

@@ -220,11 +220,11 @@ def test_automatic_samples_double_and_go_on_from_a_checkpoint() -> None:
 
 REFUSED = {
     "odd": ({"measure_snr": True, "spp": 5}, "spp is 5; make it even"),
-    "unused": ({"adaptive_spp": {"target_snr": 2.0}}, "adaptive_spp goes with spp = 'auto', and spp is 4"),
+    "unused": ({"adaptive_spp": {"target_snr": 2.0}}, "adaptive_spp requires spp = 'auto', but spp is 4"),
     "misspelt": ({"spp": "atuo"}, "'spp' is 'atuo': input should be a valid integer"),
     "true": ({"spp": True}, "'spp' is True: input should be a valid integer"),
     "none": ({"spp": 0}, "'spp' is 0: input should be greater than or equal to 1"),
-    "no power": ({"spp": "auto", "adaptive_spp": {"min": 6}}, "min = 6 is no power of two from 2 on; take 4"),
+    "no power": ({"spp": "auto", "adaptive_spp": {"min": 6}}, "min = 6 is not a power of two (2, 4, ...); use 4"),
     "one": ({"spp": "auto", "adaptive_spp": {"min": 1}}, "take 2"),
     "order": ({"spp": "auto", "adaptive_spp": {"min": 64, "max": 8}}, "min = 64 is above max = 8"),
     "key": (

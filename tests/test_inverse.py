@@ -127,15 +127,15 @@ BAD_CONFIGS = {
     ),
     "refined backwards": (
         {"parameters": [{"key": "a", "resolutions": [4, 8, 16], "refine_at": [20, 10]}]},
-        "'a': refine_at [20, 10] does not increase",
+        "'a': refine_at [20, 10] is not increasing",
     ),
     "refined after the end": (
         {"parameters": [{"key": "a", "resolutions": [4, 8], "refine_at": [50]}], "iterations": 50},
-        "'a': refine_at 50 is not before the end of the 50 iterations",
+        "'a': refine_at 50 is not less than iterations = 50",
     ),
     "a pose has no resolutions": (
         {"parameters": [{"key": "a", "pose": "rigid", "resolutions": [4]}]},
-        "'resolutions' does not go with a pose",
+        "'resolutions' does not apply to a pose",
     ),
     "unknown key of a parameter": (
         {"parameters": [{"key": "a", "upr": 1}]},
@@ -157,11 +157,14 @@ BAD_CONFIGS = {
     "no iterations": ({"iterations": 0}, "'iterations' is 0"),
     "negative seed": ({"seed": -1}, "'seed' is -1"),
     "zero learning rate": ({"learning_rate": 0}, "'learning_rate' is 0"),
-    "nothing to match": ({"target": {}}, "nothing to match"),
+    "nothing to match": ({"target": {}}, "no target images"),
     "images and values": ({"target": {"images": ["a"], "values": {"k": 1}}}, "'images' excludes 'values'"),
     "an optimiser of Dr.Jit's": ({"optimizer": dr.opt.Adam(lr=0.1)}, "'optimizer' is Adam"),
     "an optimiser in the place of a target": ({"target": dr.opt.SGD(lr=0.1)}, "'target' is SGD"),
-    "graded by itself": ({"target": {"values": {"k": 1}, "integrator": {"type": "pathreplay"}}}, "grade itself"),
+    "graded by itself": (
+        {"target": {"values": {"k": 1}, "integrator": {"type": "pathreplay"}}},
+        "with itself",
+    ),
 }
 
 

@@ -184,12 +184,12 @@ def test_a_job_that_was_left_goes_on_bit_for_bit(room: Path) -> None:
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "stages": ({"stages": [{"iterations": 40}]}, "leave 'stages' out"),
-    "batches": ({"view_batch_size": 1}, "leave 'view_batch_size' out"),
-    "pixels": ({"pixel_batch_size": 9}, "leave 'pixel_batch_size' out"),
-    "baseline": ({"baseline": {"type": "prb"}}, "leave 'baseline' out"),
-    "schedule": ({"final_learning_rate_ratio": 0.5}, "leave 'final_learning_rate_ratio' out"),
-    "auto": ({"spp": "auto"}, "leave 'spp = 'auto'' out"),
+    "stages": ({"stages": [{"iterations": 40}]}, "remove 'stages'"),
+    "batches": ({"view_batch_size": 1}, "remove 'view_batch_size'"),
+    "pixels": ({"pixel_batch_size": 9}, "remove 'pixel_batch_size'"),
+    "baseline": ({"baseline": {"type": "prb"}}, "remove 'baseline'"),
+    "schedule": ({"final_learning_rate_ratio": 0.5}, "remove 'final_learning_rate_ratio'"),
+    "auto": ({"spp": "auto"}, "remove 'spp = 'auto''"),
     "grids": (
         {"parameters": [{"key": "a", "resolutions": [2, 4], "refine_at": [3]}]},
         "leave 'refine_at' out",

@@ -248,7 +248,7 @@ BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
         replace("spp = 1\ne", "spp = 1\ndeterministic = 'yes'\ne"),
         ["'deterministic'", "true or false"],
     ),
-    "TOML nested deep": (replace("spp = 1\ne", f"spp = {'[' * 3000}{']' * 3000}\ne"), ["nested too deep"]),
+    "TOML nested deep": (replace("spp = 1\ne", f"spp = {'[' * 3000}{']' * 3000}\ne"), ["nested too deeply"]),
     "TOML of many digits": (replace("spp = 1\ne", f"spp = {'1' * 10000}\ne"), ["more digits"]),
     "hexadecimal of many digits": (replace("spp = 1\ne", f"spp = 0x{'f' * 10000}\ne"), ["'spp' is", "4300 digits"]),
     # Only regular files are opened.

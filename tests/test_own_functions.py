@@ -39,14 +39,14 @@ for value in ("much", b"much", "", {}, {"a": 1}, {1.0}, loop, (loop,), deep, Non
         Imported("Loss", "own:f", lambda: value)(mi.TensorXf)
         print("taken:", repr(value)[:30])
     except PathreplayError as error:
-        assert str(error).startswith("Loss 'own:f' gives ") and str(error).endswith("arrays of them"), error
+        assert str(error).startswith("Loss 'own:f' returns ") and str(error).endswith("or Dr.Jit arrays"), error
 try:
     Imported("Loss", "own:f", lambda: mi.set_variant("scalar_rgb"))(float)
 except PathreplayError as error:
     print(error)
 print(mi.variant())
 """
-SETS = "Loss 'own:f' sets the variant 'scalar_rgb', and the job runs in 'llvm_ad_rgb'; leave that to the job"
+SETS = "Loss 'own:f' sets the variant 'scalar_rgb', but the job runs in 'llvm_ad_rgb'; do not set a variant there"
 
 
 def test_what_is_no_number_is_refused_by_its_type(run_python: Callable[..., Any]) -> None:
@@ -109,18 +109,18 @@ def of_the_target(image, target):
     return dr.square(target)
 """
 JOBS: dict[str, tuple[dict[str, Any], str]] = {
-    "loss leaves": ({"loss": "own:leaves"}, "Loss 'own:leaves' cannot be computed (it ends Python: SystemExit(7)); "),
-    "loss leaves later": ({"loss": "own:leaves_later"}, "(it ends Python: SystemExit('no more'))"),
+    "loss leaves": ({"loss": "own:leaves"}, "Loss 'own:leaves' cannot be computed (it exits Python: SystemExit(7)); "),
+    "loss leaves later": ({"loss": "own:leaves_later"}, "(it exits Python: SystemExit('no more'))"),
     "penalty leaves": (
         {"parameters": [{"key": TEXTURE, "regularizer": "own:leaves"}]},
-        "Penalty 'own:leaves' cannot be computed (it ends Python: SystemExit(7)); ",
+        "Penalty 'own:leaves' cannot be computed (it exits Python: SystemExit(7)); ",
     ),
     "derivation leaves": (
         {
             "parameters": [{"key": "share", "shape": [1], "initial": 0.5}],
             "derived": [{"key": TEXTURE, "function": "own:leaves", "of": ["share"]}],
         },
-        "Derivation 'own:leaves' cannot be computed (it ends Python: SystemExit(7)); ",
+        "Derivation 'own:leaves' cannot be computed (it exits Python: SystemExit(7)); ",
     ),
     **{
         name: ({"loss": f"own:{name}"}, f"Loss 'own:{name}' does not depend on the image")

@@ -260,13 +260,13 @@ MOVED = {
 }
 PRB = {"type": "prb", "max_depth": 3}
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "loss": ({"loss": "ssim"}, "loss = 'ssim' wants whole pictures; take l2 or relative-l2"),
+    "loss": ({"loss": "ssim"}, "loss = 'ssim' needs whole images; use l2 or relative-l2"),
     "loss, in a stage": (
         {"loss": "l1", "pixel_batch_size": None, "stages": [{"iterations": 3, "pixel_batch_size": 4}]},
-        "loss = 'l1' wants whole pictures",
+        "loss = 'l1' needs whole images",
     ),
-    "exposure": ({"exposure": {"fix_scale": False}}, "'exposure' wants whole pictures; leave one of them out"),
-    "auto": ({"spp": "auto"}, "spp = 'auto' cannot lessen"),
+    "exposure": ({"exposure": {"fix_scale": False}}, "'exposure' needs whole images; remove one of them"),
+    "auto": ({"spp": "auto"}, "spp = 'auto' cannot reduce"),
     "integrator": ({"integrator": PRB}, "PRBIntegrator renders whole pictures; take the integrator 'pathreplay'"),
     "baseline": ({"baseline": PRB}, "PRBIntegrator renders whole pictures"),
     "replay": ({"integrator": {"type": "pathreplay", "adjoint": "replay"}}, "adjoint = 'replay' .*; use 'recorded'"),

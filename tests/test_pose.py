@@ -242,8 +242,8 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
         {"pose": "translation", "initial": None, "rotation_learning_rate": 1},
         "'rotation_learning_rate' is not part of pose = 'translation'",
     ),
-    "bound on a pose": ({"lower": 0}, "'lower' does not go with a pose"),
-    "start without a pose": ({"pose": None}, "belongs to a pose"),
+    "bound on a pose": ({"lower": 0}, "'lower' does not apply to a pose"),
+    "start without a pose": ({"pose": None}, "applies to a pose only"),
     "no distance": ({"error_scale": 0}, "'parameters.0.error_scale' is 0"),
 }
 

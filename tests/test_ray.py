@@ -99,9 +99,9 @@ def test_the_example_has_many_views_and_the_token_is_for_its_owner() -> None:
 
 
 def test_ranges_must_divide_the_samples() -> None:
-    with pytest.raises(PathreplayError, match="spp_shards = 3 does not divide the 4 samples"):
+    with pytest.raises(PathreplayError, match="spp = 4 cannot be split into spp_shards = 3 equal shards"):
         make_config({**JOB, "spp_shards": 3})
-    with pytest.raises(PathreplayError, match="does not divide the 8 samples per pixel, in two halves"):
+    with pytest.raises(PathreplayError, match="into spp_shards = 8 equal shards, each in two halves"):
         make_config({**JOB, "spp": AUTO, "spp_shards": 8})
     assert make_config({**JOB, "spp_shards": 4}).parts == 4
 

@@ -155,7 +155,7 @@ def test_recorded_passes_and_traced_ones_agree() -> None:
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "not the sum": ({"iterations": 6}, "iterations is 6, and the stages have 7; leave 'iterations' out"),
+    "not the sum": ({"iterations": 6}, "iterations is 6, but the stages have 7 in total; remove 'iterations'"),
     "odd": ({"measure_snr": True, "stages": [{"iterations": 1, "spp": 3}]}, "a stage has spp = 3; make it even"),
     "none": ({"stages": []}, "'stages'"),
     "empty": ({"stages": [{}]}, "key 'stages.0.iterations' is missing; add it"),

@@ -177,15 +177,15 @@ REFUSED = {
         {"parameters": [{"key": "wall.bsdf.reflectance.value", "total_variation": 0.1}]},
         "is no texture and no volume; leave 'total_variation' out",
     ),
-    "no option": ({"optimizer": {"type": "sgd", "beta_1": 0.5}}, "'beta_1' is no option of type = 'sgd'"),
+    "no option": ({"optimizer": {"type": "sgd", "beta_1": 0.5}}, "'beta_1' is not an option of type = 'sgd'"),
     "misspelt": ({"optimizer": {"typ": "sgd"}}, "unknown key 'optimizer.typ'; did you mean 'type'?"),
     "beyond": ({"optimizer": {"beta_2": 1.0}}, "optimizer.beta_2"),
     "nesterov alone": ({"optimizer": {"type": "sgd", "nesterov": True}}, "add momentum"),
     "constant decays": (
         {"learning_rate_schedule": "constant", "final_learning_rate_ratio": 0.5},
-        "does not go with learning_rate_schedule = 'constant'",
+        "has no effect with learning_rate_schedule = 'constant'",
     ),
-    "too long": ({"warmup_steps": 8}, "warmup_steps = 8 is not before the end of the 8 iterations"),
+    "too long": ({"warmup_steps": 8}, "warmup_steps = 8 is not less than iterations = 8"),
     "at a bound": (
         {"parameters": [{"key": "wall.bsdf.reflectance.value", "initial": [0.1, 1, 0.5], "parameterization": "logit"}]},
         "starts at 1, and parameterization = 'logit' wants values below 1",
@@ -196,7 +196,7 @@ REFUSED = {
     ),
     "twice": (
         {"parameters": [{"key": "wall.vertex_positions", "large_steps_lambda": 3.0, "parameterization": "log"}]},
-        "'large_steps_lambda' does not go with 'parameterization'",
+        "'large_steps_lambda' and 'parameterization' exclude each other",
     ),
 }
 

@@ -173,7 +173,11 @@ def test_what_alpha_cannot_be_is_refused_in_one_line(folder: Path) -> None:
         ({"images": ["picture.exr"], "alpha": "compare"}, {}, "the film of sensor 'eye' has none; write pixel_format"),
         ({"images": ["opaque.png"], "alpha": "scene"}, {}, "has no alpha to go with alpha = 'scene'"),
         ({"images": ["picture.exr"], "alpha": "scene"}, {"parameters": sky}, "'sky.radiance.value' is to be found"),
-        ({"values": {"ball.bsdf.reflectance.value": 0.4}, "alpha": "scene"}, {}, "alpha = 'scene' is about 'images'"),
+        (
+            {"values": {"ball.bsdf.reflectance.value": 0.4}, "alpha": "scene"},
+            {},
+            "alpha = 'scene' applies to 'images'",
+        ),
     ):
         with pytest.raises(PathreplayError) as told:
             problem_of(target, **more)

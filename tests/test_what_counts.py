@@ -170,16 +170,16 @@ REFUSED = {
     "too many": ({"target": {"images": ["target.exr"], "masks": ["mask.exr"] * 2}}, "2 masks for 1 sensors"),
     "two masks": (
         {"target": {"images": ["target.exr"], "masks": ["mask.exr"], "alpha": "mask"}},
-        "'masks' and alpha = 'mask' are two masks",
+        "'masks' and alpha = 'mask' both define a mask",
     ),
     "no alpha": ({"target": {"images": ["target.exr"], "alpha": "mask"}}, "has no alpha to be its mask"),
-    "no picture": ({"target": {"values": {KEY: 0.5}, "alpha": "mask"}}, "alpha = 'mask' is about 'images'"),
+    "no picture": ({"target": {"values": {KEY: 0.5}, "alpha": "mask"}}, "alpha = 'mask' applies to 'images' only"),
     "nothing left": ({"test_views": [0]}, "Every sensor of the job is held out"),
     "elsewhere": ({"test_views": ["other"]}, "sensor 'other' is not among 'sensors'"),
     "unknown view": ({"test_views": ["third"]}, "No sensor 'third' in the scene"),
     "no module": ({"loss": "not_there:loss"}, "Loss 'not_there:loss' cannot be imported (No module named 'not_there')"),
     "no function": ({"loss": "broken:loss"}, "has no attribute 'loss'"),
-    "a number": ({"loss": "broken:number"}, "is no function of image and target, but 3"),
+    "a number": ({"loss": "broken:number"}, "is not a function of image and target, but 3"),
     "another shape": ({"loss": "broken:shapes"}, "Loss 'broken:shapes'"),
 }
 

@@ -1,4 +1,4 @@
-"""What ``--set KEY=VALUE`` changes in a job, before it is checked."""
+"""Overrides of a job by ``--set KEY=VALUE``, applied before the job is checked."""
 
 from __future__ import annotations
 
@@ -9,15 +9,21 @@ from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config.parsing import from_toml
 
 DEEPEST = 16
-"""Parts of a key: no job has tables as deep."""
+"""Most parts of a dotted key; the tables of a job are far less deep."""
 _VALUES = (bool, int, float, str, list, dict)
 
 
 def defined(job: Any, changes: Sequence[str], option: str = "--set") -> Any:
-    """The job with these changes, as TOML has it; ``job`` itself is not changed. ``option`` is where they were given.
+    """Return a copy of the job with overrides applied; ``job`` itself is not changed.
 
-    A key is one of TOML's, where a number leads into a list: ``parameters.0.learning_rate``. A value that is no TOML is
-    a text, so that names need no quotes. Raises PathreplayError for what is no change, or leads nowhere.
+    Args:
+        job: the parsed job.
+        changes: overrides ``KEY=VALUE``. A key is a dotted TOML key in which a number indexes a list, as in
+            ``parameters.0.learning_rate``. A value that is not valid TOML is a string, so names need no quotes.
+        option: name of the command-line option, for messages.
+
+    Raises:
+        PathreplayError: an override has no '=', its key is malformed, or the key does not exist in a list or table.
     """
     for change in changes:
         key, equals, text = change.partition("=")
@@ -27,29 +33,28 @@ def defined(job: Any, changes: Sequence[str], option: str = "--set") -> Any:
     return job
 
 
-def _path(key: str, told: str) -> list[str]:
+def _path(key: str, option: str) -> list[str]:
     try:
-        found = from_toml(f"{key} = 0")
+        node = from_toml(f"{key} = 0")
     except (ValueError, RecursionError):
-        found = {}
+        node = {}
     path: list[str] = []
-    while isinstance(found, dict) and len(found) == 1:
-        ((name, found),) = found.items()
+    while isinstance(node, dict) and len(node) == 1:
+        ((name, node),) = node.items()
         path.append(name)
-    if found != 0 or not 0 < len(path) <= DEEPEST:
+    if node != 0 or not 0 < len(path) <= DEEPEST:
         raise PathreplayError(
-            f"{told} names no key; write it as in TOML, such as integrator.max_depth, and quote what has dots in "
-            "its name"
+            f"{option} names no key; write a TOML key such as integrator.max_depth, and quote parts that contain dots"
         )
     return path
 
 
 def _value(text: str) -> Any:
     try:
-        found = from_toml(f"value = {text}")
+        table = from_toml(f"value = {text}")
     except (ValueError, RecursionError):
         return text
-    return found["value"] if len(found) == 1 and isinstance(found["value"], _VALUES) else text
+    return table["value"] if len(table) == 1 and isinstance(table["value"], _VALUES) else text
 
 
 def _put(table: Any, path: list[str], value: Any, option: str) -> Any:
@@ -58,8 +63,10 @@ def _put(table: Any, path: list[str], value: Any, option: str) -> Any:
     name, *rest = path
     if isinstance(table, list):
         if not name.isdecimal() or len(name) > 9 or int(name) >= len(table):
-            raise PathreplayError(f"{option}: {shown(name)} is no place in a list of {len(table)}; count from 0")
-        return [_put(each, rest, value, option) if i == int(name) else each for i, each in enumerate(table)]
+            raise PathreplayError(
+                f"{option}: {shown(name)} is not an index into a list of {len(table)} entries; count from 0"
+            )
+        return [_put(entry, rest, value, option) if i == int(name) else entry for i, entry in enumerate(table)]
     if not isinstance(table, dict):
-        raise PathreplayError(f"{option}: {shown(name)} is asked of {shown(table)}, which is no table; correct the key")
+        raise PathreplayError(f"{option}: {shown(table)} is not a table and has no key {shown(name)}; correct the key")
     return {**table, name: _put(table.get(name, {}), rest, value, option)}

@@ -1,4 +1,4 @@
-"""What is wrong with a job, as one line: pydantic's errors, as somebody would say them who knows the file."""
+"""Validation errors of a job as one-line messages in terms of its file, made from pydantic's errors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from pathreplay.errors import shown
 
-# What to write instead, by pydantic's type of error; the other messages say it themselves.
+# Remedy by pydantic's error type; the messages of other types contain it.
 _INSTEAD = {
     "int_type": "write a whole number such as 16",
     "float_type": "write a number such as 0.5",
@@ -21,13 +21,13 @@ _INSTEAD = {
     "model_type": "write a table: { ... }",
     "table_type": "write a table: { ... }",
     "finite_number": "write a finite number",
-    "json_invalid": "mend it there",
+    "json_invalid": "fix the syntax there",
 }
-# The last key of a value that may be of several kinds -> what all of them are.
+# Keys whose values have several types -> those types in words.
 _KINDS = {
     "initial": "a number, a list of numbers, the name of an image or volume file, or { image = ... }",
     "values": "a number, a list of numbers, the name of an image or volume file, or { image = ... }",
-    "scene_parameters": "a number, true, false or a text in quotes",
+    "scene_parameters": "a number, true, false or a quoted string",
     "sensors": "the names or numbers of sensors: [0, ...]",
     "test_views": "the names or numbers of sensors: [0, ...]",
     "reference": "the name or number of a sensor",
@@ -35,7 +35,7 @@ _KINDS = {
     "masks": "file names, or a pattern such as 'masks/*.png'",
 }
 
-# Keys of 0.1.0's first edition -> what they are called now, in one table or another.
+# Old keys -> new keys; where several are given, the one that the table has.
 RENAMED = {
     "rival": "baseline",
     "learning_rate_decay": "final_learning_rate_ratio",
@@ -65,12 +65,15 @@ RENAMED = {
 
 
 def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[str, type[BaseModel]]) -> str:
-    """The first thing wrong, as one line: where it is, what it is, what would be right.
+    """Describe the most telling error in one line: location, value and remedy.
 
-    ``tables`` are the models of the tables within a ``job``, by the key that leads to them.
+    Args:
+        error: pydantic's error for a whole job.
+        job: model of the job.
+        tables: models of its sub-tables, by key.
     """
     details = error.errors()
-    # A value that may be a number, list, name or table fails once per alternative: an unknown key says the most.
+    # A value of a union type fails once per alternative; an unknown key is the most telling of these failures.
     first = next((e for e in details if e["type"] == "extra_forbidden"), details[0])
     where = ".".join(_path(first["loc"])) or "the job"
     if first["type"] == "extra_forbidden":
@@ -85,9 +88,9 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
         return f"key '{where}' is missing; add it"
     if first["type"] == "value_error":
         reason = str(first["ctx"]["error"])
-        # Ours name the table that they are about; a number's does not.
+        # Validators of tables name the table in their message; validators of numbers do not.
         return f"'{where}': {reason}" if isinstance(first["input"], Real) else reason
-    # The value as it was written: alternatives are judged by their parts.
+    # If several alternatives failed, describe all types that the key accepts.
     kinds = next((kinds for key, kinds in _KINDS.items() if key in _path(first["loc"])), None)
     if kinds is not None and len(details) > 1:
         return f"'{where}' is {shown(first['input'])}; write {kinds}"
@@ -96,7 +99,7 @@ def first_error(error: ValidationError, job: type[BaseModel], tables: Mapping[st
 
 
 def _renamed(key: str, table: type[BaseModel]) -> str | None:
-    """What a key of a table was renamed to."""
+    """Return the new name of an old key of the table, or None."""
     return next((name for name in RENAMED.get(key, "").split() if name in table.model_fields), None)
 
 
@@ -104,6 +107,6 @@ _ALTERNATIVES = ("int", "float", "bool", "str", "count", "Picture", "Value", "Di
 
 
 def _path(loc: tuple[int | str, ...]) -> list[str]:
-    """Where an error is, as a user would say it: without the names of the alternatives that were tried."""
+    """Return the location of an error as keys, without pydantic's names of union alternatives."""
     tried = ("list[", "function-", "constrained-", "nullable[")
     return [str(p) for p in loc if p not in _ALTERNATIVES and not str(p).startswith(tried)]

@@ -1,4 +1,4 @@
-"""Who computes a job's shards: this process, or actors of Ray, and how many of what size."""
+"""Where the shards of a job are evaluated: in this process or by Ray actors, with the options of Ray."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ ExecutorName = Literal["local", "ray"]
 
 
 class RayOptions(Table):
-    """With ``executor = "ray"``: the cluster, and its actors. None of it changes what comes out."""
+    """The Ray cluster and its actors, for ``executor = "ray"``. These options do not change the results."""
 
     address: str | None = None
-    """Address of a running cluster, HOST:PORT or 'auto'; default: a cluster of this run alone."""
+    """Address of a running cluster, HOST:PORT or 'auto'; default: start a private cluster for this run."""
     actors: Count | None = None
-    """Number of actors; default: as many as fit, and shards of an iteration."""
+    """Number of actors; default: as many as fit on the cluster, at most one per shard of an iteration."""
     threads: Count | None = None
     """Cores of each actor."""
     max_restarts: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 100
-    """How often a lost actor is restarted."""
+    """Maximum number of restarts of a lost actor."""
     max_task_retries: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 4
-    """How often a shard is computed again whose actor is lost."""
+    """Maximum number of retries of a shard whose actor was lost."""

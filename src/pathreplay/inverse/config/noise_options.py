@@ -1,4 +1,4 @@
-"""How many samples a job takes, where it says so itself by the signal to noise of its gradients."""
+"""Samples per pixel of a job: a fixed number, or adapted to the signal-to-noise ratio of its gradients."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathreplay.inverse.config.tables import Count, Positive, Table
 
 AUTO = "auto"
 
-# By a discriminator, so that what is neither is judged as a number.
+# The discriminator makes invalid values fail as numbers, which gives the better message.
 Spp = Annotated[
     Annotated[Count, Tag("count")] | Annotated[Literal["auto"], Tag("auto")],
     Discriminator(lambda value: "auto" if isinstance(value, str) and value == AUTO else "count"),
@@ -18,17 +18,17 @@ Spp = Annotated[
 
 
 class AdaptiveSpp(Table):
-    """With ``spp = "auto"``: the signal to noise that every gradient shall have, and between which samples per pixel.
+    """Target signal-to-noise ratio and bounds of the samples per pixel, for ``spp = "auto"``.
 
-    These are powers of two, and so are all between them: passes are recorded anew for each.
+    The number of samples is always a power of two, because each number needs a new recording of the passes.
     """
 
     target_snr: Positive = 1.0
-    """Signal-to-noise ratio that every gradient should have."""
+    """Signal-to-noise ratio that the gradient of every parameter should reach."""
     min: Count = 8
-    """Samples per pixel at first and at least; a power of two."""
+    """Initial and smallest number of samples per pixel; a power of two."""
     max: Count = 256
-    """Samples per pixel at most; a power of two."""
+    """Largest number of samples per pixel; a power of two."""
 
     @model_validator(mode="after")
     def _in_order(self) -> AdaptiveSpp:
@@ -36,7 +36,7 @@ class AdaptiveSpp(Table):
             value = getattr(self, name)
             if value < 2 or value & (value - 1):
                 near = max(2, 1 << (value.bit_length() - 1))
-                raise ValueError(f"adaptive_spp: {name} = {value} is no power of two from 2 on; take {near}")
+                raise ValueError(f"adaptive_spp: {name} = {value} is not a power of two (2, 4, ...); use {near}")
         if self.min > self.max:
             raise ValueError(f"adaptive_spp: min = {self.min} is above max = {self.max}; swap them")
         return self

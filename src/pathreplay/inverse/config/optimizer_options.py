@@ -1,4 +1,4 @@
-"""Options of optimisers, as a job gives them: which there are, and what they are if none is given."""
+"""Optimisers of a job, their options and the defaults of these."""
 
 from __future__ import annotations
 
@@ -10,62 +10,62 @@ from pathreplay.inverse.config.tables import Count, Positive, Share, Switch, Tab
 
 
 class Optimizer(Table):
-    """An optimiser of Dr.Jit's by ``type``, or SciPy's L-BFGS-B, with its options; None: as `DEFAULTS` has it.
+    """An optimiser of ``drjit.opt`` or SciPy's L-BFGS-B, with its options; None stands for the value in `DEFAULTS`.
 
-    Those of Dr.Jit's have its names. ``weight_decay`` pulls towards zero what is stepped (with a transform, that is not
-    the value itself).
+    The options of Dr.Jit's optimisers keep their names. ``weight_decay`` acts on the optimised variable, which is not
+    the value itself if the parameter has a ``parameterization``.
     """
 
     type: Literal["adam", "adamw", "sgd", "rmsprop", "l-bfgs-b"] = "adam"
     """Optimiser of drjit.opt, or SciPy's L-BFGS-B."""
     beta_1: Share | None = None
-    """Decay of the mean of gradients (Adam, AdamW)."""
+    """Decay rate of the first moment (Adam, AdamW)."""
     beta_2: Share | None = None
-    """Decay of the mean of squared gradients (Adam, AdamW)."""
+    """Decay rate of the second moment (Adam, AdamW)."""
     epsilon: Positive | None = None
-    """Added to the root of the second moment (Adam, AdamW, RMSProp)."""
+    """Constant added to the square root of the second moment (Adam, AdamW, RMSProp)."""
     uniform: Switch | None = None
-    """Scale all entries of a variable alike (UniformAdam)."""
+    """Use one second moment for all entries of a variable (UniformAdam)."""
     amsgrad: Switch | None = None
-    """Use the largest second moment so far."""
+    """Use the maximum of all second moments so far (AMSGrad)."""
     weight_decay: Positive | None = None
-    """Pull towards zero in the space of the steps (AdamW)."""
+    """Decoupled weight decay, in the space of the steps (AdamW)."""
     momentum: Share | None = None
-    """Momentum of SGD."""
+    """Momentum (SGD)."""
     nesterov: Switch | None = None
-    """Nesterov's momentum (SGD)."""
+    """Use Nesterov momentum (SGD)."""
     alpha: Share | None = None
-    """Decay of the mean of squared gradients (RMSProp)."""
+    """Decay rate of the second moment (RMSProp)."""
     history_size: Count | None = None
-    """Corrections that L-BFGS keeps."""
+    """Number of corrections that L-BFGS-B keeps."""
     tolerance: Positive | None = None
-    """L-BFGS ends when the loss falls by less than this fraction of the first."""
+    """L-BFGS-B stops when a step lowers the loss by less than this fraction of the initial loss."""
 
     @model_validator(mode="after")
     def _of_its_type(self) -> Optimizer:
         known = DEFAULTS[self.type]
         if wrong := self.model_fields_set - set(known) - {"type"}:
             raise ValueError(
-                f"optimizer: '{min(wrong)}' is no option of type = '{self.type}', which has {', '.join(known)}; "
-                "leave it out, or take another type"
+                f"optimizer: '{min(wrong)}' is not an option of type = '{self.type}', which has {', '.join(known)}; "
+                "remove it, or use another type"
             )
         if self.nesterov and not self.momentum:
-            raise ValueError("optimizer: 'nesterov' wants momentum; add momentum = 0.9, or leave it out")
+            raise ValueError("optimizer: 'nesterov' needs momentum; add momentum = 0.9, or remove 'nesterov'")
         return self
 
     @property
     def searches(self) -> bool:
-        """Whether it compares losses of iterations, which all see the same noise then."""
+        """Whether it compares losses between iterations, which then all use the same random numbers."""
         return self.type == "l-bfgs-b"
 
     def options(self) -> dict[str, Any]:
-        """All of its type, those that were not given included."""
+        """Return all options of the type, with defaults for those that are not given."""
         return DEFAULTS[self.type] | self.model_dump(exclude={"type"}, exclude_none=True)
 
 
 _ADAM = {
     "beta_1": 0.9,
-    # The second moment remembers about 1 / (1 - beta_2) steps. Its usual 0.999 outlasts a whole run of a few hundred.
+    # The second moment averages over about 1 / (1 - beta_2) steps; with the usual 0.999, more than most runs have.
     "beta_2": 0.99,
     "epsilon": 1e-8,
     "uniform": False,
@@ -76,6 +76,6 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "adamw": {**_ADAM, "weight_decay": 0.01},
     "sgd": {"momentum": 0.0, "nesterov": False},
     "rmsprop": {"alpha": 0.99, "epsilon": 1e-8},
-    # The tolerance is a share of the first loss. Below, falls are lost in the rounding of single precision.
+    # Relative to the initial loss; smaller decreases are within the rounding error of single precision.
     "l-bfgs-b": {"history_size": 10, "tolerance": 1e-6},
 }

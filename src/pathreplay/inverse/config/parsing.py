@@ -1,4 +1,4 @@
-"""The text of a job, TOML, JSON or YAML, as tables: what is none is told in one line."""
+"""Parse a job from TOML, JSON or YAML into dictionaries; syntax errors become one-line messages."""
 
 from __future__ import annotations
 
@@ -19,43 +19,43 @@ else:
     import tomli as tomllib
 
 YAML = (".yaml", ".yml")
-"""Endings of files that are YAML; `.json` is JSON, all others are TOML."""
+"""Suffixes of YAML files; `.json` selects JSON, any other suffix TOML."""
 
 _LONGEST, _LONGEST_YAML = 64 * 2**20, 2**18
-"""Bytes: no job is as long, and what is larger is some other file. PyYAML takes seconds for as many."""
+"""Largest size of a file in bytes; a larger one is not a job. PyYAML takes seconds for 2**18 bytes."""
 
 _DEEPEST = 64
-"""Lists and tables of YAML inside each other: its reader needs several frames for each."""
+"""Deepest nesting of YAML; PyYAML recurses by several stack frames per level."""
 
 
 def most_bytes(path: Path) -> int:
-    """The size of a file, beyond which it is no job."""
+    """Return the largest size in bytes that a job in this file may have."""
     return _LONGEST_YAML if path.suffix.lower() in YAML else _LONGEST
 
 
 def parsed(path: Path, text: str) -> Any:
-    """What the text of the file says, by the ending of its name. Raises PathreplayError for what cannot be read."""
+    """Parse the text of a file in the format of its suffix. Raises PathreplayError for syntax errors."""
     kind, read = _FORMATS.get(path.suffix.lower(), ("TOML", tomllib.loads))
     try:
         return read(text)
     except RecursionError:
-        raise PathreplayError(f"Config {path} is nested too deep; write the job as in docs/optimize.md") from None
+        raise PathreplayError(f"Config {path} is nested too deeply; write the job as in docs/optimize.md") from None
     except (tomllib.TOMLDecodeError, json.JSONDecodeError, yaml.YAMLError) as error:
         why = _of_yaml(error) if isinstance(error, yaml.YAMLError) else error
-        raise PathreplayError(f"Config {path} is not valid {kind}: {why}; mend it there") from None
+        raise PathreplayError(f"Config {path} is not valid {kind}: {why}; fix the syntax there") from None
     except ValueError:
-        raise PathreplayError(f"Config {path} has a number of more digits than Python reads; shorten it") from None
+        raise PathreplayError(f"Config {path} has a number with more digits than Python reads; shorten it") from None
 
 
 def from_toml(text: str) -> dict[str, Any]:
-    """The table that a text of TOML is. Raises ValueError or RecursionError."""
+    """Parse TOML. Raises ValueError or RecursionError."""
     return tomllib.loads(text)
 
 
 class _Plain(yaml.SafeLoader):
-    """YAML 1.2's core, as JSON would have it: `no` is a text, `1e-3` a number, `12:30` no number of seconds.
+    """Loader of the YAML 1.2 core schema: `no` is a string, `1e-3` a number, and `12:30` a string.
 
-    A key that is given twice is an error, and so are tags, and anchors: a few lines of them can name a billion things.
+    Duplicate keys and tags are errors, and so are anchors, which can expand a few lines to billions of nodes.
     """
 
     yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}
@@ -67,9 +67,11 @@ class _Plain(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         event = self.peek_event()
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-            raise yaml.MarkedYAMLError(None, None, "anchors and aliases are not read; write it out", event.start_mark)
+            raise yaml.MarkedYAMLError(
+                None, None, "anchors and aliases are not supported; write the value out", event.start_mark
+            )
         if getattr(event, "tag", None) is not None:
-            raise yaml.MarkedYAMLError(None, None, f"the tag {shown(event.tag)} is not read", event.start_mark)
+            raise yaml.MarkedYAMLError(None, None, f"the tag {shown(event.tag)} is not supported", event.start_mark)
         if self._depth == _DEEPEST:
             raise RecursionError
         self._depth += 1
@@ -81,10 +83,10 @@ class _Plain(yaml.SafeLoader):
         keys: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag != "tag:yaml.org,2002:str":
-                raise yaml.MarkedYAMLError(None, None, "a key is no text; put it in quotes", key.start_mark)
+                raise yaml.MarkedYAMLError(None, None, "a key is not a string; put it in quotes", key.start_mark)
             if key.value in keys:
-                said = f"the key {shown(key.value)} is given twice; leave one out"
-                raise yaml.MarkedYAMLError(None, None, said, key.start_mark)
+                problem = f"the key {shown(key.value)} is given twice; remove one"
+                raise yaml.MarkedYAMLError(None, None, problem, key.start_mark)
             keys.add(key.value)
         return super().construct_mapping(node, deep)
 
@@ -97,13 +99,13 @@ for _tag, _pattern, _first in (
     ("null", r"(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
 ):
     _Plain.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first))
-# PyYAML takes 010 for eight; to YAML 1.2 and to people it is ten, and 0o10 is eight.
+# PyYAML reads 010 as octal 8; in YAML 1.2 it is decimal 10, and 0o10 is octal 8.
 _BASES = {"0o": 8, "0x": 16}
 _Plain.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value, _BASES.get(node.value[:2], 10)))
 
 
 def _of_yaml(error: yaml.YAMLError) -> str:
-    """The first thing wrong, and where, as the others say it."""
+    """Format the error and its position as the TOML and JSON parsers do."""
     mark = getattr(error, "problem_mark", None)
     where = "" if mark is None else f" (line {mark.line + 1}, column {mark.column + 1})"
     return f"{getattr(error, 'problem', None) or error}{where}"

@@ -1,4 +1,4 @@
-"""What a job says of the pictures that are rendered while it runs: of how many views, how often, at what price."""
+"""Preview images of a job: number of views, number of frames and time budget."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pathreplay.inverse.config.tables import Finite, Table, Whole
 
 
 class Preview(Table):
-    """A ``share`` of the run's time goes to pictures of some ``views``, at most ``frames`` times; 0: to none."""
+    """Images that are rendered during a run, for its live page and its report."""
 
     share: Annotated[Finite, Field(ge=0, le=0.5)] = 0.03
-    """Fraction of the run's time that goes to previews; 0: none."""
+    """Fraction of the run's time spent on previews; 0 disables them."""
     views: Annotated[Whole, Field(ge=1, le=64)] = 4
-    """Views that are rendered."""
+    """Number of views to render."""
     frames: Annotated[Whole, Field(ge=1, le=1000)] = 48
-    """Images of each view at most."""
+    """Maximum number of images per view."""

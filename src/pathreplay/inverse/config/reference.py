@@ -1,4 +1,4 @@
-"""The reference of a job as Markdown: a table of keys for each table, made from the schema."""
+"""Reference of all keys of a job as Markdown, generated from the schema."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathreplay.inverse.config.schema import Config
 
 HEAD = """# Keys of a job
 
-Every key that a config may have. This page is the output of `pathreplay schema --markdown`;
-[jobs](optimize.md) explains how keys work together.
+All keys of a config file. This page is the output of `pathreplay schema --markdown`;
+[jobs](optimize.md) explains how the keys work together.
 """
 _TITLES = {
     "Parameter": "[[parameters]]",
-    "Displacement": "initial = { ... } of a pose",
+    "Displacement": "initial = { ... } for a pose",
     "Picture": "{ image = ... }",
     "Derivation": "[[derived]]",
     "Target": "[target]",
@@ -29,16 +29,16 @@ _TITLES = {
     "RayOptions": "[ray]",
 }
 _NAMES = {
-    "integer": "whole number",
+    "integer": "integer",
     "number": "number",
-    "string": "text",
+    "string": "string",
     "boolean": "true or false",
     "object": "table",
 }
 
 
 def reference() -> str:
-    """The page."""
+    """Return the page."""
     schema = Config.model_json_schema()
     tables = [_table("The job", schema)]
     tables += [_table(f"`{title}`", schema["$defs"][name]) for name, title in _TITLES.items()]
@@ -47,7 +47,7 @@ def reference() -> str:
 
 def _table(title: str, of: dict[str, Any]) -> str:
     needed = of.get("required", [])
-    lines = [f"## {title}", "", "| key | kind | default | meaning |", "| --- | --- | --- | --- |"]
+    lines = [f"## {title}", "", "| key | type | default | meaning |", "| --- | --- | --- | --- |"]
     for key, about in of["properties"].items():
         default = "required" if key in needed else _default(about)
         meaning = about["description"].replace("|", "\\|").replace("\n", " ")
@@ -61,7 +61,7 @@ def _default(about: dict[str, Any]) -> str:
 
 
 def _kind(about: dict[str, Any]) -> str:
-    """What values a key takes; ranges are told where they are wrong."""
+    """Describe the types of a key's values; ranges are left to the error messages."""
     return " or ".join(dict.fromkeys(_kinds(about)))
 
 

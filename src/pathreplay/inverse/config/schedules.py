@@ -1,4 +1,4 @@
-"""Learning rates over a run, by name: how large a step is at each iteration, next to the rate that a job gives."""
+"""Learning-rate schedules."""
 
 from __future__ import annotations
 
@@ -9,10 +9,18 @@ Schedule = Literal["exponential", "linear", "cosine", "constant"]
 
 
 def rate(schedule: Schedule, position: int, iterations: int, decay: float, warmup_steps: int = 0) -> float:
-    """The factor of iteration ``position`` of so many: 1 at the first, ``decay`` where one more would come.
+    """Return the factor on the learning rate at iteration ``position``.
 
-    With x = position / iterations: decay^x, 1 - (1 - decay) x, decay + (1 - decay) (1 + cos πx) / 2, or 1. Through the
-    first ``warmup_steps`` iterations it grows besides, in equal steps.
+    With x = position / iterations it is decay^x (exponential), 1 - (1 - decay) x (linear),
+    decay + (1 - decay) (1 + cos πx) / 2 (cosine) or 1 (constant). During warm-up it is multiplied by
+    (position + 1) / (warmup_steps + 1).
+
+    Args:
+        schedule: name of the schedule.
+        position: iteration, from 0 to iterations - 1.
+        iterations: number of iterations of the run.
+        decay: ratio of the final to the initial rate, reached at ``position == iterations``.
+        warmup_steps: number of iterations of linear warm-up.
     """
     x = position / iterations
     if schedule == "exponential":

@@ -1,4 +1,4 @@
-"""The stages of a job, as it gives them: what is otherwise for some of its iterations."""
+"""Stages of a job: settings that hold for a range of its iterations."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from pathreplay.inverse.config.tables import Count, Positive, Table, Whole
 
 
 class Stage(Table):
-    """So many iterations, in which some things are otherwise; None: as in the rest of the job."""
+    """A range of iterations that overrides some settings of the job; None stands for the setting of the job."""
 
     iterations: Count
-    """Iterations of the stage."""
+    """Number of iterations of the stage."""
     downscale: Annotated[Whole, Field(ge=1, le=2**16)] = 1
-    """Factor by which films are smaller."""
+    """Factor by which the width and height of all films are reduced."""
     spp: Count | None = None
-    """Samples per pixel; default: those of the job."""
+    """Samples per pixel; default: the spp of the job."""
     max_depth: Count | None = None
-    """Depth of paths; default: that of the job."""
+    """Maximum path depth; default: the max_depth of the job's integrator."""
     sensors: Annotated[list[Whole | str], Field(min_length=1)] | None = None
-    """Sensors that the stage learns from; default: those of the job."""
+    """Sensors whose views are part of the loss; default: the sensors of the job."""
     view_batch_size: Count | None = None
-    """Views in an iteration."""
+    """Views per iteration; default: the view_batch_size of the job."""
     pixel_batch_size: Count | None = None
-    """Pixels of each view in an iteration."""
+    """Pixels of each view per iteration; default: the pixel_batch_size of the job."""
     parameters: Annotated[list[str], Field(min_length=1)] | None = None
-    """Keys or globs of the parameters that move; the others are frozen. Default: all."""
+    """Keys or globs of the parameters to optimise; the others are frozen. Default: all."""
     learning_rate_factor: Positive = 1.0
     """Factor on all learning rates."""
 
 
 def begins(stages: Sequence[Stage]) -> list[int]:
-    """The iteration with which each begins, and that after the last one."""
-    found = [0]
+    """Return the first iteration of each stage, followed by the total number of iterations."""
+    firsts = [0]
     for stage in stages:
-        found.append(found[-1] + stage.iterations)
-    return found
+        firsts.append(firsts[-1] + stage.iterations)
+    return firsts
 
 
 def place(stages: Sequence[Stage], iteration: int) -> int:
-    """Which stage an iteration belongs to; beyond the end, the last one."""
+    """Return the index of the stage that an iteration belongs to; beyond the end, the last stage."""
     return min(sum(begin <= iteration for begin in begins(stages)[1:]), len(stages) - 1)

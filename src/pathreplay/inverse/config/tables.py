@@ -1,4 +1,4 @@
-"""What the tables of a job are made of: numbers that are strictly what they should be, and no key that is unknown."""
+"""Building blocks of the tables of a job: strictly typed numbers, tables without unknown keys, and plugins."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ def _whole(value: Any) -> Any:
 
 
 def _single(value: Any) -> Any:
-    """A number as a float; Mitsuba computes in single precision, so what that cannot hold is no number to it."""
+    """Convert a number to a float; reject values beyond single precision, in which Mitsuba computes."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return value
     try:
         number = float(value)
-    except OverflowError:  # a whole number that not even double precision holds
+    except OverflowError:  # an integer beyond double precision
         number = 2 * LARGEST
     if math.isfinite(number) and abs(number) > LARGEST:
-        raise ValueError(f"{shown(value)} is beyond single precision; give a number up to {LARGEST:.3g}")
+        raise ValueError(f"{shown(value)} exceeds the range of single precision; give a number up to {LARGEST:.3g}")
     return number
 
 
 LARGEST = float(np.finfo(np.float32).max)
-# Strict: true is not 1, and "16" is not 16. NumPy's numbers are numbers.
+# Strict: true is not accepted for 1, nor "16" for 16. NumPy scalars are accepted.
 Whole = Annotated[int, Field(strict=True), BeforeValidator(_whole)]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False), BeforeValidator(_single)]
 Positive = Annotated[Finite, Field(gt=0)]
@@ -42,14 +42,43 @@ Count = Annotated[Whole, Field(ge=1, le=2**31 - 1)]
 
 
 class Table(BaseModel):
-    """A table of a job; it never changes."""
+    """Base class of the tables of a job: immutable, without unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     @model_validator(mode="before")
     @classmethod
     def _is_a_table(cls, value: Any) -> Any:
-        """Of mappings only dictionaries: an optimiser of Dr.Jit's is one, and says nothing of what it is."""
+        """Reject mappings other than dictionaries: a Dr.Jit optimizer is a mapping, but holds none of the keys."""
         if isinstance(value, Mapping) and not isinstance(value, dict):
             raise PydanticCustomError("table_type", "input should be a dictionary")
         return value
+
+
+Argument = Switch | Whole | Finite | str
+"""Replacement of a ``$name`` placeholder in a scene file, or argument of a built-in scene."""
+
+
+class Plugin(BaseModel):
+    """A Mitsuba plugin: its type and its options, which Mitsuba checks."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, use_attribute_docstrings=True)
+
+    type: str
+    """Name of the plugin; its options are further keys of the same table."""
+
+    @model_validator(mode="after")
+    def _has_edges(self) -> Plugin:
+        if self.type != "pathreplay" and (asked := {"boundary", "boundary_spp"} & set(self.model_extra or {})):
+            raise ValueError(
+                f"'{min(asked)}' is an option of the integrator 'pathreplay', which '{self.type}' does not have; "
+                "leave it out"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _of_32_bits(self) -> Plugin:
+        for name, value in (self.model_extra or {}).items():
+            if isinstance(value, int) and abs(value) >= 2**31:
+                raise ValueError(f"'{name}' of '{self.type}' is {shown(value)}; give a whole number below {2**31}")
+        return self

@@ -1,4 +1,4 @@
-"""Functions of the user's own, by import path (``module:function``) or as objects: losses, regularizers and more."""
+"""User functions (losses, regularizers, derivations), by import path ``module:function`` or as callables."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from pathreplay.errors import PathreplayError, shown
 from pathreplay.scenes.descriptions import one_line
 
 DEEPEST = 8
-"""Of lists in each other, whose numbers are looked at."""
+"""Deepest nesting of lists in a return value."""
 
 
 @dataclass(frozen=True)
 class Imported:
-    """A function, and what it is called in messages: 'Loss', and 'module:function'."""
+    """A user function with its name in messages: the kind ('Loss') and the import path ('module:function')."""
 
     kind: str
     name: str
@@ -35,26 +35,26 @@ class Imported:
         return f"{self.kind} '{self.name}'"
 
     def __call__(self, convert: Callable[[Any], Any], *args: Any) -> Any:
-        """``convert`` of what it returns.
+        """Call the function and return its value, converted by ``convert``.
 
-        Raises PathreplayError for whatever either of them raises, and where what is returned is not made of numbers.
+        Raises PathreplayError if either of them raises, or if the return value is not numeric.
         """
         try:
             with _same_variant(str(self)):
                 value = self.function(*args)
             if wrong := _no_numbers(value):
-                raise PathreplayError(f"{self} gives {wrong}; return numbers, or Dr.Jit's arrays of them")
+                raise PathreplayError(f"{self} returns {wrong}; return numbers or Dr.Jit arrays")
             return convert(value)
         except PathreplayError:
             raise
-        except (Exception, SystemExit) as error:  # whatever the function does
-            raise PathreplayError(f"{self} cannot be computed ({_why(error)}); mend it, or name another") from error
+        except (Exception, SystemExit) as error:  # user code may raise anything
+            raise PathreplayError(f"{self} cannot be computed ({_why(error)}); fix it, or name another") from error
 
 
 class Modules:
-    """The modules that a job names: those of the folder ``base`` first, each run once, then installed ones.
+    """Finds and imports user functions: modules in the folder ``base`` come before installed ones.
 
-    ``given`` are callables by the name that stands for them in a job.
+    A module is executed once. ``given`` maps names to callables, which take precedence over modules.
     """
 
     def __init__(self, base: Path | None = None, given: Mapping[str, Callable[..., Any]] | None = None) -> None:
@@ -62,9 +62,15 @@ class Modules:
         self._known: dict[str, Any] = {}
 
     def function(self, kind: str, name: str, takes: str) -> Imported:
-        """The function ``name``, which is to be one that ``takes`` something; ``kind`` is what it is for.
+        """Import a function; this executes its module on first use.
 
-        Its module is run. Raises PathreplayError if there is none, if it fails, or has no such function.
+        Args:
+            kind: purpose of the function, for messages.
+            name: import path ``module:function``, or a name in ``given``.
+            takes: description of its arguments, for messages.
+
+        Raises:
+            PathreplayError: the module does not exist, its import fails, or it has no such function.
         """
         if name in self._given:
             return Imported(kind, getattr(self._given[name], "__qualname__", name), self._given[name])
@@ -73,27 +79,28 @@ class Modules:
             if module not in self._known:
                 with _same_variant(f"The module of {kind} '{name}'"):
                     self._known[module] = self._loaded(module)
-            found = getattr(self._known[module], function)
+            imported = getattr(self._known[module], function)
         except PathreplayError:
             raise
-        except (Exception, SystemExit) as error:  # whatever the module does when it is imported
+        except (Exception, SystemExit) as error:  # an import may raise anything
             why = f"{kind} '{name}' cannot be imported ({_why(error)}); write module:function"
             raise PathreplayError(why) from None
-        if not callable(found):
-            raise PathreplayError(f"{kind} '{name}' is no function of {takes}, but {shown(found)}; name another")
-        return Imported(kind, name, found)
+        if not callable(imported):
+            raise PathreplayError(f"{kind} '{name}' is not a function of {takes}, but {shown(imported)}; name another")
+        return Imported(kind, name, imported)
 
     def _loaded(self, name: str) -> Any:
-        """The module in the folder, anew, since other folders may have others of that name; else an installed one.
+        """Execute a module of the folder ``base``, or import an installed one.
 
-        While it is run it finds itself and its neighbours, as it would if Python had been started in its folder.
+        A module of the folder is always executed, since another folder may have a module of the same name. During the
+        execution, imports resolve to the folder first, as if Python had been started in it.
         """
         path = None if self._base is None else self._base / f"{name}.py"
         if self._base is None or path is None or not path.is_file():
             return importlib.import_module(name)
         spec = importlib.util.spec_from_file_location(name, path)
         if spec is None or spec.loader is None:
-            raise ImportError(f"{path} is no module")
+            raise ImportError(f"{path} is not a module")
         module = importlib.util.module_from_spec(spec)
         folder, before = str(self._base.resolve()), dict(sys.modules)
         sys.path.insert(0, folder)
@@ -102,9 +109,9 @@ class Modules:
             spec.loader.exec_module(module)
         finally:
             sys.path.remove(folder)
-            for each, found in list(sys.modules.items()):
-                if each not in before and Path(getattr(found, "__file__", None) or "").parent == Path(folder):
-                    del sys.modules[each]
+            for key, loaded in list(sys.modules.items()):
+                if key not in before and Path(getattr(loaded, "__file__", None) or "").parent == Path(folder):
+                    del sys.modules[key]
             if name in before:
                 sys.modules[name] = before[name]
             else:
@@ -114,36 +121,36 @@ class Modules:
 
 @contextmanager
 def _same_variant(who: str) -> Iterator[None]:
-    """Raise PathreplayError, which names ``who``, where Mitsuba's variant is another after this block; put it back."""
+    """Restore Mitsuba's variant if the block changed it, and raise PathreplayError with ``who`` as its subject."""
     before = mi.variant()
     yield
     if (after := mi.variant()) != before:
         mi.set_variant(before)
         raise PathreplayError(
-            f"{who} sets the variant '{after}', and the job runs in '{before}'; leave that to the job"
+            f"{who} sets the variant '{after}', but the job runs in '{before}'; do not set a variant there"
         )
 
 
 def _why(error: BaseException) -> str:
     if isinstance(error, SystemExit):
-        return f"it ends Python: {error!r}"
+        return f"it exits Python: {error!r}"
     return one_line(error) or type(error).__name__
 
 
 def _no_numbers(value: Any, depth: int = 0) -> str:
-    """What a value is, if it is none of what Dr.Jit's types can be made of; else "".
+    """Describe a value that Dr.Jit cannot convert to an array; return "" if it can.
 
-    Those types look into whatever has entries, also into texts, whose entries are texts again: they would do so for
-    ever, and hear no signal.
+    The check is needed because Dr.Jit's constructors iterate over any sequence. The elements of a string are strings
+    again, so they would recurse forever, uninterruptible by signals.
     """
     if isinstance(value, (list, tuple)):
         if depth == DEEPEST:
-            return f"lists in each other, more than {DEEPEST} deep"
-        return next(filter(None, (_no_numbers(each, depth + 1) for each in value)), "")
+            return f"lists nested more than {DEEPEST} deep"
+        return next(filter(None, (_no_numbers(entry, depth + 1) for entry in value)), "")
     if isinstance(value, (np.ndarray, np.generic)):
-        return "" if value.dtype.kind in "biuf" else f"NumPy's array of {value.dtype}"
+        return "" if value.dtype.kind in "biuf" else f"a NumPy array of {value.dtype}"
     transform = hasattr(value, "matrix") and type(value).__module__.startswith("mitsuba")
     others = hasattr(value, "__dlpack__") or hasattr(value, "__cuda_array_interface__")  # arrays of other packages
     if isinstance(value, numbers.Real) or dr.is_array_v(value) or transform or others:
         return ""
-    return "nothing" if value is None else f"the {type(value).__name__}, {shown(value)},"
+    return "None" if value is None else f"a {type(value).__name__}, {shown(value)},"

@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.capture_options import Capture
+from pathreplay.inverse.config.target_options import Capture
 from pathreplay.inverse.dataset.colmap import photos_of_colmap
 from pathreplay.inverse.dataset.photos import Photo
 from pathreplay.inverse.dataset.transforms_json import photos_of_json

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.schema import Derivation
+from pathreplay.inverse.config.parameter_options import Derivation
 from pathreplay.inverse.config.user_functions import Imported, Modules
 from pathreplay.inverse.parameters.grids import resampled
 from pathreplay.inverse.parameters.values import Array, seen

@@ -11,7 +11,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.film.image import MOST_SAMPLES
-from pathreplay.inverse.config.schema import Parameter
+from pathreplay.inverse.config.parameter_options import Parameter
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.platform import memory
 

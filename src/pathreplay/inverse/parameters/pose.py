@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.schema import PARTS, PoseKind
+from pathreplay.inverse.config.parameter_options import PARTS, PoseKind
 from pathreplay.scenes.parameters import get_array, is_transform
 
 PART_NAMES = (":translation", ":rotation")

@@ -9,7 +9,7 @@ import scipy.special
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.schema import TransformKind
+from pathreplay.inverse.config.parameter_options import TransformKind
 from pathreplay.inverse.parameters.values import Array
 
 CLOSEST = 1e-6

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.schema import Picture, Value
+from pathreplay.inverse.config.parameter_options import Picture, Value
 from pathreplay.inverse.images.io import Image, find_image, read_image, resized, with_channels
 from pathreplay.inverse.parameters.grids import Array, resampled
 from pathreplay.scenes.parameters import get_array, is_transform

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.schema import Config, Derivation, Displacement, Parameter
+from pathreplay.inverse.config.parameter_options import Derivation, Displacement, Parameter
+from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.config.user_functions import Modules
 from pathreplay.inverse.parameters import limits as parameter_limits
 from pathreplay.inverse.parameters.exposures import EXPOSURE

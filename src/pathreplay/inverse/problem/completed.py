@@ -8,7 +8,8 @@ import mitsuba as mi
 
 from pathreplay.integrators.path_limits import Limits, read_limits
 from pathreplay.integrators.scene_facts import facts_of
-from pathreplay.inverse.config.schema import Config, Plugin
+from pathreplay.inverse.config.schema import Config
+from pathreplay.inverse.config.tables import Plugin
 from pathreplay.scenes.descriptions import load_integrator
 
 SHOWN = {"max_depth": "how long paths are", "hide_emitters": "whether emitters are seen"}

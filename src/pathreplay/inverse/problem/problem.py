@@ -19,7 +19,8 @@ from pathreplay.integrators.edge_notes import edges_note, moves_edges
 from pathreplay.integrators.film.image import fit_film
 from pathreplay.integrators.integrator import EDGES
 from pathreplay.integrators.reach import reached_sensors
-from pathreplay.inverse.config.schema import Config, Plugin
+from pathreplay.inverse.config.schema import Config
+from pathreplay.inverse.config.tables import Plugin
 from pathreplay.inverse.config.user_functions import Modules
 from pathreplay.inverse.dataset.capture import Shot, fingerprint, read_capture
 from pathreplay.inverse.dataset.targets import (

@@ -1,0 +1,192 @@
+"""Tables of a job that describe its parameters: values, poses, bounds, regularisation and derived parameters."""
+
+from __future__ import annotations
+
+import difflib
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+
+from pathreplay.errors import shown
+from pathreplay.inverse.config.tables import Count, Finite, Positive, Switch, Table
+
+
+class Picture(Table):
+    """An image file as the value of a texture."""
+
+    image: str
+    """Image file, or 'matplotlib:NAME' for a sample image of matplotlib."""
+    fit: Literal["stretch", "crop"] = "stretch"
+    """Resample the image to the shape of the texture directly, or crop it to the aspect ratio first."""
+    raw: Switch = False
+    """Use the stored values without decoding them from sRGB."""
+
+
+Value = Finite | list[Finite] | str | Picture
+"""Value of a parameter: one number for all entries, a list of numbers (a colour), or the name of a file."""
+
+
+def _import_path(value: str) -> str:
+    module, _, function = value.partition(":")
+    if not module or not function or ":" in function:
+        raise ValueError(f"{shown(value)} is not an import path; write module:function")
+    return value
+
+
+ImportPath = Annotated[str, AfterValidator(_import_path)]
+"""``module:function``."""
+
+Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
+
+
+PoseKind = Literal["translation", "rotation", "rigid"]
+PARTS = {"translation": ("translation",), "rotation": ("rotation",), "rigid": ("translation", "rotation")}
+"""Variables of each kind of pose."""
+
+TransformKind = Literal["log", "softplus", "logit"]
+
+
+class Displacement(Table):
+    """Initial displacement of a pose relative to the scene."""
+
+    translation: Vector | None = None
+    """Translation in scene units."""
+    rotation: Vector | None = None
+    """Rotation vector in degrees."""
+
+
+def _kind_of_initial(value: Any) -> str:
+    names = list(value) if isinstance(value, dict) else []
+    posed = any(difflib.get_close_matches(str(name), Displacement.model_fields, n=1) for name in names)
+    return "Displacement" if posed or isinstance(value, Displacement) else "Value"
+
+
+Initial = Annotated[
+    Annotated[Value, Tag("Value")] | Annotated[Displacement, Tag("Displacement")], Discriminator(_kind_of_initial)
+]
+"""Initial value of a parameter or, for a pose, its initial displacement relative to the scene."""
+
+
+NOT_OF_A_POSE = frozenset(
+    "lower upper resolutions refine_at large_steps_lambda parameterization total_variation l2_to_initial "
+    "laplacian_weight regularizer shape".split()
+)
+
+
+class Parameter(Table):
+    """A scene parameter to recover, or several that match a glob."""
+
+    key: str
+    """Key of mitsuba.traverse(scene), or a glob such as '*.reflectance.value'."""
+    lower: Finite | None = None
+    """Lower bound, enforced by projection after each step."""
+    upper: Finite | None = None
+    """Upper bound, enforced by projection after each step."""
+    learning_rate: Positive | None = None
+    """Learning rate of this parameter; default: the learning rate of the job."""
+    initial: Initial | None = None
+    """Initial value: a number, a list (a colour), an image or volume file, or an image table; for a pose, a
+    displacement. Default: the value in the scene."""
+    resolutions: Annotated[list[Count], Field(min_length=1)] | None = None
+    """Resolutions of a texture or volume, coarse to fine, as the number of entries along its longest axis."""
+    refine_at: list[Count] | None = None
+    """Iterations at which the second and each later resolution begin; default: the stages, if there is one per
+    resolution."""
+    pose: PoseKind | None = None
+    """Optimise a rigid motion of the parameter, which is a to_world transform or the vertex_positions of a mesh."""
+    pivot: Vector | None = None
+    """Centre of rotation of a pose; default: the origin of the object (for a mesh, the mean of its vertices)."""
+    error_scale: Positive | None = None
+    """Length relative to which position errors of a pose are reported."""
+    rotation_learning_rate: Positive | None = None
+    """Learning rate of the rotation in degrees; default: the learning rate of the parameter, in radians."""
+    large_steps_lambda: Positive | None = None
+    """Smoothness λ of Large Steps (Nicolet et al. 2021), for vertex_positions."""
+    parameterization: TransformKind | None = None
+    """Function of the value in which the optimiser takes its steps."""
+    total_variation: Positive | None = None
+    """Weight of the total variation of a texture or volume."""
+    l2_to_initial: Positive | None = None
+    """Weight of the mean squared difference from the initial value."""
+    laplacian_weight: Positive | None = None
+    """Weight of the mean squared distance between each vertex and the mean of its neighbours."""
+    regularizer: ImportPath | None = None
+    """Function of the values that is added to the loss, as module:function."""
+    shape: Annotated[list[Count], Field(min_length=1, max_length=8)] | None = None
+    """Shape of an array that is not part of the scene; scene parameters are derived from it."""
+
+    @property
+    def displacement(self) -> Displacement:
+        """Initial displacement of a pose relative to the scene; empty if the job gives none."""
+        return self.initial if isinstance(self.initial, Displacement) else Displacement()
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Parameter:
+        posed = {"pivot", "error_scale", "rotation_learning_rate"} & self.model_fields_set
+        if self.pose is None:
+            if isinstance(self.initial, Displacement):
+                posed.add("initial")
+            if posed:
+                self._refuse(f"'{min(posed)}' applies to a pose only; add pose = 'translation', 'rotation' or 'rigid'")
+            return self
+        if plain := NOT_OF_A_POSE & self.model_fields_set:
+            self._refuse(f"'{min(plain)}' does not apply to a pose; remove it, or set 'initial' to displace the pose")
+        if not isinstance(self.initial, Displacement | None):
+            self._refuse("'initial' of a pose is a displacement; write { translation = [...], rotation = [...] }")
+        parts = PARTS[self.pose]
+        wrong = [f"initial.{part}" for part in sorted(self.displacement.model_fields_set) if part not in parts]
+        if self.rotation_learning_rate is not None and "rotation" not in parts:
+            wrong.append("rotation_learning_rate")
+        if wrong:
+            self._refuse(f"'{wrong[0]}' is not part of pose = '{self.pose}'; set pose = 'rigid', or remove it")
+        return self
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Parameter:
+        if self.large_steps_lambda is not None and not (self.lower is None and self.upper is None):
+            self._refuse(
+                "'large_steps_lambda' excludes 'lower' and 'upper', because clamped vertices tear the mesh; remove them"
+            )
+        if self.large_steps_lambda is not None and self.parameterization is not None:
+            self._refuse(
+                "'large_steps_lambda' and 'parameterization' exclude each other: both define the coordinates of the "
+                "steps; remove one"
+            )
+        sizes, begins = self.resolutions or [], self.refine_at or []
+        # Without refine_at, the stages of the job may define the iterations: see `Config.refine_at`.
+        if self.refine_at is not None and len(begins) != max(0, len(sizes) - 1):
+            self._refuse_count()
+        if sorted(set(begins)) != begins:
+            self._refuse(f"refine_at {begins} is not increasing; sort it and remove duplicates")
+        if self.parameterization == "log" and self.lower is not None and self.lower < 0:
+            self._refuse(
+                f"parameterization = 'log' only represents values above 0, but lower = {self.lower:g}; use 'softplus'"
+            )
+        if self.parameterization == "logit" and (self.lower is None) != (self.upper is None):
+            self._refuse(
+                "parameterization = 'logit' needs two bounds; give both 'lower' and 'upper', or neither (0 and 1)"
+            )
+        if self.lower is not None and self.upper is not None and self.upper <= self.lower:
+            bounds = f"upper bound {self.upper:g} is not above lower bound {self.lower:g}"
+            self._refuse(f"{bounds}; swap them or widen the range")
+        return self
+
+    def _refuse_count(self) -> None:
+        self._refuse(
+            f"{len(self.resolutions or [])} resolutions and {len(self.refine_at or [])} entries in refine_at; give one "
+            "iteration for each resolution after the first"
+        )
+
+    def _refuse(self, why: str) -> None:
+        raise ValueError(f"parameter '{self.key}': {why}")
+
+
+class Derivation(Table):
+    """A scene parameter, or several that match a glob, computed from other parameters by a user function."""
+
+    key: str
+    """Scene parameter that the function computes, or a glob."""
+    function: ImportPath
+    """Function as module:function; its arguments are the value in the scene and the parameters in 'of'."""
+    of: Annotated[list[str], Field(min_length=1)]
+    """Parameters of the job, in the order of the function's arguments."""
