@@ -1,8 +1,8 @@
-"""Takes 24 pictures all around a ball below a sky, and writes them down as a capture: transforms.json and EXR files.
+"""Render 24 views around a ball under a sky, and write them as a capture: transforms.json and EXR files.
 
     python examples/capture/make_capture.py [FOLDER] [--views 24] [--width 64] [--spp 1024] [--recover]
 
-What is in the pictures stands here only: neither the job nor its scene file know the texture, the roughness or the sky.
+Only this script has the true texture, roughness and sky; the job and its scene file do not.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ROUGHNESS = 0.25
 
 
 def paint() -> np.ndarray:
-    """Bands and spots of a few colours, 32 x 16."""
+    """Make a texture of coloured bands and spots, 32 x 16."""
     v, u = np.meshgrid((np.arange(16) + 0.5) / 16, (np.arange(32) + 0.5) / 32, indexing="ij")
     band = 0.5 + 0.4 * np.sin(2 * np.pi * (3 * v + 0.15 * np.sin(4 * np.pi * u)))
     spots = (np.sin(8 * np.pi * u) * np.sin(6 * np.pi * v) > 0.55)[:, :, None]
@@ -33,7 +33,7 @@ def paint() -> np.ndarray:
 
 
 def sky() -> np.ndarray:
-    """Bright above and dark below, with a soft warm light at one side and a cold one at the other, 32 x 16."""
+    """Make an environment map, 32 x 16: bright above, dark below, with a warm and a cold soft light on two sides."""
     v, u = np.meshgrid((np.arange(16) + 0.5) / 16, (np.arange(32) + 0.5) / 32, indexing="ij")
     ground = (0.15 + 0.75 * (1 - v))[:, :, None] * [0.8, 0.9, 1.0]
     for u0, v0, colour in ((0.2, 0.3, [6.0, 4.5, 3.0]), (0.7, 0.45, [1.0, 1.8, 3.0])):

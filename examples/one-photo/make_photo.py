@@ -1,7 +1,7 @@
-"""Take the photo: render the room with what is to be found in it, as a PNG of 8 bits: python make_photo.py
+"""Render the photo, an 8-bit PNG of the room with the true materials and light: python make_photo.py
 
-`TRUTH` is what the job has to find. It sees nothing of it but the picture. With ``--compare RUN`` prints what a run has
-found over that.
+`TRUTH` has the values that the job recovers; it only sees the image. With ``--compare RUN``, print the ratios of the
+values that a run has recovered to the true ones.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main(resolution: int = 96, spp: int = 1024, into: Path = FOLDER) -> None:
 
 
 def compare(run: Path) -> None:
-    """Print by what factor each number of a run is off."""
+    """Print the ratio of each recovered value to the true one."""
     from safetensors.numpy import load_file
 
     found = load_file(run / "parameters.safetensors")

@@ -1,9 +1,9 @@
-"""Recover the photograph on a wall of the Cornell box by a network of PyTorch's that predicts it, from one picture.
+"""Recover the photograph on a wall of the Cornell box from one image, as the output of a PyTorch network.
 
     python examples/torch-network/recover.py
 
-The network takes the place of a texel on the wall, as waves of several lengths, and gives its colour. Mitsuba's path
-tracer renders the target. Prints the root mean square errors of the texture; writes the found one beside the true one.
+The network maps the Fourier-encoded position of a texel to its colour. Mitsuba's path tracer renders the target.
+The script prints the root mean square error of the texture, and writes an image of the recovered and the true texture.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class TermResult(NamedTuple):
 
 
 def waves(size: int) -> torch.Tensor:
-    """sin and cos of 2^k π x and 2^k π y at the texels' centres: (size², 4 WAVES)."""
+    """Encode the centres of the texels by sin and cos of 2^k π x and 2^k π y, shape (size², 4 WAVES)."""
     at = (torch.arange(size) + 0.5) / size
     y, x = torch.meshgrid(at, at, indexing="ij")
     angles = torch.stack([x, y], -1).reshape(-1, 2, 1) * torch.pi * 2.0 ** torch.arange(WAVES)
@@ -48,7 +48,7 @@ def waves(size: int) -> torch.Tensor:
 def recover(
     resolution: int = 96, texture: int = 64, steps: int = 300, picture: Path = Path("network.png")
 ) -> TermResult:
-    """Train the network on renderings of one view; ``picture`` shows what was found, and the truth."""
+    """Train the network on one view; write the recovered and the true texture side by side to ``picture``."""
     torch.manual_seed(0)
     arguments = {"resolution": resolution, "texture": texture}
     truth = resized(read_image(find_image("matplotlib:grace_hopper.jpg", Path())), texture, texture, crop=True)

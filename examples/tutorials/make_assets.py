@@ -1,6 +1,6 @@
 """Write the meshes, the volume and the sky of these examples into examples/tutorials/assets: python make_assets.py
 
-They stand for those of Mitsuba's tutorials (bunny.ply, volume.vol, suzanne.ply, ico_10k.ply, envmap2.exr).
+They replace the assets of Mitsuba's tutorials (bunny.ply, volume.vol, suzanne.ply, ico_10k.ply, envmap2.exr).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ ASSETS = Path(__file__).parent / "assets"
 
 
 def cloud(size: int = 48) -> np.ndarray:
-    """Density up to 0.5 in balls that overlap, with waves on them: (z, y, x)."""
+    """Make a density of overlapping, modulated blobs with values up to 0.5, shape (z, y, x)."""
     z, y, x = np.meshgrid(*3 * ((np.arange(size) + 0.5) / size * 2 - 1,), indexing="ij")
     density = np.full_like(x, -0.25)
     for cx, cy, cz, radius in (
@@ -30,7 +30,7 @@ def cloud(size: int = 48) -> np.ndarray:
 
 
 def sky(rows: int = 32) -> np.ndarray:
-    """Smooth light that differs in all directions: (rows, 2 rows, 3)."""
+    """Make a smooth environment map without symmetries, shape (rows, 2 rows, 3)."""
     v, u = np.meshgrid(
         (np.arange(rows) + 0.5) / rows * np.pi, (np.arange(2 * rows) + 0.5) / rows * np.pi, indexing="ij"
     )
@@ -39,7 +39,7 @@ def sky(rows: int = 32) -> np.ndarray:
 
 
 def main() -> None:
-    """Write all files, in the place of those that are there."""
+    """Write all files, replacing existing ones."""
     set_variant()
     from pathreplay.inverse.images.io import exr_bytes
     from pathreplay.scenes.bodies import ball, knobs, mesh
