@@ -157,7 +157,7 @@ def test_lenses_of_a_transforms_json_are_undone(folder: Path) -> None:
     centre = [(view.target[:, :, 0] * axis).sum() / view.target[:, :, 0].sum() for axis in (u, v)]
     assert centre == pytest.approx([50 * x + 29, 50 * y + 21], abs=0.1)
     assert view.weight is not None and view.weight.mean() == pytest.approx(1, abs=1e-6)
-    assert "come from a distorting lens" in " ".join(problem.notes)
+    assert "taken with a distorting lens" in " ".join(problem.notes)
 
 
 def test_pictures_are_brought_to_the_width_of_renderings() -> None:
@@ -199,7 +199,7 @@ def test_a_folder_has_a_mask_for_each_picture(folder: Path) -> None:
     write(lens)
     for view in build_problem(make_config({**JOB, "capture": capture}), folder).views:
         assert view.weight is not None and view.weight == pytest.approx(2 * left, abs=1e-5)
-    with pytest.raises(PathreplayError, match="the capture has masks, and alpha = 'mask' is another"):
+    with pytest.raises(PathreplayError, match="the capture has masks, which exclude alpha = 'mask'"):
         build_problem(make_config({**JOB, "capture": capture, "target": {"alpha": "mask"}}), folder)
     both = {"capture": {"transforms": "capture/transforms.json"}, "target": {"alpha": "mask"}}
     for view in build_problem(make_config({**JOB, **both}), folder).views:
@@ -221,22 +221,22 @@ def with_frame(**changes: Any) -> dict[str, Any]:
 
 
 REFUSED: dict[str, tuple[Any, str]] = {
-    "no JSON": ("{", "is no transforms.json as we know it"),
-    "a list": ([1], "is no transforms.json as we know it"),
+    "no JSON": ("{", "is not a valid transforms.json"),
+    "a list": ([1], "is not a valid transforms.json"),
     "no frames": ({"frames": []}, "'frames'"),
     "no lens": ({"frames": FRAMES}, "neither fl_x nor camera_angle_x"),
     "another lens": ({**PLAIN, "camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR'; undistort"),
-    "k4 of whom": ({**PLAIN, "k1": 0.1, "k4": -0.01}, "has k4 = -0.01, which is one thing to OpenCV and another"),
-    "bent without end": ({**PLAIN, "k1": 1e300}, "is no transforms.json as we know it ('k1'"),
-    "other shape": ({**PLAIN, "w": 12, "h": 12}, "said to be 12 x 12, and its picture is 12 x 8"),
-    "no picture": (with_frame(file_path="gone"), "picture 'gone' does not exist"),
+    "k4 of whom": ({**PLAIN, "k1": 0.1, "k4": -0.01}, "has k4 = -0.01, which OpenCV and Nerfstudio define differently"),
+    "bent without end": ({**PLAIN, "k1": 1e300}, "is not a valid transforms.json ('k1'"),
+    "other shape": ({**PLAIN, "w": 12, "h": 12}, "is 12 x 12 in the capture, but its file is 12 x 8"),
+    "no picture": (with_frame(file_path="gone"), "image 'gone' does not exist"),
     "no name": (with_frame(file_path="/"), "is a folder"),
     "a long name": (with_frame(file_path="x" * 4096), "cannot be reached"),
     "a far camera": (with_frame(transform_matrix=placed(1e300)), "'frames.0.transform_matrix"),
     "a NUL": (with_frame(file_path="go\0ne"), "cannot be reached"),
-    "sheared": (with_frame(transform_matrix=np.diag([1, 2, 1, 1]).tolist()), "no rotation and translation"),
-    "a mirror": (with_frame(transform_matrix=np.diag([-1, 1, 1, 1]).tolist()), "no rotation and translation"),
-    "not finite": (json.dumps(PLAIN).replace("0.6", "NaN"), "is no transforms.json as we know it"),
+    "sheared": (with_frame(transform_matrix=np.diag([1, 2, 1, 1]).tolist()), "is not a rigid motion"),
+    "a mirror": (with_frame(transform_matrix=np.diag([-1, 1, 1, 1]).tolist()), "is not a rigid motion"),
+    "not finite": (json.dumps(PLAIN).replace("0.6", "NaN"), "is not a valid transforms.json"),
     "twice": ({**PLAIN, "frames": [FRAMES[0], FRAMES[0]]}, "would both be called 'pictures_shot_0'"),
 }
 
@@ -259,14 +259,14 @@ JOBS_REFUSED = {
     "no source": ({"capture": {"width": 6}}, "give either 'transforms' (a transforms.json) or 'colmap'"),
     "folder of a file": ({"capture": {"transforms": "a.json", "images": "b"}}, "'images' applies to 'colmap' only"),
     "no masks": ({"capture": {"transforms": "capture/transforms.json", "masks": "gone"}}, "has no shot 0.exr.png"),
-    "all of a weight": ({"view_weights": {"shot_0": 2.0}}, "view_weights: view 'shot_0' is held out"),
+    "all of a weight": ({"view_weights": {"shot_0": 2.0}}, "view_weights: 'shot_0' is a test view"),
     "weight of nobody": ({"view_weights": {"shot_9": 2.0}}, "No sensor 'shot_9' in the scene"),
     "weight of another": ({"view_weights": {"other": 2.0}, "sensors": ["shot_1"]}, "'other' is not among 'sensors'"),
-    "no alpha to compare": ({"target": {"alpha": "compare"}}, "has no alpha to go with alpha = 'compare'"),
+    "no alpha to compare": ({"target": {"alpha": "compare"}}, "has no alpha channel for alpha = 'compare'"),
     "no file": ({"capture": {"transforms": "gone.json"}}, "gone.json; give the path of a transforms.json"),
     "pictures twice": ({"target": {"images": ["a.png"]}}, "come from 'capture'; remove either 'target.images'"),
-    "another camera": ({"sensors": ["other", "shot_1"]}, "'other' is no camera of the capture"),
-    "no alpha": ({"target": {"alpha": "mask"}}, "has no alpha to be its mask"),
+    "another camera": ({"sensors": ["other", "shot_1"]}, "'other' is not a camera of the capture"),
+    "no alpha": ({"target": {"alpha": "mask"}}, "has no alpha channel for alpha = 'mask'"),
     "every": ({"capture": {"transforms": "capture/transforms.json", "test_every": 1}}, "capture.test_every"),
     "misspelt": ({"capture": {"transform": "capture/transforms.json"}}, "did you mean 'transforms'?"),
 }

@@ -122,7 +122,7 @@ def test_a_job_takes_pictures_and_masks_of_a_model(folder: Path) -> None:
         for view in problem.views:
             assert view.target.shape == (16, 24, 3) and view.weight is not None
             assert view.weight[8, 8] > 1 and view.weight[8, 20] == 0
-        assert any("are resampled to what a pinhole sees" in note for note in problem.notes)
+        assert any("images undistorted to a pinhole camera" in note for note in problem.notes)
 
 
 def patched(name: str, at: int, layout: str, *values: Any) -> Callable[[Path], None]:
@@ -158,20 +158,23 @@ def emptied(folder: Path) -> None:
 REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no model": (lambda folder: shutil.rmtree(folder / "sparse"), "No COLMAP model in sparse/0"),
     "no images": (lambda folder: (folder / "sparse/0/images.bin").unlink(), "images.bin does not exist"),
-    "no pictures": (lambda folder: shutil.rmtree(folder / "images"), "give the folder of the pictures"),
-    "cut short": (cut, "images.bin is no file of a COLMAP model as we know it (it is cut short)"),
-    "nothing registered": (emptied, "images.bin has no image; register some"),
-    "too many": (patched("images.bin", 0, "<Q", 10**12), "(1000000000000 images)"),
-    "too many cameras": (patched("cameras.bin", 0, "<Q", 10**12), "(1000000000000 cameras)"),
+    "no pictures": (lambda folder: shutil.rmtree(folder / "images"), "give the folder of the images"),
+    "cut short": (cut, "images.bin is not a supported COLMAP file (it is truncated)"),
+    "nothing registered": (emptied, "images.bin has no images; register some"),
+    "too many": (patched("images.bin", 0, "<Q", 10**12), "(it has 1000000000000 images)"),
+    "too many cameras": (patched("cameras.bin", 0, "<Q", 10**12), "(it has 1000000000000 cameras)"),
     "another lens": (patched("cameras.bin", 12, "<i", 10), "the camera model 'number 10'; undistort"),
-    "no place": (patched("images.bin", 12, "<d", float("nan")), "which are no place of a camera"),
-    "no camera": (patched("images.bin", 68, "<I", 77), "was taken by camera 77, which the model does not have"),
-    "no focal length": (patched("cameras.bin", 32, "<d", 0.0), "a focal length of 0"),
-    "another size": (patched("cameras.bin", 16, "<Q", 200), "is said to be 200 x 80, and its picture is 120 x 80"),
-    "many points": (patched("images.bin", 87, "<Q", 2**60), "it is cut short"),
+    "no place": (patched("images.bin", 12, "<d", float("nan")), "which are not a valid camera pose"),
+    "no camera": (patched("images.bin", 68, "<I", 77), "refers to camera 77, which the model lacks"),
+    "no focal length": (patched("cameras.bin", 32, "<d", 0.0), "has the focal length 0"),
+    "another size": (patched("cameras.bin", 16, "<Q", 200), "is 200 x 80 in the model, but its file is 120 x 80"),
+    "many points": (patched("images.bin", 87, "<Q", 2**60), "the file is truncated"),
     "text of another lens": (exchanged("cameras.txt", "OPENCV_FISHEYE", "FOV"), "the camera model 'FOV'"),
-    "text without numbers": (exchanged("images.txt", " 1 sub", " one sub"), "images.txt is no file of a COLMAP model"),
-    "text with too few": (exchanged("cameras.txt", "PINHOLE 120 80", "PINHOLE 120"), "cameras.txt is no file"),
+    "text without numbers": (
+        exchanged("images.txt", " 1 sub", " one sub"),
+        "images.txt is not a supported",
+    ),
+    "text with too few": (exchanged("cameras.txt", "PINHOLE 120 80", "PINHOLE 120"), "cameras.txt is not a supported"),
 }
 
 

@@ -319,25 +319,25 @@ def test_exports_render_to_the_same_picture() -> None:
 SHARE = free("share", 1)
 # Of each: what is recovered, what is derived, and what the message says.
 REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any] | None, str]] = {
-    "unused": (SHARE, None, "has a 'shape', but nothing is derived from it; name it in 'of'"),
-    "of the scene": (free(WALL, 3), made(FLOOR, "dark", WALL), "is one of the scene; leave 'shape' out"),
+    "unused": (SHARE, None, "'shape' is given, but nothing is derived from it; name it in 'of'"),
+    "of the scene": (free(WALL, 3), made(FLOOR, "dark", WALL), "is part of the scene; remove 'shape'"),
     "both": ({"key": WALL}, made(WALL, "dark", WALL), f"'{WALL}' is named twice, by '{WALL}' and '{WALL}'"),
     "nothing": (
         {"key": FLOOR},
         made(WALL, "dark", "flor"),
-        f"'flor', which is none of the job's parameters ({FLOOR}); add [[parameters]] with this key and a 'shape'",
+        f"'flor', which is not a parameter of the job ({FLOOR}); add [[parameters]] with this key and a 'shape'",
     ),
     "a reserved name": (
         free("exposure", 1),
         made(WALL, "grey", "exposure"),
-        "has the name of something else; rename it",
+        "has a reserved name; rename it",
     ),
-    "a chain": ({"key": FLOOR}, made(WALL, "dark", WALL), f"'{WALL}', which is derived itself; name what that is"),
+    "a chain": ({"key": FLOOR}, made(WALL, "dark", WALL), f"'{WALL}', which is derived itself; name the parameters"),
     "not recovered": ({"key": PAPER}, made(WALL, "dark", FLOOR), "which the job does not recover; add [[parameters]]"),
     "by hand": (
         SHARE,
         made(WALL, "by_hand", "share"),
-        "a value that does not depend on 'share'; compute it with Dr.Jit",
+        "that does not depend on 'share'; compute it with Dr.Jit",
     ),
     "one resolution": (
         free("small", 4, 4, 3, resolutions=[2, 4], refine_at=[1]),
@@ -347,7 +347,7 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any] | None, str]] = {
     "one resolution of a penalty": (
         free("small", 4, 4, 3, resolutions=[2, 4], refine_at=[1], regularizer="own:small_penalty"),
         made(PAPER, "stretched", "small"),
-        "Penalty 'own:small_penalty' cannot be computed",
+        "Regularizer 'own:small_penalty' cannot be computed",
     ),
     "no such key": (SHARE, made("Wal.reflectance.value", "grey", "share"), f"nearest: {WALL}"),
     "no such function": (SHARE, made(WALL, "gray", "share"), "cannot be imported"),
@@ -362,9 +362,9 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any] | None, str]] = {
     "another shape": (
         SHARE,
         made(PAPER, "tiny", "share"),
-        "gives the shape (1, 1, 3) for 'Paper.reflectance.data', which has (4, 4, 3)",
+        "returns the shape (1, 1, 3) for 'Paper.reflectance.data'; return the shape (4, 4, 3)",
     ),
-    "infinite": (SHARE, made(WALL, "infinite", "share"), "gives NaN or infinite numbers"),
+    "infinite": (SHARE, made(WALL, "infinite", "share"), "returns NaN or infinite values"),
     "too many": (
         free("share", 10**5, 10**5, 10),
         made(WALL, "grey", "share"),
@@ -374,16 +374,20 @@ REFUSED: dict[str, tuple[dict[str, Any], dict[str, Any] | None, str]] = {
     "smooth": (
         {**SHARE, "large_steps_lambda": 2.0},
         made(WALL, "grey", "share"),
-        "is no mesh's vertex_positions; leave 'large_steps_lambda' out",
+        "is not the vertex_positions of a mesh; remove 'large_steps_lambda'",
     ),
     "no mesh": (
         {"key": WALL, "laplacian_weight": 1.0},
         None,
-        "is no mesh's vertex_positions; leave 'laplacian_weight' out",
+        "is not the vertex_positions of a mesh; remove 'laplacian_weight'",
     ),
-    "two numbers": ({"key": WALL, "regularizer": "own:two"}, None, "Penalty 'own:two' gives 2 numbers; return one"),
-    "no slope": ({"key": WALL, "regularizer": "own:lost"}, None, "has a derivative that is no finite number"),
-    "no module": ({"key": WALL, "regularizer": "elsewhere:f"}, None, "Penalty 'elsewhere:f' cannot be imported"),
+    "two numbers": (
+        {"key": WALL, "regularizer": "own:two"},
+        None,
+        "Regularizer 'own:two' returns 2 numbers",
+    ),
+    "no slope": ({"key": WALL, "regularizer": "own:lost"}, None, "it or its gradient is not finite"),
+    "no module": ({"key": WALL, "regularizer": "elsewhere:f"}, None, "Regularizer 'elsewhere:f' cannot be imported"),
 }
 
 
@@ -453,7 +457,7 @@ def test_functions_may_change_what_they_are_given() -> None:
 
 
 def test_a_value_that_becomes_infinite_on_the_way_names_its_function() -> None:
-    with pytest.raises(PathreplayError, match="Derivation 'own:worse' gives NaN or infinite numbers for 'Body"):
+    with pytest.raises(PathreplayError, match="Derivation 'own:worse' returns NaN or infinite values for 'Body"):
         run(
             [free("share", 1, initial=0.6, l2_to_initial=1e-9)],
             [made(BODY, "worse", "share")],

@@ -173,7 +173,10 @@ SMOOTH_REFUSED = {
         "'large_steps_lambda' excludes 'lower' and 'upper'",
     ),
     "pose": ({**BODY, "large_steps_lambda": 5}, "'large_steps_lambda' does not apply to a pose"),
-    "colour": ({"key": "body.bsdf.reflectance.value", "large_steps_lambda": 5}, "no mesh's vertex_positions"),
+    "colour": (
+        {"key": "body.bsdf.reflectance.value", "large_steps_lambda": 5},
+        "not the vertex_positions of a mesh",
+    ),
     "zero": ({"key": KEY, "large_steps_lambda": 0}, "'parameters.0.large_steps_lambda' is 0"),
 }
 

@@ -202,7 +202,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         "exposure: fix_scale = false and 'reference' exclude each other",
     ),
     "no view": ({"exposure": {"reference": "eye-9"}}, "No sensor 'eye-9' in the scene"),
-    "held out": ({"exposure": {"reference": "eye-3"}}, "the reference 'eye-3' is held out; name a view"),
+    "held out": ({"exposure": {"reference": "eye-3"}}, "the reference 'eye-3' is a test view; name a training view"),
     "misspelt": ({"exposure": {"white_ballance": True}}, "did you mean 'white_balance'?"),
     "no number": ({"exposure": True}, "'exposure' is True"),
 }
@@ -218,7 +218,7 @@ def test_what_exposures_cannot_be_is_refused_in_one_line(case: str, folder: Path
 
 def test_one_channel_has_no_white_balance(folder: Path) -> None:
     (folder / "room.xml").write_text(scene(film="luminance"))
-    with pytest.raises(PathreplayError, match="one channel have no white to balance"):
+    with pytest.raises(PathreplayError, match="'white_balance' needs colour images"):
         build_problem(make_config({**JOB, "exposure": {"white_balance": True}}), folder)
 
 

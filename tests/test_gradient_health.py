@@ -68,8 +68,8 @@ def test_a_gradient_that_is_no_number_is_named_once_and_counted(
     result = optimize(make_config(job(max_consecutive_nonfinite=5)))
     told = [line for line in capsys.readouterr().err.splitlines() if "NaN" in line]
     assert told == [
-        f"pathreplay: 3 gradient entries of '{KEY}' were NaN or infinite in view 'view-0' at iteration 2, and count as "
-        "zero; more of it is only counted"
+        f"pathreplay: 3 gradient entries of '{KEY}' were NaN or infinite in view 'view-0' at iteration 2 and count as "
+        "zero; further ones are counted, but not reported"
     ]
     assert [entry.dropped for entry in result.history] == [0, 0, 3, 3, 3, 3, *6 * [0]]
     assert result.history[3].dropped_shares == {KEY: 1.0} and result.history[0].dropped_shares == {}
@@ -80,7 +80,7 @@ def test_a_row_of_them_ends_the_run_with_a_checkpoint(spoilt: type[Spoilt]) -> N
     with pytest.raises(PathreplayError) as told:
         optimize(make_config(job(max_consecutive_nonfinite=3, checkpoint_every=100)), progress=False)
     line = str(told.value)
-    assert f"The gradient of '{KEY}' was NaN or infinite, half of it or more, in iterations 2 to 4" in line
+    assert f"At least half of the gradient of '{KEY}' was NaN or infinite in iterations 2 to 4" in line
     assert line.endswith("what was done is saved, go on with: pathreplay optimize --resume run")
     spoilt.passes = 0
     again = optimize(resume="run", progress=False)
@@ -197,8 +197,8 @@ def test_a_gradient_that_is_noise_is_told_of_once(capsys: pytest.CaptureFixture[
         for event in (*told, *told):
             bar.observe(event)
     assert capsys.readouterr().err == (
-        f"pathreplay: the gradient of '{KEY}' is lost in noise since about iteration {WINDOW - 1}: signal to noise 0 "
-        "with spp = 8; take more, or it has arrived\n"
+        f"pathreplay: the gradient of '{KEY}' is dominated by noise since about iteration {WINDOW - 1}: its "
+        "signal-to-noise ratio is 0 with spp = 8; raise spp unless the value has converged\n"
     )
 
 
@@ -225,7 +225,7 @@ REFUSED = {
     "true": ({"spp": True}, "'spp' is True: input should be a valid integer"),
     "none": ({"spp": 0}, "'spp' is 0: input should be greater than or equal to 1"),
     "no power": ({"spp": "auto", "adaptive_spp": {"min": 6}}, "min = 6 is not a power of two (2, 4, ...); use 4"),
-    "one": ({"spp": "auto", "adaptive_spp": {"min": 1}}, "take 2"),
+    "one": ({"spp": "auto", "adaptive_spp": {"min": 1}}, "use 2"),
     "order": ({"spp": "auto", "adaptive_spp": {"min": 64, "max": 8}}, "min = 64 is above max = 8"),
     "key": (
         {"spp": "auto", "adaptive_spp": {"target_snd": 1.0}},

@@ -94,9 +94,9 @@ def test_values_take_the_parameter_s_shape(tmp_path: Path) -> None:
     assert make_value("k", texture, [0.1, 0.2, 0.3], tmp_path)[1, 2] == pytest.approx([0.1, 0.2, 0.3])
     assert make_value("k", texture, "t.exr", tmp_path) == pytest.approx(0.25)
     assert make_value("k", colour, [1.0, 2.0, 3.0], tmp_path) == pytest.approx([1, 2, 3])
-    with pytest.raises(PathreplayError, match="2 numbers, the parameter takes 3"):
+    with pytest.raises(PathreplayError, match="2 numbers, but the parameter takes 3"):
         make_value("k", colour, [1.0, 2.0], tmp_path)
-    with pytest.raises(PathreplayError, match="no texture"):
+    with pytest.raises(PathreplayError, match="not a texture"):
         make_value("k", colour, "t.exr", tmp_path)
 
 
@@ -106,7 +106,7 @@ def test_volume_files_are_values_of_grids(tmp_path: Path) -> None:
     save_vol(tmp_path / "v.vol", data)
     assert np.array_equal(make_value("k", grid, "v.vol", tmp_path), resampled(data, (4, 4, 4, 1)))
     save_vol(tmp_path / "rgb.vol", np.zeros((2, 2, 2, 3)))
-    with pytest.raises(PathreplayError, match=r"rgb\.vol has 3 channels, 'k' has 1"):
+    with pytest.raises(PathreplayError, match=r"rgb\.vol has 3 channels, but 'k' has 1"):
         make_value("k", grid, "rgb.vol", tmp_path)
     with pytest.raises(PathreplayError, match=r"No volume file .*none\.vol"):
         make_value("k", grid, "none.vol", tmp_path)

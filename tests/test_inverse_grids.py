@@ -83,5 +83,5 @@ def test_a_stop_around_a_refinement_changes_nothing(stops: tuple[int, int], monk
 
 def test_a_colour_has_no_resolutions(tmp_path: Path) -> None:
     colour = {"key": "floor.reflectance.value", "resolutions": [4]}
-    with pytest.raises(PathreplayError, match=r"floor\.reflectance\.value' of shape \(3,\) is no texture"):
+    with pytest.raises(PathreplayError, match=r"floor\.reflectance\.value' of shape \(3,\) is not a texture"):
         optimize(make_config({**JOB, "parameters": [colour]}), progress=False)

@@ -337,7 +337,7 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
         (bad(views=View(0, np.full((16, 16, 3), np.nan))), "NaN"),
         (bad(views=View(0, np.zeros((16, 16, 3)), weight=np.zeros((16, 16)))), "is black"),
         (bad(loss="l3"), "No loss 'l3'"),
-        (bad(loss=lambda a, b: "much"), "cannot be computed|gives the str"),
+        (bad(loss=lambda a, b: "much"), "cannot be computed|returns the str"),
         (bad(integrator={"type": "path"}), "computes no gradients"),
         (bad(spp=0), "problem: 'spp' is 0"),
         (bad(parameters={WALL: Parameter(bounds=(1, 0))}), "is not above lower bound"),

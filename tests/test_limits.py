@@ -41,7 +41,7 @@ def test_the_named_resolution_is_the_largest_that_fits(shape: tuple[int, ...], m
         require_grid("k", shape, [4, 10**20])
     largest = int(str(error.value).rsplit(" ", 1)[1])
     require_grid("k", shape, [largest])
-    with pytest.raises(PathreplayError, match=f"take up to {largest}$"):
+    with pytest.raises(PathreplayError, match=f"use a resolution up to {largest}$"):
         require_grid("k", shape, [largest + 1])
 
 

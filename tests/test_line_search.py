@@ -116,7 +116,9 @@ def test_a_state_that_does_not_fit_is_refused() -> None:
 
 def test_many_parameters_are_refused() -> None:
     values = {"a": np.zeros(MOST + 1, np.float32)}
-    with pytest.raises(PathreplayError, match=f"are {MOST + 1} numbers, and type = 'l-bfgs-b' takes up to {MOST}"):
+    with pytest.raises(
+        PathreplayError, match=f"{MOST + 1} entries, but optimizer type = 'l-bfgs-b' takes up to {MOST}"
+    ):
         LineSearch(values, OPTIONS, {"a": (-1.0, 1.0)})
 
 
@@ -192,7 +194,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "auto": ({"spp": "auto"}, "remove 'spp = 'auto''"),
     "grids": (
         {"parameters": [{"key": "a", "resolutions": [2, 4], "refine_at": [3]}]},
-        "leave 'refine_at' out",
+        "remove 'refine_at'",
     ),
     "option": ({"optimizer": {"type": "l-bfgs-b", "beta_1": 0.9}}, "which has history_size, tolerance"),
 }

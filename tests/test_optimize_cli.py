@@ -141,7 +141,7 @@ BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
         ["named twice", "paint.*.data"],
     ),
     "missing target": (replace("target.exr", "targt.exr"), ["targt.exr", "does not exist"]),
-    "target is no image": (replace("target.exr", "ball.xml"), ["ball.xml", "of no format that is read"]),
+    "target is no image": (replace("target.exr", "ball.xml"), ["ball.xml", "has an unsupported format"]),
     "wrong-sized target": (small_target, ["target.exr", "5 x 3", "6 x 4"]),
     "too many targets": (replace('["target.exr"]', '["target.exr", "target.exr"]'), ["2 target images for 1 sensors"]),
     "NaN in the target": (spoil("target.exr", np.nan), ["target.exr", "NaN", "(1, 0, 2)"]),
@@ -187,7 +187,7 @@ BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "film beyond the memory": (film(60_000, 60_000), ["60000 x 60000", "GB of memory", "smaller film"]),
     "grid beyond the memory": (
         replace(KEY, KEY + ", resolutions = [10000000]"),
-        ["has the resolution 10000000", "up to"],
+        ["at the resolution 10000000", "up to"],
     ),
     "grid beyond all numbers": (
         replace(KEY, KEY + f", resolutions = [{10**30}]"),
@@ -209,7 +209,7 @@ BAD: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "start beyond single precision": (replace(KEY, KEY + ", initial = 1e300"), ["initial", "1e+300", "3.4e+38"]),
     "start whose loss is infinite": (
         replace(f"{KEY}, lower = 0, upper = 1", f"{KEY}, initial = 3e38"),
-        ["Start picture of sensor 'eye'"],
+        ["Initial image of sensor 'eye'"],
     ),
     "learning rate of a parameter": (replace(KEY, KEY + ", learning_rate = 1e30"), ["paint", "1e+30", "learning_rate"]),
     "learning rate of all": (replace("spp = 1\ne", "learning_rate = 1e30\nspp = 1\ne"), ["paint", "1e+30"]),

@@ -113,7 +113,7 @@ JOBS: dict[str, tuple[dict[str, Any], str]] = {
     "loss leaves later": ({"loss": "own:leaves_later"}, "(it exits Python: SystemExit('no more'))"),
     "penalty leaves": (
         {"parameters": [{"key": TEXTURE, "regularizer": "own:leaves"}]},
-        "Penalty 'own:leaves' cannot be computed (it exits Python: SystemExit(7)); ",
+        "Regularizer 'own:leaves' cannot be computed (it exits Python: SystemExit(7)); ",
     ),
     "derivation leaves": (
         {

@@ -79,7 +79,7 @@ def test_copies_of_a_vertex_count_as_one_and_lonely_ones_not_at_all() -> None:
 
 
 def own(function: object) -> Own:
-    return Own(Imported("Penalty", "own:f", function))  # type: ignore[arg-type]
+    return Own(Imported("Regularizer", "own:f", function))  # type: ignore[arg-type]
 
 
 def test_a_function_of_ones_own() -> None:
@@ -90,10 +90,10 @@ def test_a_function_of_ones_own() -> None:
 
 
 WRONG = {
-    "two": (lambda x: dr.gather(type(x.array), x.array, [0, 1]), "gives 2 numbers"),
-    "none": (lambda x: None, "gives nothing; return numbers"),
-    "raises": (lambda x: 1 / 0, "cannot be computed (division by zero); mend it"),
-    "infinite": (lambda x: dr.sum(1 / (x - x), axis=None), "no finite number"),
+    "two": (lambda x: dr.gather(type(x.array), x.array, [0, 1]), "returns 2 numbers"),
+    "none": (lambda x: None, "returns None; return numbers"),
+    "raises": (lambda x: 1 / 0, "cannot be computed (division by zero); fix it"),
+    "infinite": (lambda x: dr.sum(1 / (x - x), axis=None), "is not finite"),
 }
 
 
@@ -107,8 +107,8 @@ def test_what_is_no_penalty_is_told_in_one_line(name: str) -> None:
 
 def test_a_module_is_looked_for_in_the_folder_first(tmp_path: Path) -> None:
     (tmp_path / "json.py").write_text("def loads(v):\n    return 7\n")
-    assert Modules(tmp_path).function("Penalty", "json:loads", "values")(int, "1") == 7
-    assert Modules().function("Penalty", "json:loads", "values")(int, "1") == 1
+    assert Modules(tmp_path).function("Regularizer", "json:loads", "values")(int, "1") == 7
+    assert Modules().function("Regularizer", "json:loads", "values")(int, "1") == 1
 
 
 def test_terms_are_added() -> None:

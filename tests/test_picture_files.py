@@ -104,7 +104,7 @@ def test_a_single_layer_is_the_picture(room: Path) -> None:  # noqa: F811
 
 def test_several_layers_are_none(room: Path) -> None:  # noqa: F811
     (room / "a.exr").write_bytes(exr(picture(), *(f"{layer}.{c}" for layer in ("diffuse", "specular") for c in "RGB")))
-    with pytest.raises(PathreplayError, match=r"'a\.exr' has 6 channels, sensor 'left' renders 3"):
+    with pytest.raises(PathreplayError, match=r"'a\.exr' has 6 channels, but sensor 'left' renders 3"):
         build_problem(job("a.exr"), room)
 
 
@@ -146,7 +146,7 @@ def test_textures_of_the_scene_are_looked_at_too(room: Path) -> None:  # noqa: F
 
 def test_a_mask_of_another_size_is_told_by_its_head(room: Path) -> None:  # noqa: F811
     mi.Bitmap(np.ones((3, 5, 1), np.float32)).write("small.exr")
-    with pytest.raises(PathreplayError, match=r"Mask 'small.exr' is 5 x 3, sensor 'left' renders 12 x 10"):
+    with pytest.raises(PathreplayError, match=r"Mask 'small.exr' is 5 x 3, but sensor 'left' renders 12 x 10"):
         build_problem(job("small.exr", "mask"), room)
 
 

@@ -178,7 +178,7 @@ def test_a_job_learns_by_a_network(stub: types.ModuleType, room: Path) -> None:
 def test_without_the_module_one_line_says_so(room: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lpips", None)
     losses._network.cache_clear()
-    with pytest.raises(PathreplayError, match=r"Loss 'lpips' needs a module .*pip install 'pathreplay\[lpips\]'"):
+    with pytest.raises(PathreplayError, match=r"Loss 'lpips' needs a package .*pip install 'pathreplay\[lpips\]'"):
         optimize(make_config({**JOB, "loss": "lpips"}), progress=False)
     assert [path.name for path in room.iterdir()] == ["room.xml"]
 

@@ -269,7 +269,7 @@ def test_other_integrators_move_no_camera() -> None:
 @pytest.mark.usefixtures("sheet")
 def test_a_matrix_takes_no_value_in_the_target() -> None:
     target = {**JOB["target"], "values": {"eye.to_world": [1, 2, 3, 4]}}  # type: ignore[dict-item]
-    with pytest.raises(PathreplayError, match=r"matrix 'eye\.to_world'"):
+    with pytest.raises(PathreplayError, match=r"'eye\.to_world' is a matrix and takes no value"):
         run(target=target)
 
 

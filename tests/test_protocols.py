@@ -109,7 +109,7 @@ def test_a_state_of_other_variables_is_refused(make: Make) -> None:
 def test_a_state_of_another_optimiser_is_refused() -> None:
     optimiser = DrJitOptimiser(start())
     go_on(optimiser, start(), 1)
-    with pytest.raises(ValueError, match="nothing that this optimizer keeps"):
+    with pytest.raises(ValueError, match="is not a state array of this optimizer"):
         DrJitOptimiser(start(), Optimizer(type="sgd")).restore(optimiser.state(), start())
 
 

@@ -175,7 +175,7 @@ def test_a_prior_keeps_values_between_start_and_truth() -> None:
 REFUSED = {
     "varying number": (
         {"parameters": [{"key": "wall.bsdf.reflectance.value", "total_variation": 0.1}]},
-        "is no texture and no volume; leave 'total_variation' out",
+        "is not a texture or volume; remove 'total_variation'",
     ),
     "no option": ({"optimizer": {"type": "sgd", "beta_1": 0.5}}, "'beta_1' is not an option of type = 'sgd'"),
     "misspelt": ({"optimizer": {"typ": "sgd"}}, "unknown key 'optimizer.typ'; did you mean 'type'?"),
@@ -188,11 +188,11 @@ REFUSED = {
     "too long": ({"warmup_steps": 8}, "warmup_steps = 8 is not less than iterations = 8"),
     "at a bound": (
         {"parameters": [{"key": "wall.bsdf.reflectance.value", "initial": [0.1, 1, 0.5], "parameterization": "logit"}]},
-        "starts at 1, and parameterization = 'logit' wants values below 1",
+        "starts at 1, but parameterization = 'logit' needs values below 1",
     ),
     "of nothing": (
         {"parameters": [{"key": "wall.bsdf.reflectance.value", "initial": 0.0, "parameterization": "log"}]},
-        "starts at 0, and parameterization = 'log' wants values above 0",
+        "starts at 0, but parameterization = 'log' needs values above 0",
     ),
     "twice": (
         {"parameters": [{"key": "wall.vertex_positions", "large_steps_lambda": 3.0, "parameterization": "log"}]},

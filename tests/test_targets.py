@@ -93,10 +93,10 @@ def test_colour_profiles_are_ignored_with_a_word(folder: Path) -> None:
     turned[274] = 6
     grey.save(folder / "turned.jpg", exif=turned)
     (note,) = problem_of({"images": ["odd.png"]}).notes
-    assert note.startswith("target image 'odd.png' has a colour profile (ICC)") and "taken as sRGB" in note
+    assert note.startswith("target image 'odd.png' has an ICC colour profile") and "decoded as sRGB" in note
     assert problem_of({"images": ["usual.png"]}).notes == ()
     (note,) = problem_of({"images": ["turned.jpg"]}).notes
-    assert "is to be turned (Exif)" in note
+    assert "has an Exif orientation" in note
     assert target_of("odd.png") == pytest.approx(target_of("usual.png"))
 
 
@@ -120,8 +120,8 @@ def test_a_pattern_gives_a_picture_to_each_view(folder: Path) -> None:
     assert [(view.name, round(float(view.target.mean()), 3)) for view in views] == [("left", 0.3), ("eye", 0.7)]
     for given, words in {
         "photos/1*.exr": "1 target images for 2 sensors (left, eye)",
-        "photos/*.tif": "No file fits the pattern 'photos/*.tif' in ",
-        "phot*/*.exr": "wildcards in a folder's name",
+        "photos/*.tif": "No file matches the pattern 'photos/*.tif' in ",
+        "phot*/*.exr": "wildcards in a folder name",
         "gone/*.exr": "its folder cannot be read (No such file or directory)",
     }.items():
         with pytest.raises(PathreplayError) as told:
@@ -170,9 +170,9 @@ def test_what_alpha_cannot_be_is_refused_in_one_line(folder: Path) -> None:
     (folder / "opaque.png").write_bytes(png_bytes(colours()))
     sky = [{"key": "sky.radiance.value"}]
     for target, more, words in (
-        ({"images": ["picture.exr"], "alpha": "compare"}, {}, "the film of sensor 'eye' has none; write pixel_format"),
-        ({"images": ["opaque.png"], "alpha": "scene"}, {}, "has no alpha to go with alpha = 'scene'"),
-        ({"images": ["picture.exr"], "alpha": "scene"}, {"parameters": sky}, "'sky.radiance.value' is to be found"),
+        ({"images": ["picture.exr"], "alpha": "compare"}, {}, "in the film of sensor 'eye'; set its pixel_format"),
+        ({"images": ["opaque.png"], "alpha": "scene"}, {}, "has no alpha channel for alpha = 'scene'"),
+        ({"images": ["picture.exr"], "alpha": "scene"}, {"parameters": sky}, "'sky.radiance.value' is to be recovered"),
         (
             {"values": {"ball.bsdf.reflectance.value": 0.4}, "alpha": "scene"},
             {},
@@ -183,5 +183,5 @@ def test_what_alpha_cannot_be_is_refused_in_one_line(folder: Path) -> None:
             problem_of(target, **more)
         assert words in str(told.value) and "\n" not in str(told.value)
     (folder / "room.xml").write_text(scene("rgba"))
-    with pytest.raises(PathreplayError, match="makes pictures opaque, and the film of sensor 'eye' has alpha"):
+    with pytest.raises(PathreplayError, match="makes images opaque, but the film of sensor 'eye' has an alpha"):
         target_of("picture.exr", alpha="scene")

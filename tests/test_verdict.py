@@ -159,6 +159,6 @@ def test_what_moves_together_is_told_apart_by_what_stands_still(
 def test_a_verdict_is_one_line_that_names_what_to_do() -> None:
     whole = Verdict(("a",), ("b", "c", "d"), (("b", "c"),), ("e",))
     said = str(whole)
-    assert "'b' against 'c'" in said and "nothing: 'e'" in said and "moving: 'a'" in said and "allows: 'd'" in said
-    assert "\n" not in said and "allows: all" in str(Verdict(arrived=("a", "b")))
-    assert str(Verdict()) == "values: less than 20 iterations do not say whether they still move"
+    assert "'b' against 'c'" in said and "affect: 'e'" in said and "moving: 'a'" in said and "noise: 'd'" in said
+    assert "\n" not in said and "noise: all" in str(Verdict(arrived=("a", "b")))
+    assert str(Verdict()) == "values: fewer than 20 iterations, too few to test convergence"

@@ -172,9 +172,9 @@ REFUSED = {
         {"target": {"images": ["target.exr"], "masks": ["mask.exr"], "alpha": "mask"}},
         "'masks' and alpha = 'mask' both define a mask",
     ),
-    "no alpha": ({"target": {"images": ["target.exr"], "alpha": "mask"}}, "has no alpha to be its mask"),
+    "no alpha": ({"target": {"images": ["target.exr"], "alpha": "mask"}}, "has no alpha channel for alpha = 'mask'"),
     "no picture": ({"target": {"values": {KEY: 0.5}, "alpha": "mask"}}, "alpha = 'mask' applies to 'images' only"),
-    "nothing left": ({"test_views": [0]}, "Every sensor of the job is held out"),
+    "nothing left": ({"test_views": [0]}, "Every sensor of the job is a test view"),
     "elsewhere": ({"test_views": ["other"]}, "sensor 'other' is not among 'sensors'"),
     "unknown view": ({"test_views": ["third"]}, "No sensor 'third' in the scene"),
     "no module": ({"loss": "not_there:loss"}, "Loss 'not_there:loss' cannot be imported (No module named 'not_there')"),
@@ -239,7 +239,7 @@ def test_a_mask_that_is_lost_is_missed(room: Path) -> None:
     job = {**JOB, "iterations": 1, "target": {"images": ["target.exr"], "masks": ["mask.exr"]}}
     folder = optimize(make_config(job), progress=False).folder
     (folder / "images" / "weight-one.exr").write_bytes(exr_bytes(LEFT[:2]))
-    with pytest.raises(PathreplayError, match=r"weight-one\.exr .* has changed since it was written"):
+    with pytest.raises(PathreplayError, match=r"weight-one\.exr has changed since it was written"):
         optimize(resume=folder, progress=False)
     (folder / "images" / "weight-one.exr").unlink()
     with pytest.raises(PathreplayError, match="The mask of sensor 'one' in the run folder"):

@@ -9,7 +9,7 @@ from pathreplay.errors import PathreplayError, shown
 from pathreplay.inverse.config.parsing import from_toml
 
 DEEPEST = 16
-"""Most parts of a dotted key; the tables of a job are far less deep."""
+"""Largest number of parts of a dotted key; the tables of a job are far less deep."""
 _VALUES = (bool, int, float, str, list, dict)
 
 

@@ -12,7 +12,7 @@ from pathreplay.errors import shown
 
 # Remedy by pydantic's error type; the messages of other types contain it.
 _INSTEAD = {
-    "int_type": "write a whole number such as 16",
+    "int_type": "write an integer such as 16",
     "float_type": "write a number such as 0.5",
     "bool_type": "write true or false",
     "string_type": 'write it in quotes: "..."',

@@ -19,7 +19,7 @@ class RayOptions(Table):
     actors: Count | None = None
     """Number of actors; default: as many as fit on the cluster, at most one per shard of an iteration."""
     threads: Count | None = None
-    """Cores of each actor."""
+    """Number of cores per actor."""
     max_restarts: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 100
     """Maximum number of restarts of a lost actor."""
     max_task_retries: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 4

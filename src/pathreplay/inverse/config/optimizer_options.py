@@ -25,7 +25,7 @@ class Optimizer(Table):
     epsilon: Positive | None = None
     """Constant added to the square root of the second moment (Adam, AdamW, RMSProp)."""
     uniform: Switch | None = None
-    """Use one second moment for all entries of a variable (UniformAdam)."""
+    """Normalise all entries of a variable by their largest second moment (UniformAdam)."""
     amsgrad: Switch | None = None
     """Use the maximum of all second moments so far (AMSGrad)."""
     weight_decay: Positive | None = None

@@ -17,7 +17,7 @@ class Picture(Table):
     image: str
     """Image file, or 'matplotlib:NAME' for a sample image of matplotlib."""
     fit: Literal["stretch", "crop"] = "stretch"
-    """Resample the image to the shape of the texture directly, or crop it to the aspect ratio first."""
+    """'stretch' resamples the image to the shape of the texture; 'crop' first crops its centre to the aspect ratio."""
     raw: Switch = False
     """Use the stored values without decoding them from sRGB."""
 

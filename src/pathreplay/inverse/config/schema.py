@@ -86,7 +86,7 @@ class Config(Table):
     learning_rate: Positive = 0.02
     """Learning rate of parameters that have none of their own; with Adam, approximately the length of a step."""
     final_learning_rate_ratio: Annotated[Positive, Field(le=1)] = 0.1
-    """Ratio of the final to the initial learning rate."""
+    """Ratio of the final to the initial learning rate, for schedules other than constant."""
     learning_rate_schedule: Schedule = "constant"
     """Schedule of the learning rate; default: constant, or exponential if final_learning_rate_ratio is given."""
     warmup_steps: Annotated[Whole, Field(ge=0, le=2**31 - 1)] = 0
@@ -228,7 +228,9 @@ class Config(Table):
             if entry.shape is None:
                 continue
             if entry.key not in used:
-                entry._refuse("has a 'shape', but nothing is derived from it; name it in 'of' of a [[derived]] table")
+                entry._refuse(
+                    "'shape' is given, but nothing is derived from it; name it in 'of' of a [[derived]] table"
+                )
             if prod(entry.shape) >= 2**32:
                 entry._refuse(
                     f"shape {entry.shape} has {prod(entry.shape)} entries, but arrays hold up to {2**32 - 1}; shrink it"

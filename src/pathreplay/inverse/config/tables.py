@@ -72,7 +72,7 @@ class Plugin(BaseModel):
         if self.type != "pathreplay" and (asked := {"boundary", "boundary_spp"} & set(self.model_extra or {})):
             raise ValueError(
                 f"'{min(asked)}' is an option of the integrator 'pathreplay', which '{self.type}' does not have; "
-                "leave it out"
+                "remove it"
             )
         return self
 
@@ -80,5 +80,5 @@ class Plugin(BaseModel):
     def _of_32_bits(self) -> Plugin:
         for name, value in (self.model_extra or {}).items():
             if isinstance(value, int) and abs(value) >= 2**31:
-                raise ValueError(f"'{name}' of '{self.type}' is {shown(value)}; give a whole number below {2**31}")
+                raise ValueError(f"'{name}' of '{self.type}' is {shown(value)}; give an integer below {2**31}")
         return self

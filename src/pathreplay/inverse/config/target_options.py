@@ -20,8 +20,8 @@ class Target(Table):
     masks: list[str] | str | None = None
     """Mask files, one per sensor, whose values weight the pixels: black pixels are ignored."""
     alpha: Literal["black", "mask", "scene", "compare"] = "black"
-    """Treatment of the alpha channel: composite over black, use alpha as a mask, composite over the scene's
-    environment, or compare alpha as a channel."""
+    """Treatment of the alpha channel of images: 'black' composites them over black, 'mask' uses alpha as pixel weights,
+    'scene' composites them over the scene's environment, and 'compare' compares alpha as a channel."""
     scene: str | None = None
     """Scene from which targets are rendered; default: the scene of the job."""
     scene_parameters: dict[str, Argument] | None = None
@@ -29,8 +29,8 @@ class Target(Table):
     values: dict[str, Value] = Field(default_factory=dict)
     """Values of parameters of the target scene, in place of the values in its file."""
     integrator: Plugin | None = None
-    """Integrator that renders the targets; default: path, or volpath for scenes with media, with the depth limits of
-    the job's integrator."""
+    """Integrator that renders the targets; default: path, or volpath for scenes with media, with max_depth, rr_depth
+    and hide_emitters of the job's integrator."""
     spp: Count = 512
     """Samples per pixel of the targets."""
 

@@ -121,7 +121,7 @@ class Modules:
 
 @contextmanager
 def _same_variant(who: str) -> Iterator[None]:
-    """Restore Mitsuba's variant if the block changed it, and raise PathreplayError with ``who`` as its subject."""
+    """Restore Mitsuba's variant if the block changed it, and raise PathreplayError; its message begins with ``who``."""
     before = mi.variant()
     yield
     if (after := mi.variant()) != before:
@@ -153,4 +153,4 @@ def _no_numbers(value: Any, depth: int = 0) -> str:
     others = hasattr(value, "__dlpack__") or hasattr(value, "__cuda_array_interface__")  # arrays of other packages
     if isinstance(value, numbers.Real) or dr.is_array_v(value) or transform or others:
         return ""
-    return "None" if value is None else f"a {type(value).__name__}, {shown(value)},"
+    return "None" if value is None else f"the {type(value).__name__} {shown(value)}"

@@ -1,1 +1,1 @@
-"""Views and their targets: images, captures, and lenses."""
+"""Views and their target images, captures with camera poses, and lens undistortion."""

@@ -1,7 +1,7 @@
-"""A capture: pictures and the cameras that took them, from a `transforms.json` or from a model of COLMAP's.
+"""Captures: images with camera poses, from a `transforms.json` or a COLMAP model, as Mitsuba sensors.
 
-Photos have cameras that look along -z with x to the right, and lengths are pixels; Mitsuba's look along z with x to the
-left, and have a field of view.
+The cameras of `Photo` look along -z with x to the right and have focal lengths in pixels. Mitsuba's cameras look along
++z with x to the left and have a field of view.
 """
 
 from __future__ import annotations
@@ -27,28 +27,39 @@ from pathreplay.inverse.dataset.undistortion import Lens
 from pathreplay.platform.files import file_names, file_problem
 
 STRAIGHT = 1e-3
-"""How far the axes of a camera may be from unit length and right angles."""
+"""Tolerance on the orthonormality of the axes of a camera."""
 FACING = np.diag([-1.0, 1.0, -1.0, 1.0])
-"""From Mitsuba's camera to OpenGL's."""
+"""Transform from Mitsuba's to OpenGL's camera axes."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture, its mask where there is one, its camera as a dictionary of Mitsuba's, and the lens to be undone."""
+    """An image of a capture with its camera."""
 
     image: Path
     mask: Path | None
     camera: dict[str, Any]
+    """Mitsuba dictionary of a pinhole camera."""
     lens: Lens | None = None
+    """Distortion to remove from the image; None for a pinhole camera."""
 
 
 def read_capture(
     capture: Capture, base: Path, size_of: Callable[[Path], tuple[int, int]], pixel_format: str = "rgb"
 ) -> dict[str, Shot]:
-    """The shots of a capture by name, in its order; ``size_of`` gives width and height of a picture.
+    """Read a capture.
 
-    Raises PathreplayError for what cannot be read, for lenses that cannot be undone, and for cameras that are no rigid
-    motions.
+    Args:
+        capture: its table in the job.
+        base: folder that relative paths start from.
+        size_of: returns the width and height of an image file.
+        pixel_format: pixel format of the films.
+
+    Returns:
+        The shots by name, in the order of the capture.
+
+    Raises:
+        PathreplayError: a file cannot be read, a lens model is not supported, or a camera pose is not rigid.
     """
     size_of = functools.cache(size_of)
     masks = None if capture.masks is None else base / capture.masks
@@ -68,7 +79,7 @@ def read_capture(
 
 
 def fingerprint(shots: Iterable[Shot]) -> str:
-    """What tells cameras, names and sizes of a capture from others: a SHA-256 in hexadecimal."""
+    """Hash the cameras, names and sizes of a capture (SHA-256, hexadecimal)."""
     known = [
         ({**shot.camera, "to_world": np.array(shot.camera["to_world"].matrix).tolist()}, shot.lens) for shot in shots
     ]
@@ -76,35 +87,35 @@ def fingerprint(shots: Iterable[Shot]) -> str:
 
 
 def _mask(photo: Photo, masks: Path) -> Path:
-    """The mask of a photo in a folder: of its own name, whatever its ending, with .png behind it or instead of it."""
+    """Find the mask of a photo: its file name with '.png' appended, or in place of its suffix."""
     image = photo.image.name
-    found = next((p for n in (f"{image}.png", f"{photo.image.stem}.png") if not file_problem(p := masks / n)), None)
-    if found is None:
+    mask = next((p for n in (f"{image}.png", f"{photo.image.stem}.png") if not file_problem(p := masks / n)), None)
+    if mask is None:
         raise PathreplayError(f"{photo.where}: capture.masks {masks} has no {image}.png; correct it, or add the file")
-    return found
+    return mask
 
 
 def _names(files: list[str]) -> list[str]:
-    """A name for each picture, fit for a sensor and a file: that of its file, with folders where two are the same."""
+    """Make unique names that are valid for sensors and files: file names, with folders if these are ambiguous."""
     names = [Path(file).stem for file in files]
     if len(set(names)) < len(names):
         names = [str(Path(file).with_suffix("")) for file in files]
     words = [re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_-") or "view" for name in names]
     if len(set(words)) < len(words):
         twice = next(word for word in words if words.count(word) > 1)
-        raise PathreplayError(f"The capture has two pictures that would both be called '{twice}'; remove or rename one")
+        raise PathreplayError(f"The capture has two images that would both be called '{twice}'; remove or rename one")
     return list(file_names(words).values())
 
 
 def _camera(photo: Photo, size: tuple[int, int], width: int | None, pixel_format: str) -> dict[str, Any]:
-    """The camera of a photo as a pinhole, as a dictionary of Mitsuba's."""
+    """Make the Mitsuba dictionary of the pinhole camera of a photo."""
     lens, axes = photo.lens, photo.place[:3, :3]
     if (
         np.abs(axes.T @ axes - np.eye(3)).max() > STRAIGHT
         or np.linalg.det(axes) < 0
         or (photo.place[3] != [0, 0, 0, 1]).any()
     ):
-        raise PathreplayError(f"{photo.where} has a transform_matrix that is no rotation and translation; correct it")
+        raise PathreplayError(f"{photo.where} has a transform_matrix that is not a rigid motion; correct it")
     columns = size[0] if width is None else width
     rows = max(1, round(columns * size[1] / size[0]))
     return {

@@ -1,7 +1,7 @@
-"""A model of COLMAP's: cameras and images, as text or binary. Points, rigs and frames are not looked at.
+"""Read the cameras and images of a COLMAP model, text or binary; points, rigs and frames are ignored.
 
-The formats are those of https://colmap.github.io/format.html. They are read here and not by pycolmap, which takes
-135 MB for that, does not read a model without its points, and lets a camera through whose place is NaN.
+See https://colmap.github.io/format.html for the formats. pycolmap is not used, because it takes 135 MB, requires the
+points of a model, and accepts cameras whose position is NaN.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MODELS: dict[str, tuple[int, str]] = {
     "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4"),
     "FULL_OPENCV": (6, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
 }
-"""Number of each lens model in binary files, and what its parameters are."""
+"""Lens models: number in binary files, and names of the parameters."""
 NUMBERS = {number: name for name, (number, _) in MODELS.items()}
 
 MOST_BYTES = 8 * 2**30
@@ -39,12 +39,12 @@ LONGEST_LINE = 64 * 2**20
 T = TypeVar("T")
 
 UNIT = 1e-2
-"""How far a quaternion's length may be from one."""
+"""Tolerance on the length of a quaternion."""
 
 
 @dataclass(frozen=True)
 class _Posed:
-    """An image of the model: rotation (quaternion, w first) and translation from the world to the camera."""
+    """An image of the model with its world-to-camera rotation (quaternion, w first) and translation."""
 
     number: int
     quaternion: tuple[float, ...]
@@ -56,31 +56,37 @@ class _Posed:
 def photos_of_colmap(
     folder: Path, images: Path | None, masks: Path | None, size_of: Callable[[Path], tuple[int, int]]
 ) -> list[Photo]:
-    """The photos of a model, by name; ``images`` is the folder of the pictures (default: ../../images of the model).
+    """Read the photos of a COLMAP model, sorted by name.
 
-    Of ``masks``, a folder, each photo has the file of its own name with .png behind it, as COLMAP wants them.
-    Raises PathreplayError for what cannot be read or used.
+    Args:
+        folder: folder of the model.
+        images: folder of the images; default: ``../../images`` relative to the model.
+        masks: folder of masks, named as COLMAP does: the file name of the image with '.png' appended.
+        size_of: returns the width and height of an image file.
+
+    Raises:
+        PathreplayError: a file cannot be read, or the model is inconsistent or not supported.
     """
     cameras, posed = _read(folder)
     pictures = folder / ".." / ".." / "images" if images is None else images
     photos = []
-    for each in sorted(posed, key=lambda each: each.name):
-        where = f"{folder}: image {shown(each.name)}"
-        image = pictures / each.name
+    for entry in sorted(posed, key=lambda entry: entry.name):
+        where = f"{folder}: image {shown(entry.name)}"
+        image = pictures / entry.name
         if problem := file_problem(image):
-            raise PathreplayError(f"{where}: {image} {problem}; give the folder of the pictures as capture.images")
-        mask = None if masks is None else masks / f"{each.name}.png"
+            raise PathreplayError(f"{where}: {image} {problem}; give the folder of the images as capture.images")
+        mask = None if masks is None else masks / f"{entry.name}.png"
         if mask is not None and (problem := file_problem(mask)):
             raise PathreplayError(f"{where}: its mask {mask} {problem}; correct capture.masks, or add the file")
-        if each.camera not in cameras:
-            raise PathreplayError(f"{where} was taken by camera {each.camera}, which the model does not have; mend it")
-        lens, size = cameras[each.camera], size_of(image)
+        if entry.camera not in cameras:
+            raise PathreplayError(f"{where} refers to camera {entry.camera}, which the model lacks; repair the model")
+        lens, size = cameras[entry.camera], size_of(image)
         if abs(lens.w * size[1] - lens.h * size[0]) > OFF * max(lens.w, lens.h):
             raise PathreplayError(
-                f"{where} is said to be {lens.w:g} x {lens.h:g}, and its picture is {size[0]} x {size[1]}; "
-                "give the pictures of this model"
+                f"{where} is {lens.w:g} x {lens.h:g} in the model, but its file is {size[0]} x {size[1]}; "
+                "give the images of this model"
             )
-        photos.append(Photo(where, each.name, image, mask, lens, _place(where, each)))
+        photos.append(Photo(where, entry.name, image, mask, lens, _place(where, entry)))
     return photos
 
 
@@ -88,19 +94,19 @@ def _read(folder: Path) -> tuple[dict[int, Lens], list[_Posed]]:
     ending = next((e for e in (".bin", ".txt") if not file_problem(folder / f"cameras{e}")), None)
     if ending is None:
         raise PathreplayError(
-            f"No COLMAP model in {folder}: it has neither cameras.bin nor cameras.txt; give the folder that has, such "
-            "as sparse/0"
+            f"No COLMAP model in {folder}: it has neither cameras.bin nor cameras.txt; give the folder that contains "
+            "them, such as sparse/0"
         )
     paths = [folder / f"{name}{ending}" for name in ("cameras", "images")]
     for path in paths:
         if problem := file_problem(path, MOST_BYTES):
-            also = "; it belongs to every model" if problem == MISSING else "; correct it"
-            raise PathreplayError(f"{path} {problem}{also}")
+            remedy = "; add it, since every model needs it" if problem == MISSING else "; correct it"
+            raise PathreplayError(f"{path} {problem}{remedy}")
     binary = ending == ".bin"
     cameras = dict(_parsed(paths[0], _binary_cameras if binary else _text_cameras))
     posed = _parsed(paths[1], _binary_images if binary else _text_images)
     if not posed:
-        raise PathreplayError(f"{paths[1]} has no image; register some first")
+        raise PathreplayError(f"{paths[1]} has no images; register some in COLMAP first")
     return cameras, posed
 
 
@@ -109,20 +115,20 @@ def _parsed(path: Path, parse: Callable[[BinaryIO], Iterator[T]]) -> list[T]:
         with path.open("rb") as file:
             return list(parse(file))
     except (ValueError, OSError) as error:
-        raise PathreplayError(f"{path} is no file of a COLMAP model as we know it ({error}); mend it") from None
+        raise PathreplayError(f"{path} is not a supported COLMAP file ({error}); export the model again") from None
 
 
 def _lens(model: str, width: float, height: float, parameters: list[float]) -> Lens:
     names = MODELS[model][1].split()
     if len(names) != len(parameters):
-        raise ValueError(f"a {model} of {len(parameters)} parameters, which has {len(names)}")
+        raise ValueError(f"a {model} camera has {len(parameters)} parameters instead of {len(names)}")
     given = dict(zip(names, parameters, strict=True))
     fx, fy = (given.get(name, given.get("f", 0.0)) for name in ("fx", "fy"))
     numbers = (width, height, *parameters)
     if not all(map(math.isfinite, numbers)) or max(map(abs, numbers)) > 1e6 or min(width, height) < 1:
-        raise ValueError(f"a camera of {width:g} x {height:g} with parameters {parameters}")
+        raise ValueError(f"a camera of {width:g} x {height:g} has the parameters {parameters}")
     if min(fx, fy) < 1e-3:
-        raise ValueError(f"a focal length of {min(fx, fy):g}")
+        raise ValueError(f"a camera has the focal length {min(fx, fy):g}")
     fisheye = model == "OPENCV_FISHEYE"
     radial = tuple(given.get(f"k{i}", 0.0) for i in range(1, 7))
     tangential = given.get("p1", 0.0), given.get("p2", 0.0)
@@ -131,18 +137,18 @@ def _lens(model: str, width: float, height: float, parameters: list[float]) -> L
 
 def _known(model: str) -> str:
     if model not in MODELS:
-        raise ValueError(f"the camera model {shown(model)}; undistort the pictures by COLMAP first")
+        raise ValueError(f"it has the camera model {shown(model)}; undistort the images in COLMAP first")
     return model
 
 
 def _place(where: str, posed: _Posed) -> np.ndarray:
-    """The camera in the world, looking along -z with y up; COLMAP's look along z with y down."""
+    """Return the camera-to-world matrix of a camera that looks along -z with y up; COLMAP's look along +z, y down."""
     q, t = np.array(posed.quaternion), np.array(posed.translation)
     length = float(np.linalg.norm(q)) if np.isfinite(q).all() else math.nan
     if not abs(length - 1) < UNIT or not (np.abs(t) < 1e9).all():
         raise PathreplayError(
-            f"{where} has the quaternion {posed.quaternion} and the translation {posed.translation}, which are no "
-            "place of a camera; mend the model"
+            f"{where} has the quaternion {posed.quaternion} and the translation {posed.translation}, which are not a "
+            "valid camera pose; repair the model"
         )
     w, x, y, z = q / length
     rotation = np.array(
@@ -158,14 +164,14 @@ def _place(where: str, posed: _Posed) -> np.ndarray:
 
 
 # ------------------------------------------------------------------------------
-#  Text: a line for each camera, two for each image, the second of which lists its points
+#  Text: one line per camera, two lines per image (pose, then points)
 # ------------------------------------------------------------------------------
 
 
 def _lines(file: BinaryIO) -> Iterator[str]:
     while line := file.readline(LONGEST_LINE):
         if len(line) == LONGEST_LINE:
-            raise ValueError(f"a line of more than {LONGEST_LINE} bytes")
+            raise ValueError(f"a line is longer than {LONGEST_LINE} bytes")
         text = line.decode("utf-8").strip("\r\n")
         if not text.lstrip().startswith("#"):
             yield text
@@ -175,9 +181,9 @@ def _text_cameras(file: BinaryIO) -> Iterator[tuple[int, Lens]]:
     for line in _lines(file):
         if words := line.split():
             if len(words) < 4:
-                raise ValueError(f"the line {shown(line)}")
+                raise ValueError(f"it has the line {shown(line)}")
             number, model, width, height, *parameters = words
-            yield int(number), _lens(_known(model), float(width), float(height), [float(each) for each in parameters])
+            yield int(number), _lens(_known(model), float(width), float(height), [float(word) for word in parameters])
 
 
 def _text_images(file: BinaryIO) -> Iterator[_Posed]:
@@ -187,16 +193,16 @@ def _text_images(file: BinaryIO) -> Iterator[_Posed]:
             continue
         words = line.split(maxsplit=9)
         if len(words) < 10 or len(words[9]) > LONGEST_NAME:
-            raise ValueError(f"the line {shown(line)}")
+            raise ValueError(f"it has the line {shown(line)}")
         if (count := count + 1) > MOST_IMAGES:
-            raise ValueError(f"more than {MOST_IMAGES} images")
+            raise ValueError(f"it has more than {MOST_IMAGES} images")
         q, t = tuple(map(float, words[1:5])), tuple(map(float, words[5:8]))
         yield _Posed(int(words[0]), q, t, int(words[8]), words[9])
-        next(lines, None)  # its points
+        next(lines, None)  # skip the points
 
 
 # ------------------------------------------------------------------------------
-#  Binary: little-endian, counts first
+#  Binary: little-endian, each list preceded by its length
 # ------------------------------------------------------------------------------
 
 
@@ -204,14 +210,14 @@ def _unpacked(file: BinaryIO, layout: str) -> tuple:
     size = struct.calcsize(layout)
     data = file.read(size)
     if len(data) < size:
-        raise ValueError("it is cut short")
+        raise ValueError("it is truncated")
     return struct.unpack(layout, data)
 
 
 def _binary_cameras(file: BinaryIO) -> Iterator[tuple[int, Lens]]:
     (count,) = _unpacked(file, "<Q")
     if count > MOST_IMAGES:
-        raise ValueError(f"{count} cameras")
+        raise ValueError(f"it has {count} cameras")
     for _ in range(count):
         number, model, width, height = _unpacked(file, "<IiQQ")
         name = _known(NUMBERS.get(model, f"number {model}"))
@@ -222,7 +228,7 @@ def _binary_cameras(file: BinaryIO) -> Iterator[tuple[int, Lens]]:
 def _binary_images(file: BinaryIO) -> Iterator[_Posed]:
     (count,) = _unpacked(file, "<Q")
     if count > MOST_IMAGES:
-        raise ValueError(f"{count} images")
+        raise ValueError(f"it has {count} images")
     end = file.seek(0, 2)
     file.seek(8)
     for _ in range(count):
@@ -231,9 +237,9 @@ def _binary_images(file: BinaryIO) -> Iterator[_Posed]:
         while (letter := file.read(1)) not in (b"\0", b""):
             name += letter
             if len(name) > LONGEST_NAME:
-                raise ValueError(f"a name of more than {LONGEST_NAME} bytes")
+                raise ValueError(f"a name is longer than {LONGEST_NAME} bytes")
         (points,) = _unpacked(file, "<Q")
         if points * 24 > end - file.tell():
-            raise ValueError(f"an image of {points} points, and it is cut short")
-        file.seek(points * 24, 1)  # x, y, number of the point
+            raise ValueError(f"an image has {points} points, but the file is truncated")
+        file.seek(points * 24, 1)  # skip x, y and the index of each point
         yield _Posed(number, tuple(pose[:4]), tuple(pose[4:]), camera, name.decode("utf-8"))

@@ -1,4 +1,4 @@
-"""File names with wildcards, as the files of a folder that they fit, in the order in which people count."""
+"""Expand file names with wildcards, in natural order."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from pathreplay.errors import PathreplayError, shown
 
 WILD = re.compile(r"[*?\[]")
 MOST_FILES = 100_000
-"""Of a folder that is looked through."""
+"""Largest number of files in a folder that is searched."""
 
 
 def matching(names: Iterable[str], base: Path) -> Iterator[str]:
-    """Each name, or the files that fit it where it has wildcards in its last part: photos/*.png, natural order.
+    """Yield each name or, if its last part has wildcards (photos/*.png), the matching files in natural order.
 
-    Raises PathreplayError where no file fits, or wildcards are in the name of a folder.
+    Raises PathreplayError if no file matches a pattern, or the name of a folder has wildcards.
     """
     for name in names:
         if WILD.search(name) and not _exists(base / name):
@@ -28,31 +28,31 @@ def matching(names: Iterable[str], base: Path) -> Iterator[str]:
 
 
 def natural(name: str) -> list[int | str]:
-    """By what names are sorted so that 2 comes before 10."""
+    """Return a sort key for natural order, in which 2 comes before 10."""
     return [int(part) if part.isdecimal() else part.casefold() for part in re.split(r"(\d+)", name)]
 
 
 def _expanded(name: str, base: Path) -> list[str]:
     folder, pattern = os.path.split(name)
     if WILD.search(folder):
-        raise PathreplayError(f"Pattern {shown(name)} has wildcards in a folder's name; put them into the file's alone")
-    found = []
+        raise PathreplayError(f"Pattern {shown(name)} has wildcards in a folder name; use them in the file name only")
+    names = []
     try:
         with os.scandir(base / folder) as entries:
             for count, entry in enumerate(entries):
                 if count >= MOST_FILES:
                     raise PathreplayError(
-                        f"Pattern {shown(name)}: its folder has more than {MOST_FILES} files; move the pictures to one "
-                        "of their own"
+                        f"Pattern {shown(name)}: its folder has more than {MOST_FILES} files; move the images to a "
+                        "separate folder"
                     )
                 if fnmatch.fnmatchcase(entry.name, pattern):
-                    found.append(entry.name)
+                    names.append(entry.name)
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise PathreplayError(f"Pattern {shown(name)}: its folder cannot be read ({why}); correct the path") from None
-    if not found:
-        raise PathreplayError(f"No file fits the pattern {shown(name)} in {base / folder}; correct it")
-    return [os.path.join(folder, each) for each in sorted(found, key=lambda each: (natural(each), each))]
+    if not names:
+        raise PathreplayError(f"No file matches the pattern {shown(name)} in {base / folder}; correct it")
+    return [os.path.join(folder, file) for file in sorted(names, key=lambda file: (natural(file), file))]
 
 
 def _exists(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""One photo of a capture, whichever format lists it: its file, and the lens and place of the camera that took it."""
+"""A photo of a capture with its camera, independent of the format of the capture."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pathreplay.inverse.dataset.undistortion import Lens
 
 @dataclass(frozen=True)
 class Photo:
-    """``where`` stands in messages, ``name`` is the picture's in the file or model that lists it.
-
-    ``place`` takes the camera's axes (x right, y up, looking along -z, as OpenGL has them) to the world: 4 x 4.
-    """
+    """A photo of a capture."""
 
     where: str
+    """Description of the photo in messages."""
     name: str
+    """Name of the image in the capture."""
     image: Path
     mask: Path | None
     lens: Lens
     place: np.ndarray
+    """4 x 4 camera-to-world matrix in the OpenGL convention (x right, y up, looking along -z)."""

@@ -1,4 +1,4 @@
-"""The pictures to match, rendered from a scene of their own or read from files, and the truth where it is known."""
+"""Target images and pixel weights, rendered from a target scene or read from files, and true parameter values."""
 
 from __future__ import annotations
 
@@ -40,30 +40,29 @@ from pathreplay.scenes.image_files import MOST_PIXELS
 from pathreplay.scenes.loading import load_scene_with_floats
 from pathreplay.scenes.stored import form_of
 
-# Bytes for each pixel of each view: its target, start and result stay, but go to the disk where they are many.
+# Bytes per pixel of a view: the target, initial and final image are kept, in memory up to `ROOM`, then on disk.
 _A_VIEW = 36
 
 
 @dataclass(frozen=True)
 class Targets:
-    """By view: what it should look like, and how much each pixel counts where that is not all the same.
-
-    Pictures are linear, height x width x channels; weights are height x width x 1, with the mean 1.
-    """
+    """Target images and pixel weights, by name of the view."""
 
     images: dict[str, Image]
+    """Linear images, shape (height, width, channels)."""
     weights: dict[str, Image]
+    """Weights of the pixels with mean 1, shape (height, width, 1); views without an entry weight all pixels equally."""
 
     @staticmethod
     def of(views: Iterable[View]) -> Targets:
-        """Those that views have."""
+        """Collect the targets of views."""
         views = tuple(views)
         weights = {view.name: view.weight for view in views if view.weight is not None}
         return Targets({view.name: view.target for view in views}, weights)
 
 
 def target_scene(config: Config, base: Path) -> mi.Scene:
-    """The scene from which targets are rendered, with the values that the job gives it."""
+    """Load the target scene and set the values that the job gives for it."""
     target = config.target
     spec = config.scene if target.scene is None else target.scene
     arguments = config.scene_parameters if target.scene_parameters is None else target.scene_parameters
@@ -83,20 +82,27 @@ def target_scene(config: Config, base: Path) -> mi.Scene:
 
 
 def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> dict[str, Array]:
-    """Values of the wanted parameters in the target scene, where it has them in the same shape or as such a grid."""
+    """Return the true values of parameters, as far as the target scene has them in a comparable shape.
+
+    Args:
+        scene: the target scene.
+        own: parameters of the scene of the job.
+        keys: keys of the parameters.
+    """
     params = traversed(scene)
-    found = {key: parameters.get_array(seen(params, key)) for key in keys if key in params}
-    return {k: value for k, value in found.items() if comparable(value.shape, parameters.get_array(seen(own, k)).shape)}
+    true = {key: parameters.get_array(seen(params, key)) for key in keys if key in params}
+    return {k: value for k, value in true.items() if comparable(value.shape, parameters.get_array(seen(own, k)).shape)}
 
 
 def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], album: Album) -> dict[str, Image]:
-    """Render the targets of all views. Raises PathreplayError where the target scene lacks a sensor."""
+    """Render the targets of all views. Raises PathreplayError if the target scene lacks a sensor."""
     plugin = config.target.integrator
-    assert plugin is not None  # `completed`
+    assert plugin is not None  # set by `completed`
     integrator = load_integrator(plugin.model_dump())
     if len(scene.sensors()) <= max(sensors.values()):
         raise PathreplayError(
-            f"The target scene has {len(scene.sensors())} sensors, the job uses number {max(sensors.values())} (from 0)"
+            f"The target scene has {len(scene.sensors())} sensors, but the job uses the index {max(sensors.values())} "
+            "(from 0); add sensors to it"
         )
     require_films(scene, sensors, {"target.spp": config.target.spp})
     targets: dict[str, Image] = {}
@@ -106,7 +112,7 @@ def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], a
             image = mi.render(scene, sensor=index, integrator=integrator, spp=config.target.spp, seed=mi.UInt32(seed))
             targets[name] = np.array(image, dtype=np.float32)
             del image
-        require_finite_array(f"Target picture of sensor '{name}'", targets[name])
+        require_finite_array(f"Target image of sensor '{name}'", targets[name])
         targets[name] = album.keep(targets[name])
     return targets
 
@@ -123,9 +129,24 @@ def read_targets(
     hidden: bool = False,
     album: Album,
 ) -> tuple[Targets, tuple[str, ...]]:
-    """Pictures by view (and weights, with ``alpha`` = 'mask' or a lens) from files by view, and what is to be said.
+    """Read target images from files.
 
-    ``resize``: to the size of the film, if they have another. ``lenses`` are undone. ``hidden``: emitters are not seen.
+    Args:
+        files: image file of each view.
+        alpha: treatment of the alpha channel, see `Target.alpha`.
+        scene: scene of the job.
+        sensors: index of the sensor of each view.
+        base: folder that relative paths start from.
+        resize: whether to resample images to the size of the film.
+        lenses: lens distortions to remove, by view.
+        hidden: whether the integrator hides directly visible emitters.
+        album: store of the images.
+
+    Returns:
+        The targets, with weights for alpha = 'mask' and for undistorted images, and notes for the user.
+
+    Raises:
+        PathreplayError: an image cannot be read, or does not fit its sensor or ``alpha``.
     """
     targets: dict[str, Image] = {}
     weights: dict[str, Image] = {}
@@ -138,15 +159,13 @@ def read_targets(
         for oddity in oddities(path):
             odd.setdefault(oddity, []).append(file)
         _require_alpha(what, image, alpha, name, shape)
-        # Undone and resized as it looks over black: colours of what is transparent are anything.
+        # Premultiply before resampling, since the colours of transparent pixels are arbitrary.
         image = over_black(image, path)
         if name in lenses:
-            image, there = lenses[name].undone(image)
-            if not there.any():
-                raise PathreplayError(
-                    f"{what} has nothing of what a pinhole would see in place of its lens; correct k1, k2, ..."
-                )
-            weights[name] = as_weight(f"what the lens leaves of '{file}'", resized(there, *shape[:2]).clip(0, 1), name)
+            image, valid = lenses[name].undone(image)
+            if not valid.any():
+                raise PathreplayError(f"{what} has no pixels left after undistortion; correct k1, k2, ...")
+            weights[name] = as_weight(f"the undistorted area of '{file}'", resized(valid, *shape[:2]).clip(0, 1), name)
         image = resized(image, *shape[:2])
         if alpha == "mask":
             opaque = image[:, :, -1:] * weights.get(name, np.float32(1))
@@ -157,14 +176,14 @@ def read_targets(
         targets[name] = album.keep(adapted_image(what, image, f"sensor '{name}' renders", shape[2]))
         if name in weights:
             weights[name] = album.keep(weights[name])
-        share = transparent_share(image)
-        if share and shape[2] in (1, 3) and alpha == "black":
+        fraction = transparent_share(image)
+        if fraction and shape[2] in (1, 3) and alpha == "black":
             notes.append(
-                f"target image '{file}' is transparent in {share:.1%} of its pixels: black is fitted there; if the "
-                "background of your scene is not black, take alpha = 'scene', which puts it behind, or alpha = 'mask'"
+                f"target image '{file}' is transparent in {fraction:.1%} of its pixels, which are compared with black; "
+                "if the background of your scene is not black, use alpha = 'scene' to composite over it, or 'mask'"
             )
     if lenses:
-        notes.append(f"{len(lenses)} pictures are resampled to what a pinhole sees: they come from {_kinds(lenses)}")
+        notes.append(f"images undistorted to a pinhole camera: {len(lenses)}, taken with {_kinds(lenses)}")
     notes += [
         f"target image '{files[0]}'{f' (and {len(files) - 1} others)' if len(files) > 1 else ''} {oddity}"
         for oddity, files in odd.items()
@@ -177,17 +196,19 @@ def _kinds(lenses: Mapping[str, Lens]) -> str:
 
 
 def _require_alpha(what: str, image: Image, alpha: str, name: str, shape: tuple[int, int, int]) -> None:
-    """Raise PathreplayError unless picture and film go with this ``alpha``."""
+    """Raise PathreplayError unless the image and the film support this ``alpha``."""
     if alpha != "black" and image.shape[2] not in (2, 4):
-        use = "be its mask; give masks" if alpha == "mask" else f"go with alpha = '{alpha}'; give it one"
-        raise PathreplayError(f"{what} has no alpha to {use}, or leave alpha = '{alpha}' out")
+        remedy = "give 'masks'" if alpha == "mask" else "add one"
+        raise PathreplayError(f"{what} has no alpha channel for alpha = '{alpha}'; {remedy}, or remove 'alpha'")
     if alpha == "compare" and shape[2] not in (2, 4):
         raise PathreplayError(
-            f"target: alpha = 'compare', and the film of sensor '{name}' has none; write pixel_format = \"rgba\" there"
+            f"target: alpha = 'compare' needs an alpha channel in the film of sensor '{name}'; set its "
+            'pixel_format = "rgba"'
         )
     if alpha == "scene" and shape[2] in (2, 4):
         raise PathreplayError(
-            f"target: alpha = 'scene' makes pictures opaque, and the film of sensor '{name}' has alpha; take 'compare'"
+            f"target: alpha = 'scene' makes images opaque, but the film of sensor '{name}' has an alpha channel; use "
+            "'compare'"
         )
 
 
@@ -200,7 +221,10 @@ def read_masks(
     resize: bool = False,
     lenses: Mapping[str, Lens] = MappingProxyType({}),
 ) -> dict[str, Image]:
-    """The weights that masks give, by view: white counts, black does not."""
+    """Read mask files as weights of the pixels, by view; black pixels get the weight 0.
+
+    The arguments and errors are those of `read_targets`.
+    """
     weights: dict[str, Image] = {}
     for name, file in files.items():
         shape = picture_shape(scene.sensors()[sensors[name]])
@@ -213,9 +237,9 @@ def read_masks(
 
 
 def masked(targets: Targets, masks: Mapping[str, Image]) -> Targets:
-    """The targets with these weights as well: what counts counts by all of them."""
+    """Multiply the weights of the targets by masks."""
     both = {
-        name: as_weight("what mask and picture leave", mask * targets.weights[name], name)
+        name: as_weight("the product of mask and image weights", mask * targets.weights[name], name)
         for name, mask in masks.items()
         if name in targets.weights
     }
@@ -223,49 +247,58 @@ def masked(targets: Targets, masks: Mapping[str, Image]) -> Targets:
 
 
 def require_weights(targets: Targets, masked: set[str]) -> None:
-    """Raise PathreplayError unless the views that are ``masked``, and no others, have fitting weights."""
+    """Raise PathreplayError unless exactly the views ``masked`` have weights, and these are valid."""
     for name, image in targets.images.items():
         weight = targets.weights.get(name)
         shape = (*image.shape[:2], 1)
         fits = weight is not None and weight.shape == shape and bool(np.isfinite(weight).all() and weight.any())
         if not (fits if name in masked else weight is None):
             raise PathreplayError(
-                f"The mask of sensor '{name}' in the run folder (images/weight-{name}.exr) is missing, damaged, or one "
-                "too many; start a new run"
+                f"The mask of sensor '{name}' in the run folder (images/weight-{name}.exr) is missing, damaged or "
+                "superfluous; start a new run"
             )
 
 
 def by_view(what: str, files: list[str] | str, sensors: dict[str, int], base: Path) -> dict[str, str]:
-    """A file for each view; patterns are expanded. Raises PathreplayError unless there are as many."""
-    found = list(matching([files] if isinstance(files, str) else files, base))
-    if len(found) != len(sensors):
+    """Assign files to views in order, after expanding patterns. Raises PathreplayError unless the numbers match."""
+    paths = list(matching([files] if isinstance(files, str) else files, base))
+    if len(paths) != len(sensors):
         raise PathreplayError(
-            f"{len(found)} {what} for {len(sensors)} sensors ({', '.join(sensors)}); name one per sensor, in this order"
+            f"{len(paths)} {what} for {len(sensors)} sensors ({', '.join(sensors)}); name one per sensor, in this order"
         )
-    return dict(zip(sensors, found, strict=True))
+    return dict(zip(sensors, paths, strict=True))
 
 
 def _read(what: str, path: Path, name: str, shape: tuple[int, int, int], resize: bool, *, raw: bool = False) -> Image:
-    """The image, which must have the size of the film, unless it is to be brought to it; others are not unpacked."""
+    """Read an image; unless ``resize`` is set, check before decoding that it has the size of the film."""
     (width, height), film = picture_size(path), (shape[1], shape[0])
     if not resize and (width, height) != film:
         raise PathreplayError(
-            f"{what} is {width} x {height}, sensor '{name}' renders {film[0]} x {film[1]}; resize the image or the film"
+            f"{what} is {width} x {height}, but sensor '{name}' renders {film[0]} x {film[1]}; resize the image or the "
+            "film"
         )
     return read_image(path, raw=raw, pixels=max(MOST_PIXELS, prod(film)))
 
 
 def as_weight(what: str, mask: Image, name: str) -> Image:
-    """A mask, none of it negative, as a weight with the mean 1."""
+    """Scale a non-negative mask to mean 1. Raises PathreplayError if it is black, negative or not finite."""
     require_finite_array(what, mask)
     if mask.min() < 0 or not mask.any():
         wrong = "is black" if not mask.any() else f"has the value {mask.min():g}"
-        raise PathreplayError(f"Of sensor '{name}' {what} {wrong}; paint white what counts, or leave the sensor out")
+        raise PathreplayError(
+            f"Sensor '{name}': {what} {wrong}; paint the pixels to compare white, or remove the sensor"
+        )
     return (mask / mask.mean(dtype=np.float64)).astype(np.float32)
 
 
 def require_films(scene: mi.Scene, sensors: Mapping[str, int], spp: Mapping[str, int]) -> None:
-    """Raise PathreplayError unless memory and a kernel hold every sensor (name -> index) at each ``spp`` (by key)."""
+    """Raise PathreplayError unless memory and kernel sizes suffice to render every sensor.
+
+    Args:
+        scene: the scene.
+        sensors: index of each sensor, by name.
+        spp: samples per pixel, by the key that sets them.
+    """
     pixels = 0
     for name, index in sensors.items():
         pixels += prod(film_size(scene.sensors()[index]))

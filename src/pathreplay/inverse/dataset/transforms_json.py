@@ -1,6 +1,6 @@
-"""A `transforms.json` of NeRF, instant-ngp or Nerfstudio: its frames as photos.
+"""Read a `transforms.json` of NeRF, instant-ngp or Nerfstudio.
 
-There, cameras look along -z with x to the right and y up, and lengths are pixels.
+Its cameras look along -z with x to the right and y up, and focal lengths are in pixels.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathreplay.platform.files import MISSING, file_problem
 
 MOST_BYTES = 64 * 2**20
 ENDINGS = (".png", ".jpg", ".jpeg", ".exr")
-"""Of pictures that are named without one, as NeRF's own scenes do it."""
+"""Suffixes to try for images named without one, as in the original NeRF scenes."""
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
 
 Row = Annotated[list[Annotated[FiniteFloat, Field(gt=-1e9, lt=1e9)]], Field(min_length=4, max_length=4)]
@@ -30,7 +30,7 @@ Bend = Annotated[FiniteFloat, Field(gt=-1e6, lt=1e6)]
 
 
 class _Intrinsics(BaseModel):
-    """Those of a frame take the place of the file's."""
+    """Camera intrinsics; values of a frame override values of the file."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -62,13 +62,21 @@ class _Transforms(_Intrinsics):
 
 
 def photos_of_json(path: Path, size_of: Callable[[Path], tuple[int, int]]) -> list[Photo]:
-    """The photos of a transforms.json, in its order; raises PathreplayError for what cannot be read or used."""
-    found = _read(path)
+    """Read the photos of a transforms.json, in its order.
+
+    Args:
+        path: the file.
+        size_of: returns the width and height of an image file.
+
+    Raises:
+        PathreplayError: a file cannot be read, or the capture is inconsistent or not supported.
+    """
+    transforms = _read(path)
     fields, photos = set(_Intrinsics.model_fields), []
-    for frame in found.frames:
+    for frame in transforms.frames:
         image = _picture(frame.file_path, path)
         own = frame.model_dump(include=fields, exclude_unset=True)
-        table = found.model_dump(include=fields) | own
+        table = transforms.model_dump(include=fields) | own
         if own.get("camera_angle_x") is not None and own.get("fl_x") is None:
             table |= {"fl_x": None, "fl_y": None}
         where = f"{path}: frame {shown(frame.file_path)}"
@@ -89,7 +97,7 @@ def _read(path: Path) -> _Transforms:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         what = f"'{where}': {first['msg'].lower()}" if where else first["msg"]
-        raise PathreplayError(f"Capture {path} is no transforms.json as we know it ({what}); mend it there") from None
+        raise PathreplayError(f"Capture {path} is not a valid transforms.json ({what}); correct it there") from None
 
 
 def _picture(name: str, path: Path) -> Path:
@@ -98,23 +106,25 @@ def _picture(name: str, path: Path) -> Path:
         named = [image.with_name(image.name + ending) for ending in ENDINGS]
         image = next((path for path in named if not file_problem(path)), image)
     if problem := file_problem(image):
-        raise PathreplayError(f"Capture {path}: picture {shown(name)} {problem}; correct the path or create the file")
+        raise PathreplayError(f"Capture {path}: image {shown(name)} {problem}; correct the path or create the file")
     return image
 
 
 def _lens(where: str, table: dict[str, Any], size: tuple[int, int]) -> Lens:
     if (model := table["camera_model"]) is not None and model not in MODELS:
-        raise PathreplayError(f"{where} has the camera_model {shown(model)}; undistort it to a PINHOLE first")
+        raise PathreplayError(
+            f"{where} has the unsupported camera_model {shown(model)}; undistort its image to a PINHOLE camera first"
+        )
     fisheye = table["is_fisheye"] or model == "OPENCV_FISHEYE"
     if table["k4"] and not fisheye:
         raise PathreplayError(
-            f"{where} has k4 = {table['k4']:g}, which is one thing to OpenCV and another to Nerfstudio; undistort its "
-            "picture first, and set it to 0"
+            f"{where} has k4 = {table['k4']:g}, which OpenCV and Nerfstudio define differently; undistort its image "
+            "first, and set k4 to 0"
         )
     w, h = (size[i] if table[key] is None else table[key] for i, key in enumerate("wh"))
     if abs(w * size[1] - h * size[0]) > OFF * max(w, h):
         raise PathreplayError(
-            f"{where} is said to be {w:g} x {h:g}, and its picture is {size[0]} x {size[1]}; correct w and h"
+            f"{where} is {w:g} x {h:g} in the capture, but its file is {size[0]} x {size[1]}; correct w and h"
         )
     if table["fl_x"] is not None:
         fx = table["fl_x"]

@@ -1,4 +1,4 @@
-"""The views of a job: its sensors by name, those that are held out, and how much each counts."""
+"""Views of a job: named sensors, test views and weights."""
 
 from __future__ import annotations
 
@@ -17,21 +17,34 @@ from pathreplay.platform.files import file_names
 
 @dataclass(frozen=True)
 class View:
-    """One sensor and the picture that it should see (linear, height x width x channels)."""
+    """A sensor and its target image."""
 
     name: str
     sensor: int
+    """Index of the sensor in the scene."""
     target: Image
+    """Linear image, shape (height, width, channels)."""
     weight: Image | None = None
-    """How much pixels count (height x width x 1, with the mean 1); None: all the same."""
+    """Weights of the pixels with mean 1, shape (height, width, 1); None weights all equally."""
     is_test: bool = False
-    """It is only looked at in the end, and never learned from."""
+    """Whether it is a test view, which is not part of the loss."""
     share: float = 1.0
-    """How much it counts; of the views that are learned from the mean is 1."""
+    """Weight of the view in the loss; the mean over the training views is 1."""
 
 
 def sensors_of(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int]:
-    """The wanted sensors of the scene: readable unique name, fit for a file -> index."""
+    """Select sensors of a scene.
+
+    Args:
+        scene: the scene.
+        wanted: ids or indices; None selects all.
+
+    Returns:
+        The indices of the sensors by a unique name that is valid as a file name.
+
+    Raises:
+        PathreplayError: a sensor does not exist, or none is selected.
+    """
     available = scene.sensors()
     if not available:
         raise PathreplayError("The scene has no sensor; add one")
@@ -44,13 +57,13 @@ def sensors_of(scene: mi.Scene, wanted: list[int | str] | None) -> dict[str, int
         return {name: i for i, name in enumerate(names)}
     chosen = {names[index]: index for index in (_place(item, ids, names) for item in wanted)}
     if not chosen:
-        raise PathreplayError("'sensors' is empty; name one, or leave the key out for all of them")
+        raise PathreplayError("'sensors' is empty; name a sensor, or remove the key to use all of them")
     return chosen
 
 
 def _place(item: int | str, ids: list[str], names: list[str]) -> int:
-    """The index of a sensor that is named, or given by its number."""
-    index = next((each.index(item) for each in (ids, names) if item in each), item)
+    """Return the index of a sensor that is given by its id, name or index."""
+    index = next((known.index(item) for known in (ids, names) if item in known), item)
     if not isinstance(index, int) or not 0 <= index < len(names):
         raise PathreplayError(
             f"No sensor {shown(item)} in the scene; it has {', '.join(names)} (0 to {len(names) - 1})"
@@ -59,29 +72,29 @@ def _place(item: int | str, ids: list[str], names: list[str]) -> int:
 
 
 def held_out_of(scene: mi.Scene, sensors: dict[str, int], config: Config, shots: list[str]) -> set[str]:
-    """The names of the views that are not learned from: those that the job names, and every so many of ``shots``."""
-    everywhere = sensors_of(scene, None)
+    """Return the names of the test views: those that the job names, and every n-th shot of a capture."""
+    available = sensors_of(scene, None)
     ids = [sensor.id() for sensor in scene.sensors()]
-    places = {_place(item, ids, list(everywhere)) for item in config.test_views}
-    found = {name for name, index in sensors.items() if index in places}
+    indices = {_place(item, ids, list(available)) for item in config.test_views}
+    names = {name for name, index in sensors.items() if index in indices}
     every = None if config.capture is None else config.capture.test_every
-    if len(found) < len(places):
-        other = next(name for name, index in everywhere.items() if index in places and name not in found)
+    if len(names) < len(indices):
+        other = next(name for name, index in available.items() if index in indices and name not in names)
         raise PathreplayError(
-            f"test_views: sensor '{other}' is not among 'sensors'; add it there, or leave it out here"
+            f"test_views: sensor '{other}' is not among 'sensors'; add it there, or remove it from 'test_views'"
         )
     regular = set(shots[::every]) if every else set()
-    found |= {name for name, index in sensors.items() if ids[index] in regular}
-    if len(found) == len(sensors):
-        raise PathreplayError("Every sensor of the job is held out; leave one to learn from")
-    return found
+    names |= {name for name, index in sensors.items() if ids[index] in regular}
+    if len(names) == len(sensors):
+        raise PathreplayError("Every sensor of the job is a test view; leave at least one for training")
+    return names
 
 
 def shares_of(scene: mi.Scene, sensors: dict[str, int], config: Config, test_views: set[str]) -> dict[str, float]:
-    """How much each view counts, by name."""
+    """Return the weight of each view by name; the mean over the training views is 1."""
     names = named_views(scene, sensors, list(config.view_weights), "view_weights")
     if out := set(names) & test_views:
-        raise PathreplayError(f"view_weights: view '{min(out)}' is held out, and counts for nothing; leave it out here")
+        raise PathreplayError(f"view_weights: '{min(out)}' is a test view and has no weight; remove it here")
     given = dict(zip(names, config.view_weights.values(), strict=True))
     shares = {name: given.get(name, 1.0) for name in sensors}
     mean = float(np.mean([share for name, share in shares.items() if name not in test_views]))
@@ -89,11 +102,11 @@ def shares_of(scene: mi.Scene, sensors: dict[str, int], config: Config, test_vie
 
 
 def named_views(scene: mi.Scene, sensors: dict[str, int], wanted: Sequence[int | str], key: str) -> list[str]:
-    """The names of views that a key asks for. Raises PathreplayError for what is no view of the job."""
-    everywhere, ids = list(sensors_of(scene, None)), [sensor.id() for sensor in scene.sensors()]
+    """Resolve sensors that a key of the job names. Raises PathreplayError if one is not a view of the job."""
+    available, ids = list(sensors_of(scene, None)), [sensor.id() for sensor in scene.sensors()]
     names = {index: name for name, index in sensors.items()}
-    places = [_place(item, ids, everywhere) for item in wanted]
-    for place in places:
-        if place not in names:
-            raise PathreplayError(f"{key}: sensor '{everywhere[place]}' is not among 'sensors'; add it there")
-    return [names[place] for place in places]
+    indices = [_place(item, ids, available) for item in wanted]
+    for chosen in indices:
+        if chosen not in names:
+            raise PathreplayError(f"{key}: sensor '{available[chosen]}' is not among 'sensors'; add it there")
+    return [names[chosen] for chosen in indices]

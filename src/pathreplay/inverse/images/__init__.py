@@ -1,1 +1,1 @@
-"""Images of a run: files, backgrounds, metrics, and a store on disk for many of them."""
+"""Images: files, environment backgrounds, quality metrics, and a disk-backed store."""

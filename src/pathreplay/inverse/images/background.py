@@ -1,4 +1,4 @@
-"""What a camera sees where nothing of the scene is before it: its environment."""
+"""Background of a view: the environment emitter as its camera sees it without any geometry."""
 
 from __future__ import annotations
 
@@ -13,13 +13,21 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.io import Image
 
 SAMPLES = 256
-"""Per pixel; the picture is as noisy as the environment is rough within a pixel."""
+"""Samples per pixel; noise only comes from variation of the environment within a pixel."""
 
 
 def background(scene: mi.Scene, sensor: int) -> Image:
-    """The environment as the sensor's film takes it (height x width x channels); black where there is none."""
+    """Render the environment of a scene without its geometry; without an environment, the image is black.
 
-    class Sky(mi.SamplingIntegrator):  # here, since it belongs to the variant
+    Args:
+        scene: the scene.
+        sensor: index of the sensor.
+
+    Returns:
+        The image on the film of the sensor, shape (height, width, channels).
+    """
+
+    class Sky(mi.SamplingIntegrator):  # defined here, because the base class depends on the variant
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
             si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray.d))
             si.wi, si.wavelengths = -ray.d, ray.wavelengths
@@ -33,13 +41,13 @@ def background(scene: mi.Scene, sensor: int) -> Image:
 
 
 def require_known(scene: mi.Scene, params: mi.SceneParameters, keys: Iterable[str]) -> None:
-    """Raise PathreplayError if one of the keys belongs to the environment, which is then no fixed background."""
+    """Raise PathreplayError if one of the keys is a parameter of the environment, which then changes during the run."""
     if (environment := scene.environment()) is None:
         return
     parts = {owner[2] for owner in mi.traverse(environment).properties.values()}
     for key in keys:
         if params.properties[key][2] in parts:
             raise PathreplayError(
-                f"target: alpha = 'scene' puts the scene's environment behind the pictures, and '{key}' is to be "
-                "found; take alpha = 'mask', or 'compare'"
+                f"target: alpha = 'scene' composites the images over the scene's environment, but '{key}' is to be "
+                "recovered; use alpha = 'mask' or 'compare'"
             )

@@ -1,7 +1,6 @@
-"""Arrays that are seldom looked at, such as the pictures of all views: in memory while there are few, then on the disk.
+"""Store for rarely used arrays, such as the images of all views: in memory up to a budget, then on disk.
 
-What is on the disk is mapped into memory, looks like any other array, and cannot be written to. The file has no name,
-and goes with the process.
+Arrays on disk are read-only memory maps of one unnamed temporary file, which is removed with the process.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from numpy.typing import NDArray
 from pathreplay.errors import PathreplayError
 
 ROOM = 2**28
-"""Bytes of such arrays that stay in memory."""
+"""Default memory budget in bytes."""
 SMALL = 2**16
-"""Bytes of an array that is not worth a place of its own."""
+"""Arrays up to this size in bytes always stay in memory."""
 
 Array = NDArray[np.float32]
 
 
 class Album:
-    """Keeps arrays, of which ``room`` bytes stay in memory. The folder of the file is TMPDIR, or else /var/tmp."""
+    """Keeps up to ``room`` bytes of arrays in memory and the others in a file in TMPDIR (default: /var/tmp)."""
 
     def __init__(self, room: int = ROOM) -> None:
         self.room = room
@@ -37,11 +36,11 @@ class Album:
 
     @staticmethod
     def of(budget: int | None) -> Album:
-        """One that leaves room for other things in a run that may take so many bytes."""
+        """Make a store for a run with a memory limit of ``budget`` bytes, of which it uses at most an eighth."""
         return Album(ROOM if budget is None else min(ROOM, budget // 8))
 
     def keep(self, array: Array) -> Array:
-        """The array, or one that is the same and can be read only. Raises PathreplayError where the disk is full."""
+        """Return the array itself or a read-only copy on disk. Raises PathreplayError if the disk is full."""
         if array.nbytes <= SMALL or array.nbytes <= self.room:
             self.room -= array.nbytes
             return array
@@ -56,22 +55,22 @@ class Album:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT, None):
                 raise
             raise PathreplayError(
-                f"No space left in {_folder()} for {(begin + array.nbytes) / 1e9:.2g} GB of pictures and start values "
-                "that are not held in memory: free some, or set TMPDIR to a folder on another disk"
+                f"No space left in {_folder()} for {(begin + array.nbytes) / 1e9:.2g} GB of images and initial values "
+                "that are kept on disk; free some space, or set TMPDIR to a folder on another disk"
             ) from error
-        # The next one begins where a page does, as maps must.
+        # Memory maps must begin at a page boundary.
         self._end = -(-(begin + array.nbytes) // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
         pages = mmap.mmap(self._file.fileno(), array.nbytes, access=mmap.ACCESS_READ, offset=begin)
         self._maps.append(pages)
         return np.frombuffer(pages, array.dtype).reshape(array.shape)
 
     def rest(self) -> None:
-        """Give back the memory of what was looked at: it is read again when it is wanted."""
+        """Release the memory of the mapped pages; they are read from disk again on the next access."""
         if hasattr(mmap, "MADV_DONTNEED"):
             for pages in self._maps:
                 pages.madvise(mmap.MADV_DONTNEED)
 
 
 def _folder() -> str:
-    """Where the file is: /tmp is memory itself on some systems, /var/tmp is not."""
+    """Return the folder of the file; /tmp is a memory file system on some machines, /var/tmp is not."""
     return os.environ.get("TMPDIR") or ("/var/tmp" if Path("/var/tmp").is_dir() else tempfile.gettempdir())

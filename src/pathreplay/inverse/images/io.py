@@ -1,7 +1,7 @@
-"""Images in and out: always linear radiance in memory, whatever the file holds.
+"""Read and write images; in memory, they are always linear radiance.
 
-8- and 16-bit files (PNG, JPEG, BMP, TGA, PPM) are taken as sRGB encoded and are decoded; EXR, HDR and PFM are taken as
-linear. Written PNGs are sRGB encoded after multiplication with an exposure; written EXRs are linear float32.
+Files with 8 or 16 bits (PNG, JPEG, BMP, TGA, PPM) are decoded from sRGB; EXR, HDR and PFM are linear. PNGs are written
+as sRGB after multiplication by an exposure, EXRs as linear float32.
 """
 
 from __future__ import annotations
@@ -38,14 +38,17 @@ Image = NDArray[np.float32]
 """Linear pixels, shape (height, width, channels)."""
 
 _ORIENTATION = 274
-"""Exif's tag of that name."""
+"""Exif tag of the image orientation."""
 
 SAMPLE = "matplotlib:"
-"""Prefix of a picture that matplotlib ships, e.g. ``matplotlib:grace_hopper.jpg``."""
+"""Prefix of the sample images of matplotlib, e.g. ``matplotlib:grace_hopper.jpg``."""
 
 
 def find_image(name: str, base: Path) -> Path:
-    """Path of an image file: relative to ``base``, or one of matplotlib's sample pictures."""
+    """Return the path of an image: a file relative to ``base``, or a sample image of matplotlib.
+
+    Raises PathreplayError if there is no such file.
+    """
     if name.startswith(SAMPLE):
         from matplotlib import cbook
 
@@ -58,9 +61,18 @@ def find_image(name: str, base: Path) -> Path:
 
 
 def read_image(path: Path, *, raw: bool = False, pixels: int = MOST_PIXELS) -> Image:
-    """Read an image as linear float32 (height, width, channels); ``raw`` keeps stored values (normal maps, masks).
+    """Read an image.
 
-    Raises PathreplayError where there is no image in the file, or one of more than so many ``pixels``.
+    Args:
+        path: the file.
+        raw: keep the stored values instead of decoding sRGB (for normal maps and masks).
+        pixels: largest number of pixels to accept.
+
+    Returns:
+        Linear float32 values of shape (height, width, channels).
+
+    Raises:
+        PathreplayError: the file is not a readable image, or has more than ``pixels`` pixels.
     """
     require_readable_picture(path, pixels)
     try:
@@ -68,25 +80,25 @@ def read_image(path: Path, *, raw: bool = False, pixels: int = MOST_PIXELS) -> I
             bitmap, arranged = _opened(path)
             if raw:
                 bitmap.set_srgb_gamma(False)
-            found = arranged(_linear(bitmap))
+            image = arranged(_linear(bitmap))
     except (RuntimeError, ValueError, MemoryError) as error:
-        raise PathreplayError(f"Image {path} cannot be read: {one_line(error)}") from None
-    return found[:, :, None] if found.ndim == 2 else found
+        raise PathreplayError(f"Image {path} cannot be read: {one_line(error)}; repair or replace it") from None
+    return image[:, :, None] if image.ndim == 2 else image
 
 
 def _linear(bitmap: mi.Bitmap) -> Image:
-    """The pixels, decoded where they are sRGB."""
+    """Return the pixels of a bitmap, decoded if they are sRGB."""
     formats = mi.Bitmap.PixelFormat
     if bitmap.pixel_format() in (formats.XYZ, formats.XYZA):
         bitmap = bitmap.convert(pixel_format=formats.RGB if bitmap.channel_count() == 3 else formats.RGBA)
-    # Others are as they should be; and Mitsuba converts channels by their names, which are not always those of colours.
+    # Bitmaps of other types are linear already. Mitsuba's conversion goes by channel names, which may be arbitrary.
     if bitmap.srgb_gamma() or bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16):
         bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
     return np.asarray(bitmap).astype(np.float32, copy=False)
 
 
 def _opened(path: Path) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
-    """A picture as it is stored, and what makes of its pixels what they mean."""
+    """Open a file; return its bitmap and a function that orients and scales the decoded pixels."""
     with path.open("rb") as file:
         magic = file.read(2)
         if magic in (b"P5", b"P6"):
@@ -97,13 +109,13 @@ def _opened(path: Path) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
 
 
 def _pixmap(file: BinaryIO, head: PixmapHead) -> mi.Bitmap:
-    """A PGM or PPM, of which Mitsuba knows neither comments nor the order of bytes."""
+    """Read a PGM or PPM; Mitsuba's reader supports neither comments nor big-endian 16-bit values."""
     file.seek(head.length)
     stored = np.dtype(">u2" if head.highest > 255 else np.uint8)
     count = head.width * head.height * head.channels
     data = file.read(count * stored.itemsize)
     if len(data) < count * stored.itemsize:
-        raise ValueError("it is cut short")
+        raise ValueError("it is truncated")
     values = np.frombuffer(data, stored).reshape(head.height, head.width, head.channels)
     if head.highest in (255, 65535):
         values = values.astype(stored.newbyteorder("="))
@@ -115,13 +127,13 @@ def _pixmap(file: BinaryIO, head: PixmapHead) -> mi.Bitmap:
 
 
 def _radiance(file: BinaryIO, head: RadianceHead) -> tuple[mi.Bitmap, Callable[[Image], Image]]:
-    """A Radiance picture, of which Mitsuba knows neither the exposure nor other orders than the usual one."""
+    """Read a Radiance HDR file; Mitsuba's reader supports neither EXPOSURE nor scanline orders other than -Y +X."""
     lines, columns = head.counts
     kind = "xyze" if head.xyz else "rgbe"
     file.seek(head.length)
     stream = mi.MemoryStream()
     stream.write(f"#?RADIANCE\nFORMAT=32-bit_rle_{kind}\n\n-Y {lines} +X {columns}\n".encode())
-    stream.write(file.read(8 * lines * (columns + 1)))  # twice what runs of single pixels take
+    stream.write(file.read(8 * lines * (columns + 1)))  # twice the size of the worst run-length encoding
     stream.seek(0)
 
     def arranged(image: Image) -> Image:
@@ -133,31 +145,32 @@ def _radiance(file: BinaryIO, head: RadianceHead) -> tuple[mi.Bitmap, Callable[[
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height of a picture, by the head of the file. Raises PathreplayError where that is no picture's."""
+    """Read the width and height of an image from its header. Raises PathreplayError for unknown formats."""
     if (size := size_of_picture(path)) is None:
-        raise PathreplayError(f"Image {path} is of no format that is read; take PNG, JPEG, EXR, HDR or PFM")
+        raise PathreplayError(f"Image {path} has an unsupported format; use PNG, JPEG, EXR, HDR or PFM")
     return size
 
 
 def oddities(path: Path) -> list[str]:
-    """What a picture says of itself that is not looked at, in words that follow its name."""
-    found = []
-    # What is wrong with it is told by who reads it; and of large pictures Pillow warns.
+    """List metadata of an image that is ignored, as predicates to follow its name in a message."""
+    notes = []
+    # Errors are left to `read_image`; Pillow's warnings about large images are irrelevant here.
     with contextlib.suppress(Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with PIL.Image.open(path) as picture:
             profile = picture.info.get("icc_profile") or b""
             if profile and b"sRGB" not in profile and "sRGB".encode("utf-16-be") not in profile:
-                found.append(
-                    "has a colour profile (ICC) that is not sRGB's: it is ignored, and its numbers taken as sRGB"
-                )
+                notes.append("has an ICC colour profile other than sRGB: it is ignored, and values are decoded as sRGB")
             if picture.getexif().get(_ORIENTATION, 1) != 1:
-                found.append("is to be turned (Exif): it is taken as it is stored")
-    return found
+                notes.append("has an Exif orientation: it is ignored, and pixels are used as stored")
+    return notes
 
 
 def with_channels(image: Image, channels: int) -> Image | None:
-    """The image with that many channels: alpha is dropped, grey repeated, colour averaged by luminance; else None."""
+    """Convert an image to another number of channels.
+
+    Alpha is dropped, grey is repeated, and colour is converted to luminance. Returns None for other conversions.
+    """
     have = image.shape[2]
     if have in (2, 4) and channels in (1, 3):
         image, have = image[:, :, : have - 1], have - 1
@@ -171,9 +184,9 @@ def with_channels(image: Image, channels: int) -> Image | None:
 
 
 def over_black(image: Image, path: Path) -> Image:
-    """What is seen of an image with alpha over black, which is what renderers show where nothing is; alpha stays.
+    """Premultiply the colours of an image file by its alpha, as in rendered images; alpha is kept.
 
-    EXR files hold their colours like that already; others hold them as if they were opaque.
+    EXR files store premultiplied colours already; other formats store straight alpha.
     """
     if image.shape[2] not in (2, 4) or path.suffix.lower() == ".exr":
         return image
@@ -181,28 +194,28 @@ def over_black(image: Image, path: Path) -> Image:
 
 
 def unpremultiplied(image: Image) -> Image:
-    """The colours of an image with alpha, which is over black, as if it were opaque. Alpha stays."""
+    """Divide premultiplied colours by alpha; alpha is kept."""
     alpha = image[:, :, -1:]
     colours = np.divide(image[:, :, :-1], alpha, out=np.zeros_like(image[:, :, :-1]), where=alpha > 0)
     return np.concatenate([colours, alpha], axis=2)
 
 
 def over(image: Image, behind: Image) -> Image:
-    """An image with alpha, which is over black, before a picture (of one channel, or as many): without alpha."""
+    """Composite an image with premultiplied alpha over ``behind``, which has no alpha; the result has none either."""
     return image[:, :, :-1] + (1 - image[:, :, -1:]) * behind
 
 
 def transparent_share(image: Image) -> float:
-    """The share of pixels through which a background would be seen; 0 without alpha."""
+    """Return the fraction of pixels with alpha below 1; 0 without an alpha channel."""
     return float((image[:, :, -1] < 1).mean()) if image.shape[2] in (2, 4) else 0.0
 
 
-# Rec. 709 luminance of linear RGB.
+# Rec. 709 luminance weights of linear RGB.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 
 
 def resized(image: Image, height: int, width: int, *, crop: bool = False) -> Image:
-    """Resample (Lanczos, clamped to the image's own range); ``crop`` first cuts the middle to the new aspect."""
+    """Resample an image (Lanczos, clamped to its own range); ``crop`` crops the centre to the new aspect first."""
     if crop:
         h, w = image.shape[:2]
         keep_h, keep_w = min(h, round(w * height / width)), min(w, round(h * width / height))
@@ -217,9 +230,9 @@ def resized(image: Image, height: int, width: int, *, crop: bool = False) -> Ima
 
 
 def exr_bytes(image: Image) -> bytes:
-    """The image as a float32 OpenEXR file with the channels Y, YA, RGB or RGBA (more of them: 0000, 0001, …), zipped.
+    """Encode an image as a ZIP-compressed float32 OpenEXR file with channels Y, YA, RGB or RGBA (else 0000, 0001, …).
 
-    Not by Mitsuba, which waits for its pool of threads to write one: for ever, where that has a single thread.
+    Mitsuba's writer is not used, because it waits for its thread pool and deadlocks if that has a single thread.
     """
     count = image.shape[2]
     names = {1: ["Y"], 2: ["Y", "A"], 3: ["R", "G", "B"], 4: ["R", "G", "B", "A"]}.get(
@@ -234,34 +247,34 @@ def exr_bytes(image: Image) -> bytes:
 
 
 def png_bytes(image: Image, exposure: float = 1.0) -> bytes:
-    """The image times ``exposure`` as an 8-bit sRGB PNG file."""
+    """Encode an image times ``exposure`` as an 8-bit sRGB PNG file."""
     shown = np.clip((image[:, :, :1] if image.shape[2] == 2 else image) * exposure, 0, 1).astype(np.float32)
     bitmap = mi.Bitmap(np.ascontiguousarray(shown))
-    # Through memory, so that the disk is touched in one place (run_folder), which handles a full one.
+    # Written to memory: only run_folder writes files, and it handles a full disk.
     stream = mi.MemoryStream()
     bitmap.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True).write(stream, mi.Bitmap.FileFormat.PNG)
     return bytes(stream.raw_buffer())
 
 
 def encoded(linear: NDArray[np.floating]) -> NDArray[np.floating]:
-    """sRGB of linear radiance, both from 0 to 1."""
+    """Encode linear radiance as sRGB, both in [0, 1]."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-8) ** (1 / 2.4) - 0.055)
 
 
 def displayed(image: Image, exposure: float) -> NDArray[np.floating]:
-    """The colours of an image (one channel, or three) times ``exposure``, as a display shows them: from 0 to 1."""
+    """Multiply an image by ``exposure``, drop alpha, clip to [0, 1] and encode as sRGB, as a display shows it."""
     colours = image[:, :, : 1 if image.shape[2] < 3 else 3].astype(np.float64)
     return encoded(np.clip(colours * exposure, 0, 1))
 
 
 def exposure_for(image: Image) -> float:
-    """Exposure under which 98 % of the pixels stay below white (1 for a black picture)."""
+    """Return the exposure at which 98 % of the pixels are below white (1 for a black image)."""
     level = float(np.quantile(image[..., :3].max(axis=2), 0.98))
     return 1.0 / level if level > 0 else 1.0
 
 
 def difference(image: Image, target: Image) -> Image:
-    """Signed difference as a picture: luminance above the target in red, below in blue, equal in black."""
+    """Make an image of the signed luminance difference: red above the target, blue below, black where equal."""
     delta = (with_channels(image, 1) - with_channels(target, 1))[:, :, 0]  # type: ignore[operator]
     zero = np.zeros_like(delta)
     return np.stack([np.maximum(delta, 0), zero, np.maximum(-delta, 0)], axis=2).astype(np.float32)

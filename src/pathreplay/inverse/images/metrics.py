@@ -1,4 +1,4 @@
-"""How alike two pictures look: PSNR, SSIM and FLIP, as captures are judged by them, of what a display shows."""
+"""Image quality metrics on displayed images: PSNR, SSIM and FLIP."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import scipy.ndimage
 
 from pathreplay.inverse.images.io import Image, displayed
 
-# Of the structural similarity of Wang et al. 2004: the window's width in pixels, cut at 5, and what keeps it stable.
+# SSIM (Wang et al. 2004): standard deviation and radius of the Gaussian window in pixels, and stabilising constants.
 SIGMA, CUT = 1.5, 5
 C1, C2 = 0.01**2, 0.03**2
 MOST_DB = 100.0
-"""PSNR of pictures that are the same, to single precision."""
+"""Upper limit of the PSNR, reached by images that are equal to single precision."""
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """Of a picture to its target: PSNR in decibels, SSIM (1: the same), and, if asked for, FLIP (0: the same)."""
+    """Similarity of an image to its target: PSNR in decibels, SSIM (1 if equal), and optionally FLIP (0 if equal)."""
 
     psnr: float
     ssim: float
@@ -29,38 +29,45 @@ class Likeness:
     def of(
         image: Image, target: Image, exposure: float, weight: Image | None = None, *, flip: bool = False
     ) -> Likeness:
-        """Of colours times ``exposure``, cut off at white and sRGB encoded; ``weight`` is that of pixels, with mean 1.
+        """Compare an image with its target, as displayed (see `displayed`).
 
-        PSNR = -10 log10 (mean square difference); SSIM is the mean over pixels and channels, alpha left out. ``flip``
-        asks for FLIP (Andersson et al. 2020, NVIDIA's flip-evaluator, 67 pixels per degree), None where that is absent.
+        PSNR = -10 log10 (mean square error). SSIM is the mean over pixels and colour channels.
+
+        Args:
+            image: rendered image, shape (height, width, channels).
+            target: image to compare with, of the same shape.
+            exposure: factor on both images.
+            weight: weights of the pixels with mean 1, shape (height, width, 1); None weights all equally.
+            flip: whether to compute FLIP (Andersson et al. 2020, 67 pixels per degree) by NVIDIA's flip-evaluator;
+                without that package it is None.
         """
         a, b = (displayed(picture, exposure) for picture in (image, target))
         w = np.ones((1, 1, 1)) if weight is None else weight.astype(np.float64)
         error = float(np.mean(w * (a - b) ** 2))
         psnr = MOST_DB if error <= 10 ** (-MOST_DB / 10) else -10 * float(np.log10(error))
-        seen = _flip(a, b) if flip else None
-        perceived = None if seen is None else float(np.mean(w * seen))
+        flip_map = _flip(a, b) if flip else None
+        perceived = None if flip_map is None else float(np.mean(w * flip_map))
         return Likeness(psnr, float(np.mean(w * _similarity(a, b))), perceived)
 
 
 def has_flip() -> bool:
-    """Whether FLIP can be computed here."""
+    """Return whether the package flip-evaluator is installed."""
     return importlib.util.find_spec("flip_evaluator") is not None
 
 
 def _flip(a: np.ndarray, b: np.ndarray) -> np.ndarray | None:
-    """FLIP of every pixel (height x width x 1), or None where nobody computes it."""
+    """Compute the FLIP map (height x width x 1), or return None without flip-evaluator."""
     if not has_flip():
         return None
     from flip_evaluator import evaluate
 
     test, reference = (np.ascontiguousarray(np.broadcast_to(x, (*x.shape[:2], 3)), np.float32) for x in (a, b))
-    found, _, _ = evaluate(reference, test, "LDR", True, False, False, {})
-    return np.asarray(found, np.float64)
+    flip_map, _, _ = evaluate(reference, test, "LDR", True, False, False, {})
+    return np.asarray(flip_map, np.float64)
 
 
 def _similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """SSIM of every pixel and channel."""
+    """Compute SSIM for each pixel and channel."""
 
     def mean(x: np.ndarray) -> np.ndarray:
         return scipy.ndimage.gaussian_filter(x, (SIGMA, SIGMA, 0), truncate=CUT / SIGMA)

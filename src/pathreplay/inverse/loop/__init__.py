@@ -1,1 +1,1 @@
-"""The loop: steps, events, checkpoints, and whether values still move."""
+"""The optimisation loop: steps, events, checkpoints and convergence diagnostics."""

@@ -1,4 +1,4 @@
-"""Which views an iteration looks at: all of them, or batches in an order that is shuffled anew in every round."""
+"""Batches of views: all training views, or minibatches of a random permutation in each epoch."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from pathreplay.inverse.problem.problem import Problem
 
 
 def batch(problem: Problem, config: Config, iteration: int) -> list[int]:
-    """Places of the views of an iteration, in the order in which they are evaluated.
+    """Return the indices of the views of an iteration, in the order of evaluation.
 
-    A round has every view that is learned from once; its last batch has what is left. It depends on the seed and the
-    iteration alone, so that a run that goes on takes the views that it would have taken.
+    An epoch contains every training view once; its last batch may be smaller. The batch depends only on the seed and
+    the iteration, so a resumed run continues with the same views.
     """
     views = list(problem.trained())
     n, size = len(views), config.view_batch_size
     if size is None or size >= n:
-        return views[::-1]  # what is learned of media depends on the order, and earlier versions had this one
+        return views[::-1]  # the order of earlier versions, which affects the baselines of media
     number, k = divmod(iteration, -(-n // size))
     return [views[i] for i in _shuffled(config, number, n)[k * size : (k + 1) * size]]
 
 
 def _shuffled(config: Config, number: int, n: int) -> list[int]:
-    """The order of n views in a round of this number."""
+    """Return the permutation of n views in epoch ``number``."""
     return np.random.default_rng([config.seed, BATCH, number]).permutation(n).tolist()

@@ -1,4 +1,4 @@
-"""A run under way, and its checkpoints: all that it goes on from as if never stopped, in one safetensors file."""
+"""The state of a run, and its checkpoints: sealed safetensors files from which it resumes exactly."""
 
 from __future__ import annotations
 
@@ -24,56 +24,58 @@ from pathreplay.platform.atomic_files import Content
 
 @dataclass(frozen=True)
 class Entry:
-    """One iteration of the history: loss before the step, wall-clock seconds, L2 norm of each variable's gradient.
-
-    ``dropped`` counts gradient entries that were NaN or infinite in a view and were taken as zero in this step;
-    ``dropped_shares`` says how many of each variable's that were, of all in all views. ``spp`` are samples per pixel,
-    and ``noise_norms`` how long the noise of a gradient is, where the job measures it (see `noise`). ``errors`` are
-    the root mean square errors, after the step, of the variables whose truth is known, and how far poses are from
-    theirs (see `PoseError.of`); ``picture_error`` is that of the pictures without their noise, in the iterations in
-    which it was measured (jobs with a baseline). Neither costs ``seconds``. ``penalty`` is what values add to the loss.
-    ``slopes`` are sums of each gradient over parts of its variable, and ``means`` those of its values after the step
-    (see `movement`).
-    """
+    """One iteration of the history of a run. Dictionaries are indexed by the key of the variable."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     iteration: NonNegativeInt
     loss: FiniteFloat
+    """Loss before the step, without the penalty."""
     seconds: Annotated[FiniteFloat, Field(ge=0)]
+    """Wall-clock time of the iteration, without the computation of errors."""
     gradient_norms: dict[str, float]
+    """L2 norms of the gradients."""
     dropped: NonNegativeInt = 0
+    """Number of gradient entries of single views that were NaN or infinite and counted as zero."""
     errors: dict[str, float] = field(default_factory=dict)
+    """Root mean square errors after the step of variables with known truth, and errors of poses (`PoseError.of`)."""
     picture_error: float | None = None
+    """Root mean square error of the images without their noise, in iterations that measure it (with a baseline)."""
     penalty: FiniteFloat = 0.0
+    """Sum of all regularizers."""
     spp: NonNegativeInt = 0
+    """Samples per pixel."""
     noise_norms: dict[str, float] = field(default_factory=dict)
+    """L2 norms of the noise of the gradients, if the job measures it (see `noise`)."""
     dropped_shares: dict[str, float] = field(default_factory=dict)
+    """Dropped entries as a fraction of the entries of a variable in all views."""
     slopes: dict[str, list[float]] = field(default_factory=dict)
+    """Sums of each gradient over parts of its variable (see `movement`)."""
     means: dict[str, list[float]] = field(default_factory=dict)
+    """Means of the values over the same parts, after the step."""
 
 
 @dataclass
 class Run:
-    """An optimisation under way: who computes and who steps, where it is, and what happened so far."""
+    """An optimisation in progress."""
 
     executor: Executor
     optimiser: Optimiser
     values: dict[str, Array]
-    """Of the variables, by key: what people see."""
+    """Decoded values of the variables, by key."""
     learned: Arrays = field(default_factory=dict)
-    """By the evaluations, from one to the next."""
+    """Statistics that evaluations pass on to later ones (baselines of media), by name."""
     history: list[Entry] = field(default_factory=list)
     baseline: Run | None = None
-    """Solves the same problem from the same start by another integrator in the same time."""
+    """A run of another integrator from the same initial values and in the same time."""
     whole: bool = True
-    """Not in the middle of a step, in which it cannot be saved."""
+    """False during a step, when the state is inconsistent and cannot be saved."""
 
     def seconds(self) -> float:
         return sum(entry.seconds for entry in self.history)
 
     def picture_error(self) -> float:
-        """The one that was measured last; NaN where none was."""
+        """Return the last image error that was measured; NaN if there is none."""
         return next((e.picture_error for e in reversed(self.history) if e.picture_error is not None), float("nan"))
 
 
@@ -84,24 +86,28 @@ _VALUE, _LEARNED = "value:", "learned:"
 
 
 def save(run: Run) -> Content:
-    """All that is known after the iterations so far, as a sealed file that is made while it is written."""
+    """Serialise a run as a sealed file, whose content is generated while it is written."""
     state = run.optimiser.state()
     plain: dict[str, Array] = {
         **{_LEARNED + name: value for name, value in run.learned.items()},
         **{_VALUE + key: value for key, value in run.values.items()},
     }
     metadata = {"steps": json.dumps(state.steps), "history": json.dumps([asdict(entry) for entry in run.history])}
-    arrays = {name: partial(each.__getitem__, name) for each in (plain, state.arrays) for name in each}
+    arrays = {name: partial(group.__getitem__, name) for group in (plain, state.arrays) for name in group}
     return partial(sealed_chunks, WhenAsked(arrays), metadata)
 
 
 def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Collection[str] = ()) -> None:
-    """Bring a run to where it was when ``path`` was saved; ``levels`` are those of its grids, by key.
+    """Restore a run from a checkpoint.
 
-    ``held`` are variables that some stages do not step.
+    Args:
+        path: the checkpoint.
+        run: a new run of the same job, which is changed in place.
+        levels: refinement schedules of the variables, by key; None for variables without one.
+        held: keys of variables that are frozen in some stages.
 
-    Raises PathreplayError if a bit of the file has changed, it holds what no run has written, or belongs to other
-    variables.
+    Raises:
+        PathreplayError: the file is damaged or invalid, or belongs to other variables.
     """
     try:
         values, state, history, learned = _read(path, run.values, levels, held)
@@ -119,7 +125,7 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Col
 def _read(
     path: Path, values: Arrays, levels: Mapping[str, Levels | None], held: Collection[str]
 ) -> tuple[dict[str, Array], State, list[Entry], Arrays]:
-    """Values, state of the optimiser, history and what was learned; raises what `restore` makes plain."""
+    """Read values, optimiser state, history and learned statistics; `restore` translates the errors it raises."""
     if not path.is_file():
         raise ValueError("no such file")
     with safetensors.safe_open(str(path), framework="numpy") as file:
@@ -130,23 +136,23 @@ def _read(
     history = _HISTORY.validate_json(metadata.get("history", ""), strict=True)
     if set(steps) != set(values):
         raise PathreplayError(
-            f"Checkpoint {path} holds the parameters {', '.join(steps)}, the config names {', '.join(values)}; "
+            f"Checkpoint {path} has the parameters {', '.join(steps)}, but the config names {', '.join(values)}; "
             "start a new run"
         )
     for index, entry in enumerate(history):
         if entry.iteration != index:
-            raise ValueError(f"iteration {entry.iteration} of its history stands in place {index}")
+            raise ValueError(f"entry {index} of its history has the iteration {entry.iteration}")
     for name, array in tensors.items():
         if not np.isfinite(array).all():
-            raise ValueError(f"'{name}' holds NaN or infinite values")
-    found = {key: tensors.pop(_VALUE + key) for key in values}
+            raise ValueError(f"'{name}' has NaN or infinite values")
+    saved = {key: tensors.pop(_VALUE + key) for key in values}
     for key, value in values.items():
-        grid, array = levels[key], found[key]
-        # Optimisers begin anew on a grid that was refined.
+        grid, array = levels[key], saved[key]
+        # Refining a grid resets its optimiser state, so a grid may have fewer steps than iterations.
         if steps[key] > len(history) or (steps[key] < len(history) and grid is None and key not in held):
             raise ValueError(f"{steps[key]} steps of '{key}' in {len(history)} iterations")
         shapes = [value.shape] if grid is None else list(grid.shapes)
         if array.dtype != value.dtype or array.shape not in shapes:
-            raise ValueError(f"'{key}' is {array.dtype} of shape {array.shape}, in the job {value.dtype} of {shapes}")
+            raise ValueError(f"'{key}' is {array.dtype} of shape {array.shape}, not {value.dtype} of {shapes}")
     learned = {name.removeprefix(_LEARNED): tensors.pop(name) for name in list(tensors) if name.startswith(_LEARNED)}
-    return found, State(steps, tensors), history, learned
+    return saved, State(steps, tensors), history, learned

@@ -1,4 +1,4 @@
-"""Checksums of what a run goes on from: a bit that a disk or a copy has changed is told, and never computed with."""
+"""Checksums of the files that a run resumes from, which detect corruption before the data is used."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from pathreplay.platform.files import file_problem
 from pathreplay.platform.tensor_files import safetensors_chunks
 
 SUMS = "checksums.json"
-"""Size and checksum of each picture that a run folder was made with, by name."""
+"""File with the size and checksum of each initial and target image in a run folder, by name."""
 
 SEAL = "sha256"
-"""The tensor at the end of a sealed file: the checksum of all bytes before it."""
+"""Name of the last tensor of a sealed file, which is the checksum of all preceding bytes."""
 
 _SEAL_BYTES = hashlib.sha256().digest_size
 _AT_ONCE, _MOST_BYTES = 2**20, 64 * 2**20
-_WAY_OUT = "start the job from its config"
+_REMEDY = "start the job from its config"
 
 
 @dataclass(frozen=True)
 class _Sum:
-    """What is known of a file."""
+    """Size and checksum of a file."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
@@ -42,7 +42,7 @@ _TABLE = TypeAdapter(dict[str, _Sum])
 
 
 def sealed_chunks(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> Iterator[Chunk]:
-    """`safetensors_chunks` of the arrays, and their `SEAL`."""
+    """Yield the chunks of a safetensors file of the arrays, followed by its `SEAL`."""
     digest = hashlib.sha256()
     for chunk in safetensors_chunks(arrays, metadata, {SEAL: _SEAL_BYTES}):
         digest.update(chunk)
@@ -52,16 +52,16 @@ def sealed_chunks(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str])
 
 
 def require_seal(path: Path) -> None:
-    """Raise ValueError unless the bytes of a sealed file are those that were written."""
+    """Raise ValueError unless the checksum of a sealed file is correct."""
     size = path.stat().st_size - _SEAL_BYTES
     with path.open("rb") as file:
-        found = _digest(file.read(min(_AT_ONCE, size - at)) for at in range(0, size, _AT_ONCE))
-        if file.read(_SEAL_BYTES + 1) != found.digest():
-            raise ValueError("its checksum is wrong: bits of it have changed since it was written")
+        digest = _digest(file.read(min(_AT_ONCE, size - at)) for at in range(0, size, _AT_ONCE))
+        if file.read(_SEAL_BYTES + 1) != digest.digest():
+            raise ValueError("its checksum is wrong: it has changed since it was written")
 
 
 def with_sums(files: Mapping[str, Content]) -> dict[str, Content]:
-    """The files by name, and behind them `SUMS`, which is made when they have been written."""
+    """Append the file `SUMS` to files by name; its content is generated after the others have been written."""
     sums: dict[str, _Sum] = {}
 
     def summed(name: str, content: Content) -> Iterator[Chunk]:
@@ -79,27 +79,26 @@ def with_sums(files: Mapping[str, Content]) -> dict[str, Content]:
 
 
 class Sums:
-    """The checksums in a run folder. Raises PathreplayError where they are missing or damaged."""
+    """The checksums in a run folder. Raises PathreplayError if they are missing or damaged."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, path = folder, folder / SUMS
         if problem := file_problem(path, _MOST_BYTES):
-            old = "" if path.exists() else " (runs of versions before checksums cannot be gone on with)"
-            raise PathreplayError(f"File {path} {problem}{old}; {_WAY_OUT}")
+            old = "" if path.exists() else " (runs of versions without checksums cannot be resumed)"
+            raise PathreplayError(f"File {path} {problem}{old}; {_REMEDY}")
         try:
             self.table = _TABLE.validate_json(path.read_bytes(), strict=True)
         except (OSError, ValidationError):
-            raise PathreplayError(f"File {path} is damaged; {_WAY_OUT}") from None
+            raise PathreplayError(f"File {path} is damaged; {_REMEDY}") from None
 
     def require(self, path: Path) -> None:
-        """Raise PathreplayError unless a picture of the folder is the one that was written."""
+        """Raise PathreplayError unless the checksum of an image in the folder is correct."""
         if problem := file_problem(path):
-            raise PathreplayError(f"Image {path} {problem}; {_WAY_OUT}")
+            raise PathreplayError(f"Image {path} {problem}; {_REMEDY}")
         known = self.table.get(path.relative_to(self.folder).as_posix())
         if known is None or known.bytes != path.stat().st_size or known.sha256 != _of_file(path):
             raise PathreplayError(
-                f"Image {path} or what {SUMS} says of it has changed since it was written: their checksums differ; "
-                f"{_WAY_OUT}"
+                f"Image {path} has changed since it was written: its checksum differs from {SUMS}; {_REMEDY}"
             )
 
 

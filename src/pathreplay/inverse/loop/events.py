@@ -1,4 +1,4 @@
-"""What a run tells of itself while it is under way, and how that is said."""
+"""Events of a run, and their text for the log."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathreplay.inverse.loop.checkpoint import Entry
 
 @dataclass(frozen=True)
 class Started:
-    """Iterations begin: so many are done, of so many."""
+    """Iterations begin, after ``done`` earlier ones, of ``wanted`` in total."""
 
     done: int
     wanted: int
@@ -17,7 +17,7 @@ class Started:
 
 @dataclass(frozen=True)
 class Refined:
-    """A grid goes on in another resolution."""
+    """A grid is resampled to its next resolution."""
 
     key: str
     shape: tuple[int, ...]
@@ -25,14 +25,14 @@ class Refined:
 
 @dataclass(frozen=True)
 class Finished:
-    """The optimiser takes no more steps."""
+    """The optimiser has stopped."""
 
     why: str
 
 
 @dataclass(frozen=True)
 class Entered:
-    """A stage (from 1) of so many begins, or is gone on with."""
+    """Stage ``number`` (from 1) of ``of`` begins or is resumed."""
 
     number: int
     of: int
@@ -40,7 +40,7 @@ class Entered:
 
 @dataclass(frozen=True)
 class NonFinite:
-    """So many entries of the gradient of a view were NaN or infinite, and count as zero."""
+    """Some entries of the gradient in a view were NaN or infinite and count as zero."""
 
     key: str
     view: str
@@ -50,7 +50,7 @@ class NonFinite:
 
 @dataclass(frozen=True)
 class LowSNR:
-    """The gradient of a variable is lost in noise: signal to noise, over the last iterations."""
+    """The signal-to-noise ratio of the gradient of a variable, over the last iterations, is low."""
 
     key: str
     ratio: float
@@ -60,14 +60,14 @@ class LowSNR:
 
 @dataclass(frozen=True)
 class Stepped:
-    """An iteration is done."""
+    """An iteration has finished."""
 
     entry: Entry
 
 
 @dataclass(frozen=True)
 class Stopped:
-    """No more iterations: so many are done."""
+    """Iterations end after ``done`` in total."""
 
     done: int
 
@@ -78,32 +78,32 @@ Told = Entered | Finished | Refined | NonFinite | LowSNR
 
 
 def note_of(event: Told) -> str:
-    """One line for people."""
+    """Describe an event in one line."""
     if isinstance(event, Entered):
         return f"stage {event.number} of {event.of}"
     if isinstance(event, Finished):
-        return f"no more steps: {event.why}"
+        return f"the optimiser has stopped: {event.why}"
     if isinstance(event, Refined):
-        return f"{event.key} goes on with the shape {event.shape}"
+        return f"{event.key} is refined to the shape {event.shape}"
     if isinstance(event, NonFinite):
         return (
             f"{event.entries} gradient entries of '{event.key}' were NaN or infinite in view '{event.view}' at "
-            f"iteration {event.iteration}, and count as zero; more of it is only counted"
+            f"iteration {event.iteration} and count as zero; further ones are counted, but not reported"
         )
     return (
-        f"the gradient of '{event.key}' is lost in noise since about iteration {event.iteration}: signal to noise "
-        f"{event.ratio:.2g} with spp = {event.spp}; take more, or it has arrived"
+        f"the gradient of '{event.key}' is dominated by noise since about iteration {event.iteration}: its "
+        f"signal-to-noise ratio is {event.ratio:.2g} with spp = {event.spp}; raise spp unless the value has converged"
     )
 
 
 class Notes:
-    """Lines for events, of which those that come again and again are told once for each parameter."""
+    """Log lines of events; recurring events are reported once per parameter."""
 
     def __init__(self) -> None:
         self._told: set[tuple[type, str]] = set()
 
     def of(self, event: Event) -> str:
-        """The line; "" where there is nothing to say, or it has been said."""
+        """Return the line of an event; "" if it has none, or was reported before."""
         if isinstance(event, (Started, Stepped, Stopped)):
             return ""
         if isinstance(event, (NonFinite, LowSNR)):

@@ -54,10 +54,10 @@ from pathreplay.inverse.problem.problem import Problem, errors_of, put_values, s
 from pathreplay.platform.interrupts import Stop
 from pathreplay.scenes.parameters import get_array, to_value
 
-# How often the pictures are judged in a job with a baseline: enough for a curve, at some per cent of its time.
+# Number of evaluations of the image error in a job with a baseline, which take some per cent of its time.
 JUDGEMENTS = 10
 
-# Of a gradient's entries, that were not finite: with less, the others still lead the way.
+# Fraction of non-finite gradient entries above which an iteration counts towards `max_consecutive_nonfinite`.
 HALF = 0.5
 
 
@@ -69,9 +69,15 @@ def new_run(
     evaluate: Evaluate | None = None,
     executor: Executor | None = None,
 ) -> Run:
-    """A run at the problem's start values, in this process; ``evaluate`` is what does it, if not an `Evaluator`.
+    """Make a run at the initial values of a problem.
 
-    Or ``executor``, in others.
+    Args:
+        problem: the problem.
+        integrator: integrator of the default evaluator.
+        record: whether the default evaluator records its passes as frozen functions.
+        optimizer: type and options of the optimiser; default: Adam.
+        evaluate: evaluation of shards in this process; default: an `Evaluator`.
+        executor: evaluates the shards instead, e.g. in other processes.
     """
     values = {
         v.key: np.array(v.start, np.float32) if dr.is_tensor_v(v.like) else get_array(to_value(v.like, v.start))
@@ -86,7 +92,7 @@ def new_run(
 
 def _optimiser(problem: Problem, values: Arrays, options: Optimizer) -> Optimiser:
     if options.searches:
-        free = -np.inf, np.inf  # other coordinates have their own ways to hold bounds
+        free = -np.inf, np.inf  # coordinates enforce the bounds themselves
         bounds = {v.key: free if v.coordinates else v.bounds for v in problem.variables}
         return LineSearch(values, options, bounds)
     uniform = [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
@@ -94,22 +100,31 @@ def _optimiser(problem: Problem, values: Arrays, options: Optimizer) -> Optimise
 
 
 def best_values(problem: Problem, run: Run) -> dict[str, Array]:
-    """The values that a run has come to: after its last step, or at the best one of a line search."""
-    found = run.optimiser.answer()
+    """Return the resulting values of a run: after its last step, or at the best evaluation of a line search."""
+    best = run.optimiser.answer()
     for v in problem.variables:
-        if v.coordinates and v.key in found:
-            found[v.key] = v.coordinates.values(found[v.key])
-    # Values of a run are within their bounds.
-    return {v.key: np.clip(found[v.key], *v.bounds) if v.key in found else run.values[v.key] for v in problem.variables}
+        if v.coordinates and v.key in best:
+            best[v.key] = v.coordinates.values(best[v.key])
+    # `run.values` are within their bounds already.
+    return {v.key: np.clip(best[v.key], *v.bounds) if v.key in best else run.values[v.key] for v in problem.variables}
 
 
 def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
-    """Take steps from ``len(run.history)`` to ``config.iterations``; yields what happens, for observers.
+    """Take steps from ``len(run.history)`` to ``config.iterations``, and yield the events of the run.
 
-    After each step the run's baseline takes as many as bring it to the same number of seconds. In turns, both have the
-    same share of a machine whose load changes. Its learning rate and resolutions are those of the job's iteration.
+    After each step, the run's baseline takes steps until it has used as much time. Alternating the two gives them equal
+    conditions on a machine whose load varies. The baseline uses the learning rate and resolutions of the iteration of
+    the main run.
 
-    Raises PathreplayError where loss or values are no longer finite, and after `Config.max_consecutive_nonfinite`.
+    Args:
+        problem: the problem.
+        config: the job.
+        run: the run, which is changed in place.
+        stop: request to stop, which is checked after each step.
+
+    Raises:
+        PathreplayError: the loss or a value is not finite, or gradients were not finite in
+            `Config.max_consecutive_nonfinite` consecutive iterations.
     """
     yield Started(len(run.history), config.iterations)
     faint: set[str] = set()
@@ -125,11 +140,11 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
         if baseline := run.baseline:
             while baseline.seconds() < run.seconds():
                 take_step(problem, config, baseline, i)
-            # Due after the first iteration, and after those with which a tenth of them is done.
+            # Measure the image errors after the first iteration, and after each tenth of all iterations.
             if i == 0 or JUDGEMENTS * i // config.iterations < JUDGEMENTS * (i + 1) // config.iterations:
-                for each in (run, baseline):
-                    error = judged(problem, config, each.values, i)
-                    each.history[-1] = replace(each.history[-1], picture_error=error)
+                for measured in (run, baseline):
+                    error = judged(problem, config, measured.values, i)
+                    measured.history[-1] = replace(measured.history[-1], picture_error=error)
         for key, ratio in noise.ratios(run.history).items():
             if ratio < noise.FAINT and key not in faint:
                 faint.add(key)
@@ -142,7 +157,7 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
 
 
 def computed(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
-    """The events of `iterate`, computed as the job wants it, while whoever looks on is free to compute as they want."""
+    """Yield the events of `iterate`; `computing` applies while steps are taken, not while observers handle events."""
     events = iterate(problem, config, run, stop)
     while True:
         with computing(config):
@@ -153,48 +168,62 @@ def computed(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator
 
 
 def _require_gradients(config: Config, run: Run) -> None:
-    """Raise PathreplayError if half of a gradient and more was not finite in so many iterations in a row."""
+    """Raise PathreplayError after `max_consecutive_nonfinite` iterations in which half of a gradient is not finite."""
     last = run.history[-config.max_consecutive_nonfinite :]
     if len(last) < config.max_consecutive_nonfinite:
         return
     for key in last[-1].dropped_shares:
         if all(entry.dropped_shares.get(key, 0) >= HALF for entry in last):
             raise PathreplayError(
-                f"The gradient of '{key}' was NaN or infinite, half of it or more, in iterations {last[0].iteration} "
-                f"to {last[-1].iteration}; bound it, start it elsewhere, or raise 'max_consecutive_nonfinite'"
+                f"At least half of the gradient of '{key}' was NaN or infinite in iterations {last[0].iteration} to "
+                f"{last[-1].iteration}; bound the parameter, change its 'initial', or raise "
+                "'max_consecutive_nonfinite'"
             )
 
 
 def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Event]:
-    """One step, with the learning rates and resolutions of iteration ``position``; adds an entry to the history.
+    """Take one step and append it to the history of the run.
 
-    Evaluate the views of its `batch`, a shard with a seed of its own for each (or parts of it, see `Config.parts`), and
-    sum in their order; step with the learning rate of that iteration (see `schedules`), project every variable into its
-    bounds. A grid that moves, and whose next resolution is due, is interpolated before that; the optimiser starts anew
-    on it. What is differentiated is decided by the integrator; targets, bounds and the seeds' choice of paths are not.
+    First, refine the grids whose next resolution is due, which resets their optimiser state. Then evaluate the views of
+    the `batch`, with separate seeds for each view (and each part of it, see `Config.parts`), and sum the results in a
+    fixed order. Finally, step with the learning rate of the iteration (see `schedules`) and project all variables onto
+    their bounds.
 
-    Returns what there is to tell. Raises PathreplayError where the loss is no longer finite.
+    The integrator determines which derivatives the gradient contains. Targets, bounds and random numbers are not
+    differentiated.
+
+    Args:
+        problem: the problem.
+        config: the job.
+        run: the run, which is changed in place.
+        position: iteration that determines stage, learning rate and resolutions.
+
+    Returns:
+        Events of the step.
+
+    Raises:
+        PathreplayError: the loss or a value is not finite.
     """
     begin, i = time.perf_counter(), len(run.history)
     part = part_at(problem, config, position)
-    values, told = _refined(part, run.values, position)
-    asked, halves = part.config.spp, part.config.halves_samples
-    spp = asked if isinstance(asked, int) else noise.next_spp(config.adaptive_spp, run.history)
+    values, events = _refined(part, run.values, position)
+    configured, halves = part.config.spp, part.config.halves_samples
+    spp = configured if isinstance(configured, int) else noise.next_spp(config.adaptive_spp, run.history)
     shards = _shards(part, i, spp)
-    share = len(part.problem.trained()) / len({shard.views for shard in shards})
+    scale = len(part.problem.trained()) / len({shard.views for shard in shards})
     evaluations = run.executor.run(values, shards, run.learned)
     dropped: list[dict[str, int]] = []
-    found, noise_norms = _summed(_seen(evaluations, dropped), share / part.config.parts, halves)
-    if not np.isfinite(found.loss):
+    evaluation, noise_norms = _summed(_seen(evaluations, dropped), scale / part.config.parts, halves)
+    if not np.isfinite(evaluation.loss):
         raise PathreplayError(
-            f"The loss is {found.loss} at iteration {i}; lower the learning rates, or bound the parameters that ran "
-            "away"
+            f"The loss is {evaluation.loss} at iteration {i}; lower the learning rates, or bound the parameters that "
+            "diverged"
         )
     for shard, counts in zip(shards, dropped, strict=True):
         view = problem.views[shard.views[0]].name
-        told += [NonFinite(key, view, i, count) for key, count in counts.items()]
+        events += [NonFinite(key, view, i, count) for key, count in counts.items()]
     penalties = {v.key: v.penalty.of(values[v.key]) for v in problem.variables if v.penalty}
-    gradients = found.gradients
+    gradients = evaluation.gradients
     for key, (_, slope) in penalties.items():
         if key in gradients:
             gradients[key] = gradients[key] + slope
@@ -203,30 +232,30 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
     norms, sizes = _norms(gradients), {key: gradient.size for key, gradient in gradients.items()}
     release(values)
     run.whole = False
-    run.values = _stepped(part, run, values, gradients, position, found.loss + penalty)
-    run.learned = found.learned
+    run.values = _stepped(part, run, values, gradients, position, evaluation.loss + penalty)
+    run.learned = evaluation.learned
     seconds = time.perf_counter() - begin
     entry = Entry(
         i,
-        found.loss,
+        evaluation.loss,
         seconds,
         norms,
-        sum(found.dropped.values()),
+        sum(evaluation.dropped.values()),
         errors_of(problem, run.values),
         penalty=penalty,
         spp=spp,
         noise_norms=noise_norms,
-        dropped_shares={key: n / (sizes[key] * len(shards)) for key, n in found.dropped.items()},
+        dropped_shares={key: n / (sizes[key] * len(shards)) for key, n in evaluation.dropped.items()},
         slopes=slopes,
         means={key: parts_of(run.values[key], mean=True) for key in slopes},
     )
     run.history.append(entry)
     run.whole = True
-    return told
+    return events
 
 
 def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array], list[Event]]:
-    """The values, where the next resolution is due in that, and the grids that are; those that are held can wait."""
+    """Resample grids whose next resolution is due, unless they are frozen; returns all values, and the events."""
     moving = [v for v in part.problem.variables if v.key in part.moving]
     due = {v.key: v.levels.shape_at(position) for v in moving if v.levels}
     due = {key: shape for key, shape in due.items() if values[key].shape != shape}
@@ -235,7 +264,7 @@ def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array
 
 
 def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
-    """What an iteration evaluates: its views, one after the other, each whole or in parts (see `Config.parts`)."""
+    """Make the shards of an iteration: one per view, or several per view (see `Config.parts`)."""
     same = 0 if part.config.optimizer.searches else iteration
     config, views = part.config, part.problem.views
     return [
@@ -250,28 +279,31 @@ def _norms(gradients: Arrays) -> dict[str, float]:
 
 
 def _seen(evaluations: Iterable[Evaluation], dropped: list[dict[str, int]]) -> Iterator[Evaluation]:
-    """The evaluations, while what they dropped is noted."""
-    for each in evaluations:
-        dropped.append(each.dropped)
-        yield each
-        del each
+    """Yield the evaluations and append their counts of dropped entries to ``dropped``."""
+    for evaluation in evaluations:
+        dropped.append(evaluation.dropped)
+        yield evaluation
+        del evaluation
 
 
-def _summed(evaluations: Iterator[Evaluation], share: float, halves: bool) -> tuple[Evaluation, dict[str, float]]:
-    """The sum times ``share``; and where they are of two halves, in turn, |a - b| of their sums, of each gradient."""
+def _summed(evaluations: Iterator[Evaluation], scale: float, halves: bool) -> tuple[Evaluation, dict[str, float]]:
+    """Sum evaluations and multiply by ``scale``; with alternating ``halves``, return the noise norm of each gradient.
+
+    The noise norm is |a - b| times ``scale``, where a and b are the sums over the two halves.
+    """
     if not halves:
-        return total(evaluations, share, owned=True), {}
+        return total(evaluations, scale, owned=True), {}
     sums = Total(owned=True), Total(owned=True)
-    for n, each in enumerate(evaluations):
-        sums[n % 2].add(each)
-        del each
-    a, b = (each.of() for each in sums)
+    for n, evaluation in enumerate(evaluations):
+        sums[n % 2].add(evaluation)
+        del evaluation
+    a, b = (half.of() for half in sums)
     norms = _norms({key: a.gradients[key] - b.gradients[key] for key in a.gradients})
-    return total([a, b], share), {key: share * norm for key, norm in norms.items()}
+    return total([a, b], scale), {key: scale * norm for key, norm in norms.items()}
 
 
 def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int, loss: float) -> dict[str, Array]:
-    """The values after a step of the optimiser, taken in the coordinates of each variable, and held within bounds."""
+    """Step the optimiser in the coordinates of each variable, and project the values onto their bounds."""
     config = part.config
     decay, iterations = config.final_learning_rate_ratio, config.iterations
     factor = part.factor * rate(config.learning_rate_schedule, position, iterations, decay, config.warmup_steps)
@@ -284,9 +316,9 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
     stepped = run.optimiser.step({**now, **latent}, {**gradients, **slopes}, rates, loss)
     stepped |= {key: other.values(stepped[key]) for key, other in others.items()}
     for key, value in stepped.items():
-        if not np.isfinite(value.sum(dtype=np.float64)):  # which is where all is
+        if not np.isfinite(value.sum(dtype=np.float64)):  # finite if and only if all entries are
             raise PathreplayError(
-                f"'{key}' is no finite number after iteration {len(run.history)}; lower its learning rate, or bound it"
+                f"'{key}' is not finite after iteration {len(run.history)}; lower its learning rate, or bound it"
             )
     for v in moving:
         if v.bounds != (-np.inf, np.inf):
@@ -295,24 +327,24 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
 
 
 def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:
-    """Pictures of all views with these values in the scene, by the job's integrator; same noise at every call."""
+    """Render all views with the job's integrator at these values; all calls use the same random numbers."""
     return {view.name: problem.album.keep(picture_of(problem, config, values, view)) for view in problem.views}
 
 
 def picture_of(problem: Problem, config: Config, values: Arrays, view: View, spp: int | None = None) -> Image:
-    """One of them, with so many samples per pixel."""
+    """Render one view as `render_views` does, with ``spp`` samples per pixel (default: ``eval_spp``)."""
     put_values(problem, values)
-    at = next(n for n, each in enumerate(problem.views) if each.name == view.name)
-    return exposed(values, at, _plain(problem, config, view, config.eval_spp if spp is None else spp))
+    index = next(n for n, other in enumerate(problem.views) if other.name == view.name)
+    return exposed(values, index, _plain(problem, config, view, config.eval_spp if spp is None else spp))
 
 
 def _plain(problem: Problem, config: Config, view: View, spp: int) -> Image:
-    """At the exposure 1, with the values that the scene has."""
+    """Render a view at exposure 1 with the current values of the scene."""
     return _picture(problem, view, problem.integrator, spp, config.seeds(PICTURE, view.sensor)[0])
 
 
 def with_exposures(problem: Problem, config: Config, values: Arrays) -> Arrays:
-    """The values, with the exposures of held-out views: nothing was learned from them, so that they are fitted now."""
+    """Return the values with the exposures of test views, which the run does not optimise, fitted to their targets."""
     if EXPOSURE not in values or not any(view.is_test for view in problem.views):
         return values
     put_values(problem, values)
@@ -325,11 +357,17 @@ def with_exposures(problem: Problem, config: Config, values: Arrays) -> Arrays:
 
 
 def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> float:
-    """Root mean square error of the pictures with these values in the scene, without the noise of rendering them.
+    """Estimate the root mean square error of the training views without the noise of rendering them.
 
-    With two independent renderings A and B of a view, E[(A - T)(B - T)] = (I - T)², where a square would add the
-    variance; the mean over pixels and views that are learned from is taken before the
-    root (negative ones count as zero). The noise of the targets stays in.
+    With two independent renderings A and B of an image I, E[(A - T)(B - T)] = (I - T)², whereas the square of one
+    rendering would add its variance. The root is taken of the mean over pixels and views; a negative mean counts as
+    zero. The noise of the targets T is included.
+
+    Args:
+        problem: the problem.
+        config: the job.
+        values: values of the variables.
+        iteration: selects the random numbers.
     """
     put_values(problem, values)
     squares, views = 0.0, problem.trained()
@@ -347,5 +385,5 @@ def _picture(problem: Problem, view: View, integrator: mi.Integrator, spp: int, 
     sensor = sensor_of(problem, view)
     with dr.suspend_grad():
         image = mi.render(problem.scene, sensor=view.sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
-    sensor.film().clear()  # recorded passes hold it, and would be recorded again
+    sensor.film().clear()  # frozen functions take the film as input, and a filled film would trigger a new recording
     return np.array(image, dtype=np.float32)

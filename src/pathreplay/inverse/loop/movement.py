@@ -1,9 +1,9 @@
-"""Whether values still move at the end of a run: do the last gradients point somewhere, beyond their noise?
+"""Convergence test: whether the mean of the last gradients of a variable differs from zero beyond its noise.
 
-The noise of a gradient is new in each iteration, so that its mean over a window is known to a √window-th of its
-scatter. Values that have arrived have a mean of zero; those that are on their way have not, however small the steps
-have become. Where little is left of the gradient that a run began with, little is left of the way: a loss is a parabola
-close to its end.
+The noise of gradients is independent between iterations, so the standard error of their mean over a window of n
+iterations is their standard deviation over √n. At convergence the expected gradient is zero; before, it is not, however
+small the steps are. A gradient that is small relative to the initial one also counts as converged: near a minimum the
+loss is quadratic, so the remaining distance is proportional to the gradient.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ from pathreplay.inverse.loop.checkpoint import Entry
 from pathreplay.inverse.parameters.values import Array
 
 MOST_PARTS = 8
-"""Of a variable, whose gradients are kept for this."""
+"""Largest number of parts of a variable over which gradients are summed for the test."""
 SHORTEST = 20
-"""Iterations without which nothing can be said."""
+"""Smallest number of iterations that the test needs."""
 LEFT = 0.01
-"""Of the first gradient: less is no way that is left."""
+"""Fraction of the initial gradient below which a variable counts as converged."""
 _FIRST = 5
 
 
 def parts_of(array: Array, mean: bool = False) -> list[float]:
-    """Sums over up to `MOST_PARTS` parts of an array, one after the other; or means. To six digits: a file keeps them.
+    """Sum an array over up to `MOST_PARTS` contiguous parts, or average it if ``mean``.
 
-    The noise of neighbours averages out in sums, and what they have in common adds up.
+    In a sum, independent noise of the entries averages out and a common signal adds up. Results are rounded to six
+    digits to keep checkpoints small.
     """
     flat = np.ravel(array)
     if not flat.size:
@@ -39,17 +40,16 @@ def parts_of(array: Array, mean: bool = False) -> list[float]:
 
 
 def window_of(history: Sequence[Entry], begin: int = 0) -> Sequence[Entry]:
-    """The last third of the iterations from ``begin`` on, or `SHORTEST` of them; empty where there are fewer."""
-    found = len(history) - begin
-    return history[-max(found // 3, SHORTEST) :] if found >= SHORTEST else ()
+    """Return the last third of the iterations since ``begin``, at least `SHORTEST`; empty if there are fewer."""
+    count = len(history) - begin
+    return history[-max(count // 3, SHORTEST) :] if count >= SHORTEST else ()
 
 
 def still_moves(history: Sequence[Entry], key: str, begin: int = 0) -> bool | None:
-    """Whether a variable still moves; None where too few iterations since ``begin`` say something of it.
+    """Test whether a variable still moves; returns None if there are too few iterations since ``begin``.
 
-    Of g, the sum of its gradient over each part, t = √n mean(g) / deviation(g) over the window. The mean of t² over m
-    parts is about 1, give or take √(2/m), where there is nothing but noise. Parts that stand still, such as those held
-    by a bound, are left out.
+    For the gradient sum g of each part, t = √n mean(g) / std(g) over the window of n iterations. If there is only
+    noise, the mean of t² over m parts is about 1 ± √(2/m). Constant parts, e.g. at a bound, are excluded.
     """
     window = [entry for entry in window_of(history, begin) if key in entry.slopes]
     first = [entry for entry in history[begin:] if key in entry.slopes][:_FIRST]
@@ -61,6 +61,6 @@ def still_moves(history: Sequence[Entry], key: str, begin: int = 0) -> bool | No
         return False
     mean = g.mean(axis=0)
     t = math.sqrt(len(g)) * mean[free] / g.std(axis=0, ddof=1)[free]
-    points = np.mean(np.square(t)) > 1 + 7 * math.sqrt(2 / free.sum())
-    before = np.mean([entry.slopes[key] for entry in first], axis=0)
-    return bool(points and np.linalg.norm(mean[free]) > LEFT * np.linalg.norm(before[free]))
+    significant = np.mean(np.square(t)) > 1 + 7 * math.sqrt(2 / free.sum())
+    initial = np.mean([entry.slopes[key] for entry in first], axis=0)
+    return bool(significant and np.linalg.norm(mean[free]) > LEFT * np.linalg.norm(initial[free]))

@@ -1,10 +1,10 @@
-"""What pictures do not determine: parameters that change nothing, and pairs of which one undoes what the other does.
+"""Identifiability: parameters that do not affect the images, and pairs of parameters whose effects cancel.
 
-The columns of J, the derivative of all pictures by a few numbers of each parameter, are central differences of
-renderings with the same random numbers, so that what moves a camera back and what moves all else forth give the same
-column, noise and all. Between the spaces that the columns of two parameters span is a smallest angle: where it is
-zero, some change of the one looks as some change of the other, and the pictures know only what both make together. The
-light of a lamp and the reflectance of what it lights are such a pair.
+The columns of the Jacobian J of all images with respect to some entries of each parameter are central differences with
+common random numbers. Equivalent changes (moving a camera, or moving everything else the opposite way) therefore have
+equal columns, including the noise. The test computes the smallest principal angle between the column spaces of two
+parameters. If it is zero, a change of one parameter can be undone by a change of the other, and the images determine
+only their combined effect. The radiance of an emitter and the reflectance of the surface that it lights are an example.
 """
 
 from __future__ import annotations
@@ -23,36 +23,42 @@ from pathreplay.inverse.parameters.variables import Variable
 from pathreplay.inverse.problem.problem import Problem
 
 FEW = 4
-"""Numbers of a variable that are changed one by one; those of larger ones, all in proportion."""
+"""Largest size of a variable whose entries are perturbed one by one; larger ones are scaled as a whole."""
 MOST_COLUMNS, MOST_PIXELS, MOST_ROWS = 16, 2**23, 2**20
-"""Of all variables, of all views, and what of these is compared, evenly chosen."""
+"""Largest number of columns, of pixels of all views, and of rows that are compared (evenly subsampled)."""
 MOST_SAMPLES, FREE_SAMPLES, SHARE = 16, 2**22, 0.1
-"""Of a pixel; of all renderings, where the run took few; and next to those that the run took."""
+"""Most samples per pixel; budget of samples in total, or as a fraction of the samples of the run if that is more."""
 STEP = 0.01
-"""Of a value and of how far it has come, and of a step: so much is changed."""
+"""Size of a perturbation, as a fraction of the sum of value, change during the run and learning rate."""
 UNDONE = 0.05
-"""The sine of the smallest angle: the share of a change of the pictures that the other parameter cannot undo."""
+"""Sine of the angle below which two parameters are a trade-off: the fraction of a change that cannot be undone."""
 
 Columns = Mapping[str, NDArray[np.float64]]
-"""By variable: pixels x numbers."""
+"""Columns of the Jacobian by variable, shape (pixels, entries)."""
 
 
 def trade_offs(columns: Columns) -> tuple[tuple[str, str], ...]:
-    """The pairs of which one undoes what the other does, but for `UNDONE`."""
+    """Return the pairs of variables whose effects on the images cancel up to `UNDONE`."""
     spans = {key: np.linalg.qr(column / np.linalg.norm(column, axis=0))[0] for key, column in columns.items()}
-    found = []
+    pairs = []
     for a, b in combinations(spans, 2):
         cosine = min(float(np.linalg.svd(spans[a].T @ spans[b], compute_uv=False)[0]), 1.0)
         if np.sqrt(1 - cosine**2) < UNDONE:
-            found.append((a, b))
-    return tuple(found)
+            pairs.append((a, b))
+    return tuple(pairs)
 
 
 def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Columns, tuple[str, ...]]:
-    """Derivatives of the pictures by the variables, and the variables that change nothing in them.
+    """Compute the columns of the Jacobian, without exposures.
 
-    Exposures are left out. Nothing where there are too many or too large variables, or where to look at all views would
-    cost too much beside a run that took so many samples (``taken``).
+    Args:
+        problem: the problem.
+        values: values of the variables.
+        taken: number of samples that the run has used, which bounds the cost.
+
+    Returns:
+        The columns by variable, and the variables that do not affect the images. Both are empty if there are too many
+        variables, they are too large, or rendering all views would be too expensive.
     """
     variables = [v for v in problem.variables if v.key != EXPOSURE]
     if any(values[v.key].size >= LARGE for v in variables) or len(variables) > MOST_COLUMNS:
@@ -66,24 +72,24 @@ def columns_of(problem: Problem, values: Arrays, taken: float = 0) -> tuple[Colu
     if spp < 1 or pixels > MOST_PIXELS:
         return {}, ()
     bounds = {v.key: v.bounds for v in variables}
-    found, unseen = {}, []
-    for key, each in changes.items():
+    jacobian, unseen = {}, []
+    for key, perturbations in changes.items():
         columns = []
-        for change in each:
+        for change in perturbations:
             ahead, behind = (np.clip(values[key] + sign * change, *bounds[key]) for sign in (1, -1))
             column = _rendered(problem, {**values, key: ahead}, spp) - _rendered(problem, {**values, key: behind}, spp)
             column = np.where(np.isfinite(column), column, 0)
             if column.any():
                 columns.append(column[:: max(1, column.size // MOST_ROWS)])
         if columns:
-            found[key] = np.stack(columns, axis=1).astype(np.float64)
+            jacobian[key] = np.stack(columns, axis=1).astype(np.float64)
         else:
             unseen.append(key)
-    return {key: column for key, column in found.items() if column.any(axis=0).all()}, tuple(unseen)
+    return {key: column for key, column in jacobian.items() if column.any(axis=0).all()}, tuple(unseen)
 
 
 def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
-    """All that counts of the pictures with these values in the scene, always by the same random numbers."""
+    """Render all training views with common random numbers; returns their weighted pixels in one vector."""
     pictures = []
     for view in problem.trained().values():
         picture = picture_of(problem, problem.config, values, view, spp)
@@ -92,7 +98,7 @@ def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
 
 
 def _changes(variable: Variable, value: Array, few: int = FEW) -> list[Array]:
-    """Small changes of a value: of each number, or of all in proportion."""
+    """Make small perturbations of a value: of each entry, or of all entries in proportion."""
     size = STEP * variable.learning_rate
     if value.size <= few:
         size += STEP * (_length(value) + _length(value - variable.start))
@@ -101,5 +107,5 @@ def _changes(variable: Variable, value: Array, few: int = FEW) -> list[Array]:
 
 
 def _length(value: Array) -> float:
-    """Root mean square."""
+    """Compute the root mean square."""
     return float(np.sqrt(np.mean(np.square(value, dtype=np.float64))))

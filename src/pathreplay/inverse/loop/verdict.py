@@ -1,4 +1,4 @@
-"""What is to be thought of the values that a run ended with: on their way, as exact as they get, or not determined."""
+"""Assessment of the values at the end of a run: still moving, converged, or not determined by the images."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ from pathreplay.inverse.problem.problem import Problem
 
 @dataclass(frozen=True)
 class Verdict:
-    """By key of the variables, of poses their parts: those that still move, and those that have arrived.
-
-    ``trade_offs`` are pairs that the pictures do not tell apart, and ``unseen`` are variables that change nothing in
-    them. Of variables that are in none of these there were too few iterations.
-    """
+    """Keys of variables by their state; variables in no group had too few iterations for a test."""
 
     moving: tuple[str, ...] = ()
+    """Variables that still move."""
     arrived: tuple[str, ...] = ()
+    """Variables that have converged."""
     trade_offs: tuple[tuple[str, str], ...] = ()
+    """Pairs of variables whose effects on the images cancel."""
     unseen: tuple[str, ...] = ()
+    """Variables that do not affect the images."""
 
     def __str__(self) -> str:
-        """One line."""
+        """Summarise the verdict in one line, with remedies."""
         parts = []
         if self.trade_offs:
             pairs = ", ".join(f"'{a}' against '{b}'" for a, b in self.trade_offs)
             parts.append(
-                f"not determined by the pictures: {pairs}, where one undoes what the other does: hold one of them, or "
-                "add l2_to_initial, or a view that tells them apart"
+                f"not determined by the images: {pairs}, whose effects cancel: freeze one of them, or add "
+                "l2_to_initial, or a view that distinguishes them"
             )
         if self.unseen:
-            parts.append(f"not determined by the pictures, in which they change nothing: {_listed(self.unseen)}")
+            parts.append(f"not determined by the images, which they do not affect: {_listed(self.unseen)}")
         if self.moving:
-            parts.append(f"still moving: {_listed(self.moving)}: go on with more iterations, or a higher learning_rate")
+            parts.append(f"still moving: {_listed(self.moving)}: run more iterations, or raise learning_rate")
         free = {key for pair in self.trade_offs for key in pair} | set(self.unseen)
         if arrived := [key for key in self.arrived if key not in free]:
             which = _listed(arrived) if parts else "all"
-            parts.append(f"as exact as the noise allows: {which}: more spp, or a learning rate that decays, bring more")
-        return "values: " + ("; ".join(parts) or f"less than {SHORTEST} iterations do not say whether they still move")
+            parts.append(f"converged up to noise: {which}: raise spp or let the learning rate decay to improve them")
+        return "values: " + ("; ".join(parts) or f"fewer than {SHORTEST} iterations, too few to test convergence")
 
 
 def _listed(keys: Sequence[str]) -> str:
@@ -54,7 +54,7 @@ def _listed(keys: Sequence[str]) -> str:
 
 
 def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
-    """The verdict on a run. Of one that was stopped nothing is rendered, so that trade-offs are not looked for."""
+    """Assess a run. Trade-offs need renderings, so they are not computed for a run that was ``stopped`` early."""
     moves = {v.key: still_moves(run.history, v.key, _begin(problem, v.key, run)) for v in problem.variables}
     known = [key for key, moving in moves.items() if moving is not None]
     done = bool(run.optimiser.finished)
@@ -69,15 +69,15 @@ def verdict_of(problem: Problem, run: Run, stopped: bool) -> Verdict:
         columns, unseen = columns_of(problem, run.values, taken)
         pairs = trade_offs(columns)
     except (PathreplayError, RuntimeError, ValueError, np.linalg.LinAlgError):
-        # A function of the user's, or Mitsuba, may not take what is beside the values: the run is done.
+        # User functions or Mitsuba may reject perturbed values; the run itself has succeeded.
         return Verdict(moving, arrived)
-    # An outline may stay where it is among few samples; edges pull all the same.
+    # With few samples, a perturbation may not move a silhouette across any of them, but its gradient is not zero.
     pulled = {key for entry in run.history for key, slopes in entry.slopes.items() if any(slopes)}
     return Verdict(moving, arrived, pairs, tuple(key for key in unseen if key not in pulled))
 
 
 def _begin(problem: Problem, key: str, run: Run) -> int:
-    """The iteration since which a variable is treated alike: that of the last stage, or of its last resolution."""
+    """Return the first iteration of the current stage or resolution of a variable, whichever is later."""
     stages = begins(problem.config.stages or [])[:-1]
     levels = next(v.levels for v in problem.variables if v.key == key)
     return max(at for at in (0, *stages, *(levels.begins if levels else ())) if at <= len(run.history))

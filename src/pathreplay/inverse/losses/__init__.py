@@ -1,1 +1,1 @@
-"""Losses of images by pixels, and by what people or networks see in them."""
+"""Image losses: per pixel, structural and perceptual."""

@@ -1,6 +1,6 @@
-"""Losses of whole pictures, where a pixel counts with others: up to a common factor, by structure, by a network.
+"""Losses that couple pixels: scale-invariant, SSIM and LPIPS.
 
-Their gradients are biased by the noise of a rendering: give them samples.
+Rendering noise biases their gradients; more samples per pixel reduce the bias.
 """
 
 from __future__ import annotations
@@ -16,14 +16,19 @@ from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.metrics import C1, C2, CUT, SIGMA
 from pathreplay.scenes.descriptions import one_line
 
-# Of the mean square of a target: below that a picture is black, and no factor makes it alike.
+# An image with less than this fraction of the target's mean square counts as black: its scale factor tends to 0.
 _BLACK = 1e-9
 
 
 def scale_invariant(image: mi.TensorXf, target: mi.TensorXf, weight: Any = None) -> mi.TensorXf:
-    """(s I - T)^2 with the factor s = Σ w I T / Σ w I² that makes it least, one for the whole picture.
+    """Compute (s I - T)² with the least-squares scale s = Σ w I T / Σ w I² of the whole image.
 
-    Since it is least there, s has no derivative that counts, and is held. Of a black picture s is 0.
+    The scale s is detached: at the minimum, the derivative of the loss by s is zero. For a black image, s is 0.
+
+    Args:
+        image: rendered image I, shape (height, width, channels).
+        target: target T, of the same shape.
+        weight: weights w of the pixels, shape (height, width, 1); None weights all equally.
     """
     with dr.suspend_grad():
         w = mi.TensorXf(1) if weight is None else weight
@@ -33,9 +38,9 @@ def scale_invariant(image: mi.TensorXf, target: mi.TensorXf, weight: Any = None)
 
 
 def ssim(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """1 - SSIM of each pixel and channel, of sRGB encoded colours that are not cut off at white.
+    """Compute 1 - SSIM for each pixel and channel, on sRGB-encoded colours that are not clipped at white.
 
-    Windows and constants are those of Wang et al. 2004, and of `Likeness`, by which results are reported.
+    Window and constants follow Wang et al. 2004, as in the reported metric (`Likeness`).
     """
     a, b = _encoded(image), _encoded(target)
     μ, ν = _blurred(a), _blurred(b)
@@ -44,39 +49,49 @@ def ssim(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
 
 
 def _encoded(image: mi.TensorXf) -> mi.TensorXf:
-    """sRGB's curve, which goes on above white."""
-    bright = dr.maximum(image, 0.0031308)  # also where it is not taken: powers of 0 have no derivative
+    """Apply the sRGB transfer function, extended above white."""
+    bright = dr.maximum(image, 0.0031308)  # the unselected branch must have a finite derivative, too
     return dr.select(image > 0.0031308, 1.055 * dr.power(bright, 1 / 2.4) - 0.055, 12.92 * dr.maximum(image, 0))
 
 
 def _blurred(image: mi.TensorXf) -> mi.TensorXf:
-    """Mean under the window around each pixel; pictures are mirrored at their borders."""
+    """Convolve with the Gaussian window of SSIM; images are mirrored at their borders."""
     offsets = np.arange(-CUT, CUT + 1)
     window = np.exp(-0.5 * (offsets / SIGMA) ** 2)
     window /= window.sum()
     for axis in (0, 1):
         n, stride = image.shape[axis], int(np.prod(image.shape[axis + 1 :]))
         at = dr.arange(mi.UInt32, int(np.prod(image.shape)))
-        place = at // stride % n
+        position = at // stride % n
         values = image.array
         mean = mi.Float(0)
-        for offset, share in zip(offsets, window, strict=True):
-            # Modulo 2 n, where it goes there and back.
-            there = (place + int(offset % (2 * n))) % (2 * n)
-            there = dr.select(there < n, there, 2 * n - 1 - there)
-            mean += dr.gather(mi.Float, values, at + (there - place) * stride) * float(share)
+        for offset, w in zip(offsets, window, strict=True):
+            # Mirroring makes the image periodic with period 2 n: forwards, then backwards.
+            tap = (position + int(offset % (2 * n))) % (2 * n)
+            tap = dr.select(tap < n, tap, 2 * n - 1 - tap)
+            mean += dr.gather(mi.Float, values, at + (tap - position) * stride) * float(w)
         image = mi.TensorXf(mean, image.shape)
     return image
 
 
 def lpips(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """The distance of "The Unreasonable Effectiveness of Deep Features" (2018), of each pixel (height x width x 1).
+    """Compute the perceptual distance LPIPS (Zhang et al. 2018) by the package ``lpips``, on sRGB-encoded colours.
 
-    By the module of that name, of sRGB encoded colours. Raises PathreplayError where there is none, it cannot load its
-    weights, or the pictures have no three channels.
+    Args:
+        image: rendered image, shape (height, width, 3).
+        target: target image, of the same shape.
+
+    Returns:
+        The distance at each pixel, shape (height, width, 1).
+
+    Raises:
+        PathreplayError: the package is not installed, its weights cannot be loaded, the images do not have three
+            channels, or they are too small for the network.
     """
     if image.shape[2] != 3:
-        raise PathreplayError(f"Loss 'lpips' takes three channels, the pictures have {image.shape[2]}; take another")
+        raise PathreplayError(
+            f"Loss 'lpips' needs images of three channels, but these have {image.shape[2]}; use another loss"
+        )
     network = _network()
 
     @dr.wrap(source="drjit", target="torch")
@@ -87,7 +102,7 @@ def lpips(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
     try:
         return distance(_encoded(image), _encoded(target))
     except RuntimeError as error:
-        raise PathreplayError(f"Loss 'lpips' cannot be computed ({one_line(error)}); take larger pictures") from None
+        raise PathreplayError(f"Loss 'lpips' cannot be computed ({one_line(error)}); use larger images") from None
 
 
 @lru_cache(maxsize=1)
@@ -97,8 +112,8 @@ def _network() -> Any:
 
         network = module.LPIPS(net="alex", spatial=True, verbose=False)
     except ImportError as error:
-        raise PathreplayError(f"Loss 'lpips' needs a module ({error}): pip install 'pathreplay[lpips]'") from None
-    except Exception as error:  # whatever loading weights does where there is no network, or no space
+        raise PathreplayError(f"Loss 'lpips' needs a package ({error}); pip install 'pathreplay[lpips]'") from None
+    except Exception as error:  # loading weights may fail in any way, e.g. without network access or disk space
         why = one_line(error) or type(error).__name__
         raise PathreplayError(
             f"Loss 'lpips' cannot load the weights of its network ({why}); put torchvision's AlexNet into its cache"

@@ -1,10 +1,10 @@
-"""Loss functions: how far a rendered picture is from its target, with a derivative.
+"""Per-pixel losses, and the lookup of losses by name.
 
-A loss is f(I, T), entry by entry, with I the rendered picture (noisy, differentiable) and T the target; what counts is
-its mean over pixels and channels, or over those that a weight leaves. No path is judged by itself (see `frozen`),
-hence a loss whose f' is linear in I has an unbiased gradient: ``l2`` and ``relative-l2``. The gradients of the others
-are biased by the noise in I (less with more samples); they pay where outliers would rule ``l2``. Losses in which pixels
-meet are in `picture_losses`.
+A loss f(I, T) compares the rendered image I (noisy, differentiable) with the target T; the optimiser minimises its
+(weighted) mean over pixels and channels. The image and its derivative use independent samples (see `frozen`), so the
+gradient is unbiased if f' is linear in I, as for ``l2`` and ``relative-l2``. Noise in I biases the gradients of the
+other losses, less so with more samples; they are useful where outliers would dominate ``l2``. Losses that couple pixels
+are in `image_losses`.
 """
 
 from __future__ import annotations
@@ -22,50 +22,53 @@ from pathreplay.inverse.config.user_functions import Imported, Modules
 from pathreplay.inverse.losses.image_losses import lpips, scale_invariant, ssim
 
 Loss = Callable[..., Any]
-"""loss(image, target) on tensors of one shape (height, width, channels) -> such a tensor (or one number)."""
+"""loss(image, target), on tensors of shape (height, width, channels); returns a tensor of that shape or a scalar."""
 
-# Radiance below which relative-l2 stops amplifying: about 1 % of a display's white.
+# Radiance that bounds the denominators of relative losses: about 1 % of display white.
 RELATIVE_FLOOR = 1e-2
 
 
 def l1(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """|I - T|. Gradient biased by noise in I."""
+    """Compute |I - T|. Noise in I biases the gradient."""
     return dr.abs(image - target)
 
 
 def l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """(I - T)^2. Gradient unbiased; the value carries the variance of I on top."""
+    """Compute (I - T)². The gradient is unbiased; the expected value includes the variance of I."""
     return dr.square(image - target)
 
 
 def relative_l2(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """((I - T) / (T + floor))^2, so that dark parts count. Divides by the target, hence unbiased like ``l2``."""
+    """Compute ((I - T) / (|T| + floor))², which emphasises dark regions. The gradient is unbiased, as for ``l2``."""
     return dr.square((image - target) / (dr.abs(target) + RELATIVE_FLOOR))
 
 
 def log(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """Squared difference of logarithms of 1 + I and 1 + T, for very bright spots. Gradient biased by noise in I."""
+    """Square the difference of the logarithms of 1 + I and 1 + T, for images with very bright spots.
+
+    Noise in I biases the gradient.
+    """
     positive = dr.maximum(image, 0)
     return dr.square(dr.log(1 + positive) - dr.log(1 + dr.maximum(target, 0)))
 
 
 def relative_l1(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """|I - T| / (|T| + floor). Gradient biased by noise in I."""
+    """Compute |I - T| / (|T| + floor). Noise in I biases the gradient."""
     return dr.abs(image - target) / (dr.abs(target) + RELATIVE_FLOOR)
 
 
 def smape(image: mi.TensorXf, target: mi.TensorXf) -> mi.TensorXf:
-    """|I - T| / (|I| + |T| + floor), which is below 1 however bright a pixel is. Gradient biased by noise in I."""
+    """Compute |I - T| / (|I| + |T| + floor), which is below 1 for any brightness. Noise in I biases the gradient."""
     return dr.abs(image - target) / (dr.abs(image) + dr.abs(target) + RELATIVE_FLOOR)
 
 
-#: Losses whose derivative by a pixel is a linear function of that pixel alone.
+#: Losses whose derivative with respect to a pixel is a linear function of that pixel alone.
 QUADRATIC = frozenset({l2, relative_l2})
 
-#: Losses that want to know how much pixels count: a third argument, as `mean_loss` has it.
+#: Losses that take the pixel weights of `mean_loss` as a third argument.
 WEIGHTED = frozenset({scale_invariant})
 
-#: Losses that Dr.Jit cannot record: what is not its own computes them.
+#: Losses that Dr.Jit cannot record, because another framework computes them.
 ELSEWHERE = frozenset({lpips})
 
 LOSSES: dict[str, Loss] = {
@@ -82,18 +85,25 @@ LOSSES: dict[str, Loss] = {
 
 
 def mean_loss(loss: Loss, image: Any, target: Any, weight: Any = None) -> mi.TensorXf:
-    """The mean of a loss over pixels and channels, as a tensor of one number.
+    """Average a loss over pixels and channels.
 
-    ``weight`` (height x width x 1, with mean 1) says how much pixels count; None: all the same.
+    Args:
+        loss: the loss function.
+        image: rendered image, shape (height, width, channels).
+        target: target image, of the same shape.
+        weight: weights of the pixels with mean 1, shape (height, width, 1); None weights all equally.
+
+    Returns:
+        A tensor with one entry.
     """
-    found = loss(image, target, weight) if loss in WEIGHTED else loss(image, target)
-    return dr.mean(found if weight is None else found * weight, axis=None)
+    values = loss(image, target, weight) if loss in WEIGHTED else loss(image, target)
+    return dr.mean(values if weight is None else values * weight, axis=None)
 
 
 def find_loss(name: str, modules: Modules | None = None) -> Loss:
-    """The loss called ``name``, or ``module:function``, which ``modules`` have (default: installed ones).
+    """Return a loss by its name, or import ``module:function`` through ``modules`` (default: installed modules).
 
-    Raises PathreplayError with the nearest name and the list, or why there is no such function.
+    Raises PathreplayError for an unknown name, with the nearest one, or if the import fails.
     """
     if name in LOSSES:
         return LOSSES[name]
@@ -110,7 +120,7 @@ def _imported(name: str, modules: Modules) -> Loss:
 
 @dataclass(frozen=True)
 class Own:
-    """A loss of the user's own. Raises PathreplayError where it fails, or gives neither an image nor a number."""
+    """A user loss. Raises PathreplayError if it fails, or returns neither a tensor like the image nor a scalar."""
 
     function: Imported
 
@@ -121,7 +131,7 @@ class Own:
         value = self.function(mi.TensorXf, image, target)
         if value.shape not in (image.shape, (), (1,)):
             raise PathreplayError(
-                f"{self} gives the shape {value.shape} for pictures of {image.shape}; return a tensor like the image, "
-                "or one number"
+                f"{self} returns the shape {value.shape} for images of shape {image.shape}; return a tensor of "
+                "that shape, or one number"
             )
         return value

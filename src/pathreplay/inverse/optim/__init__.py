@@ -1,1 +1,1 @@
-"""Optimisers: adaptive steps by gradients, and L-BFGS with a line search."""
+"""Optimisers: first-order optimisers of Dr.Jit, and SciPy's L-BFGS-B."""

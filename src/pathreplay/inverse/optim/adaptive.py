@@ -1,4 +1,4 @@
-"""Optimisers: from values and their gradients to the next values; what they remember can be saved, by name."""
+"""The optimiser interface, with states that can be saved, and the optimisers of Dr.Jit."""
 
 from __future__ import annotations
 
@@ -17,63 +17,72 @@ from pathreplay.inverse.config.optimizer_options import Optimizer
 from pathreplay.inverse.parameters.values import Array, Arrays
 
 _CLASSES = {"adam": drjit.opt.Adam, "adamw": drjit.opt.AdamW, "sgd": drjit.opt.SGD, "rmsprop": drjit.opt.RMSProp}
-# What they remember, in Dr.Jit's order: means of gradients and of their squares, and the greatest of those.
+# State arrays in Dr.Jit's order: first moment, second moment, maximum of the second moment (AMSGrad); velocity of SGD.
 _FIRST, _SECOND, _GREATEST, _VELOCITY = "first", "second", "greatest", "velocity"
 _KEPT = {"sgd": (_VELOCITY,), "rmsprop": (_SECOND,)}
 _MOMENTS = _FIRST, _SECOND, _GREATEST
 PIECE = 2**22
-"""Entries of a large variable that are stepped at once: what a step makes on the way is some times 16 MB."""
+"""Number of entries of a large variable that are stepped at once; each temporary of a step then takes 16 MB."""
 
 
 @dataclass(frozen=True)
 class State:
-    """What an optimiser remembers: steps since each variable began anew, and arrays by name (``what:variable``)."""
+    """State of an optimiser."""
 
     steps: dict[str, int]
+    """Number of steps of each variable since its state was last reset."""
     arrays: Mapping[str, Array]
+    """State arrays by name, ``what:variable``."""
 
 
 class Optimiser(Protocol):
-    """Arrays are by key of the variable. A variable that comes in another shape than before begins anew.
+    """Interface of optimisers; arrays are indexed by the key of the variable.
 
-    One that does not come stays as it is, and so does what is remembered of it.
+    If the shape of a variable changes, its state is reset. Variables that are missing from a step keep their state.
     """
 
     finished: str
-    """Why it takes no more steps; "" while it does."""
+    """Reason why the optimiser has stopped; "" while it runs."""
 
     def step(
         self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
     ) -> dict[str, Array]:
-        """The values after a step against the gradients; ``rates`` are about its length in each variable.
+        """Return the values after one step.
 
-        ``loss`` is that at ``values``, for those that look at it.
+        Args:
+            values: current values.
+            gradients: gradients of the loss at these values.
+            rates: learning rate of each variable.
+            loss: loss at the values, for optimisers that need it.
         """
 
     def answer(self) -> dict[str, Array]:
-        """The values that the steps so far have come to, where they are not those after the last one; else nothing."""
+        """Return the best values so far, or an empty dictionary if the values after the last step are the best."""
 
     def state(self) -> State:
-        """All that later steps depend on, besides the values."""
+        """Return all state that later steps depend on, besides the values."""
 
     def restore(self, state: State, values: Arrays) -> None:
-        """Go on from ``state`` at ``values``, bit for bit. Raises KeyError or ValueError if they do not belong."""
+        """Restore a state bit for bit. Raises KeyError or ValueError if it does not fit the variables."""
 
 
 class DrJitOptimiser:
-    """One of Dr.Jit's, of variables that begin at ``values``.
+    """An optimiser of ``drjit.opt``.
 
-    With Adam and AdamW all entries of those that are ``uniform`` are measured by the largest mean of squares, so that
-    entries with little gradient stay where they are (UniformAdam). The lengths of SGD's steps are rate x gradient.
+    Large variables are stepped in pieces (see `PIECE`). Between steps, only their state is kept, not their values.
 
-    Large variables are stepped in pieces, and between steps only what is remembered of them is held: see `PIECE`.
+    Args:
+        values: initial values by key.
+        options: type and options of the optimiser; default: Adam.
+        uniform: keys of variables whose entries Adam and AdamW normalise by their largest second moment (UniformAdam),
+            so that entries with small gradients hardly move.
     """
 
     finished = ""
 
     def __init__(self, values: Arrays, options: Optimizer | None = None, uniform: Collection[str] = ()) -> None:
         wanted = Optimizer() if options is None else options
-        self._moments = wanted.type not in _KEPT  # Adam's
+        self._moments = wanted.type not in _KEPT  # Adam and AdamW
         self._names = _MOMENTS if self._moments else _KEPT[wanted.type]
         given = wanted.options()
         self._everywhere, self._uniform = given.pop("uniform", False), frozenset(uniform if self._moments else ())
@@ -94,13 +103,13 @@ class DrJitOptimiser:
         return self._parts[self._is_uniform(key)]
 
     def _pieces(self, key: str) -> dict[str, slice]:
-        """The pieces of a variable, by the names that Dr.Jit's optimiser has for them."""
+        """Return the pieces of a variable by their names in Dr.Jit's optimiser."""
         size = prod(self._shapes[key])
         length = max(size, 1) if self._is_uniform(key) else self._piece
         return {f"{key}:{begin}": slice(begin, min(begin + length, size)) for begin in range(0, size, length)}
 
     def _begin(self, key: str, value: Array) -> None:
-        """Remember nothing of a variable yet."""
+        """Reset the state of a variable."""
         part = self._of(key)
         for name in self._pieces(key) if key in self._shapes else ():
             del part[name]
@@ -114,15 +123,15 @@ class DrJitOptimiser:
     ) -> dict[str, Array]:
         """See `Optimiser`."""
         for key, value in values.items():
-            anew = self._shapes.get(key) != value.shape
-            if anew:
+            reset = self._shapes.get(key) != value.shape
+            if reset:
                 self._begin(key, value)
-            self._steps[key] = 1 if anew else self._steps[key] + 1
+            self._steps[key] = 1 if reset else self._steps[key] + 1
         stepped = {key: np.empty_like(value, order="C") for key, value in values.items()}
         for even, part in self._parts.items():
             mine = [key for key in values if self._is_uniform(key) == even]
             pieces = {name: (key, piece) for key in mine for name, piece in self._pieces(key).items()}
-            # As numbers: Dr.Jit 1.5.0 would multiply arrays in place, and AdamW's decay with them.
+            # Floats, because Dr.Jit 1.5.0 multiplies rates that are arrays in place, which also scales AdamW's decay.
             part.set_learning_rate({name: rates[key] for name, (key, _) in pieces.items()})
             known = part.state
             for names in _together(pieces, self._piece):
@@ -145,26 +154,23 @@ class DrJitOptimiser:
         return {}
 
     def _remembered(self, name: str, part: drjit.opt.Optimizer) -> dict[str, Any]:
-        """What the optimiser remembers of a piece, by what it is: Dr.Jit's arrays."""
+        """Return the state of a piece as Dr.Jit arrays, by kind."""
         kept = part.state[name][3]
         arrays = kept[1:] if self._moments else (kept,)
         return {what: array for what, array in zip(self._names, arrays, strict=True) if array is not None}
 
     def state(self) -> State:
-        """See `Optimiser`; the arrays are means of gradients and of their squares, or the velocity of SGD.
-
-        Each is put together when it is asked for.
-        """
+        """See `Optimiser`; the arrays are moments, or the velocity of SGD, and are assembled on access."""
         kinds = {key: self._remembered(next(iter(self._pieces(key))), self._of(key)) for key in self._steps}
         makers = {f"{what}:{key}": partial(self._whole, what, key) for key in self._steps for what in kinds[key]}
         return State(dict(self._steps), WhenAsked(makers))
 
     def _whole(self, what: str, key: str) -> Array:
         part, pieces = self._of(key), self._pieces(key)
-        found = np.empty(prod(self._shapes[key]), np.float32)
+        whole = np.empty(prod(self._shapes[key]), np.float32)
         for name, piece in pieces.items():
-            found[piece] = np.array(self._remembered(name, part)[what]).ravel()
-        return found
+            whole[piece] = np.array(self._remembered(name, part)[what]).ravel()
+        return whole
 
     def restore(self, state: State, values: Arrays) -> None:
         """See `Optimiser`."""
@@ -174,33 +180,33 @@ class DrJitOptimiser:
                 self._begin(key, value)
             self._steps[key] = state.steps[key]
             kinds = self._remembered(next(iter(self._pieces(key))), part)
-            found = {what: state.arrays[f"{what}:{key}"] for what in kinds}
-            for what, array in found.items():
-                shapes = value.shape, (value.size,)  # Dr.Jit keeps them flat
+            saved = {what: state.arrays[f"{what}:{key}"] for what in kinds}
+            for what, array in saved.items():
+                shapes = value.shape, (value.size,)  # Dr.Jit's state arrays are flat
                 if array.shape not in shapes or array.dtype != value.dtype:
                     wanted = f"{value.dtype} of shape {value.shape}"
-                    raise ValueError(f"the means of '{key}' are not like its value, {wanted}")
+                    raise ValueError(f"the state of '{key}' does not have the type of its value, {wanted}")
                 if what in (_SECOND, _GREATEST) and (array < 0).any():
-                    raise ValueError(f"'{what}:{key}', a mean of squares, is negative")
+                    raise ValueError(f"'{what}:{key}', a second moment, is negative")
             for name, piece in self._pieces(key).items():
                 like = self._remembered(name, part)
-                restored = {what: type(like[what])(array.reshape(-1)[piece]) for what, array in found.items()}
+                restored = {what: type(like[what])(array.reshape(-1)[piece]) for what, array in saved.items()}
                 stored, promoted, rate, kept = part.state[name]
                 arrays = tuple(restored.get(what) for what in self._names)
                 kept = (type(kept[0])(state.steps[key]), *arrays) if self._moments else arrays[0]
                 part.state[name] = stored, promoted, rate, kept
         if rest := set(state.arrays) - set(self.state().arrays):
-            raise ValueError(f"'{min(rest)}' is nothing that this optimizer keeps")
+            raise ValueError(f"'{min(rest)}' is not a state array of this optimizer")
 
 
 def _let_go(part: drjit.opt.Optimizer, name: str) -> None:
-    """Hold no value of a piece, but what is remembered of it: zeros that nobody has written down have its shape."""
+    """Replace the value of a piece by literal zeros of its shape, which take no memory; its state is kept."""
     value, *rest = part.state[name]
     part.state[name] = (dr.zeros(type(value), value.shape), *rest)
 
 
 def _together(pieces: Mapping[str, tuple[str, slice]], most: int) -> Iterator[list[str]]:
-    """The pieces in groups that are stepped at once, of up to ``most`` entries."""
+    """Group pieces to be stepped at once, with up to ``most`` entries per group."""
     group: list[str] = []
     size = 0
     for name, (_, piece) in pieces.items():
@@ -214,7 +220,7 @@ def _together(pieces: Mapping[str, tuple[str, slice]], most: int) -> Iterator[li
 
 
 class WhenAsked(Mapping[str, Any]):
-    """Arrays by name that are made each time when they are asked for, and held by nobody else."""
+    """A read-only mapping whose arrays are computed on each access and not cached."""
 
     def __init__(self, makers: Mapping[str, Callable[[], Any]]) -> None:
         self._makers = dict(makers)

@@ -1,9 +1,9 @@
-"""L-BFGS-B, SciPy's, as an optimiser that is told a loss and a gradient at a time: for few parameters.
+"""SciPy's L-BFGS-B as an `Optimiser` that gets one loss and gradient at a time, for few parameters.
 
-Each iteration of a job is one evaluation that it asks for, which may be a trial of its line search and worse than
-those before. What it comes to is the best one. SciPy keeps its state to itself; but all that it does follows from what
-it was told, so it is asked from the start again with everything that is known, until it asks for something new. That
-takes no time next to a rendering, and makes it possible to go on from a checkpoint bit for bit.
+Each iteration of a job is one function evaluation, which may be a trial step of the line search with a larger loss than
+before. The result is the best evaluation. SciPy does not expose its state, but it is deterministic: at each iteration
+it is restarted and answered from the record of past evaluations, until it requests a new one. This takes negligible
+time compared with rendering, and makes resuming from a checkpoint exact to the bit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathreplay.inverse.optim.adaptive import State
 from pathreplay.inverse.parameters.values import Array, Arrays
 
 MOST = 1000
-"""Numbers that it takes: what it remembers, and what a checkpoint holds, grows with each evaluation."""
+"""Largest number of parameter entries; the record of evaluations, and so a checkpoint, grows with each iteration."""
 
 ENDLESS = 10**9
 
@@ -30,14 +30,21 @@ _START, _SCALE, _LOSSES, _GRADIENTS, _NEXT = (f"search:{n}" for n in ("start", "
 
 
 class _Asked(Exception):
-    """An evaluation is asked for that nobody has made."""
+    """SciPy requests an evaluation that is not in the record."""
 
 
 class LineSearch:
-    """An `Optimiser` of variables that begin at ``values``, within ``bounds`` (lowest and highest) by key.
+    """L-BFGS-B with bounds.
 
-    Lengths are measured in the first learning rate of each variable, and losses in the first one. Raises
-    PathreplayError where there are more than `MOST` numbers.
+    Variables are scaled by their initial learning rates, losses by the initial loss.
+
+    Args:
+        values: initial values by key.
+        options: options of the optimiser.
+        bounds: lower and upper bound of each variable, by key.
+
+    Raises:
+        PathreplayError: there are more than `MOST` entries.
     """
 
     def __init__(self, values: Arrays, options: Optimizer, bounds: Mapping[str, tuple[float, float]]) -> None:
@@ -45,7 +52,7 @@ class LineSearch:
         n = sum(value.size for value in values.values())
         if n > MOST:
             raise PathreplayError(
-                f"The parameters are {n} numbers, and type = '{options.type}' takes up to {MOST}; take 'adam'"
+                f"The parameters have {n} entries, but optimizer type = '{options.type}' takes up to {MOST}; use 'adam'"
             )
         given = options.options()
         self._memory, self._tolerance = given["history_size"], given["tolerance"]
@@ -60,7 +67,7 @@ class LineSearch:
     def step(
         self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
     ) -> dict[str, Array]:
-        """See `Optimiser`; the next point to be evaluated, or the best one where nothing more is to be found."""
+        """See `Optimiser`; returns the next point to evaluate, or the best one if the search has finished."""
         if self.finished:
             return self.answer()
         if not self._losses:
@@ -72,10 +79,10 @@ class LineSearch:
         return self.answer() if self.finished else self._split(self._next)
 
     def _ask(self) -> None:
-        """Hear from SciPy what it wants to know next, or that it has finished."""
+        """Run SciPy on the record of evaluations, until it requests a new point or finishes."""
         self._points, unit = [], abs(self._losses[0]) or 1.0
 
-        def told(x: Vector) -> tuple[float, Vector]:
+        def recorded(x: Vector) -> tuple[float, Vector]:
             k = len(self._points)
             self._points.append(x.copy())
             if k == len(self._losses):
@@ -83,8 +90,8 @@ class LineSearch:
             return self._losses[k] / unit, self._gradients[k] / unit
 
         try:
-            found = scipy.optimize.minimize(
-                told,
+            result = scipy.optimize.minimize(
+                recorded,
                 self._start,
                 jac=True,
                 method="L-BFGS-B",
@@ -100,8 +107,8 @@ class LineSearch:
         except _Asked:
             self._next = self._points.pop()
             return
-        falls = "the loss falls no further" if found.success else "no step lowers the loss: what is left may be noise"
-        self.finished = f"{falls} ({' '.join(str(found.message).split())})"
+        reason = "the loss has converged" if result.success else "no step lowers the loss, possibly because of noise"
+        self.finished = f"{reason} ({' '.join(str(result.message).split())})"
 
     def _split(self, x: Vector) -> dict[str, Array]:
         parts, at = {}, 0
@@ -112,11 +119,11 @@ class LineSearch:
         return parts
 
     def answer(self) -> dict[str, Array]:
-        """The point with the lowest loss so far; nothing before the first step."""
+        """Return the point with the lowest loss so far; empty before the first step."""
         return self._split(self._points[int(np.argmin(self._losses))]) if self._losses else {}
 
     def state(self) -> State:
-        """See `Optimiser`: what it was told."""
+        """See `Optimiser`; the state is the record of evaluations."""
         steps = dict.fromkeys(self._shapes, len(self._losses))
         if not self._losses:
             return State(steps, {})
@@ -135,9 +142,9 @@ class LineSearch:
         n = len(self._bounds)
         (count,) = {state.steps[key] for key in values} or {0}
         if {key: value.shape for key, value in values.items()} != self._shapes:
-            raise ValueError("its parameters have other shapes")
+            raise ValueError("the shapes of its parameters differ")
         if rest := set(state.arrays) - {_START, _SCALE, _LOSSES, _GRADIENTS, _NEXT}:
-            raise ValueError(f"'{min(rest)}' is nothing that this optimizer keeps")
+            raise ValueError(f"'{min(rest)}' is not a state array of this optimizer")
         if not count:
             return
         shapes = {_START: (n,), _SCALE: (n,), _LOSSES: (count,), _GRADIENTS: (count, n), _NEXT: (n,)}
@@ -152,7 +159,7 @@ class LineSearch:
         self._ask()
         expected = state.arrays.get(_NEXT)
         if len(self._points) != count or (expected is not None and not np.array_equal(self._next, expected)):
-            raise ValueError("SciPy asks for other values than it did; it may be of another version")
+            raise ValueError("SciPy requests other points than recorded; its version may have changed")
 
 
 def _flat(arrays: Arrays) -> Vector:

@@ -1,1 +1,1 @@
-"""What is optimised: variables, their reparameterizations, poses, regularizers, and what is derived from them."""
+"""Parameters of a problem: variables, reparameterizations, poses, regularizers and derived parameters."""

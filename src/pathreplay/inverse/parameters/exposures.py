@@ -1,7 +1,8 @@
-"""The exposure of each view: factors on its rendered picture that are recovered with the rest, as one more variable.
+"""Exposures: scale factors on the rendered image of each view, recovered as one additional variable.
 
-With a factor e, what is compared with the target T is e I. The derivative of a loss f by e is f'(e I, T) I, in which
-the noise of I would meet itself and make every e too small. Two independent renderings A and B are taken: f'(e A, T) B.
+With a factor e, the loss f compares e I with the target T, and its derivative by e is f'(e I, T) I. Using one rendering
+for both occurrences of I would bias e towards small values, because their noise is correlated. The estimator therefore
+uses two independent renderings A and B: f'(e A, T) B.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from pathreplay.inverse.parameters.reparameterization import Transform
 from pathreplay.inverse.parameters.values import Array, Arrays
 
 EXPOSURE = "exposure"
-"""Key of the variable: views x 1, or with white balance views x colours."""
+"""Key of the variable, of shape (views, 1), or (views, colours) with white balance."""
 
 
 class Factors:
-    """Steps are taken in the logarithm of the factors; those of one view stay 1, or their geometric mean does.
+    """Logarithmic coordinates of the factors (`Coordinates`), with their common scale fixed.
 
-    ``fixed`` are the rows whose mean logarithm (of each colour) is taken off after each step; none: nothing is.
+    After each step, the mean logarithm over the rows ``fixed`` is subtracted per colour: their geometric mean stays 1.
+    If ``fixed`` is empty, nothing is subtracted.
     """
 
     uniform = False
@@ -39,11 +41,11 @@ class Factors:
         return self._log.latent(values)
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """See `Coordinates`; also of what `values` takes off all factors."""
-        found = self._log.gradient(values, by_values)
+        """See `Coordinates`; includes the derivative of the subtracted mean."""
+        by_latent = self._log.gradient(values, by_values)
         if self.fixed:
-            found[self.fixed] -= found.sum(axis=0) / len(self.fixed)
-        return found
+            by_latent[self.fixed] -= by_latent.sum(axis=0) / len(self.fixed)
+        return by_latent
 
     def values(self, latent: Array) -> Array:
         """See `Coordinates`."""
@@ -51,15 +53,15 @@ class Factors:
 
 
 def start(views: int, channels: int, white_balance: bool) -> Array:
-    """Factors of one. Raises PathreplayError where there is one colour only to be balanced."""
+    """Return initial factors of 1. Raises PathreplayError for white balance of images with one colour channel."""
     colours = channels - (channels in (2, 4))
     if white_balance and colours == 1:
-        raise PathreplayError("exposure: pictures of one channel have no white to balance; leave 'white_balance' out")
+        raise PathreplayError("exposure: 'white_balance' needs colour images, but these have one channel; remove it")
     return np.ones((views, colours if white_balance else 1), np.float32)
 
 
 def factor_of(values: Arrays, view: int, channels: int) -> Image | None:
-    """What the picture of a view is multiplied with: 1 x 1 x channels, 1 for alpha; None without exposures."""
+    """Return the factor on the image of a view, shape (1, 1, channels), 1 for alpha; None without exposures."""
     if EXPOSURE not in values:
         return None
     row = values[EXPOSURE][view]
@@ -69,13 +71,25 @@ def factor_of(values: Arrays, view: int, channels: int) -> Image | None:
 
 
 def exposed(values: Arrays, view: int, picture: Image) -> Image:
-    """The picture of a view at its exposure."""
+    """Multiply the image of a view by its factor."""
     factor = factor_of(values, view, picture.shape[2])
     return picture if factor is None else picture * factor
 
 
 def derivative(loss: Loss, a: Any, b: Any, factor: Any, target: Any, weight: Any) -> Any:
-    """Of the mean loss by the logarithm of the factor, for each channel, from two independent renderings."""
+    """Estimate the derivative of the mean loss by the logarithm of the factor of each channel.
+
+    Args:
+        loss: the loss function.
+        a: a rendering of the view, without exposure.
+        b: a second, independent rendering.
+        factor: factor on the image, shape (1, 1, channels).
+        target: target image.
+        weight: weights of the pixels, or None.
+
+    Returns:
+        One derivative per channel.
+    """
     image = dr.detach(a) * factor
     dr.enable_grad(image)
     dr.backward(mean_loss(loss, image, target, weight))
@@ -83,16 +97,16 @@ def derivative(loss: Loss, a: Any, b: Any, factor: Any, target: Any, weight: Any
 
 
 def gradient(values: Arrays, view: int, by_log: Array) -> Array:
-    """That of the variable, from the derivative by the logarithms of one view's factors, for each channel."""
+    """Convert the result of `derivative` for one view to a gradient of the whole variable."""
     rows = values[EXPOSURE]
-    found = np.zeros_like(rows)
+    by_factors = np.zeros_like(rows)
     colours = by_log[: len(by_log) - (len(by_log) in (2, 4))]
-    found[view] = (colours if rows.shape[1] > 1 else colours.sum()) / rows[view]
-    return found
+    by_factors[view] = (colours if rows.shape[1] > 1 else colours.sum()) / rows[view]
+    return by_factors
 
 
 def fitted(picture: Image, target: Image, weight: Image | None, each: bool) -> Array:
-    """The factors at which a picture comes closest to its target: least squares, over all colours or for each."""
+    """Fit the factors of an image to its target by least squares: one per colour if ``each``, else one for all."""
     colours = picture.shape[2] - (picture.shape[2] in (2, 4))
     w = np.ones((1, 1, 1)) if weight is None else weight.astype(np.float64)
     a, t = (image[:, :, :colours].astype(np.float64) for image in (picture, target))
@@ -103,9 +117,11 @@ def fitted(picture: Image, target: Image, weight: Image | None, each: bool) -> A
 
 
 def with_held_out(values: Mapping[str, Array], pictures: Mapping[int, tuple[Image, Image, Image | None]]) -> Arrays:
-    """The values with factors for views that nothing was learned from.
+    """Return the values with fitted factors for test views, which the optimisation does not determine.
 
-    ``pictures`` are rendering (at exposure 1), target and weight of such views, by place.
+    Args:
+        values: values by key.
+        pictures: rendering at exposure 1, target and weight of each test view, by index of the view.
     """
     rows = values[EXPOSURE].copy()
     for view, (picture, target, weight) in pictures.items():
@@ -114,7 +130,7 @@ def with_held_out(values: Mapping[str, Array], pictures: Mapping[int, tuple[Imag
 
 
 def fixed_rows(names: Iterable[str], trained: Iterable[int], reference: str | None, free: bool) -> list[int]:
-    """The rows that `Factors` holds: that of the ``reference``, those that are learned from, or none."""
+    """Return the rows whose mean `Factors` fixes: none if ``free``, the reference view, or all training views."""
     if free:
         return []
     return list(trained) if reference is None else [list(names).index(reference)]

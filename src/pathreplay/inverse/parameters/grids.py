@@ -1,6 +1,6 @@
-"""Grids of values, textures and volumes alike: the same function at another resolution, coarse to fine, and slices.
+"""Resampling, refinement schedules, errors and display of grids, which are textures or volumes.
 
-A grid has one or more spatial axes and, last, its channels: (y, x, channels) or (z, y, x, channels).
+A texture has the shape (y, x, channels), a volume (z, y, x, channels).
 """
 
 from __future__ import annotations
@@ -17,55 +17,61 @@ from pathreplay.inverse.images.io import Image
 Array = NDArray[np.float32]
 
 LARGEST_SHOWN = 2048
-"""Pixels along a side of a texture that is looked at: more than a screen has, and no burden to a page."""
+"""Largest side in pixels of a displayed texture; it exceeds a screen and keeps report pages small."""
 _PIECE = 2**22
 
 
 @dataclass(frozen=True)
 class Levels:
-    """The resolutions that a grid goes through: shape ``shapes[j]`` from iteration ``begins[j]`` on."""
+    """Refinement schedule of a grid: it has the shape ``shapes[j]`` from iteration ``begins[j]`` on."""
 
     shapes: tuple[tuple[int, ...], ...]
     begins: tuple[int, ...]
 
     def shape_at(self, iteration: int) -> tuple[int, ...]:
-        """The shape that the grid should have in an iteration."""
+        """Return the shape of the grid in an iteration."""
         return max((b, s) for b, s in zip(self.begins, self.shapes, strict=True) if b <= iteration)[1]
 
 
 def make_levels(shape: Sequence[int], longest: Sequence[int], refine_at: Sequence[int]) -> Levels:
-    """Levels of a grid of that shape: its longest axis gets ``longest[j]`` entries, the others in proportion."""
+    """Make the levels of a grid.
+
+    Args:
+        shape: shape of the grid in the scene.
+        longest: number of entries along the longest axis, per level; the other axes keep the proportions.
+        refine_at: first iteration of the second and each later level.
+    """
     *axes, channels = shape
-    # Mitsuba's bitmaps refuse fewer than two texels on an axis.
+    # Mitsuba's bitmap textures need at least two texels per axis.
     shapes = [(*(max(min(n, 2), round(n * size / max(axes))) for n in axes), channels) for size in longest]
     return Levels(tuple(shapes), (0, *refine_at))
 
 
 def resampled(grid: Array, shape: Sequence[int]) -> Array:
-    """The grid in another ``shape`` (same channels): linear between the centres of its cells, constant beyond them.
+    """Resample a grid to another ``shape`` with the same channels, linearly between cell centres and clamped outside.
 
-    That is how Mitsuba looks grids and textures up, so a doubled resolution changes the function by no more than the
-    bends between the old centres. It keeps bounds. Where entries get fewer than half, some are passed over.
+    This matches the texture and volume lookup of Mitsuba, so doubling the resolution hardly changes the function. The
+    result stays within the range of the values. Downsampling by more than a factor of two skips entries.
     """
     factors = [new / old for new, old in zip((*shape[:-1], grid.shape[-1]), grid.shape, strict=True)]
     return scipy.ndimage.zoom(grid, factors, np.float32, order=1, mode="nearest", grid_mode=True)
 
 
 def comparable(shape: Sequence[int], other: Sequence[int]) -> bool:
-    """Whether two arrays are the same quantity: of one shape, or grids of as many axes and channels."""
+    """Return whether two arrays can be compared: equal shapes, or grids with equal numbers of axes and channels."""
     same_kind = len(shape) == len(other) and len(shape) >= 3 and shape[-1] == other[-1]
     return same_kind or tuple(shape) == tuple(other)
 
 
 def matched(grid: Array, other: Array) -> Array:
-    """``grid`` in the shape of ``other``, to which it is `comparable`."""
+    """Resample ``grid`` to the shape of ``other``; the two must be `comparable`."""
     return grid if grid.shape == other.shape else resampled(grid, other.shape)
 
 
 def rmse(value: Array, truth: Array) -> float:
-    """Root mean square error; grids of different resolutions are compared at that of the truth."""
+    """Compute the root mean square error; a grid is resampled to the resolution of the truth."""
     a, b = matched(value, truth).reshape(-1), truth.reshape(-1)
-    # In pieces: differences in double precision would take four times what the values do.
+    # In pieces, because temporaries in double precision need four times the memory of the values.
     squares = [
         float(np.square(a[i : i + _PIECE].astype(np.float64) - b[i : i + _PIECE]).sum())
         for i in range(0, b.size, _PIECE)
@@ -74,7 +80,7 @@ def rmse(value: Array, truth: Array) -> float:
 
 
 def shown(image: Image, side: int = LARGEST_SHOWN) -> Image:
-    """A picture of at most ``side`` pixels along each side: means of squares of pixels, where it has more."""
+    """Reduce an image to at most ``side`` pixels per side by averaging blocks of pixels."""
     n = -(-max(image.shape[:2]) // side)
     if n == 1:
         return image
@@ -86,9 +92,9 @@ def shown(image: Image, side: int = LARGEST_SHOWN) -> Image:
 
 
 def slices(volume: Array) -> Image:
-    """The middle slices of a volume (z, y, x, channels), side by side: seen along z, along y and along x.
+    """Show the middle slices of a volume (z, y, x, channels) side by side, as seen along z, y and x.
 
-    Up is y in the first and the last and z in the second one.
+    The up axis is y in the first and third image and z in the second.
     """
     z, y, x = (n // 2 for n in volume.shape[:3])
     cuts = [volume[z, ::-1], volume[::-1, y], volume[:, ::-1, x].swapaxes(0, 1)]

@@ -1,4 +1,4 @@
-"""What a parameter may be: grids and values that fit the memory, and learning rates and poses of a sensible size."""
+"""Limits on parameters: sizes that fit into memory, and plausible learning rates and poses."""
 
 from __future__ import annotations
 
@@ -15,57 +15,64 @@ from pathreplay.inverse.config.parameter_options import Parameter
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.platform import memory
 
-# A value: old and new, as Dr.Jit holds it; its gradient and their sum; Adam's two moments; once more on the way.
+# Bytes per optimised number: old, new and Dr.Jit's value, gradient and gradient sum, Adam's two moments, a temporary.
 _A_VALUE = 32
-# A step of Adam's is about the learning rate: nothing is found by steps a million times the value.
+# Largest ratio of a learning rate, which is about the step length of Adam, to the values.
 _LONGEST_STEP = 1e6
+# Largest ratio of a pivot or displacement to the extent of the scene.
 _FARTHEST = 1e4
 
 
 def require_grid(key: str, shape: Sequence[int], resolutions: Sequence[int]) -> None:
-    """Raise PathreplayError unless a grid of ``shape`` (axes, then channels) fits the memory in every resolution."""
+    """Raise PathreplayError unless a grid of ``shape`` (axes, then channels) fits into memory in every resolution."""
     *axes, channels = (int(n) for n in shape)
     largest = max(axes)
 
     def cells(size: int) -> int:
-        # In whole numbers, which do not overflow: what is asked for may be anything.
+        # Python integers, which do not overflow for any input.
         return channels * prod(max(min(n, 2), (n * size + largest // 2) // largest) for n in axes)
 
     wanted = max(resolutions)
     most = min(memory.available() // _A_VALUE, MOST_SAMPLES)
     if cells(wanted) <= most:
         return
-    # A resolution has at least as many cells.
+    # cells(n) >= n, so resolutions above `most` need not be searched.
     fits = bisect.bisect_right(range(min(wanted, most + 1)), most, key=cells) - 1
-    way_out = f"take up to {fits}" if fits > 0 else "free some memory"
+    remedy = f"use a resolution up to {fits}" if fits > 0 else "free some memory"
     raise PathreplayError(
-        f"Parameter '{key}' has the resolution {wanted}: {cells(wanted)} values, of which {most} fit the memory "
-        f"that is left; {way_out}"
+        f"Parameter '{key}' has {cells(wanted)} values at the resolution {wanted}, but only {most} fit into the "
+        f"available memory; {remedy}"
     )
 
 
 def require_values(sizes: Mapping[str, int]) -> None:
-    """Raise PathreplayError unless parameters of these ``sizes`` (numbers, by key) fit the memory, and their steps."""
+    """Raise PathreplayError unless variables and optimiser state fit into memory; ``sizes`` are entries by key."""
     largest = max(sizes, key=lambda key: sizes[key])
     thing = f"Optimising {sum(sizes.values())} numbers ('{largest}' has {sizes[largest]})"
-    memory.require(sum(sizes.values()) * _A_VALUE, thing, "take fewer, or coarser textures and grids")
+    memory.require(sum(sizes.values()) * _A_VALUE, thing, "use fewer parameters, or coarser textures and volumes")
 
 
 def require_learning_rate(key: str, rate: float, start: np.ndarray, bounds: Sequence[float | None] = ()) -> None:
-    """Raise PathreplayError if a step of ``rate`` is a million times the largest value and bound of the parameter."""
+    """Raise PathreplayError if ``rate`` exceeds a million times the largest magnitude of the values and bounds."""
     scale = max(1.0, float(np.abs(start).max(initial=0.0)), *(abs(bound) for bound in bounds if bound is not None))
     if rate > _LONGEST_STEP * scale:
         raise PathreplayError(
-            f"Parameter '{key}' has the learning rate {rate:g}, about the step that it takes per iteration, and values "
-            f"up to {scale:g}; lower 'learning_rate' (a hundredth of the values is a good start)"
+            f"Parameter '{key}' has the learning rate {rate:g}, which is about the length of a step, and values up to "
+            f"{scale:g}; lower 'learning_rate' (a hundredth of the values is a good start)"
         )
 
 
 def require_near(scene: mi.Scene, key: str, value: Array, entry: Parameter) -> None:
-    """Raise PathreplayError if pivot or start of a pose (of ``value``) lie ten thousand times as far as the scene goes.
+    """Raise PathreplayError if the pivot or initial displacement of a pose is implausibly large.
 
-    Beyond, the rounding of single precision (1e-7 of the number) is a thousandth of the scene and grows from there.
-    Starts that are turned by more than once around are refused, too.
+    Coordinates are limited to ten thousand times the extent of the scene, beyond which rounding in single precision
+    (relative error 1e-7) exceeds a thousandth of the extent. Rotations are limited to one full turn.
+
+    Args:
+        scene: the scene.
+        key: key of the parameter.
+        value: its value, a 4 x 4 matrix or vertex positions.
+        entry: its table in the job.
     """
     box = scene.bbox()
     corners = [np.array(box.min), np.array(box.max)] if box.valid() else []
@@ -76,8 +83,10 @@ def require_near(scene: mi.Scene, key: str, value: Array, entry: Parameter) -> N
         largest = max(map(abs, vector or [0.0]))
         if largest > _FARTHEST * extent:
             raise PathreplayError(
-                f"Parameter '{key}': '{name}' goes to {largest:g}, and the scene to {extent:.3g}; give "
-                f"numbers up to {_FARTHEST * extent:.3g}"
+                f"Parameter '{key}': '{name}' has coordinates up to {largest:g}, but the scene extends to "
+                f"{extent:.3g}; give coordinates up to {_FARTHEST * extent:.3g}"
             )
     if (turn := start.rotation) and max(map(abs, turn)) > 360:
-        raise PathreplayError(f"Parameter '{key}' starts turned by {turn} degrees; give angles between -360 and 360")
+        raise PathreplayError(
+            f"Parameter '{key}': 'initial.rotation' is {turn} degrees; give angles between -360 and 360"
+        )

@@ -1,11 +1,12 @@
-"""Steps that are spread over a mesh, so that it stays one: "Large Steps in Inverse Rendering of Geometry" (2021).
+"""Preconditioned mesh optimisation: "Large Steps in Inverse Rendering of Geometry" (Nicolet et al. 2021).
 
-A gradient by vertices is noisy, and only those near an outline have one. So not the vertices v are stepped but
+Gradients of vertex positions are noisy, and often only vertices near silhouettes have one. The
+optimiser therefore does not step the vertices v but
 
-    u = (I + λ L) v,        with L the Laplacian of the mesh that counts neighbours,
+    u = (I + λ L) v,        where L is the combinatorial Laplacian of the mesh,
 
-which makes of a step δu the smooth change (I + λ L)⁻¹ δu. It is what Mitsuba's `mi.ad.LargeSteps` does, with a sparse
-solver that SciPy has.
+so that a step δu moves the vertices by the smooth displacement (I + λ L)⁻¹ δu. This is Mitsuba's `mi.ad.LargeSteps`,
+with the sparse solver of SciPy.
 """
 
 from __future__ import annotations
@@ -21,9 +22,14 @@ Array = NDArray[np.float32]
 
 
 class Surface:
-    """Of a mesh by its vertices (3 n numbers) and faces (3 m): `Coordinates`.
+    """Large Steps coordinates (`Coordinates`) of a mesh with n vertices and m faces.
 
-    Vertices in one place are one, so that no seam opens.
+    Vertices with equal positions are merged, so that no seam opens.
+
+    Args:
+        positions: vertex positions, 3 n floats.
+        faces: vertex indices, 3 m integers.
+        smooth: the smoothness λ.
     """
 
     uniform = True
@@ -35,19 +41,19 @@ class Surface:
         self._solver = scipy.sparse.linalg.splu(self._matrix)
 
     def latent(self, values: Array) -> Array:
-        """u of v."""
+        """Compute u from v."""
         points = np.zeros((self._matrix.shape[0], 3))
         points[self._copies] = values.reshape(-1, 3)
         return self._spread(self._matrix @ points)
 
     def values(self, latent: Array) -> Array:
-        """v of u."""
+        """Compute v from u."""
         points = np.zeros((self._matrix.shape[0], 3))
         points[self._copies] = latent.reshape(-1, 3)
         return self._spread(self._solver.solve(points))
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """The derivative by u, of that by v; all copies of a vertex have the same, which is that of their common u."""
+        """Convert the gradient by v to the gradient by u; merged vertices get the gradient of their common u."""
         total = np.zeros((self._matrix.shape[0], 3))
         np.add.at(total, self._copies, by_values.reshape(-1, 3))
         return self._spread(self._solver.solve(total))

@@ -1,12 +1,12 @@
-"""Poses as variables: a shift and a turn of what the scene holds, and how far a pose is from the true one.
+"""Poses: rigid motions of transforms and meshes as variables, and their errors.
 
-With M₀ the transform of the scene file, c the pivot, t the translation and r the rotation vector (axis times angle),
+With the transform M₀ of the scene, the pivot c, the translation t and the rotation vector r (axis times angle),
 
     M(t, r) = T(c + t) · R(r) · T(-c) · M₀,      R(r) = I + a K + b K²,   K x = r × x,   θ = |r|,
                                                  a = sin θ / θ,   b = (1 - cos θ) / θ²      (Rodrigues)
 
-t and r are in the axes of the world. Meshes, which keep no transform, get the same motion on their vertices. Sixteen
-free numbers would shear and scale instead, which no rigid thing does.
+t and r are in world coordinates. The vertices of meshes, which have no transform, are moved in the same way. Optimising
+the sixteen entries of a matrix instead would also shear and scale the object.
 """
 
 from __future__ import annotations
@@ -26,39 +26,40 @@ from pathreplay.inverse.config.parameter_options import PARTS, PoseKind
 from pathreplay.scenes.parameters import get_array, is_transform
 
 PART_NAMES = (":translation", ":rotation")
-"""How names of the variables of a pose end."""
+"""Suffixes of the keys of the variables of a pose."""
 
-# θ² below which series stand in for a and b: their next terms, θ⁴ / 120 and θ⁴ / 720, are below float32 rounding there.
+# Below this θ², series replace a and b; the omitted terms, θ⁴ / 120 and θ⁴ / 720, are below float32 rounding there.
 _SMALL = 1e-3
 
 
 @dataclass(frozen=True)
 class Pose:
-    """The moving thing behind one key: ``…to_world`` (a transform) or ``…vertex_positions`` (3 n floats)."""
+    """Rigid motion of one scene parameter: ``…to_world`` (a transform) or ``…vertex_positions`` (3 n floats)."""
 
     key: str
     kind: PoseKind
     base: Any
-    """M₀ or the vertices, as the scene file has them; detached."""
+    """M₀ or the vertex positions in the scene; detached."""
     pivot: tuple[float, float, float]
     distance: float | None
-    """Length that translation errors are compared with."""
+    """Length relative to which position errors are reported."""
     truth: NDArray[np.float32] | None
-    """The transform or the vertices of the target scene."""
+    """The transform or the vertex positions in the target scene."""
 
     def parts(self) -> dict[str, str]:
-        """'translation' and/or 'rotation' -> name of that variable in the optimiser."""
+        """Map 'translation' and 'rotation', as far as the pose has them, to the keys of their variables."""
         return {part: f"{self.key}:{part}" for part in PARTS[self.kind]}
 
     @property
     def of(self) -> tuple[str, ...]:
-        """Names of the variables that make it."""
+        """Keys of the variables that the pose is computed from."""
         return tuple(self.parts().values())
 
     def value(self, variables: Mapping[str, Any]) -> Any:
-        """The parameter's value for the optimiser's variables; derivatives flow to them.
+        """Compute the value of the scene parameter; derivatives propagate to the variables.
 
-        Translations are in scene units, rotation vectors in radians (both ``mi.Vector3f`` of size 1).
+        Args:
+            variables: ``mi.Vector3f`` of width 1 by key: translation in scene units, rotation vector in radians.
         """
         moves = {part: variables[name] for part, name in self.parts().items()}
         zero = mi.Vector3f(0)
@@ -69,12 +70,12 @@ class Pose:
             A = mi.Matrix4f(R)
             for row, entry in enumerate(shift - R @ c):
                 A[row, 3] = entry
-            # Rounding of the product may not touch the last row: cameras divide by what it makes.
+            # One product with an affine matrix keeps the last row exact: cameras divide by the homogeneous coordinate.
             return type(self.base)(type(self.base.matrix)(A @ mi.Matrix4f(self.base.matrix)))
         return dr.ravel(R @ (dr.unravel(mi.Vector3f, self.base) - c) + shift)
 
     def error(self, value: NDArray[np.float32]) -> PoseError | None:
-        """How far ``value`` (of :func:`get_array`) is from the truth; None where that is not known."""
+        """Compare ``value`` (from `get_array`) with the true pose; returns None if that is unknown."""
         if self.truth is None:
             return None
         a, b = value.astype(np.float64), self.truth.astype(np.float64)
@@ -92,30 +93,40 @@ class Pose:
 
 @dataclass(frozen=True)
 class PoseError:
-    """Between two poses of a thing: distance of its origins (a mesh: centres), also as a share of a length; angle."""
+    """Difference between two poses: distance between origins (centres of meshes), and rotation angle."""
 
     position: float
+    """Distance in scene units."""
     relative: float | None
+    """Distance as a fraction of `Pose.distance`."""
     degrees: float
 
     def of(self, key: str) -> dict[str, float]:
-        """By names that say of which pose: 'KEY:position' (scene units) and 'KEY:degrees'."""
+        """Return the errors by name: 'KEY:position' (scene units) and 'KEY:degrees'."""
         return dict(zip(error_names(key), (self.position, self.degrees), strict=True))
 
     def __str__(self) -> str:
-        share = "" if self.relative is None else f" ({100 * self.relative:.3g} % of its distance)"
-        return f"{self.position:.3g}{share} and {self.degrees:.3g}° off"
+        fraction = "" if self.relative is None else f" ({100 * self.relative:.3g} % of its distance)"
+        return f"{self.position:.3g}{fraction} and {self.degrees:.3g}° off"
 
 
 def error_names(key: str) -> tuple[str, str]:
-    """What the two errors of a pose are called."""
+    """Return the names of the two errors of a pose."""
     return f"{key}:position", f"{key}:degrees"
 
 
 def make_pose(key: str, value: Any, kind: PoseKind, pivot: list[float] | None, distance: float | None) -> Pose:
-    """A pose for the parameter ``key``; the default pivot is the origin of the object's own frame (a mesh: its centre).
+    """Make a pose for the parameter ``key``.
 
-    Raises PathreplayError where the parameter is neither a transform nor a mesh's vertices.
+    Args:
+        key: key of the parameter.
+        value: its value in the scene.
+        kind: which parts of the motion are variables.
+        pivot: centre of rotation; default: the origin of the transform, or the mean of the vertices.
+        distance: length relative to which position errors are reported.
+
+    Raises:
+        PathreplayError: the parameter is neither a transform nor the vertex positions of a mesh.
     """
     array = get_array(value)
     if is_transform(value):
@@ -124,16 +135,16 @@ def make_pose(key: str, value: Any, kind: PoseKind, pivot: list[float] | None, d
         origin = array.reshape(-1, 3).mean(axis=0)
     else:
         raise PathreplayError(
-            f"Parameter '{key}' is a {type(value).__name__} and has no pose; leave 'pose' out, or name a 'to_world' "
-            "or a 'vertex_positions'"
+            f"Parameter '{key}' is a {type(value).__name__} and has no pose; remove 'pose', or name a 'to_world' or "
+            "'vertex_positions' parameter"
         )
     x, y, z = (float(v) for v in (origin if pivot is None else pivot))
-    # A copy: the map hands out a reference to what the scene holds, and the scene is about to change.
+    # A copy, because `value` refers to the scene's value, which changes during the run.
     return Pose(key, kind, type(value)(dr.detach(value)), (x, y, z), distance, None)
 
 
 def rotation_matrix(r: Any) -> Any:
-    """R(r) for a rotation vector in radians, differentiable at r = 0 too."""
+    """Compute R(r) for a rotation vector in radians; the derivative is finite at r = 0, too."""
     θ2 = dr.squared_norm(r)
     small = θ2 < _SMALL
     safe = dr.select(small, _SMALL, θ2)

@@ -1,6 +1,6 @@
-"""What a job adds to the loss for values alone: of textures and volumes, of meshes, of anything by a user's function.
+"""Regularizers: terms of the loss that depend on the values of a parameter alone.
 
-Each is a function of the values v, as people see them, that gives a number and its derivative by v.
+Each maps decoded values v to a number and its gradient by v.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from pathreplay.inverse.parameters.neighbours import neighbours
 from pathreplay.inverse.parameters.values import Array
 
 ROUND = 1e-3
-"""Differences of neighbours below which total variation is a parabola."""
+"""Smoothing length r of total variation: it is quadratic for smaller differences."""
 
 Term = Callable[[Array], tuple[float, NDArray[np.floating]]]
-"""Of values: what is added to the loss, and its derivative, in their shape."""
+"""Maps values to a term of the loss and its gradient, which has the shape of the values."""
 
 
 @dataclass(frozen=True)
 class Penalty:
-    """The sum of its terms."""
+    """Sum of the regularizers of a parameter."""
 
     terms: tuple[Term, ...]
 
     def of(self, values: Array) -> tuple[float, Array]:
-        """The penalty of values, and its gradient."""
+        """Return the penalty and its gradient."""
         penalty, gradient = 0.0, np.zeros(values.shape)
         for term in self.terms:
             more, slope = term(values)
@@ -46,9 +46,9 @@ class Penalty:
 
 @dataclass(frozen=True)
 class TotalVariation:
-    """w · mean √(Δv² + r²) - r, with all differences Δv of neighbours along an axis of a grid.
+    """Total variation w · Σ mean(√(Δv² + r²) - r) of a grid.
 
-    r is `ROUND`. The last axis, the channels, is none of them.
+    The sum is over the spatial axes, the mean over all differences Δv of neighbours along an axis, and r is `ROUND`.
     """
 
     weight: float
@@ -69,7 +69,7 @@ class TotalVariation:
 
 @dataclass(frozen=True)
 class Prior:
-    """w · mean (v - start)²; the start of a grid in another resolution is interpolated."""
+    """Quadratic penalty w · mean (v - start)²; a start of another resolution is resampled."""
 
     weight: float
     start: Array
@@ -82,19 +82,24 @@ class Prior:
 
 
 class Laplacian:
-    """w · mean |v - mean of its neighbours|² over the vertices v of a mesh, so that its surface has no bumps.
+    """Laplacian penalty w · mean |v - mean of its neighbours|² over the vertices v of a mesh, which smooths bumps.
 
-    In squared units of the scene, whatever the mesh is; the finer it is, the less there is of it. Vertices that were in
-    one place at first count as one, in the middle of where they are now.
+    It is in squared scene units, independent of the size of the mesh, and decreases as the mesh is refined. Vertices
+    with equal initial positions are merged into one vertex at their current mean position.
+
+    Args:
+        weight: the weight w.
+        positions: initial vertex positions, 3 n floats.
+        faces: vertex indices, 3 m integers.
     """
 
     def __init__(self, weight: float, positions: Array, faces: NDArray[np.integer]) -> None:
         places, adjacent = neighbours(positions, faces)
         n, counts = adjacent.shape[0], np.asarray(adjacent.sum(axis=1)).ravel()
-        alone = counts == 0
-        away = scipy.sparse.diags((~alone).astype(float)) - scipy.sparse.diags(1 / np.maximum(counts, 1)) @ adjacent
-        each = np.arange(len(places))
-        middle = scipy.sparse.coo_matrix((1 / np.bincount(places, minlength=n)[places], (places, each))).tocsr()
+        isolated = counts == 0
+        away = scipy.sparse.diags((~isolated).astype(float)) - scipy.sparse.diags(1 / np.maximum(counts, 1)) @ adjacent
+        indices = np.arange(len(places))
+        middle = scipy.sparse.coo_matrix((1 / np.bincount(places, minlength=n)[places], (places, indices))).tocsr()
         self.weight, self._away = weight, (away @ middle).tocsr()
 
     def __call__(self, values: Array) -> tuple[float, NDArray[np.floating]]:
@@ -106,29 +111,29 @@ class Laplacian:
 
 @dataclass(frozen=True)
 class Own:
-    """A user's function of the values, a tensor in their shape, to one number; its derivative is Dr.Jit's.
+    """A user function of a tensor of values that returns one number, differentiated by Dr.Jit.
 
-    Where that does not depend on them, as a plain 0 where nothing is wrong, it is zero.
+    The gradient is zero if the result does not depend on the values, e.g. if the function returns a constant 0.
     """
 
     function: Imported
 
     def __call__(self, values: Array) -> tuple[float, NDArray[np.floating]]:
-        """See `Term`. Raises PathreplayError for what is no number."""
+        """See `Term`. Raises PathreplayError if the function fails, or its value or gradient is not finite."""
         v: Any = mi.TensorXf(np.ascontiguousarray(values))
         dr.enable_grad(v)
-        value = self.function(_flat, mi.TensorXf(v))  # which it may change
+        value = self.function(_flat, mi.TensorXf(v))  # a copy, which the function may modify
         if dr.width(value) != 1:
-            raise PathreplayError(f"{self.function} gives {dr.width(value)} numbers; return one, such as a mean")
+            raise PathreplayError(f"{self.function} returns {dr.width(value)} numbers; return one, such as a mean")
         if dr.grad_enabled(value):
             dr.backward(value)
-        found, gradient = float(value[0]), np.array(dr.grad(v))
-        if not (np.isfinite(found) and np.isfinite(gradient).all()):
+        penalty, gradient = float(value[0]), np.array(dr.grad(v))
+        if not (np.isfinite(penalty) and np.isfinite(gradient).all()):
             raise PathreplayError(
-                f"{self.function} is {found:g}, or has a derivative that is no finite number, where its parameter is "
-                "now; mend it (lengths have no derivative at 0), or bound the parameter"
+                f"{self.function} is {penalty:g}, and it or its gradient is not finite at the current values; fix it "
+                "(e.g. the derivative of a length is infinite at 0), or bound the parameter"
             )
-        return found, gradient
+        return penalty, gradient
 
 
 def _flat(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Where steps are taken instead of the values themselves: in logarithms, say, where a step is a share of a value."""
+"""Reparameterization: the optimiser steps a function of the values, such as their logarithm."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from pathreplay.inverse.config.parameter_options import TransformKind
 from pathreplay.inverse.parameters.values import Array
 
 CLOSEST = 1e-6
-"""How close values come to a bound of theirs, in shares of the range: beyond, a step would do nothing more."""
+"""Smallest distance of values from a bound, relative to the range; closer to it, the derivative by u vanishes."""
 
 LARGEST_LOG = 88.0
-"""The largest logarithm of a value: beyond, single precision ends."""
+"""Largest logarithm of a value; above it, single precision overflows."""
 
 
 class Coordinates(Protocol):
-    """Other coordinates u of values v."""
+    """A change of coordinates between values v and the latent variables u that the optimiser steps."""
 
     uniform: bool
-    """Whether all entries of u are of one kind, so that an optimiser is to measure them by one number."""
+    """Whether the optimiser should normalise all entries of u by their largest second moment (UniformAdam)."""
 
     def latent(self, values: Array) -> Array:
-        """u of v."""
+        """Compute u from v."""
 
     def gradient(self, values: Array, by_values: Array) -> Array:
-        """The derivative by u at v, of that by v."""
+        """Convert the gradient by v at ``values`` to the gradient by u."""
 
     def values(self, latent: Array) -> Array:
-        """v of u."""
+        """Compute v from u."""
 
 
 class Transform:
-    """Each value for itself, so that none leaves (lower, upper).
+    """Entrywise coordinates that keep values within (lower, upper).
 
     log       v = exp u
     softplus  v = lower + log(1 + exp u)
     logit     v = lower + (upper - lower) / (1 + exp(-u))
 
-    Computed in double precision, returned in single.
+    The computation is in double precision, the results are in single precision.
     """
 
     uniform = False
@@ -53,13 +53,13 @@ class Transform:
         self.upper = (1.0 if not np.isfinite(upper) else upper) if kind == "logit" else np.inf
 
     def require_inside(self, key: str, values: Array) -> None:
-        """Raise PathreplayError unless all values are between the bounds, and not on them."""
+        """Raise PathreplayError unless all values are strictly between the bounds."""
         for wrong, what in ((values <= self.lower, "above"), (values >= self.upper, "below")):
             if wrong.any():
                 bound = self.lower if what == "above" else self.upper
                 raise PathreplayError(
-                    f"Parameter '{key}' starts at {values[wrong].flat[0]:g}, and parameterization = '{self.kind}' "
-                    f"wants values {what} {bound:g}; start elsewhere with 'initial', or leave it out"
+                    f"Parameter '{key}' starts at {values[wrong].flat[0]:g}, but parameterization = '{self.kind}' "
+                    f"needs values {what} {bound:g}; set another 'initial', or remove 'parameterization'"
                 )
 
     def latent(self, values: Array) -> Array:
@@ -97,7 +97,7 @@ class Transform:
         return np.asarray(self._inside(v), np.float32)
 
     def _inside(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """The values, held off the bounds."""
+        """Clamp the values to a small distance from the bounds."""
         v = values.astype(np.float64)
         if self.kind == "logit":
             off = CLOSEST * (self.upper - self.lower)

@@ -1,4 +1,4 @@
-"""Parameter values as the user writes them (numbers, colours, image and volume files), in the scene's shape."""
+"""Conversion of values in a job (numbers, colours, image and volume files) to arrays in the shape of the parameter."""
 
 from __future__ import annotations
 
@@ -18,21 +18,27 @@ from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.volume_files import load_volume
 
 Arrays = Mapping[str, Array]
-"""By key of the variable, or by name."""
+"""Arrays by key of the variable."""
 
 
 def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
-    """What the user wrote as the new value of the parameter ``key``, in the shape that it has in the scene (``like``).
+    """Convert a value of a job to an array.
 
-    A number fills every entry; a list is a colour (repeated over a texture) or all entries of a flat array; an image is
-    resampled to the texture's size, and its channels are adapted; a volume is resampled to the grid's. Relative paths
-    start at ``base``.
+    A number fills all entries. A list is a colour, repeated over a texture, or all entries of a flat array. An image is
+    resampled to the size of the texture and converted to its channels. A volume is resampled to the size of the grid.
 
-    Raises PathreplayError where the value does not fit the parameter, or the file is missing, unreadable or not finite.
+    Args:
+        key: key of the parameter.
+        like: decoded Dr.Jit value of the parameter in the scene, which defines the shape.
+        value: the value in the job.
+        base: folder that relative paths start from.
+
+    Raises:
+        PathreplayError: the value does not fit the parameter, or the file is missing, unreadable or not finite.
     """
     if is_transform(like):
         raise PathreplayError(
-            f"Value given for the matrix '{key}'; set it in the scene, and displace the start of a pose"
+            f"Parameter '{key}' is a matrix and takes no value; set it in the scene, or displace it as a pose"
         )
     current = get_array(like)
     if isinstance(value, (int, float)):
@@ -42,20 +48,20 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
         width = current.shape[-1]
         if len(given) != width:
             raise PathreplayError(
-                f"Value of '{key}' has {len(given)} numbers, the parameter takes {width}; list {width}, or give one"
+                f"Value of '{key}' has {len(given)} numbers, but the parameter takes {width}; list {width}, or give one"
             )
         return np.broadcast_to(given, current.shape).copy()
     if current.ndim == 4 and isinstance(value, str):
         path = base / value
         data = load_volume(path).data
         if data.shape[3] != current.shape[3]:
-            channels = f"{data.shape[3]} channels, '{key}' has {current.shape[3]}"
+            channels = f"{data.shape[3]} channels, but '{key}' has {current.shape[3]}"
             raise PathreplayError(f"Volume {path} has {channels}; convert the volume")
         return resampled(data, current.shape)
     picture = value if isinstance(value, Picture) else Picture(image=value)
     if current.ndim != 3:
         raise PathreplayError(
-            f"Value of '{key}' is the image '{picture.image}', but the parameter is no texture "
+            f"Value of '{key}' is the image '{picture.image}', but the parameter is not a texture "
             f"(shape {current.shape}); give numbers"
         )
     image = read_image(find_image(picture.image, base), raw=picture.raw)
@@ -64,21 +70,31 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
 
 
 def seen(params: mi.SceneParameters, key: str) -> Any:
-    """What people see of a parameter of the scene: the kind of value that jobs take, optimise and save."""
+    """Return the decoded value of a scene parameter, which is what jobs take, optimise and save (see `Form`)."""
     return form_of(params, key).see(params[key])
 
 
 def adapted_image(name: str, image: Image, other: str, channels: int) -> Image:
-    """The image with as many channels as an ``other`` has; raises PathreplayError if it cannot, or is not finite."""
+    """Convert an image to a number of channels.
+
+    Args:
+        name: subject of the message if that fails.
+        image: the image.
+        other: what needs the channels, as subject and verb for the message.
+        channels: number of channels.
+
+    Raises:
+        PathreplayError: the conversion is not defined, or the image is not finite.
+    """
     adapted = with_channels(image, channels)
     if adapted is None:
-        raise PathreplayError(f"{name} has {image.shape[2]} channels, {other} {channels}; convert it")
+        raise PathreplayError(f"{name} has {image.shape[2]} channels, but {other} {channels}; convert it")
     require_finite_array(name, adapted)
     return adapted
 
 
 def require_finite_array(name: str, array: Array) -> None:
-    """Raise PathreplayError that names the first entry that is NaN or infinite."""
+    """Raise PathreplayError if an entry is NaN or infinite; the message names the first one."""
     bad = ~np.isfinite(array)
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])

@@ -1,4 +1,4 @@
-"""What the optimiser moves: variables with bounds, rates and starts, as the parameters of a job ask for them."""
+"""Variables of the optimiser, made from the parameters of a job: bounds, learning rates and initial values."""
 
 from __future__ import annotations
 
@@ -30,73 +30,86 @@ from pathreplay.scenes import parameters
 from pathreplay.scenes.stored import AS_STORED, Form, form_of
 
 RESERVED = frozenset({EXPOSURE, "__metadata__"})
-"""Names that mean something else where values are kept."""
+"""Keys with a special meaning in files of values."""
 
 
 @dataclass(frozen=True)
 class Variable:
-    """What the optimiser moves: its name, bounds, learning rate, start value, and the truth where it is known.
+    """A variable of the optimiser; all values are decoded.
 
-    The name is the key of a scene parameter, that of a pose with ':translation' or ':rotation' behind it, or that of
-    numbers which others are derived from.
+    Its key is the key of a scene parameter, the key of a pose followed by ':translation' or ':rotation', or the key of
+    an array from which scene parameters are derived.
     """
 
     key: str
     like: Any
-    """A Dr.Jit value of its type and shape."""
+    """A Dr.Jit value of the type and shape of the variable."""
     bounds: tuple[float, float]
-    """Lowest and highest value that a step may end at."""
+    """Lower and upper bound, enforced by projection after each step."""
     learning_rate: float
     start: Array
+    """Initial value."""
     truth: Array | None
-    """In the shape of ``start``, or for a grid in another resolution."""
+    """True value if known, in the shape of ``start``, or in another resolution for a grid."""
     levels: Levels | None = None
-    """Of a grid that is refined on the way."""
+    """Refinement schedule of a grid."""
     coordinates: Coordinates | None = None
-    """Where steps are taken, if not in the values themselves."""
+    """Coordinates in which steps are taken; None for the values themselves."""
     penalty: Penalty | None = None
-    """What is added to the loss for its values alone."""
+    """Regularizers of the values."""
     form: Form = AS_STORED
-    """How Mitsuba stores it; everything here is what people see."""
+    """Conversion between decoded values and the values that Mitsuba stores."""
 
     def held(self, values: Array) -> Any:
-        """Values as Dr.Jit holds them; a grid may have another resolution than at first."""
+        """Convert an array to Dr.Jit; the resolution of a grid may differ from its initial one."""
         return type(self.like)(values) if dr.is_tensor_v(self.like) else parameters.to_value(self.like, values)
 
 
 def keys_of(
     params: mi.SceneParameters, config: Config, integrator: mi.Integrator
 ) -> tuple[dict[str, Parameter], dict[str, Derivation]]:
-    """The scene's keys that are recovered, and those that are derived, each with its entry.
+    """Resolve the keys and globs of a job.
 
-    Raises PathreplayError for those that cannot move, or are named twice.
+    Args:
+        params: parameters of the scene.
+        config: the job.
+        integrator: integrator that must be able to differentiate the parameters.
+
+    Returns:
+        The tables of the job by scene key: of recovered parameters, and of derived parameters.
+
+    Raises:
+        PathreplayError: a parameter does not exist, is not differentiable, or is named twice.
     """
-    found: dict[str, Parameter | Derivation] = {}
+    tables: dict[str, Parameter | Derivation] = {}
     entries: list[Parameter | Derivation] = [entry for entry in config.parameters if entry.shape is None]
     for entry in [*entries, *config.derived]:
         for key in parameters.resolve_keys(params, entry.key):
-            if key in found:
+            if key in tables:
                 raise PathreplayError(
-                    f"Parameter '{key}' is named twice, by '{found[key].key}' and '{entry.key}'; remove one"
+                    f"Parameter '{key}' is named twice, by '{tables[key].key}' and '{entry.key}'; remove one"
                 )
             parameters.require_differentiable(params, key, integrator)
-            found[key] = entry
+            tables[key] = entry
     return (
-        {key: entry for key, entry in found.items() if isinstance(entry, Parameter)},
-        {key: entry for key, entry in found.items() if isinstance(entry, Derivation)},
+        {key: entry for key, entry in tables.items() if isinstance(entry, Parameter)},
+        {key: entry for key, entry in tables.items() if isinstance(entry, Derivation)},
     )
 
 
 def free_of(params: mi.SceneParameters, config: Config) -> dict[str, Parameter]:
-    """The entries with a shape of their own, by key. Raises PathreplayError for names that are others'."""
+    """Return the parameters that are not part of the scene (those with a ``shape``), by key.
+
+    Raises PathreplayError if such a key is already in use or reserved.
+    """
     free: dict[str, Parameter] = {}
     for entry in config.parameters:
         if entry.shape is None:
             continue
         if entry.key in params:
-            raise PathreplayError(f"Parameter '{entry.key}' is one of the scene; leave 'shape' out, or rename it")
+            raise PathreplayError(f"Parameter '{entry.key}' is part of the scene; remove 'shape', or rename it")
         if entry.key in RESERVED or entry.key.endswith(PART_NAMES):
-            raise PathreplayError(f"Parameter '{entry.key}' with a 'shape' has the name of something else; rename it")
+            raise PathreplayError(f"Parameter '{entry.key}' with a 'shape' has a reserved name; rename it")
         if entry.key in free:
             raise PathreplayError(f"Parameter '{entry.key}' is named twice; remove one")
         free[entry.key] = entry
@@ -112,16 +125,28 @@ def make_variables(
     modules: Modules,
     starts: Mapping[str, Array] = MappingProxyType({}),
 ) -> tuple[list[Variable], list[Pose]]:
-    """Of each key a variable, or a pose with those of its parts; truths are not known yet.
+    """Make the variables and poses of a job; their true values are set later.
 
-    ``starts`` are arrays by the key of an entry, in place of its ``initial``.
-    Raises PathreplayError for starts, rates and options that do not fit what is there.
+    Args:
+        scene: the scene.
+        params: parameters of the scene.
+        keys: tables of the parameters, by key.
+        config: the job.
+        base: folder that relative paths start from.
+        modules: finder of user functions.
+        starts: initial values by the key of a table, in place of its ``initial``.
+
+    Returns:
+        The variables, and the poses that are computed from some of them.
+
+    Raises:
+        PathreplayError: an initial value, learning rate or option does not fit the parameter.
     """
     variables: list[Variable] = []
     poses: list[Pose] = []
     for key, entry in keys.items():
         rate = entry.learning_rate or config.learning_rate
-        # A step of SGD is the rate times the gradient, which may be anything.
+        # The step of SGD scales with the gradient, so its learning rate cannot be checked.
         bounded = parameter_limits.require_learning_rate if config.optimizer.type != "sgd" else lambda *_: None
         if entry.pose is None:
             form = AS_STORED if entry.shape else form_of(params, key)
@@ -137,7 +162,7 @@ def make_variables(
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
             if dr.is_tensor_v(like):
-                like = dr.zeros(type(like), start.shape)  # which nobody writes down
+                like = dr.zeros(type(like), start.shape)  # a literal, which takes no memory
             penalty = _penalty(params, key, entry, start, levels, modules)
             variables.append(Variable(key, like, bounds, rate, start, None, levels, coordinates, penalty, form))
             continue
@@ -147,7 +172,7 @@ def make_variables(
         for part, name in pose.parts().items():
             start = np.array(getattr(entry.displacement, part) or [0.0, 0.0, 0.0], np.float32)
             if part == "rotation":
-                # Users write degrees. A learning rate without unit is taken in radians, fit for a scene of size 1.
+                # The job gives degrees; the general learning rate is in radians, which suits a scene of size 1.
                 start = np.radians(start)
                 degrees = entry.rotation_learning_rate
                 rate = rate if degrees is None else float(np.radians(degrees))
@@ -170,22 +195,22 @@ def _coordinates(params: mi.SceneParameters, key: str, entry: Parameter, start: 
 
 
 def _faces(params: mi.SceneParameters, key: str, option: str) -> NDArray[np.integer]:
-    """Of the mesh whose vertices a parameter is. Raises PathreplayError, for this option, where it is not."""
+    """Return the faces of the mesh with these vertex positions. Raises PathreplayError if there is no such mesh."""
     owner, _, name = key.rpartition(".")
     if name != "vertex_positions" or (faces := f"{owner}.faces") not in params:
-        raise PathreplayError(f"Parameter '{key}' is no mesh's vertex_positions; leave '{option}' out")
+        raise PathreplayError(f"Parameter '{key}' is not the vertex_positions of a mesh; remove '{option}'")
     return np.array(params[faces])
 
 
 def _penalty(
     params: mi.SceneParameters, key: str, entry: Parameter, start: Array, levels: Levels | None, modules: Modules
 ) -> Penalty | None:
-    """What the entry asks for. Raises PathreplayError for what cannot be computed, in some resolution."""
+    """Make the regularizers of a parameter. Raises PathreplayError if one cannot be computed in every resolution."""
     terms: list[Term] = []
     if entry.total_variation is not None:
         if start.ndim < 3:
             raise PathreplayError(
-                f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'total_variation' out"
+                f"Parameter '{key}' of shape {start.shape} is not a texture or volume; remove 'total_variation'"
             )
         terms.append(TotalVariation(entry.total_variation))
     if entry.l2_to_initial is not None:
@@ -194,14 +219,14 @@ def _penalty(
         faces = _faces(params, key, "laplacian_weight")
         terms.append(Laplacian(entry.laplacian_weight, parameters.get_array(params[key]), faces))
     if entry.regularizer is not None:
-        terms.append(Own(modules.function("Penalty", entry.regularizer, "values")))
+        terms.append(Own(modules.function("Regularizer", entry.regularizer, "values")))
         for shape in levels.shapes if levels else [start.shape]:
             terms[-1](resampled(start, shape))
     return Penalty(tuple(terms)) if terms else None
 
 
 def _numbers(key: str, shape: list[int]) -> Any:
-    """Zeros that nobody has written down. Raises PathreplayError where memory has no room for them."""
+    """Make a literal zero tensor. Raises PathreplayError if an array of its size does not fit into memory."""
     parameter_limits.require_values({key: prod(shape)})
     return dr.zeros(mi.TensorXf, shape)
 
@@ -211,7 +236,7 @@ def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> L
         return None
     if start.ndim < 3:
         raise PathreplayError(
-            f"Parameter '{key}' of shape {start.shape} is no texture and no volume; leave 'resolutions' out"
+            f"Parameter '{key}' of shape {start.shape} is not a texture or volume; remove 'resolutions'"
         )
     parameter_limits.require_grid(key, start.shape, entry.resolutions)
     return make_levels(start.shape, entry.resolutions, refine_at)
@@ -220,21 +245,21 @@ def _levels(key: str, entry: Parameter, refine_at: list[int], start: Array) -> L
 def _start(key: str, like: Any, form: Form, entry: Parameter, base: Path, given: Array | None) -> Array:
     if not dr.is_array_v(like):
         raise PathreplayError(
-            f"Parameter '{key}' is a matrix, whose 16 numbers do not stay a motion; give it "
+            f"Parameter '{key}' is a matrix, and steps of its 16 entries would not keep it rigid; set "
             "pose = 'translation', 'rotation' or 'rigid'"
         )
     if given is not None:
         start = np.array(given, np.float32)
         if start.shape != parameters.get_array(like).shape:
             raise PathreplayError(
-                f"Parameter '{key}' starts at an array of shape {start.shape}, in the scene it has "
-                f"{parameters.get_array(like).shape}; reshape it"
+                f"Parameter '{key}' starts at an array of shape {start.shape}, but has the shape "
+                f"{parameters.get_array(like).shape} in the scene; reshape it"
             )
-        require_finite_array(f"The start of '{key}'", start)
+        require_finite_array(f"The initial value of '{key}'", start)
     elif entry.initial is None:
         start = parameters.get_array(like)
     else:
-        assert not isinstance(entry.initial, Displacement)  # the schema wants a pose for one
+        assert not isinstance(entry.initial, Displacement)  # the schema allows that for poses only
         start = form.of_colours(key, make_value(key, like, entry.initial, base))
     for bound, name, wrong in ((entry.lower, "lower", np.less), (entry.upper, "upper", np.greater)):
         if bound is not None and wrong(start, np.float32(bound)).any():

@@ -1,4 +1,4 @@
-"""What a job leaves out is taken from elsewhere: its integrator from the scene, that of the targets from the job's."""
+"""Default integrators of a job, taken from the scene, and of its targets, taken from the job."""
 
 from __future__ import annotations
 
@@ -12,16 +12,25 @@ from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.config.tables import Plugin
 from pathreplay.scenes.descriptions import load_integrator
 
-SHOWN = {"max_depth": "how long paths are", "hide_emitters": "whether emitters are seen"}
-"""Limits that change the expected picture, and what each decides."""
+SHOWN = {"max_depth": "the length of paths", "hide_emitters": "whether emitters are visible"}
+"""Options that change the expected image, and what each determines."""
 
 
 def completed(config: Config, scene: mi.Scene) -> tuple[Config, tuple[str, ...]]:
-    """The job with all of its integrators, and one line where targets show something else than the job renders.
+    """Fill in the integrators that a job leaves out.
 
-    Where the job has no `integrator`, it is `pathreplay` with the options of the scene's own. Targets that are rendered
-    and have no integrator are rendered by `path`, or `volpath` where the scene has media, with the limits of the job's.
-    Raises PathreplayError for integrators that cannot be made.
+    The default integrator of a job is `pathreplay` with the options of the scene's integrator. The default integrator
+    of rendered targets is `path`, or `volpath` for scenes with media, with the limits of the job's integrator.
+
+    Args:
+        config: the job.
+        scene: its scene.
+
+    Returns:
+        The completed job, and a note if targets are rendered with other limits than the job's.
+
+    Raises:
+        PathreplayError: an integrator cannot be created.
     """
     if "integrator" not in config.model_fields_set and (options := _options(scene.integrator())):
         config = config.model_copy(update={"integrator": Plugin(type="pathreplay", **options)})
@@ -37,13 +46,13 @@ def completed(config: Config, scene: mi.Scene) -> tuple[Config, tuple[str, ...]]
 
 
 def _options(own: Any) -> dict[str, Any]:
-    """The options of `pathreplay` that a scene's integrator implies; empty without one, or if it has no limits."""
+    """Return the options of `pathreplay` that the scene's integrator implies; empty if it has none or no limits."""
     limits = None if own is None else read_limits(own)
     if limits is None:
         return {}
     if hasattr(own, "options"):
         return vars(limits) | own.options()
-    # Mitsuba's integrators are unbounded unless they are told, and unbounded paths would be walked twice.
+    # An unbounded max_depth, Mitsuba's default, is not copied, since `pathreplay` would trace unbounded paths twice.
     return {name: value for name, value in vars(limits).items() if name != "max_depth" or value >= 0}
 
 
@@ -55,9 +64,9 @@ def _differences(ours: Limits | None, theirs: Limits | None, config: Config) -> 
         return ()
     target = config.target.integrator
     assert target is not None
-    said = ", ".join(f"{name} = {getattr(theirs, name)} for {getattr(ours, name)}" for name in others)
+    said = ", ".join(f"{name} = {getattr(theirs, name)} instead of {getattr(ours, name)}" for name in others)
     why = " and ".join(SHOWN[name] for name in others)
     return (
-        f"targets are rendered by '{target.type}' with {said} of the job's '{config.integrator.type}', which decides "
-        f"{why}: what is recovered makes up for that; leave [target] integrator out, or set both alike",
+        f"targets are rendered by '{target.type}' with {said} of the job's '{config.integrator.type}', which sets "
+        f"{why}; this biases the recovered values: remove [target] integrator, or set both alike",
     )

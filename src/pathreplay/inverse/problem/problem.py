@@ -1,4 +1,4 @@
-"""The inverse problem: scene, variables with bounds, views with targets; checked before the first iteration."""
+"""The inverse problem: scene, variables with bounds, and views with targets; checked before the first iteration."""
 
 from __future__ import annotations
 
@@ -58,73 +58,74 @@ from pathreplay.scenes.loading import load_scene_for
 
 
 class Held:
-    """The values that were asked for last, as Dr.Jit holds them: there are none beside them."""
+    """Cache of the last values that were converted to Dr.Jit, so that only one copy exists."""
 
     def __init__(self) -> None:
         self._known: dict[str, tuple[weakref.ref[Array], Any]] = {}
 
     def variables(self, problem: Problem, values: Arrays) -> dict[str, Any]:
-        """As `variables_of`, without derivatives; the same arrays as before, where the values are."""
+        """Convert values as `variables_of`, without gradients; reuse the arrays if the values are the same objects."""
         keys = [v.key for v in problem.variables]
         if any(key not in self._known or self._known[key][0]() is not values[key] for key in keys):
-            self._known = {}  # before there is more
-            made = variables_of(problem, values)
-            # Values may go when nobody else wants them, and their places in memory may be those of others.
-            self._known = {key: (weakref.ref(values[key]), value) for key, value in made.items()}
-        found = {key: self._known[key][1] for key in keys}
-        dr.disable_grad(found)
-        return found
+            self._known = {}  # release the old copies first
+            converted = variables_of(problem, values)
+            # Weak references, because ids of freed arrays may be reused, and the cache must not keep arrays alive.
+            self._known = {key: (weakref.ref(values[key]), value) for key, value in converted.items()}
+        variables = {key: self._known[key][1] for key in keys}
+        dr.disable_grad(variables)
+        return variables
 
 
 @dataclass(frozen=True)
 class Problem:
-    """min over the variables of the mean over views of loss(render(scene, view), target of the view)."""
+    """Minimise, over the variables, the mean over the views of loss(render(scene, view), target of the view)."""
 
     config: Config
-    """The job, with what it leaves to others: see `completed`."""
+    """The job with its default integrators filled in (see `completed`)."""
     scene: mi.Scene
     params: mi.SceneParameters
     integrator: mi.Integrator
     baseline: mi.Integrator | None
-    """Solves the same problem in the same time, for comparison."""
+    """Integrator that solves the same problem in the same time, for comparison."""
     judge: mi.Integrator
-    """Renders the pictures by which both are compared: the one that made the targets, where it is known."""
+    """Integrator of the images in which both are compared: that of the targets if they are rendered."""
     variables: tuple[Variable, ...]
     poses: tuple[Pose, ...]
     views: tuple[View, ...]
     loss: Loss
     notes: tuple[str, ...]
-    """What was done to the scene that the user should know of."""
+    """Messages to the user about changes to the scene and missing gradients."""
     derived: tuple[Derived, ...] = ()
     capture: str | None = None
-    """What tells its capture from others."""
+    """Hash of the capture (see `fingerprint`)."""
     album: Album = field(default_factory=Album)
-    """Where its pictures are kept, and starts and truths."""
+    """Store of images, initial values and true values."""
     held: Held = field(default_factory=Held)
+    """Cache of converted values."""
 
     def moves(self, moving: frozenset[str]) -> set[str]:
-        """The keys of the scene whose values are others when these variables are."""
-        made = {each.key for each in self.made() if not moving.isdisjoint(each.of)}
-        return {key for key in moving if key in self.params} | made
+        """Return the keys of the scene parameters that depend on some of these variables."""
+        computed = {entry.key for entry in self.made() if not moving.isdisjoint(entry.of)}
+        return {key for key in moving if key in self.params} | computed
 
     def reached(self, moving: frozenset[str]) -> set[int]:
-        """The places of the views whose pictures, before any exposure, depend on one of these variables."""
+        """Return the indices of the views whose rendered images, before exposure, depend on some of these variables."""
         sensors = [self.scene.sensors()[view.sensor] for view in self.views]
-        found = reached_sensors(self.scene, sensors, self.params, self.moves(moving))
-        return {n for n, reached in enumerate(found) if reached}
+        flags = reached_sensors(self.scene, sensors, self.params, self.moves(moving))
+        return {n for n, reached in enumerate(flags) if reached}
 
     def made(self) -> tuple[Pose | Derived, ...]:
-        """What is made of variables."""
+        """Return the scene parameters that are computed from variables: poses and derived parameters."""
         return *self.poses, *self.derived
 
     def trained(self) -> dict[int, View]:
-        """The views that are learned from, by their place."""
+        """Return the training views by index."""
         return {n: view for n, view in enumerate(self.views) if not view.is_test}
 
 
 def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
-    """The values of the variables (what people see) as Dr.Jit holds them, in memory of its own."""
-    # NumPy's memory, which Dr.Jit would take over, begins anywhere: to a frozen function that is another kind of input.
+    """Convert the decoded values of the variables to evaluated Dr.Jit arrays that own their memory."""
+    # Dr.Jit would wrap NumPy's memory, whose alignment varies and would force frozen functions to record again.
     one = dr.opaque(mi.Float, 1)
     variables = {v.key: v.held(values[v.key]) * one for v in problem.variables}
     dr.eval(variables)
@@ -132,62 +133,83 @@ def variables_of(problem: Problem, values: Arrays) -> dict[str, Any]:
 
 
 def scene_values(problem: Problem, variables: Mapping[str, Any]) -> dict[str, Any]:
-    """The scene's parameters, by key and as Mitsuba stores them; derivatives flow to the variables."""
+    """Compute the scene parameters in the form that Mitsuba stores; derivatives propagate to the variables.
+
+    Args:
+        problem: the problem.
+        variables: Dr.Jit values of the variables, by key.
+
+    Returns:
+        Values of scene parameters, by key.
+    """
     plain = {v.key: v.form.store(variables[v.key]) for v in problem.variables if v.key in problem.params}
-    made = {each.key: each.form.store(each.value(variables)) for each in problem.derived}
-    return plain | made | {pose.key: pose.value(variables) for pose in problem.poses}
+    derived = {entry.key: entry.form.store(entry.value(variables)) for entry in problem.derived}
+    return plain | derived | {pose.key: pose.value(variables) for pose in problem.poses}
 
 
 def sensor_of(problem: Problem, view: View) -> mi.Sensor:
-    """The sensor of a view, whose film has the size of its picture."""
+    """Return the sensor of a view, after resizing its film to the target image."""
     sensor = problem.scene.sensors()[view.sensor]
     fit_film(sensor, view.target.shape)
     return sensor
 
 
 def put_values(problem: Problem, values: Arrays) -> None:
-    """Give the scene these values of the variables, without derivatives."""
+    """Set the scene parameters to the values of the variables, without gradients."""
     problem.params.update(scene_values(problem, problem.held.variables(problem, values)))
 
 
 def errors_of(problem: Problem, values: Arrays) -> dict[str, float]:
-    """How far all whose truth is known are from it, by key: root mean squares; of poses by name, see `PoseError.of`.
+    """Compute the errors of all values whose true value is known.
 
-    Raises PathreplayError where a derived parameter is no longer finite.
+    Args:
+        problem: the problem.
+        values: values of the variables.
+
+    Returns:
+        Root mean square errors by key, and the errors of poses by name (see `PoseError.of`).
+
+    Raises:
+        PathreplayError: a derived parameter is not finite.
     """
-    found = {v.key: rmse(values[v.key], v.truth) for v in problem.variables if v.truth is not None}
+    errors = {v.key: rmse(values[v.key], v.truth) for v in problem.variables if v.truth is not None}
     poses = [pose for pose in problem.poses if pose.truth is not None]
     variables = problem.held.variables(problem, values) if problem.derived or poses else {}
-    for each in problem.derived:
-        value = each.require_finite(variables)
-        if each.truth is not None:
-            found[each.key] = rmse(parameters.get_array(value), each.truth)
+    for entry in problem.derived:
+        value = entry.require_finite(variables)
+        if entry.truth is not None:
+            errors[entry.key] = rmse(parameters.get_array(value), entry.truth)
     for pose in poses:
         if error := pose.error(parameters.get_array(pose.value(variables))):
-            found |= error.of(pose.key)
-    return found
+            errors |= error.of(pose.key)
+    return errors
 
 
 @dataclass(frozen=True)
 class InMemory:
-    """What a problem is given as objects, where a job would name files."""
+    """Objects that a problem is given in place of the files and plugins that a job names."""
 
     scene: mi.Scene | None = None
     integrator: mi.Integrator | None = None
     functions: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
-    """Callables, by the names that stand for them in the config."""
+    """Callables, by their names in the job."""
     starts: Mapping[str, Array] = field(default_factory=dict)
-    """Arrays by key of the parameter, in place of its ``initial``."""
+    """Initial values by key of the parameter, in place of its ``initial``."""
 
 
 def build_problem(
     config: Config, base: Path, targets: Targets | None = None, memory: InMemory | None = None
 ) -> Problem:
-    """Load and check everything that the job names; relative paths start at ``base``.
+    """Load and check everything that a job names.
 
-    ``targets`` are those of an earlier part of the same run, or arrays; otherwise they are read or rendered.
-    ``memory`` holds what is not named but there.
-    Raises PathreplayError for whatever in the job cannot work.
+    Args:
+        config: the job.
+        base: folder that relative paths start from.
+        targets: target images, if they exist already (of a resumed run, or arrays); None to read or render them.
+        memory: objects in place of files and plugins that the job would name.
+
+    Raises:
+        PathreplayError: a part of the job is invalid or inconsistent.
     """
     album = Album.of(config.budget)
     given = memory or InMemory()
@@ -203,33 +225,33 @@ def build_problem(
         integrator = _gradient_integrator(config.integrator)
     else:
         _require_gradients(integrator, type(integrator).__name__)
-    named, made = keys_of(params, config, integrator)
+    named, derivations = keys_of(params, config, integrator)
     free = free_of(params, config)
-    keys = [*named, *made]
+    keys = [*named, *derivations]
     notes += _edges(params, keys, integrator)
     baseline = None if config.baseline is None else _gradient_integrator(config.baseline)
     if baseline is not None:
         keys_of(params, config, baseline)
-        _edges(params, keys, baseline)  # for its log: one note is enough
+        _edges(params, keys, baseline)  # only to suppress its own warning; one note is enough
     judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
-    # Before any target is rendered: the cheap mistakes first.
+    # Cheap checks come before the rendering of targets.
     sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
-    taken = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
+    used = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
     test_views = held_out_of(scene, sensors, config, list(shots))
     feasibility.require_visible(scene, params, keys)
     if config.target.alpha == "scene":
         require_known(scene, params, keys)
     require_films(scene, sensors, {"spp": config.most_spp, "eval_spp": config.eval_spp})
-    unsolved, moved = make_variables(scene, params, named | free, config, base, modules, given.starts)
-    derived = make_derived(params, made, unsolved, modules)
+    unsolved, unsolved_poses = make_variables(scene, params, named | free, config, base, modules, given.starts)
+    derived = make_derived(params, derivations, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
-    targets, truth, said = _seen(config, targets, taken, scene, params, sensors, keys, base, album)
-    notes += said
+    targets, truth, messages = _seen(config, targets, used, scene, params, sensors, keys, base, album)
+    notes += messages
     if missing := set(sensors) - set(targets.images):
-        raise PathreplayError(f"The run folder has no target picture of sensor '{missing.pop()}'; start a new run")
+        raise PathreplayError(f"The run folder has no target image of sensor '{missing.pop()}'; start a new run")
     masked_all = config.target.masks is not None or config.target.alpha == "mask"
-    weighted = {n for n in sensors if masked_all or (n in taken and (taken[n].mask or taken[n].lens))}
+    weighted = {n for n in sensors if masked_all or (n in used and (used[n].mask or used[n].lens))}
     require_weights(targets, weighted if memory is None else set(targets.weights))
     shares = shares_of(scene, sensors, config, test_views)
     views = tuple(
@@ -241,21 +263,21 @@ def build_problem(
         feasibility.require_finite_loss(loss, view.name, view.target, view.weight)
         album.rest()
     variables = tuple(_kept(album, replace(variable, truth=truth.get(variable.key))) for variable in unsolved)
-    poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in moved)
-    derived = tuple(replace(each, truth=truth.get(each.key)) for each in derived)
-    # Traversed anew: an object from which values were read expects all its keys at the next update().
+    poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in unsolved_poses)
+    derived = tuple(replace(entry, truth=truth.get(entry.key)) for entry in derived)
+    # Traversed again: SceneParameters from which values were read expect all of their keys at the next update().
     params = traversed(scene)
     parameters.keep_only(params, keys)
-    known = fingerprint(taken.values()) if taken else None
+    digest = fingerprint(used.values()) if used else None
     return Problem(
-        config, scene, params, integrator, baseline, judge, variables, poses, views, loss, notes, derived, known, album
+        config, scene, params, integrator, baseline, judge, variables, poses, views, loss, notes, derived, digest, album
     )
 
 
 def _loaded(
     config: Config, base: Path, shots: Mapping[str, Shot], scene: mi.Scene | None
 ) -> tuple[mi.Scene, Config, tuple[str, ...]]:
-    """The scene, the job with what it leaves to the scene (see `completed`), and what is to be said about both."""
+    """Load the scene and fill in the default integrators of the job; returns both, and notes for the user."""
     if scene is not None:
         config, differences = completed(config, scene)
         return scene, config, differences
@@ -278,7 +300,7 @@ def _seen(
     base: Path,
     album: Album,
 ) -> tuple[Targets, dict[str, Array], tuple[str, ...]]:
-    """Targets, those that are there or new ones; true values by key, where they are known; and what is to be said."""
+    """Read or render the targets unless they are given; returns them, true values by key, and notes for the user."""
     truth: dict[str, Array] = {}
     notes: tuple[str, ...] = ()
     first = targets is None
@@ -288,7 +310,7 @@ def _seen(
         if targets is None:
             with one_thread(config.deterministic):
                 targets = Targets(rendered_targets(config, other, sensors, album), {})
-        # Dr.Jit traces calls through every instance alive: the target scene would be in all our kernels.
+        # Dr.Jit traces virtual calls through all live instances, so a live target scene would enlarge every kernel.
         del other
         gc.collect()
     elif targets is None:
@@ -305,38 +327,40 @@ def _kept(album: Album, variable: Variable) -> Variable:
 
 
 def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list[Variable]:
-    """The factors on the pictures, where the job asks for them."""
-    if (asked := config.exposure) is None:
+    """Make the variable of the exposures, if the job has them."""
+    if (options := config.exposure) is None:
         return []
-    value = start_of_exposures(len(views), min(view.target.shape[2] for view in views), asked.white_balance)
+    value = start_of_exposures(len(views), min(view.target.shape[2] for view in views), options.white_balance)
     trained = [n for n, view in enumerate(views) if not view.is_test]
     reference = None
-    if asked.reference is not None:
-        places = named_views(scene, {view.name: view.sensor for view in views}, [asked.reference], "exposure.reference")
-        reference = places[0]
+    if options.reference is not None:
+        names = named_views(
+            scene, {view.name: view.sensor for view in views}, [options.reference], "exposure.reference"
+        )
+        reference = names[0]
         if views[[view.name for view in views].index(reference)].is_test:
             raise PathreplayError(
-                f"exposure: the reference '{reference}' is held out; name a view that is learned from"
+                f"exposure: the reference '{reference}' is a test view; name a training view as the reference"
             )
-    fixed = fixed_rows([view.name for view in views], trained, reference, not asked.fix_scale)
-    rate = asked.learning_rate or config.learning_rate
+    fixed = fixed_rows([view.name for view in views], trained, reference, not options.fix_scale)
+    rate = options.learning_rate or config.learning_rate
     return [Variable(EXPOSURE, mi.TensorXf(value), (-np.inf, np.inf), rate, value, None, coordinates=Factors(fixed))]
 
 
 def _pictures(
     config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path, album: Album
 ) -> tuple[Targets, tuple[str, ...]]:
-    """Targets from the files of a capture, or from those that the job names, and what is to be said about them."""
+    """Read the targets from the files of a capture, or from files that the job names; returns notes, too."""
     alpha, hidden = config.target.alpha, bool((config.integrator.model_extra or {}).get("hide_emitters"))
     if config.capture is None:
         files = by_view("target images", config.target.images or [], sensors, base)
         return read_targets(files, alpha, scene, sensors, base, hidden=hidden, album=album)
     if other := set(sensors) - set(shots):
-        raise PathreplayError(f"sensors: '{min(other)}' is no camera of the capture, and has no picture; leave it out")
+        raise PathreplayError(f"sensors: '{min(other)}' is not a camera of the capture and has no image; remove it")
     pictures = {name: str(shot.image.resolve()) for name, shot in shots.items()}
     masks = {name: str(shot.mask.resolve()) for name, shot in shots.items() if shot.mask is not None}
     if masks and alpha == "mask":
-        raise PathreplayError("target: the capture has masks, and alpha = 'mask' is another; leave alpha out")
+        raise PathreplayError("target: the capture has masks, which exclude alpha = 'mask'; remove one of them")
     lenses = {name: shot.lens for name, shot in shots.items() if shot.lens is not None}
     targets, notes = read_targets(
         pictures, alpha, scene, sensors, base, resize=True, lenses=lenses, hidden=hidden, album=album
@@ -356,10 +380,13 @@ def _require_gradients(integrator: mi.Integrator, name: str) -> None:
 
 
 def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integrator) -> tuple[str, ...]:
-    """What is to be said of edges that move. An integrator of ours need not say it once more."""
+    """Return a note if visibility boundaries move: boundary terms are expensive, or the gradient lacks them.
+
+    This also suppresses the integrator's own note.
+    """
     moving = [key for key in keys if moves_edges(params, key)]
     edges = getattr(integrator, "boundary", "none")
-    # By name: Mitsuba's projective integrators sample edges. Ours tells itself what it leaves out.
+    # Mitsuba's projective integrators have boundary terms; they are recognised by name.
     if not moving or "Projective" in type(integrator).__name__ or edges == "all":
         return ()
     if hasattr(integrator, "told"):
