@@ -138,7 +138,7 @@ class _Devices:
             self.now, k, indices, seconds, lives = heapq.heappop(events)
             idle = waiting
             if not lives:
-                step.sharing.forget(k)
+                step.scheduler.forget(k)
                 for index in indices:
                     step.lost(index, k)
                 heapq.heappush(events, (self.free[k], k, [], 0.0, True))
@@ -183,7 +183,8 @@ def measured_ray(costs: Costs, size: int = 10**7) -> Costs:
         def gradient(self, size: int) -> np.ndarray:
             return np.ones(size, np.float32)
 
-    with connected(RayOptions(), 2) as (ray, _):
+    with connected(RayOptions(), 2) as cluster:
+        ray = cluster.ray
         actor = ray.remote(Echo).remote()
         ray.get(actor.gradient.remote(1))
         latency = min(_timed(lambda: ray.get(actor.gradient.remote(1))) for _ in range(50))

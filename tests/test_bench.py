@@ -24,6 +24,7 @@ from benchmarks.measures.job import Job, Machine, Point, Record  # noqa: E402
 from benchmarks.measures.methods import DIFFERENCE  # noqa: E402
 from benchmarks.measures.replay_error import SWEEP  # noqa: E402
 from benchmarks.measures.worker import MEASURES, told  # noqa: E402
+from benchmarks.schedule import Costs, Trouble, built, simulated  # noqa: E402
 from benchmarks.tasks import depth, edges, iteration, media, noise, scale, surface, truth  # noqa: E402
 
 MACHINE = Machine("a processor", 2, 2, "Linux", "3.11", "3.9.1", "1.5.0", "0.1.0", "23.1.4", "llvm_ad_rgb")
@@ -402,3 +403,10 @@ def test_the_numbers_of_the_readme_are_those_of_the_tables() -> None:
     told = re.findall(estimates, (ROOT / "README.md").read_text(encoding="utf-8"))
     measured = set(re.findall(estimates, (ROOT / "docs" / "evidence.md").read_text(encoding="utf-8")))
     assert len(told) >= 5 and set(told) <= measured
+
+
+def test_the_simulated_schedule_agrees_with_the_model_and_survives_the_loss_of_devices() -> None:
+    costs, size = Costs(), (400, 10, 10**6)  # shards, devices, parameters
+    undisturbed, lossy = (simulated(costs, *size, trouble) for trouble in (Trouble(), Trouble(lost_after=100.0)))
+    assert undisturbed == pytest.approx(built(costs, *size), rel=0.05)
+    assert 1.02 * undisturbed < lossy < 3 * undisturbed

@@ -66,9 +66,9 @@ def test_where_ray_is_not_installed_a_line_says_so(
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     before = set(room.iterdir())
-    with pytest.raises(PathreplayError, match=r"executor = 'ray' needs a module .*pip install 'pathreplay\[ray\]'"):
+    with pytest.raises(PathreplayError, match=r"executor = 'ray' needs Ray .*pip install 'pathreplay\[ray\]'"):
         run("surfaces", executor="ray")
-    with pytest.raises(PathreplayError, match="needs a module"):
+    with pytest.raises(PathreplayError, match="needs Ray"):
         optimize(make_config(job_of("surfaces")), progress=False, executor="ray")
     assert set(room.iterdir()) == before
 
@@ -228,7 +228,7 @@ def test_actors_that_are_killed_change_nothing(capfd: pytest.CaptureFixture[str]
     out, told = capfd.readouterr()
     assert "raylet" not in out + told, "Ray's own words are not for users"
     assert killed and found == expected
-    assert "was lost and is started again; its shards are computed again" in told
+    assert "was lost and is being restarted; its shards are computed again" in told
     (restarts,) = re.findall(r"(\d+) restarts", told)
     assert 1 <= int(restarts) <= len(killed), "one that is killed while it starts is started without a word"
 
@@ -325,7 +325,7 @@ def test_what_is_left_of_a_cluster_ends_and_a_line_says_so(who: str, tmp_path: P
         each.kill()
     status, _, err = ended(process)
     if who == "driver":
-        assert "the process has ended in the middle of its run" in err
+        assert "the process ended during its run" in err
     else:
         assert status == 2 and err.count(ERROR) == 1, err
         assert f"{ERROR}ray: the cluster is lost" in err and "go on with: pathreplay optimize --resume run" in err

@@ -13,22 +13,39 @@ from .room import Room
 
 KIND = "ray"
 
-# Ends as the run does; with status 77 where a process of Ray stays, 78 where a run that went on did not say why.
+# Exits with the run's status, with 77 if a process of Ray stays, or with 78 if the restart of an actor was not logged.
 KILL = """
 import os, signal, subprocess, sys, time
 os.environ["RAY_DEFAULT_OBJECT_STORE_MAX_MEMORY_BYTES"] = str(2**28)  # a file, and those of a case are limited
 from pathlib import Path
 import psutil
 names, early = sys.argv[1].split(","), sys.argv[2] == "early"
-restarts = names == ["RayActor"]  # Ray starts actors again, and the run goes on
+restarts = names == ["RayActor"]  # Ray restarts actors, and the run continues
 run = [sys.executable, "-m", "pathreplay.cli", "optimize", "job.toml", "--executor", "ray"]
 process = subprocess.Popen(run, stderr=subprocess.PIPE if restarts else None, text=True)
 me = psutil.Process(process.pid)
-tree = lambda *names: [p for p in me.children(recursive=True) if not names or any(name in p.name() for name in names)]
 checkpoint = Path("runs/job/checkpoint.safetensors")
-ready = (lambda: tree("RayActor")) if early else checkpoint.exists
-while not ready() and process.poll() is None:
-    time.sleep(0.05)
+
+def tree(*names):
+    found = []
+    for child in me.children(recursive=True):
+        try:
+            if not names or any(name in child.name() for name in names):
+                found.append(child)
+        except psutil.NoSuchProcess:  # it has just ended
+            pass
+    return found
+
+def saved():
+    return checkpoint.stat().st_mtime if checkpoint.exists() else 0.0
+
+def wait(until):
+    while not until() and process.poll() is None:
+        time.sleep(0.05)
+
+wait(lambda: tree("RayActor") if early else saved())
+start = saved()  # written before the first iteration; the next one shows that the run is under way
+wait(lambda: early or saved() > start)
 time.sleep(0.2 if early else 2)
 if process.poll() is not None:
     sys.exit(process.returncode)
@@ -37,16 +54,14 @@ victims = known if names == ["all"] else [me] if names == ["driver"] else tree(*
 for victim in victims:
     victim.kill()
 if restarts:
-    # Without end: the run is stopped once an actor that was started again has finished an iteration.
-    while not set(tree("RayActor")) - set(victims) and process.poll() is None:
-        time.sleep(0.05)
-    started = time.time()
-    while checkpoint.stat().st_mtime <= started and process.poll() is None:
-        time.sleep(0.05)
+    # Stop the run once it has saved an iteration of the restarted actor.
+    wait(lambda: set(tree("RayActor")) - set(victims))
+    restarted = time.time()
+    wait(lambda: saved() > restarted)
     process.send_signal(signal.SIGTERM)
     words = process.communicate()[1]
     sys.stderr.write(words)
-    if "was lost and is started again" not in words:
+    if "was lost and is being restarted" not in words:
         sys.exit(78)
 status = process.wait()
 gone, alive = psutil.wait_procs(known, timeout=15)

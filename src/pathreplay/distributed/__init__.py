@@ -1,1 +1,1 @@
-"""Evaluations by actors of Ray, on this machine or on a cluster."""
+"""Evaluates shards by Ray actors, on this machine or on a cluster."""

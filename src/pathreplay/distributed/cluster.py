@@ -1,8 +1,8 @@
-"""Ray as a job uses it: a cluster of its own on this machine, which nobody else can reach, or one at an address.
+"""Connects a job to Ray: a private cluster on this machine that nobody else can reach, or a cluster at an address.
 
-A cluster of its own listens on loopback only, wants a secret token of whoever speaks to it, and keeps its sockets in a
-folder that only this user can enter. Left alone, Ray would listen on every interface. One at an address must
-have authentication on, since what is sent to it is unpickled, and so are its answers.
+A private cluster listens on loopback only, requires a secret token from every client, and keeps its sockets in a folder
+that only this user can enter. By default Ray would listen on every interface. A cluster at an address must have
+authentication enabled, because requests and answers are unpickled.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from pathreplay.inverse.config.executor_options import RayOptions
 from pathreplay.platform.interrupts import undisturbed
 
 OLDEST = (2, 60)
-"""Its token authentication is on for clusters that a program starts."""
+"""First version whose token authentication covers clusters that are started by a program."""
 
-# Ray's own way to use loopback addresses, made for the firewalls of other systems.
+# Ray uses loopback addresses when this is off; the switch exists for the firewalls of other systems.
 _MANY_MACHINES = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 _MODE, _TOKEN, _ADDRESS = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS"
 _LONGEST_FOLDER = 20
 _SECRET = secrets.token_hex(32)
-"""Of all clusters of this process's own: Ray reads it once."""
+"""Token of all private clusters of this process; Ray reads it only once."""
 
 _KNOCK_S = 5.0
-"""Seconds that the head of a cluster has to take a connection."""
+"""Seconds within which the head of a cluster must accept a connection."""
 
 _VITAL = ("gcs_server", "raylet")
 
@@ -50,28 +50,31 @@ class Cluster:
 
     ray: Any
     own: bool
-    """It is of this run alone."""
+    """Whether it is private to this run."""
     processes: list[psutil.Process] = field(default_factory=list)
-    """Of our own: those without which nothing is answered any more."""
-    _asked: float = -1e9
+    """Processes of a private cluster that must run for any request to be answered."""
+    _checked: float = -1e9
 
-    def has_others(self) -> bool:
-        """Whether it is there for others, too, and answers."""
+    def is_shared(self) -> bool:
+        """Whether the cluster also serves others and still responds."""
         return not self.own and self._answers()
 
     def require_processes(self) -> None:
-        """Raise PathreplayError if one of the `processes` does not run any more."""
+        """Raise PathreplayError if one of the `processes` has exited."""
         for process, name in zip(self.processes, _VITAL, strict=False):
             if not _runs(process):
-                raise _lost(f"{name} does not run any more")
+                raise _lost(f"{name} has exited")
 
     def require(self, pause: float = 0.0) -> None:
-        """Raise PathreplayError as `require_processes`, or if the head does not answer; asked after a pause only."""
+        """Raise PathreplayError if a process has exited, or if the head does not respond.
+
+        The head is contacted at most once every ``pause`` seconds.
+        """
         self.require_processes()
-        if time.monotonic() - self._asked >= pause:
-            self._asked = time.monotonic()
+        if time.monotonic() - self._checked >= pause:
+            self._checked = time.monotonic()
             if not self._answers():
-                raise _lost(f"head at {self.ray.get_runtime_context().gcs_address} does not answer")
+                raise _lost(f"head at {self.ray.get_runtime_context().gcs_address} does not respond")
 
     def _answers(self) -> bool:
         host, _, port = self.ray.get_runtime_context().gcs_address.rpartition(":")
@@ -84,7 +87,7 @@ class Cluster:
 
 def _lost(why: str) -> PathreplayError:
     return PathreplayError(
-        f"ray: the cluster is lost: its {why}; look into Ray's logs and start it again, or use executor = 'local'"
+        f"ray: the cluster is lost: its {why}; check Ray's logs and restart it, or use executor = 'local'"
     )
 
 
@@ -96,27 +99,34 @@ def _runs(process: psutil.Process) -> bool:
 
 
 def load_ray() -> Any:
-    """The module. Raises PathreplayError where it is not installed, or too old."""
-    os.environ.setdefault(_MODE, "token")  # read when it is imported
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # leave devices as they are; it warns otherwise
+    """Import Ray. Raises PathreplayError if it is not installed or too old."""
+    os.environ.setdefault(_MODE, "token")  # Ray reads it on import
+    # Keep Ray from hiding devices from actors without a GPU; Ray warns if this is not set.
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
         import ray
     except ImportError as error:
-        raise PathreplayError(f"executor = 'ray' needs a module ({error}): pip install 'pathreplay[ray]'") from None
-    found = tuple(int(part) for part in ray.__version__.split(".")[:2])
-    if found < OLDEST:
+        raise PathreplayError(f"executor = 'ray' needs Ray ({error}); pip install 'pathreplay[ray]'") from None
+    version = tuple(int(part) for part in ray.__version__.split(".")[:2])
+    if version < OLDEST:
         raise PathreplayError(
-            f"executor = 'ray' needs Ray 2.60 or newer, this is {ray.__version__}: pip install 'pathreplay[ray]'"
+            f"executor = 'ray' needs Ray 2.60 or newer, found {ray.__version__}; pip install 'pathreplay[ray]'"
         )
     return ray
 
 
 @contextmanager
 def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
-    """Ray, connected within this block to the cluster of the options.
+    """Connect to the cluster of the options within this block.
 
-    One of its own gets so many ``cores``. What was connected before, by whoever calls us, is used and left as it is.
-    Raises PathreplayError.
+    An existing connection of the caller is used and left open.
+
+    Args:
+        options: the job's ``ray`` table.
+        cores: CPUs of a private cluster, which is started if the options and the environment name no address.
+
+    Raises:
+        PathreplayError: Ray is missing, cannot start, cannot be reached, or has no authentication.
     """
     ray = load_ray()
     if ray.is_initialized():
@@ -126,7 +136,7 @@ def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
     address = options.address or os.environ.get(_ADDRESS)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_silent(ray))
-        with undisturbed():  # Ray has handlers of its own for signals
+        with undisturbed():  # Ray installs signal handlers of its own
             if address is None:
                 cluster = _start(ray, stack, cores)
             else:
@@ -137,14 +147,14 @@ def connected(options: RayOptions, cores: int) -> Iterator[Cluster]:
 
 
 def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> Cluster:
-    """A cluster of our own."""
-    usual = tempfile.gettempdir()
-    # Which only this user may enter; Ray's is open to all. Names of sockets may have 107 characters.
-    folder = tempfile.mkdtemp(prefix="pathreplay-", dir=usual if len(usual) <= _LONGEST_FOLDER else "/tmp")
+    """Start a private cluster."""
+    temporary = tempfile.gettempdir()
+    # Only this user may enter the folder; Ray's default is open to all users. Socket paths have at most 107 characters.
+    folder = tempfile.mkdtemp(prefix="pathreplay-", dir=temporary if len(temporary) <= _LONGEST_FOLDER else "/tmp")
     guard = Guard(Path(folder))
     stack.callback(guard.close)
-    before = _sessions()  # what the user has started himself is none of Ray's
-    with _private_environment(ray), _apart(ray):
+    before = _sessions()  # sessions that the caller has started are not Ray's
+    with _private_environment(ray), _own_sessions(ray):
         try:
             ray.init(
                 address="local",
@@ -155,45 +165,45 @@ def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> Cluster:
                 _node_ip_address="127.0.0.1",
                 _temp_dir=str(Path(folder) / "ray"),
             )
-        except Exception as error:  # Ray's own are of that kind
+        except Exception as error:  # Ray raises plain exceptions here
             guard.watch(_sessions() - before)
             with contextlib.suppress(Exception):
                 ray.shutdown()
             raise PathreplayError(f"executor = 'ray': Ray cannot start here ({_first_line(error)})") from None
     guard.watch(_sessions() - before)
-    known = {process.name(): process for process in psutil.Process().children()}
-    cluster = Cluster(ray, True, [known[name] for name in _VITAL if name in known])
+    children = {process.name(): process for process in psutil.Process().children()}
+    cluster = Cluster(ray, True, [children[name] for name in _VITAL if name in children])
     stack.callback(ray.shutdown)
     _require_authentication(ray, "of this run")
-    if open_to_others := _beyond_loopback():
+    if exposed := _beyond_loopback():
         raise PathreplayError(
-            f"executor = 'ray': Ray {ray.__version__} listens at {open_to_others[0]}, where others reach it; install "
-            "another version, or use executor = 'local'"
+            f"executor = 'ray': Ray {ray.__version__} listens at {exposed[0]}, where other machines can reach it; "
+            "install another version, or use executor = 'local'"
         )
     return cluster
 
 
 def _sessions() -> set[int]:
-    """Those that Ray's processes are in: see `_apart`."""
-    ours, found = os.getsid(0), set()
+    """Session ids of our children, except our own session; see `_own_sessions`."""
+    ids = set()
     for process in psutil.Process().children(recursive=True):
         with contextlib.suppress(OSError):
-            found.add(os.getsid(process.pid))
-    return found - {ours}
+            ids.add(os.getsid(process.pid))
+    return ids - {os.getsid(0)}
 
 
 def _connect(ray: Any, address: str) -> None:
     if os.environ.get(_MODE) != "token":
         raise PathreplayError(
-            f"ray: {_MODE} = '{os.environ.get(_MODE)}' turns authentication off, and who reaches a cluster without it "
-            f"can run programs there; start the cluster with {_MODE}=token, and set it here, too"
+            f"ray: {_MODE} = '{os.environ.get(_MODE)}' turns authentication off, and anyone who reaches such a cluster "
+            f"can run programs on it; start the cluster with {_MODE}=token, and set it here as well"
         )
     try:
         ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except (RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
         raise PathreplayError(
-            f"ray: no cluster at '{address}' that lets this program in ({_first_line(error)}); start one there with "
-            f"'ray start' on this machine, too, and give both the same token (see docs/scale.md)"
+            f"ray: no cluster at '{address}' accepts this program ({_first_line(error)}); run 'ray start' there and on "
+            "this machine, with the same token on both (see docs/scale.md)"
         ) from None
     try:
         _require_authentication(ray, f"at '{address}'")
@@ -207,8 +217,8 @@ def _require_authentication(ray: Any, which: str) -> None:
     core = ray._raylet
     if core.get_authentication_mode() != core.AuthenticationMode.TOKEN:
         raise PathreplayError(
-            f"ray: the cluster {which} has no authentication, and who reaches it can run programs there; start it with "
-            f"{_MODE}=token"
+            f"ray: the cluster {which} has no authentication, and anyone who reaches it can run programs on it; start "
+            f"it with {_MODE}=token"
         )
 
 
@@ -220,30 +230,30 @@ GcsClient(address=sys.argv[1]).check_alive([], timeout=10)
 
 
 def _require_closed(ray: Any, address: str) -> None:
-    """Raise PathreplayError if the cluster lets somebody in who has no token."""
+    """Raise PathreplayError if the cluster accepts clients without a token."""
     gcs = ray.get_runtime_context().gcs_address
     others = {name: value for name, value in os.environ.items() if name not in (_TOKEN, "RAY_AUTH_TOKEN_PATH")}
     command = [sys.executable, "-c", _KNOCK, gcs]
     knock = subprocess.run(command, env={**others, _MODE: "disabled"}, capture_output=True, check=False)
     if knock.returncode == 0:
         raise PathreplayError(
-            f"ray: the cluster at '{address}' lets in whoever reaches it, without a token; start it with {_MODE}=token"
+            f"ray: the cluster at '{address}' accepts clients without a token; start it with {_MODE}=token"
         )
 
 
 @contextmanager
 def _private_environment(ray: Any) -> Iterator[None]:
-    """Within this block Ray starts a cluster that uses loopback and our token, and tells nobody of it."""
-    ours = {_MANY_MACHINES: "0", _MODE: "token", _TOKEN: _SECRET, "RAY_USAGE_STATS_ENABLED": "0"}
-    # Seconds of silence of its head after which Ray would end this process; `Cluster.require` notices earlier.
-    ours["RAY_gcs_rpc_server_reconnect_timeout_s"] = str(10**6)
-    ours["RAY_worker_niceness"] = "0"  # actors are the run, and no less urgent than it would be by itself
-    before = {name: os.environ.get(name) for name in ours}
+    """Make Ray start clusters on loopback, with our token and without usage statistics, within this block."""
+    settings = {_MANY_MACHINES: "0", _MODE: "token", _TOKEN: _SECRET, "RAY_USAGE_STATS_ENABLED": "0"}
+    # Ray ends this process when the head has been silent for so many seconds; `Cluster.require` notices earlier.
+    settings["RAY_gcs_rpc_server_reconnect_timeout_s"] = str(10**6)
+    settings["RAY_worker_niceness"] = "0"  # actors do the work of the run: same priority as this process
+    before = {name: os.environ.get(name) for name in settings}
     constants = ray._private.ray_constants
     many = constants.ENABLE_RAY_CLUSTER
-    os.environ.update(ours)
+    os.environ.update(settings)
     constants.ENABLE_RAY_CLUSTER = False
-    ray._raylet.Config.initialize("")  # both may have been read before
+    ray._raylet.Config.initialize("")  # both values may have been read before
     ray._raylet.AuthenticationTokenLoader.instance().reset_cache()
     try:
         yield
@@ -256,21 +266,21 @@ def _private_environment(ray: Any) -> Iterator[None]:
 
 
 @contextmanager
-def _apart(ray: Any) -> Iterator[None]:
-    """Within this block Ray's processes are started in sessions of their own, where the kernel ends them with this one.
+def _own_sessions(ray: Any) -> Iterator[None]:
+    """Start Ray's processes in sessions of their own within this block, where the kernel still ends them with us.
 
-    A terminal or a scheduler sends its signals to all processes of a job. This one ends a run in peace then, and needs
-    its actors for that.
+    A terminal or a scheduler sends its signals to all processes of a job. This process then finishes the iteration and
+    writes everything, for which it needs its actors.
     """
     services = ray._private.services
     plain = services.ConsolePopen
 
-    class Apart(plain):  # type: ignore[misc, valid-type]
+    class SessionPopen(plain):  # type: ignore[misc, valid-type]
         def __init__(self, *arguments: Any, **options: Any) -> None:
             super().__init__(*arguments, **options, start_new_session=True)
 
     if sys.platform.startswith("linux"):
-        services.ConsolePopen = Apart
+        services.ConsolePopen = SessionPopen
     try:
         yield
     finally:
@@ -279,7 +289,7 @@ def _apart(ray: Any) -> Iterator[None]:
 
 @contextmanager
 def _silent(ray: Any) -> Iterator[None]:
-    """Within this block Ray does not print what happens to its processes: we tell it in a line of our own."""
+    """Suppress Ray's messages about its processes within this block; we log a line of our own instead."""
     worker = ray._private.worker
     plain = worker.print_to_stdstream
     worker.print_to_stdstream = lambda *_, **__: None
@@ -290,16 +300,17 @@ def _silent(ray: Any) -> Iterator[None]:
 
 
 def _beyond_loopback() -> list[str]:
-    """Addresses other than loopback at which this process's children, or itself, listen for Ray."""
-    found = []
+    """Addresses other than loopback at which children of this process listen."""
+    addresses = []
     for process in psutil.Process().children(recursive=True):
         with contextlib.suppress(psutil.Error):
-            found += [
-                f"{each.laddr.ip}:{each.laddr.port}"
-                for each in process.net_connections(kind="inet")
-                if each.status == psutil.CONN_LISTEN and each.laddr.ip not in ("127.0.0.1", "::1", "::ffff:127.0.0.1")
+            addresses += [
+                f"{connection.laddr.ip}:{connection.laddr.port}"
+                for connection in process.net_connections(kind="inet")
+                if connection.status == psutil.CONN_LISTEN
+                and connection.laddr.ip not in ("127.0.0.1", "::1", "::ffff:127.0.0.1")
             ]
-    return found
+    return addresses
 
 
 def _first_line(error: BaseException) -> str:

@@ -1,7 +1,8 @@
-"""Sees to it that nothing of a cluster of our own stays, however this process ends: a process that outlives it.
+"""Removes every process and file of a private Ray cluster, however this process ends.
 
-Ray's processes are ended by the kernel with the one that started them, but not what those have started: agents of a
-raylet that was killed stay for ever. And Ray ends a process without a word whose raylet is gone: the guard says it.
+The guard is a process that outlives this one. The kernel ends the processes that we started for Ray when this one ends,
+but not their own children: the agents of a killed raylet would run forever. Ray also ends a process silently when its
+raylet is gone. The guard prints the reason then.
 """
 
 from __future__ import annotations
@@ -15,17 +16,17 @@ from pathlib import Path
 
 _PATIENCE_S = 20.0
 
-# It reads the numbers of sessions until this process closes the pipe or is gone.
+# The guard reads session ids from the pipe until this process closes it or ends.
 _GUARD = """
 import os, shutil, signal, sys, time
 for name in ("SIGINT", "SIGTERM", "SIGHUP"):
     signal.signal(getattr(signal, name), signal.SIG_IGN)
-said = {word for line in sys.stdin for word in line.split()}
-sessions = {int(word) for word in said - {"done"}} - {os.getsid(0)}
-if "done" not in said:
+words = {word for line in sys.stdin for word in line.split()}
+sessions = {int(word) for word in words - {"done"}} - {os.getsid(0)}
+if "done" not in words:
     try:
-        print("pathreplay: the process has ended in the middle of its run: it was killed, or Ray has ended it, whose "
-              "processes are gone; go on with: pathreplay optimize --resume RUN_FOLDER", file=sys.stderr, flush=True)
+        print("pathreplay: the process ended during its run: it was killed, or Ray ended it because Ray's processes "
+              "were gone; resume with: pathreplay optimize --resume RUN_FOLDER", file=sys.stderr, flush=True)
     except OSError:
         pass
 def left():
@@ -37,10 +38,10 @@ def left():
         except OSError:
             pass
 for _ in range(50):
-    found = list(left())
-    if not found:
+    remaining = list(left())
+    if not remaining:
         break
-    for number in found:
+    for number in remaining:
         try:
             os.kill(number, signal.SIGKILL)
         except OSError:
@@ -51,7 +52,7 @@ shutil.rmtree(sys.argv[1], ignore_errors=True)
 
 
 class Guard:
-    """Removes ``folder`` when this process ends, or at `close`; before that it ends what is left of the sessions."""
+    """Kills the remaining processes of the watched sessions and removes ``folder``, at `close` or when we end."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -62,17 +63,17 @@ class Guard:
         )  # fmt: skip
 
     def watch(self, sessions: Iterable[int]) -> None:
-        """Tell it of sessions that are Ray's."""
+        """Add sessions whose processes belong to Ray."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             print(*sessions, file=self._process.stdin, flush=True)
 
     def close(self) -> None:
-        """Let it do its work now, and wait for it."""
+        """Clean up now, and wait until it is done."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             print("done", file=self._process.stdin)
             self._process.stdin.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_PATIENCE_S)
-        shutil.rmtree(self._folder, ignore_errors=True)  # it may have been killed
+        shutil.rmtree(self._folder, ignore_errors=True)  # the guard may have been killed

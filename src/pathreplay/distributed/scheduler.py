@@ -1,9 +1,9 @@
-"""Who computes which shard of a step: decided by measured seconds while results come in, and without effect on them.
+"""Assigns the shards of a step to actors by measured durations, while results come in and without effect on them.
 
-Every actor goes on with the views that it had before, whose kernels it holds. One that has nothing left takes from
-whoever has most left; so the shares of the actors become such that all end together. When nothing is left to begin,
-a shard that takes much longer than expected is computed by an idle actor as well, and the first result counts.
-Short shards go together in one question, since asking has a price.
+Every actor keeps the views that it had before, because it holds their kernels. An actor with nothing left takes a shard
+from the actor with the most remaining work, so that all actors end at about the same time. When no shard is left to
+start, an idle actor also computes a shard that takes much longer than expected, and the first result counts. Short
+shards share one request, because each request has a fixed cost.
 """
 
 from __future__ import annotations
@@ -14,76 +14,76 @@ from dataclasses import dataclass, field
 from pathreplay.inverse.objective.evaluate import Shard
 
 Actor = int
-"""The number of an actor; one that was started again keeps it."""
+"""Number of an actor; a restarted actor keeps it."""
 
 LATE = 2.0
-"""A question is late when it has taken so many times what it would take one who has never done its first shard.
+"""A request is a straggler after LATE times the expected cold-start duration of its first shard.
 
-Noise of a shared machine is less, and whoever begins it as well can then be the first.
+This exceeds the timing noise of a shared machine, and a second actor that starts the shard can still be first.
 """
 
 WARM = 2
-"""Evaluations of a view by an actor after which its kernels are there: one is traced, the next one is recorded."""
+"""Evaluations of a view after which an actor holds its kernels: the first is traced, the second is recorded."""
 
 SHORTEST_S, LONGEST_S = 0.01, 0.1
-"""Short shards go with one question, as many as take so long: a call has a price (`benchmarks.schedule --measure`)."""
+"""Range of the duration of a request of several short shards (`benchmarks.schedule --measure` gives a call's cost)."""
 
 AHEAD = 0.7
-"""Of what an actor has left, how much goes with one question at most: the rest can still be taken by others."""
+"""Maximum fraction of an actor's remaining work in one request; other actors can still take the rest."""
 
 TOGETHER = 2**26
-"""Bytes of gradients that an actor has for one question at most, unless one shard has more."""
+"""Maximum bytes of gradients per request of several shards."""
 
 SMOOTHING = 0.5
-"""How much of what was known of a view's seconds stays when they are measured again."""
+"""Weight of the previous estimate when the duration of a view is measured again."""
 
 Kind = tuple[tuple[int, ...], int, int]
-"""What shards that take the same time have in common: views, samples, stage."""
+"""Key of shards of equal duration: views, samples, stage."""
 
 
 def kind_of(shard: Shard) -> Kind:
-    """What decides how long a shard takes: its views, samples and stage."""
+    """Key of all that determines the duration of a shard: its views, samples and stage."""
     return shard.views, shard.samples, shard.stage
 
 
 @dataclass
 class Scheduler:
-    """What is known of shards and actors from step to step."""
+    """Measurements of shards and actors that are kept from step to step."""
 
     seconds: dict[Kind, float] = field(default_factory=dict)
-    """Of an evaluation by an actor that has done it before; of any, until one is ``warm``."""
+    """Warm duration per shard kind (cold duration until one is known)."""
     warm: set[Kind] = field(default_factory=set)
-    """Those whose seconds are of an actor that had their kernels."""
+    """Kinds whose ``seconds`` are a warm duration."""
     extra: float = 0.0
-    """More seconds of one that has not."""
+    """Additional seconds of a cold evaluation."""
     owner: dict[Kind, Actor] = field(default_factory=dict)
-    """Who did it last."""
+    """Actor that evaluated the kind last."""
     times: dict[tuple[Actor, Kind], int] = field(default_factory=dict)
-    """How often an actor has done it."""
+    """Number of evaluations per actor and kind."""
     waited: dict[Actor, float] = field(default_factory=dict)
-    """Seconds that an actor went without work in steps before, since what was left would have taken it longer."""
+    """Seconds that an actor was idle in earlier steps, because it would have finished later than the owner."""
     refused: dict[Actor, float] = field(default_factory=dict)
-    """The same of this step."""
+    """The same for the current step."""
 
     def begin(self) -> None:
-        """A step begins."""
+        """Begin a step."""
         for actor, seconds in self.refused.items():
             self.waited[actor] = self.waited.get(actor, 0.0) + seconds
         self.refused.clear()
 
     def expected(self, actor: Actor, kind: Kind) -> float | None:
-        """Seconds that the actor will take; None where such a shard has never been done."""
+        """Seconds that the actor is expected to take; None if no shard of this kind was measured."""
         known = self.seconds.get(kind)
         if known is None:
             return None
         return known if self.holds(actor, kind) else known + self.extra
 
     def holds(self, actor: Actor, kind: Kind) -> bool:
-        """Whether the actor has the kernels of such a shard."""
+        """Whether the actor holds the kernels of such a shard."""
         return self.times.get((actor, kind), 0) >= WARM
 
     def measured(self, actor: Actor, kind: Kind, seconds: float) -> None:
-        """An actor has taken so many seconds."""
+        """Record the duration of an evaluation."""
         times = self.times.get((actor, kind), 0)
         self.times[actor, kind], self.owner[kind] = times + 1, actor
         known = self.seconds.get(kind)
@@ -93,7 +93,7 @@ class Scheduler:
             if kind in self.warm:
                 self._learn(seconds - known)
         elif kind in self.warm:
-            seconds = min(seconds, LATE * known)  # an accident shall not make the next one seem early
+            seconds = min(seconds, LATE * known)  # an outlier must not delay the detection of the next straggler
             self.seconds[kind] = SMOOTHING * known + (1 - SMOOTHING) * seconds
         else:
             self._learn(known - seconds)
@@ -104,48 +104,51 @@ class Scheduler:
         self.extra = SMOOTHING * self.extra + (1 - SMOOTHING) * max(0.0, extra)
 
     def forget(self, actor: Actor) -> None:
-        """The actor was lost with all that it held."""
+        """Drop what is known of an actor that was lost with its kernels."""
         self.times = {key: n for key, n in self.times.items() if key[0] != actor}
         self.owner = {kind: other for kind, other in self.owner.items() if other != actor}
         self.waited.pop(actor, None)
 
 
 @dataclass
-class Question:
-    """What an actor is at: shards that are answered together."""
+class Request:
+    """Shards that an actor is evaluating and answers together."""
 
     shards: list[int]
     since: float
     more: float = 0.0
-    """Seconds of those that went along with the first one."""
+    """Expected seconds of all shards but the first."""
 
 
 class Step:
-    """The shards of one step: which wait, who is at which, which are done. Costs little for each, however many."""
+    """State of the shards of one step: waiting, running or done. Each operation is cheap for any number of shards."""
 
     def __init__(self, scheduler: Scheduler, shards: Sequence[Shard]) -> None:
         self.scheduler = scheduler
         scheduler.begin()
         self.kinds = [kind_of(shard) for shard in shards]
         self.waiting: dict[Actor | None, list[int]] = {}
-        """By who had them last, if that is known: the longest comes last, of some that are alike the first."""
+        """Waiting shards by owner, or None if unknown, in ascending order of duration; equals in descending order."""
         self.left: dict[Actor | None, float] = {}
-        """Seconds that each will take for those, which are the ``cost`` of all of them."""
+        """Expected seconds of an owner's waiting shards: the sum of their ``cost``."""
         self.cost: dict[int, float] = {}
-        self.running: dict[Actor, Question] = {}
+        self.running: dict[Actor, Request] = {}
         self.done: set[int] = set()
         self.again: set[int] = set()
-        """Begun by a second actor, since they were late."""
+        """Late shards that a second actor has started."""
         self._wait(range(len(shards)))
         self.all = sum(self.left.values())
-        """Seconds of all of them, as far as that is known."""
+        """Expected seconds of all shards, as far as known."""
 
     def in_turn(self, idle: Iterable[Actor]) -> list[Actor]:
-        """Idle actors in the order in which they are asked: those that go on by themselves, who has waited longest."""
+        """Sort idle actors by priority: owners of waiting shards first, then those that have waited longest."""
         return sorted(idle, key=lambda actor: (not self.waiting.get(actor), -self.scheduler.waited.get(actor, 0.0)))
 
     def next(self, actor: Actor, now: float, idle: Collection[Actor]) -> int | None:
-        """The shard that an idle actor begins; None if it has nothing to do for now. ``idle`` are all that are so."""
+        """Start a shard on an idle actor and return its index; None if there is nothing to do for now.
+
+        ``idle`` are all idle actors.
+        """
         for owner in (actor, None):
             if self.waiting.get(owner):
                 return self._begin(actor, owner, -1, now)
@@ -155,8 +158,8 @@ class Step:
         most = self._busiest(now)
         if most is not None:
             other, left = most
-            # It goes without help where it would be ready sooner by itself. But who has waited longer for others than
-            # it takes to make kernels may do so, or one that comes late would never have any.
+            # Leave the shard to its owner if that is faster. Time that the actor has waited in earlier steps counts in
+            # its favour: an actor that joins late would never build any kernels otherwise.
             worth = left + self.scheduler.waited.get(actor, 0.0)
             for place in reversed(range(len(self.waiting[other]))):
                 if (self.scheduler.expected(actor, self.kinds[self.waiting[other][place]]) or 0.0) < worth:
@@ -167,40 +170,40 @@ class Step:
         if late is None or late[0] > now:
             return None
         self.again.add(late[1])
-        self.running[actor] = Question([late[1]], now)
+        self.running[actor] = Request([late[1]], now)
         return late[1]
 
     def along(self, actor: Actor, size: int, actors: int) -> list[int]:
-        """Shards that an actor begins with the one that was its `next`: of its own, if they are short.
+        """Add short shards of the actor's own to the request that `next` has started; returns their indices.
 
-        They are a share of what it has left, and no more than each of so many ``actors`` would have, so that questions
-        become shorter and actors still end together. A gradient has ``size`` bytes.
+        They are a fraction of the actor's remaining work, and at most an even share among ``actors``. So requests
+        become shorter towards the end, and all actors still end at about the same time. A gradient has ``size`` bytes.
         """
-        waiting, question = self.waiting.get(actor, []), self.running[actor]
-        if not self.scheduler.holds(actor, self.kinds[question.shards[0]]):
+        waiting, request = self.waiting.get(actor, []), self.running[actor]
+        if not self.scheduler.holds(actor, self.kinds[request.shards[0]]):
             return []
-        room, first = TOGETHER // max(1, size), self._seconds(actor, question.shards[0])
-        even = self.all / actors * (1 + 1e-6)  # of shards that are alike all have as many, in spite of rounding
+        room, first = TOGETHER // max(1, size), self._seconds(actor, request.shards[0])
+        even = self.all / actors * (1 + 1e-6)  # rounding must not cut off the last of equally long shards
         limit = min(LONGEST_S, even, max(SHORTEST_S, AHEAD * (first + self.left.get(actor, 0.0))))
-        while waiting and len(question.shards) < room and self.scheduler.holds(actor, self.kinds[waiting[-1]]):
-            more = question.more + self.cost[waiting[-1]]
+        while waiting and len(request.shards) < room and self.scheduler.holds(actor, self.kinds[waiting[-1]]):
+            more = request.more + self.cost[waiting[-1]]
             if first + more > limit:
                 break
-            question.shards.append(self._take(actor, -1))
-            question.more = more
-        return question.shards[1:]
+            request.shards.append(self._take(actor, -1))
+            request.more = more
+        return request.shards[1:]
 
     def _goes_on(self, actor: Actor, idle: Collection[Actor]) -> bool:
-        """Whether it is known when: not of one that is lost, or still busy with a step before, or stuck."""
+        """Whether the actor will reach its waiting shards: it is not lost, stuck, or busy with an earlier step."""
         return self.again.isdisjoint(self.running[actor].shards) if actor in self.running else actor in idle
 
     def heard(self, index: int, actor: Actor) -> None:
-        """An actor is not at a shard any more, nor at those of the same question; it may begin others."""
+        """End the actor's request that contains the shard; the actor may then start another."""
         if actor in self.running and index in self.running[actor].shards:
             del self.running[actor]
 
     def finished(self, index: int, actor: Actor, seconds: float) -> bool:
-        """A result is there; whether it is the first of its shard. The actor may be at its next one already."""
+        """Record a result; returns whether it is its shard's first. The actor may run its next request already."""
         self.heard(index, actor)
         self.scheduler.measured(actor, self.kinds[index], seconds)
         first = index not in self.done
@@ -208,7 +211,7 @@ class Step:
         return first
 
     def lost(self, index: int, actor: Actor) -> None:
-        """An actor has gone without a result; if no other is at the shard, it waits again. Its others are nobody's."""
+        """Put the shard of a lost actor back, unless another actor runs it. Its waiting shards become unowned."""
         self.heard(index, actor)
         self.left.pop(actor, None)
         theirs = self.waiting.pop(actor, [])
@@ -219,7 +222,7 @@ class Step:
         self._wait(theirs)
 
     def patience(self) -> float | None:
-        """When the next shard is late, for whoever waits; None if none will be."""
+        """Time at which the next running shard becomes late; None if none will."""
         late = self._latest()
         return None if late is None else late[0]
 
@@ -236,7 +239,7 @@ class Step:
 
     def _begin(self, actor: Actor, owner: Actor | None, place: int, now: float) -> int:
         index = self._take(owner, place)
-        self.running[actor] = Question([index], now)
+        self.running[actor] = Request([index], now)
         return index
 
     def _take(self, owner: Actor | None, place: int) -> int:
@@ -248,28 +251,28 @@ class Step:
         return 0.0 if owner is None else self.scheduler.expected(owner, self.kinds[index]) or 0.0
 
     def _busiest(self, now: float) -> tuple[Actor, float] | None:
-        """Who has most left to do, of those for whom shards wait, and how many seconds."""
-        found: tuple[Actor, float] | None = None
+        """Actor with waiting shards that has the most remaining work, and its seconds."""
+        busiest: tuple[Actor, float] | None = None
         for owner, indices in self.waiting.items():
             if owner is None or not indices:
                 continue
             left = self.left[owner]
             if owner in self.running:
-                at = self.running[owner]
-                left += max(0.0, self._seconds(owner, at.shards[0]) + at.more - (now - at.since))
-            if found is None or (left, -owner) > (found[1], -found[0]):
-                found = owner, left
-        return found
+                request = self.running[owner]
+                left += max(0.0, self._seconds(owner, request.shards[0]) + request.more - (now - request.since))
+            if busiest is None or (left, -owner) > (busiest[1], -busiest[0]):
+                busiest = owner, left
+        return busiest
 
     def _latest(self) -> tuple[float, int] | None:
-        """When the first of the shards that are at one actor alone is late, and which that is."""
+        """Time at which the first shard that only one actor runs becomes late, and its index."""
         late, seconds, extra = [], self.scheduler.seconds, self.scheduler.extra
-        for question in self.running.values():
-            known = seconds.get(self.kinds[question.shards[0]])
+        for request in self.running.values():
+            known = seconds.get(self.kinds[request.shards[0]])
             if known is None:
                 continue
-            for index in question.shards:
+            for index in request.shards:
                 if index not in self.again and index not in self.done:
-                    late.append((question.since + LATE * (known + question.more + extra), index))
+                    late.append((request.since + LATE * (known + request.more + extra), index))
                     break
         return min(late, default=None)

@@ -1,4 +1,4 @@
-"""What an actor of Ray holds and does: the scene of a job, its compiled kernels, and evaluations of shards by them."""
+"""The Ray actor: holds the scene of a job and its compiled kernels, and evaluates shards with them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from pathreplay.scenes.descriptions import told
 
 @dataclass(frozen=True)
 class WorkerInit:
-    """What an actor needs to know to build the problem of a job as the process has it that sends this."""
+    """What an actor needs to build the same problem as the driver process."""
 
     config: Config
     base: Path
@@ -38,32 +38,32 @@ class WorkerInit:
 
 @dataclass(frozen=True)
 class Ready:
-    """Who an actor is, when it is ready."""
+    """Identifies an actor once its problem is built."""
 
     host: str
     process: int
     versions: str
     machine: str
-    """What decides how its kernels round."""
+    """Processor and LLVM version, which determine how its kernels round."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What an actor has to say of a shard."""
+    """Result of one shard."""
 
     evaluation: Evaluation
     seconds: float
     warnings: tuple[str, ...]
-    """What was logged meanwhile."""
+    """Mitsuba log messages of level Warn and above, emitted during the evaluation."""
 
 
 def versions() -> str:
-    """Of what has to be the same in all actors, and in the process that asks them."""
+    """Versions of the packages that must match in the driver and in all actors."""
     return ", ".join(f"{name} {version(name)}" for name in ("pathreplay", "mitsuba", "drjit", "numpy"))
 
 
 class RayActor:
-    """Evaluates shards of one job; nothing that is sent changes it, but for kernels, which it keeps."""
+    """Evaluates shards of one job. Requests leave no state behind except compiled kernels."""
 
     def __init__(self) -> None:
         self.problem: Problem | None = None
@@ -72,18 +72,18 @@ class RayActor:
         self.log: Any = None
 
     def hello(self, setup: WorkerInit) -> Ready:
-        """Build the problem: before anything else. Raises PathreplayError for what this machine has not."""
+        """Build the problem; must be called first. Raises PathreplayError if this machine lacks something it needs."""
         backend.set_variant(setup.variant)
         dr.set_thread_count(setup.threads)
         self.evaluators = {}
         self.problem = build_problem(setup.config, setup.base, setup.targets)
         self.config = self.problem.config
-        self.log = _kept_log()
+        self.log = _capture_log()
         machine = f"{_processor()}, LLVM {'.'.join(map(str, backend.loaded_version()))}"
         return Ready(platform.node(), os.getpid(), versions(), machine)
 
     def evaluate(self, baseline: bool, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> list[Answer] | None:
-        """Shards by the job's integrator, or by that of its baseline; None where this actor was started again since."""
+        """Evaluate shards with the integrator of the job or its baseline; None if the actor was restarted meanwhile."""
         return None if self.problem is None else [self._answer(baseline, values, shard, learned) for shard in shards]
 
     def _answer(self, baseline: bool, values: Arrays, shard: Shard, learned: Arrays) -> Answer:
@@ -111,10 +111,10 @@ class RayActor:
         return self.evaluators[baseline]
 
 
-def _kept_log() -> Any:
-    """Takes the place of what Mitsuba's log is written to: nobody looks at the terminal of an actor."""
+def _capture_log() -> Any:
+    """Collect Mitsuba's log in memory, since nobody reads the terminal of an actor."""
 
-    class Kept(mi.Appender):  # type: ignore[misc]  # here, since it belongs to the variant
+    class LogBuffer(mi.Appender):  # type: ignore[misc]  # defined here, since the base class depends on the variant
         def __init__(self) -> None:
             super().__init__()
             self.lines: list[str] = []
@@ -126,19 +126,19 @@ def _kept_log() -> Any:
         def log_progress(self, *_: Any) -> None:
             pass
 
-    kept, logger, plain = Kept(), mi.logger(), mi.DefaultFormatter()
+    buffer, logger, plain = LogBuffer(), mi.logger(), mi.DefaultFormatter()
     plain.set_has_date(False)
     plain.set_has_log_level(False)
     plain.set_has_thread(False)
     plain.set_has_class(False)
     logger.set_formatter(plain)
     logger.clear_appenders()
-    logger.add_appender(kept)
-    return kept
+    logger.add_appender(buffer)
+    return buffer
 
 
 def _processor() -> str:
-    """The processor's name, where the system tells it."""
+    """Name of the processor if the system reports one, else the machine type."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
