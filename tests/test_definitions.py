@@ -86,7 +86,7 @@ def test_a_run_remembers_its_changes(job: Path) -> None:
     assert result.iterations == 2
     assert load_config(result.folder / "config.json").loss == "l1"
     assert "job.json --set iterations=2 --set loss=l1" in result.report.read_text()
-    with pytest.raises(PathreplayError, match="leave CONFIG, --output and --set out"):
+    with pytest.raises(PathreplayError, match="omit CONFIG, --output and --set"):
         optimize(resume=result.folder, progress=False, define=["iterations=4"])
 
 

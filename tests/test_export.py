@@ -295,7 +295,7 @@ def test_the_cameras_of_a_run_can_be_read_as_a_capture(run: Path) -> None:
 def test_what_cannot_be_exported_is_told_and_leaves_nothing(trouble: str, run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     line = {
-        "no run": "is no run folder",
+        "no run": "is not a run folder",
         "no result": "has no result yet",
         "a result that is none": "cannot be read",
         "no scene": "is no longer there; put it back",

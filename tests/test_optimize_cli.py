@@ -295,8 +295,8 @@ def test_bad_input_gets_one_line_and_status_2(
     [
         ([], ["config file", "--resume"]),
         (["jb.toml"], ["No config file jb.toml", "job.toml"]),
-        (["job.toml", "--resume", "."], ["leave CONFIG"]),
-        (["--resume", "."], ["no run folder"]),
+        (["job.toml", "--resume", "."], ["omit CONFIG"]),
+        (["--resume", "."], ["is not a run folder"]),
         (["job.toml", "--output", "/proc/none/run"], ["/proc/none/run", "--output"]),
     ],
 )

@@ -109,8 +109,8 @@ DAMAGE = {
     ),
     "views that are none": (lambda run: (run / "views.json").write_text("{"), "is no JSON"),
     "a picture that is none": (lambda run: (run / "images/result-left.png").write_text("x"), "cannot be read"),
-    "no config": (lambda run: (run / "config.json").unlink(), "no config"),
-    "no run": (lambda run: (run / "run.json").unlink(), "no run folder"),
+    "no config": (lambda run: (run / "config.json").unlink(), "config or run.json missing"),
+    "no run": (lambda run: (run / "run.json").unlink(), "is not a run folder"),
 }
 
 

@@ -167,7 +167,7 @@ def test_nothing_is_written_into_what_gets_the_name_of_the_folder_meanwhile(what
             (tmp_path / "run").symlink_to("outside")
         return [b"1"]
 
-    with pytest.raises(PathreplayError, match="run was removed or renamed during the run, which ends here"):
+    with pytest.raises(PathreplayError, match="run was removed or renamed during the run, so the run ends"):
         folder.write({"within/one": content, "two": b"2", "other/three": b"3"})
     folder.lock.close()
     assert [path.name for path in (tmp_path / "elsewhere").rglob("*")] == [LOCK]

@@ -253,7 +253,7 @@ def test_a_damaged_page_gets_one_line(server: RunServer, folder: Path, content: 
 def test_what_is_no_run_is_told(tmp_path: Path, folder: Path) -> None:
     with pytest.raises(PathreplayError, match="No run folder"):
         run_files.require_run(tmp_path / "missing")
-    with pytest.raises(PathreplayError, match="is no run folder"):
+    with pytest.raises(PathreplayError, match="is not a run folder"):
         run_files.require_run(tmp_path)
     (folder / PAGE).unlink()
     with pytest.raises(PathreplayError, match="shows nothing yet"):

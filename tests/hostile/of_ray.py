@@ -21,10 +21,11 @@ from pathlib import Path
 import psutil
 names, early = sys.argv[1].split(","), sys.argv[2] == "early"
 restarts = names == ["RayActor"]  # Ray restarts actors, and the run continues
-run = [sys.executable, "-m", "pathreplay.cli", "optimize", "job.toml", "--executor", "ray"]
-process = subprocess.Popen(run, stderr=subprocess.PIPE if restarts else None, text=True)
+command = [sys.executable, "-m", "pathreplay.cli", "optimize", "job.toml", "--executor", "ray"]
+process = subprocess.Popen(command, stderr=subprocess.PIPE if restarts else None, text=True)
 me = psutil.Process(process.pid)
-checkpoint = Path("runs/job/checkpoint.safetensors")
+run = Path("runs/job")
+checkpoint = run / "checkpoint.safetensors"
 
 def tree(*names):
     found = []
@@ -65,6 +66,10 @@ if restarts:
         sys.exit(78)
 status = process.wait()
 gone, alive = psutil.wait_procs(known, timeout=15)
+if status not in (0, 2) and run.exists():
+    # The process was ended by force, perhaps while it wrote a file. Resuming must be possible and removes the rest.
+    from pathreplay.runs.run_folder import open_run_folder
+    open_run_folder(run)
 sys.exit(77 if alive else 1 if names == ["driver"] else status)
 """
 

@@ -1,4 +1,4 @@
-"""Jobs: an optimisation that a config describes, from the first check to the report in its run folder."""
+"""Jobs: an optimization described by a config, from the first check to the report in its run folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One optimisation job, as the command ``pathreplay optimize`` and Python start it: whole, or by its iterations."""
+"""Starts an optimization job for ``pathreplay optimize`` and for Python: as a whole, or iteration by iteration."""
 
 from __future__ import annotations
 
@@ -25,24 +25,27 @@ def optimize(
     define: Sequence[str] = (),
     executor: str | None = None,
 ) -> RunResult:
-    """Recover the parameters that a job names, and write its run folder.
+    """Recover the parameters of a job, and write its run folder.
+
+    The first Ctrl-C, SIGTERM or SIGHUP ends the run after the current iteration, with everything written; a further
+    Ctrl-C aborts it (KeyboardInterrupt). Until the run folder exists, signals keep their previous handlers. A
+    ``deterministic`` job uses a single thread; the previous number of threads is restored afterwards.
 
     Args:
         config: path of a TOML or YAML file, or a Config (relative paths in it start at the current folder).
-        resume: run folder of an earlier, unfinished run, to go on with; excludes ``config`` and ``output``.
-        output: run folder to make; the default is the config's ``output``, else ``runs/<name of the config>``. Where it
+        resume: run folder of an earlier, unfinished run to continue; excludes ``config`` and ``output``.
+        output: run folder to create; the default is the config's ``output``, else ``runs/<name of the config>``. If it
             exists, a number is appended: an earlier run is never touched.
-        progress: draw a progress bar on stderr (lines, now and then, where that is no terminal), or in a notebook.
-        define: changes of what the file says, each ``KEY=VALUE`` (see docs/optimize.md).
-        executor: who computes, ``local`` or ``ray``, whatever the config says, also where a run is gone on with.
+        progress: show a progress bar in a notebook or on stderr (periodic lines if stderr is not a terminal).
+        define: changes to the config file, each ``KEY=VALUE`` (see docs/optimize.md).
+        executor: ``local`` or ``ray``; overrides the config, also for a resumed run.
 
-    The first Ctrl-C, SIGTERM or SIGHUP ends the run after the current iteration with everything written; a Ctrl-C after
-    that aborts (KeyboardInterrupt). Until the run folder is there, signals do what they did before. With
-    ``deterministic`` all that is computed is computed by one thread, whatever was set; that comes back afterwards.
+    Returns:
+        Parameters, errors, history and image metrics of the run; all of it is also in the run folder.
 
     Raises:
-        PathreplayError: anything in the job that cannot work, told before the first iteration; a full disk; a run
-            folder that is in use, damaged, or vanishes.
+        PathreplayError: something in the job cannot work (raised before the first iteration), the disk is full, or the
+            run folder is in use, damaged, or vanishes.
     """
     try:
         with iterate(
@@ -52,7 +55,7 @@ def optimize(
                 pass
             return session.stop()
     finally:
-        # Python finds the scene only by its collector, and Dr.Jit traces calls through every scene that is alive.
+        # The scene is part of a reference cycle, and Dr.Jit traces virtual calls through every scene that is alive.
         gc.collect()
 
 
@@ -65,13 +68,13 @@ def iterate(
     define: Sequence[str] = (),
     executor: str | None = None,
 ) -> Optimization:
-    """Optimise a job iteration by iteration: a loop over it gives a `State` after each.
+    """Run a job iteration by iteration: iterating over the result yields a `State` after each.
 
-    Arguments, signals and errors are those of `optimize`; the config is checked now, the rest when the first state is
-    asked for. See `Optimization` for how it ends.
+    Arguments, signals and errors are those of `optimize`. The config is checked immediately, everything else when the
+    first state is requested. See `Optimization` for how it ends.
     """
     if executor is not None and executor not in get_args(ExecutorName):
-        raise PathreplayError(f"executor is {shown(executor)}; give one of {', '.join(get_args(ExecutorName))}")
+        raise PathreplayError(f"executor is {shown(executor)}; use one of {', '.join(get_args(ExecutorName))}")
     job, path, resumed = _started(config, resume, output, tuple(define))
     if executor is not None:
         job = replace(job, config=job.config.model_copy(update={"executor": executor}))
@@ -81,11 +84,11 @@ def iterate(
 def _started(
     config: str | Path | Config | None, resume: str | Path | None, output: str | Path | None, changes: tuple[str, ...]
 ) -> tuple[Job, Path, RunFolder | None]:
-    """The job, where its run folder shall be, and the one that is gone on with."""
+    """The job, the path of its run folder, and the folder to resume, if any."""
     if resume is not None:
         if config is not None or output is not None or changes:
             raise PathreplayError(
-                "--resume takes config and output from the run folder; leave CONFIG, --output and --set out"
+                "--resume takes config and output from the run folder; omit CONFIG, --output and --set"
             )
         job, folder = open_run_folder(Path(resume))
         return job, folder.given, folder
@@ -93,11 +96,11 @@ def _started(
         raise PathreplayError("Nothing to do: give a config file, or --resume RUN_FOLDER")
     if not isinstance(config, (str, Path, Config)):
         raise PathreplayError(
-            f"config is a {type(config).__name__}; give the path of a TOML or YAML file, or make_config of a dictionary"
+            f"config is a {type(config).__name__}; give the path of a TOML or YAML file, or make_config(dictionary)"
         )
     if isinstance(config, Config):
         if changes:
-            raise PathreplayError("define changes what a file says; give make_config the values that you want")
+            raise PathreplayError("define changes a config file; for a Config, pass the values to make_config instead")
         job = Job(config, None, Path.cwd())
     else:
         job = Job(load_config(Path(config), changes), Path(config), Path(config).parent.absolute(), changes)

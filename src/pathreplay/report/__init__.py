@@ -1,1 +1,1 @@
-"""Reports: figures and pages of a run, while it goes on and when it has ended."""
+"""Reports: figures and pages of a run, during the run and after its end."""

@@ -1,4 +1,4 @@
-"""Matplotlib as reports use it: with the settings that it comes with, whatever the user's files and variables say."""
+"""Imports Matplotlib with its default settings, regardless of the user's configuration files and variables."""
 
 from __future__ import annotations
 
@@ -9,25 +9,23 @@ from contextlib import contextmanager
 
 from pathreplay.errors import PathreplayError
 
-# Of a user's: a backend that is none, or a file that cannot be read, ends the import. Reports use no backend.
+# A user's invalid backend or unreadable settings file makes the import fail. Reports need no backend.
 _SETTINGS = {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
 
 
 def _import() -> None:
-    """Import matplotlib. Raises PathreplayError where a file of settings in the current folder cannot be read."""
+    """Import matplotlib. Raises PathreplayError if a settings file in the current folder cannot be read."""
     try:
         import matplotlib
     except (ValueError, RuntimeError):
         for name in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
-            del sys.modules[name]  # half imported
+            del sys.modules[name]  # partially imported
         before = {name: os.environ.get(name) for name in _SETTINGS}
         os.environ.update(_SETTINGS)
         try:
             import matplotlib  # noqa: F401
         except (ValueError, RuntimeError) as error:
-            raise PathreplayError(
-                f"matplotlib cannot be imported ({error}); mend its settings (matplotlibrc)"
-            ) from None
+            raise PathreplayError(f"matplotlib cannot be imported ({error}); fix its settings (matplotlibrc)") from None
         finally:
             for name, value in before.items():
                 os.environ.pop(name)
@@ -43,7 +41,7 @@ from matplotlib.figure import Figure as Figure  # noqa: E402
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Within this block figures are made and drawn by the settings that matplotlib comes with."""
+    """Create and draw figures with matplotlib's default settings within this block."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         yield

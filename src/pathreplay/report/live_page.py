@@ -1,7 +1,8 @@
-"""What can be seen of a run while it runs: a page in its folder, pictures now and then, and a wish to stop it.
+"""The live page of a run: its content, preview images, and the file that asks the run to stop.
 
-All is in the folder ``previews``: ``page.json`` is what the page says, frames are called ITERATION-WHAT-NAME.webp.
-None of it is needed to go on: what cannot be written or rendered is left out, and never ends a run.
+Everything is in the folder ``previews``: ``page.json`` holds the content of the page, and frames are named
+ITERATION-WHAT-NAME.webp. None of it is needed to resume. A preview that cannot be written or rendered is omitted and
+never ends a run.
 """
 
 from __future__ import annotations
@@ -53,15 +54,15 @@ FOLDER, PAGE, STOP = "previews", "previews/page.json", "stop"
 BUTTON = "the stop button"
 FRAME = re.compile(r"(\d{6,})-((?:view|texture|volume)-.+)\.webp")
 
-# Seconds between two states of the page at least, and how many times longer than writing one took.
+# Minimum seconds between two updates of the page, and minimum ratio of that pause to the time of writing one.
 PAUSE_S, PAUSE = 1.0, 100
-# Pixels along the longer side: of pictures to compare, and of frames.
+# Pixels along the longer side of comparison images and of frames.
 LARGEST, FRAME_SIDE = 1024, 384
-# Of all frames in a report: enough for a film of each picture, and no burden to a page.
+# Size limit of all frames in a report: enough for a film per image, and small for a page.
 MOST_FILM_BYTES = 2_000_000
-# Pixels along the longer side of the small pictures that a notebook shows.
+# Pixels along the longer side of the thumbnails in a notebook.
 SMALL_SIDE = 192
-# Samples per pixel of a picture at least, where the job's own pictures have as many: fewer are hard to look at.
+# Minimum samples per pixel of a preview, unless `eval_spp` is lower: noisier images are hard to judge.
 LEAST_SPP = 16
 
 CAPTIONS = {"target": "target", "result": "now", "difference": f"difference ×{DIFFERENCE_GAIN:g}"}
@@ -70,7 +71,7 @@ PAGES = TypeAdapter(Page)
 
 
 class Previews:
-    """Observes a run: tells ``stop`` of a file `STOP` in its folder, and keeps its page up to date."""
+    """Observes a run: updates its page, and triggers ``stop`` when the file `STOP` appears in its folder."""
 
     def __init__(
         self, folder: RunFolder, config: Config, problem: Problem, run: Run, before: Mapping[str, Image], stop: Stop
@@ -86,14 +87,14 @@ class Previews:
         self._spent = self._cost = 0.0
         self._resumed, self._stride = 0, 1.0
         self._kept = [0]
-        self._likenesses = self._alike()
+        self._likenesses = self._measure_likeness()
         self._shown_at = 0
-        self._stale = (folder.path / STOP).exists()  # a wish to stop an earlier part of the run
+        self._stale = (folder.path / STOP).exists()  # a stop request for an earlier part of the run
         self._log: list[str] = list(problem.notes)
         self._notes = Notes()
 
     def observe(self, event: Event) -> None:
-        """Raises nothing but what ends the process."""
+        """Update the page. Raises only what ends the process."""
         if note := self._notes.of(event):
             self._log.append(note)
         if isinstance(event, Started):
@@ -103,37 +104,37 @@ class Previews:
                 self._write(self._begun() | (self._frames(0, self._before) if self._share else {}))
         elif isinstance(event, Stepped):
             if event.entry.iteration == self._resumed:
-                self._went_on()
+                self._continued()
             if self.stop.by is None and (self.folder.path / STOP).exists():
                 self.stop.by = BUTTON
             self._stepped(event.entry.iteration + 1, event.entry.seconds)
         elif isinstance(event, Stopped):
-            self._take_wish()
+            self._remove_stop_file()
             by, took = f" by {self.stop.by}" if self.stop.by else "", time.perf_counter() - self._began
             self._log.append(f"ended after {event.done} iterations{by}")
-            self._log.append(f"pictures while it ran took {self._spent:.1f} of {took:.1f} s")
+            self._log.append(f"previews took {self._spent:.1f} of {took:.1f} s")
             self._write({})
 
     @property
     def shown_at(self) -> int:
-        """After how many iterations there were pictures the last time."""
+        """Number of completed iterations at the last preview."""
         return self._shown_at
 
     def small_pictures(self) -> tuple[pages.View, ...]:
-        """Target, now and difference of the views, small, each within its address."""
-        found = []
+        """Thumbnails of target, current image and difference of each view, as data URIs."""
+        views = []
         for view in self._views:
-            shown, stored = self._now[view.name].pictures(), self._stored(view)
-            small = {kind: _encoded(shown[kind], stored, SMALL_SIDE, "webp") for kind in CAPTIONS}
+            images, stored = self._now[view.name].pictures(), self._stored(view)
+            small = {kind: _encoded(images[kind], stored, SMALL_SIDE, "webp") for kind in CAPTIONS}
             pictures = tuple(Picture(kind, CAPTIONS[kind], uri("image/webp", data)) for kind, data in small.items())
-            found.append(pages.View(view.name, pictures))
-        return tuple(found)
+            views.append(pages.View(view.name, pictures))
+        return tuple(views)
 
-    def _take_wish(self) -> None:
+    def _remove_stop_file(self) -> None:
         self.folder.discard([STOP])
 
     def finished(self, after: Mapping[str, Image]) -> dict[str, tuple[Still, ...]]:
-        """Films for the report, by view-NAME, texture-NAME and volume-NAME; their last frames are the results."""
+        """Films for the report by view-NAME, texture-NAME and volume-NAME; the last frames show the results."""
         if self._share:
             with contextlib.suppress(PathreplayError):
                 self.folder.write(self._frames(len(self.run.history), {name: after[name] for name in self._before}))
@@ -141,33 +142,33 @@ class Previews:
 
     def _stepped(self, done: int, seconds: float) -> None:
         now = time.perf_counter()
-        # An iteration renders its views, and differentiates them: pictures of a few take less.
+        # Until the first preview, assume that one costs as much as an iteration, which also differentiates.
         if self._share and self._spent + (self._cost or seconds) <= self._share * (now - self._began):
-            files = self._look(done)
-            passed = self._passed(done)
-            self._write(files, passed)
+            files = self._render_previews(done)
+            dropped = self._dropped_frames(done)
+            self._write(files, dropped)
             self._cost = time.perf_counter() - now
             self._spent += self._cost
         elif now - self._written >= self._pause:
             self._write({})
 
-    def _passed(self, done: int) -> set[int]:
-        """Keep the frame of this iteration, and let others go: the last one is always there, the rest are apart."""
+    def _dropped_frames(self, done: int) -> set[int]:
+        """Iterations whose frames are removed: the latest frame stays, earlier ones are thinned to even distances."""
         kept = self._kept
-        passed = {kept.pop()} if len(kept) > 1 and kept[-1] - kept[-2] < self._stride else set()
+        dropped = {kept.pop()} if len(kept) > 1 and kept[-1] - kept[-2] < self._stride else set()
         kept.append(done)
         if len(kept) > self.config.preview.frames + 1:
-            passed |= set(kept[1:-1:2])
-            kept[:] = [i for i in kept if i not in passed]
+            dropped |= set(kept[1:-1:2])
+            kept[:] = [i for i in kept if i not in dropped]
             self._stride = (kept[-1] - kept[0]) / max(1, len(kept) - 1)
-        return passed
+        return dropped
 
-    def _forget(self, passed: Callable[[int], bool]) -> None:
-        found = frames(self.folder.path)
-        self.folder.discard(f"{FOLDER}/{path.name}" for iteration, _, path in found if passed(iteration))
+    def _remove_frames(self, dropped: Callable[[int], bool]) -> None:
+        names = (f"{FOLDER}/{path.name}" for iteration, _, path in frames(self.folder.path) if dropped(iteration))
+        self.folder.discard(names)
 
-    def _look(self, done: int) -> dict[str, bytes]:
-        """Pictures of the views as they are now."""
+    def _render_previews(self, done: int) -> dict[str, bytes]:
+        """Render the views with the current values; returns preview files by name."""
         try:
             spp = max(self.config.most_spp, min(LEAST_SPP, self.config.eval_spp))
             values = best_values(self.problem, self.run)
@@ -176,10 +177,10 @@ class Previews:
             if self.stop.aborted:
                 raise
             self._share = 0.0
-            self._log.append(f"no more pictures: {plain_line(str(error))}")
+            self._log.append(f"no more previews: {plain_line(str(error))}")
             return {}
         self._now = {v.name: _pictures_of(v, self._before[v.name], images[v.name]) for v in self._views}
-        self._likenesses, self._shown_at = self._alike(), done
+        self._likenesses, self._shown_at = self._measure_likeness(), done
         files = self._frames(done, images)
         for view in self._views:
             for kind in ("result", "difference"):
@@ -187,14 +188,14 @@ class Previews:
                 files[f"{FOLDER}/{kind}-{view.name}.png"] = _encoded(image, self._stored(view), LARGEST, "png")
         return files
 
-    def _alike(self) -> dict[str, Likeness]:
+    def _measure_likeness(self) -> dict[str, Likeness]:
         return {name: Likeness.of(it.result, it.target, it.exposure, it.weight) for name, it in self._now.items()}
 
     def _stored(self, view: View) -> float:
         return min(self._exposure, exposure_for(view.target))
 
     def _begun(self) -> dict[str, bytes]:
-        """The pictures that do not change, and those of the start as the first that do."""
+        """Files of the images that never change, and of the initial values as the first previews."""
         files = {}
         for view in self._views:
             for kind, image in self._now[view.name].pictures().items():
@@ -205,38 +206,38 @@ class Previews:
         return files
 
     def _frames(self, done: int, images: Mapping[str, Image]) -> dict[str, bytes]:
-        found = {}
+        shown = {}
         for view in self._views:
-            found[f"view-{view.name}"] = (images[view.name], self._stored(view))
+            shown[f"view-{view.name}"] = (images[view.name], self._stored(view))
         for item in recovered_of(self.problem, self.run):
-            for what, shown in (("texture", item.textures()), ("volume", item.volumes())):
-                if shown:
-                    found[f"{what}-{item.file_name}"] = (shown["result"], 1.0)
+            for what, images_by_kind in (("texture", item.textures()), ("volume", item.volumes())):
+                if images_by_kind:
+                    shown[f"{what}-{item.file_name}"] = (images_by_kind["result"], 1.0)
         return {
             f"{FOLDER}/{done:06d}-{name}.webp": _encoded(image, exposure, FRAME_SIDE, "webp")
-            for name, (image, exposure) in found.items()
+            for name, (image, exposure) in shown.items()
         }
 
-    def _went_on(self) -> None:
-        """The first step is done, so this run can go on, and may clear away what an earlier part of it has left.
+    def _continued(self) -> None:
+        """Clean up after an earlier part of the run; called after the first step, when resuming has succeeded.
 
-        Frames that a killed run has made beyond its checkpoint are none of this run's.
+        A killed run may have written frames beyond its checkpoint, which do not belong to this run.
         """
-        self._forget(lambda iteration: iteration > self._resumed)
+        self._remove_frames(lambda iteration: iteration > self._resumed)
         self._kept = sorted({0, *(iteration for iteration, _, _ in frames(self.folder.path))})
         if self._stale:
-            self._take_wish()
+            self._remove_stop_file()
         if self._resumed:
             self._write(self._begun())
 
-    def _write(self, files: Mapping[str, bytes], passed: Collection[int] = ()) -> None:
-        """Pictures and page; the frames of iterations that have ``passed`` go, once newer ones are there."""
+    def _write(self, files: Mapping[str, bytes], dropped: Collection[int] = ()) -> None:
+        """Write images and page, then remove the frames of the ``dropped`` iterations."""
         begin = time.perf_counter()
-        with contextlib.suppress(PathreplayError):  # a full disk ends the run with its next checkpoint
+        with contextlib.suppress(PathreplayError):  # if the disk is full, the next checkpoint ends the run
             if files:
                 self.folder.write(files)
-            if passed:
-                self._forget(passed.__contains__)
+            if dropped:
+                self._remove_frames(dropped.__contains__)
             self.folder.write({PAGE: PAGES.dump_json(self._page())})
         self._written = time.perf_counter()
         self._pause = max(PAUSE_S, PAUSE * (self._written - begin))
@@ -246,7 +247,7 @@ class Previews:
         learned = len(self.problem.trained())
         done, wanted = len(history), config.iterations
         (_, first), *others = facts(config, history)
-        stopping = (f"Asked to stop by {self.stop.by}.",) if self.stop.by else ()
+        stopping = (f"Stop requested by {self.stop.by}.",) if self.stop.by else ()
         shown = films(self.folder.path)
         return Page(
             title=self.folder.path.name,
@@ -254,8 +255,8 @@ class Previews:
             notices=stopping + dropped_notice(history),
             facts=((f"{done} of {wanted}", first), *others),
             views=tuple(self._view(view, shown) for view in self._views),
-            views_note=f"{len(self._views)} of {len(self.problem.views)} views, the last time after {self._shown_at} "
-            "iterations. Difference: red where it is brighter than the target, blue where it is darker.",
+            views_note=f"{len(self._views)} of {len(self.problem.views)} views, last rendered after {self._shown_at} "
+            "iterations. Difference: red where brighter than the target, blue where darker.",
             exposure=self._exposure,
             plots=plots(history),
             plots_note=plots_note(history),
@@ -263,7 +264,7 @@ class Previews:
             command=resume_command(self.folder.name),
             how=(integrator_row(config), target_row(config)),
             log=tuple(self._log),
-            titles={"plots": "Curves", "parameters": "Parameters", "how": "How it goes on if it is stopped"},
+            titles={"plots": "Curves", "parameters": "Parameters", "how": "How to resume"},
         )
 
     def _view(self, view: View, shown: Mapping[str, tuple[Still, ...]]) -> pages.View:
@@ -274,8 +275,8 @@ class Previews:
         )
         likeness = self._likenesses[view.name]
         note = (
-            f"Root mean square difference from the target {it.error(it.result):.4g}, PSNR {likeness.psnr:.2f} dB, "
-            f"SSIM {likeness.ssim:.4f}, noise included."
+            f"RMS difference from the target {it.error(it.result):.4g}, PSNR {likeness.psnr:.2f} dB, "
+            f"SSIM {likeness.ssim:.4f}, including render noise."
         )
         film = shown.get(f"view-{view.name}", ())
         return pages.View(view.name, pictures, stored, it.exposure, view.is_test, note, film)
@@ -285,7 +286,7 @@ class Previews:
         return number_of(items) + len(self.problem.poses)
 
     def _parameters(self, shown: Mapping[str, tuple[Still, ...]]) -> tuple[Parameter, ...]:
-        found = []
+        parameters = []
         for item in recovered_of(self.problem, self.run):
             film = shown.get(f"texture-{item.file_name}") or shown.get(f"volume-{item.file_name}") or ()
             pictures = [
@@ -294,18 +295,19 @@ class Previews:
             if film:
                 pictures.insert(1, Picture("now", f"after {film[-1].iteration} iterations", film[-1].src))
             rows = numbers(item)
-            found.append(Parameter(item.key, tuple(pictures), rows=rows, note="" if rows else about(item), film=film))
+            note = "" if rows else about(item)
+            parameters.append(Parameter(item.key, tuple(pictures), rows=rows, note=note, film=film))
         for pose in poses_of(self.problem, self.run):
-            found.append(Parameter(pose.pose.key, rows=pose_rows(pose), note=pose_note(pose)))
-        return tuple(found)
+            parameters.append(Parameter(pose.pose.key, rows=pose_rows(pose), note=pose_note(pose)))
+        return tuple(parameters)
 
 
 def _chosen(problem: Problem, count: int) -> list[View]:
-    """So many views, evenly among those that are learned from and those that are not; both, where there are both."""
-    out = [view for view in problem.views if view.is_test]
-    learned = [view for view in problem.views if not view.is_test]
-    some = min(len(out), count // 2)
-    chosen = {view.name for view in (*_evenly(learned, max(1, count - some)), *_evenly(out, some))}
+    """Choose ``count`` evenly spaced views; up to half of them are test views."""
+    test = [view for view in problem.views if view.is_test]
+    trained = [view for view in problem.views if not view.is_test]
+    test_count = min(len(test), count // 2)
+    chosen = {view.name for view in (*_evenly(trained, max(1, count - test_count)), *_evenly(test, test_count))}
     return [view for view in problem.views if view.name in chosen]
 
 
@@ -314,7 +316,7 @@ def _evenly(views: list[View], count: int) -> list[View]:
 
 
 def _grids(item: Recovered) -> dict[str, Image]:
-    """Start and truth of a texture or a volume, as far as they are known."""
+    """Initial value and truth of a texture or a volume, if known."""
     return {kind: image for kind, image in (item.textures() or item.volumes()).items() if kind in ("start", "truth")}
 
 
@@ -328,8 +330,8 @@ def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
 
 
 def _encoded(image: Image, exposure: float, side: int, kind: str) -> bytes:
-    """The picture as a display shows it, no longer than ``side`` pixels: PNG, or WebP, which loses what few see."""
-    # In double precision a large texture would take more than all else that is known of it.
+    """Encode a tone-mapped image of at most ``side`` x ``side`` pixels, as PNG or lossy WebP."""
+    # Downscale first: a large texture in double precision would need more memory than everything else about it.
     pixels = np.round(255 * displayed(grids.shown(image, 2 * side), exposure)).astype(np.uint8)
     picture = PIL.Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
     if max(picture.size) > side:
@@ -341,24 +343,26 @@ def _encoded(image: Image, exposure: float, side: int, kind: str) -> bytes:
 
 
 def frames(run: Path) -> Iterator[tuple[int, str, Path]]:
-    """Iteration, what it shows and file of each frame in a run folder, in order."""
-    found = [(FRAME.fullmatch(path.name), path) for path in (run / FOLDER).glob("*.webp") if not path.is_symlink()]
-    yield from sorted((int(match[1]), match[2], path) for match, path in found if match)
+    """Iteration, subject and file of each frame in a run folder, in order."""
+    matches = [(FRAME.fullmatch(path.name), path) for path in (run / FOLDER).glob("*.webp") if not path.is_symlink()]
+    yield from sorted((int(match[1]), match[2], path) for match, path in matches if match)
 
 
 def films(run: Path, most_bytes: int | None = None) -> dict[str, tuple[Still, ...]]:
-    """The frames of a run by what they show; whole, as many as the limit lets, or by address without one."""
-    found: dict[str, list[tuple[int, Path]]] = {}
+    """The frames of a run by subject: data URIs thinned to ``most_bytes``, or relative addresses without a limit."""
+    stills_of: dict[str, list[tuple[int, Path]]] = {}
     for iteration, what, path in frames(run):
-        found.setdefault(what, []).append((iteration, path))
+        stills_of.setdefault(what, []).append((iteration, path))
     if most_bytes is None:
         return {
             what: tuple(Still(iteration, f"{FOLDER}/{path.name}") for iteration, path in stills)
-            for what, stills in found.items()
+            for what, stills in stills_of.items()
         }
-    sizes = sum(path.stat().st_size for stills in found.values() for _, path in stills)
+    sizes = sum(path.stat().st_size for stills in stills_of.values() for _, path in stills)
     step = max(1, -(-sizes // most_bytes))
-    kept = {what: [s for i, s in enumerate(reversed(stills)) if i % step == 0][::-1] for what, stills in found.items()}
+    kept = {
+        what: [s for i, s in enumerate(reversed(stills)) if i % step == 0][::-1] for what, stills in stills_of.items()
+    }
     return {
         what: tuple(Still(iteration, uri("image/webp", path.read_bytes())) for iteration, path in stills)
         for what, stills in kept.items()

@@ -1,1 +1,1 @@
-"""Run folders: what a job writes, and the lock of who writes it."""
+"""Run folders: the files of a job, and the lock that gives one process write access."""

@@ -1,4 +1,4 @@
-"""The lock of a run folder: one process at a time writes into it; the system lets go of it when that process ends."""
+"""The lock of a run folder: one process writes at a time, and the system releases the lock when that process ends."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ LOCK = "lock"
 class FolderLock:
     """Holds the lock file of ``folder`` from construction to `close`.
 
-    The file stays when nobody holds it; what counts is the lock on it (flock), which the end of the process, however
-    violent, takes away. Where the file system or the operating system has no such locks, nothing is locked.
+    The file remains when the lock is released. Only the lock on it (flock) counts, which the system releases when the
+    process ends for any reason. Nothing is locked if the file system or the operating system does not support flock.
 
-    Raises PathreplayError where another process (or thread) holds it, or the folder cannot be written.
+    Raises PathreplayError if another process or thread holds the lock, or if the folder cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -35,7 +35,7 @@ class FolderLock:
             self.file = os.open(path, flags, 0o644)
         except OSError as error:
             raise PathreplayError(
-                f"Lock file {path} cannot be opened ({error.strerror}); make the folder writable, or remove that file"
+                f"Lock file {path} cannot be opened ({error.strerror}); make the folder writable, or remove the file"
             ) from None
         try:
             self._take(folder, path)
@@ -46,7 +46,7 @@ class FolderLock:
     def _take(self, folder: Path, path: Path) -> None:
         about = os.fstat(self.file)
         if not stat.S_ISREG(about.st_mode) or about.st_nlink != 1:
-            raise PathreplayError(f"Lock file {path} is no file of its own; remove it")
+            raise PathreplayError(f"Lock file {path} is not a regular file with a single link; remove it")
         if fcntl is None:
             return
         try:
@@ -55,17 +55,17 @@ class FolderLock:
             match = re.fullmatch(r"(\d+) ([\w.-]+)\s*", os.pread(self.file, 200, 0).decode("ascii", "replace"))
             holder = f"process {match[1]} on {match[2]}" if match else "another process"
             raise PathreplayError(
-                f"Run folder {folder} is in use by {holder}; wait for its end, or stop it with Ctrl-C or "
+                f"Run folder {folder} is in use by {holder}; wait until it ends, or stop it with Ctrl-C or "
                 "SIGTERM, then resume"
             ) from None
         except OSError:
-            return  # a file system without locks
-        with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
+            return  # the file system does not support locks
+        with contextlib.suppress(OSError):  # the lock holds even if the disk is full
             os.ftruncate(self.file, 0)
             os.pwrite(self.file, f"{os.getpid()} {socket.gethostname()}\n".encode(), 0)
 
     def close(self) -> None:
-        """Let go; a second call does nothing."""
+        """Release the lock; a second call does nothing."""
         if self.file >= 0:
             os.close(self.file)
             self.file = -1

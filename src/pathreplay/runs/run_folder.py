@@ -1,4 +1,4 @@
-"""The run folder on disk: a new one for every run, every file whole or absent, an earlier run never touched."""
+"""The run folder on disk: each run gets a new one, files are written atomically, and earlier runs stay untouched."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ BASELINE_CHECKPOINT = "baseline/checkpoint.safetensors"
 
 @dataclass(frozen=True)
 class Job:
-    """What a run does, the file that says so (None where Python does), and the folder where its paths start.
+    """The config of a run, the file that it was read from (None if from Python), and the base of its relative paths.
 
-    ``changes`` are those that the command line made to the file.
+    ``changes`` are the ``--set`` options of the command line.
     """
 
     config: Config
@@ -45,9 +45,12 @@ class Job:
 
 
 class RunFolder:
-    """A folder that belongs to one run, until its ``lock`` is closed.
+    """A folder that belongs to one run until its ``lock`` is closed.
 
-    ``given`` is its path from the folder ``home`` (default: the current one), and stays it wherever the user goes.
+    Args:
+        given: its path relative to ``home``.
+        home: folder that ``given`` is relative to (default: the current folder). A later change of the current folder
+            has no effect.
     """
 
     def __init__(self, given: Path, home: Path | None = None) -> None:
@@ -55,121 +58,129 @@ class RunFolder:
         self.path = self.home / given
         self.lock = FolderLock(self.path)
         self.identity = _identity(self.path)
-        self.made_for_it: list[Path] = []
-        """Folders that it was put into and that were not there before, the innermost first."""
+        self.created_parents: list[Path] = []
+        """Parent folders that were created for it, innermost first."""
 
     @property
     def name(self) -> Path:
-        """The path to be told to somebody who is in the current folder."""
-        with contextlib.suppress(OSError):  # that folder may be gone
+        """The path to show to the user, as seen from the current folder."""
+        with contextlib.suppress(OSError):  # the current folder may be gone
             if Path.cwd() == self.home:
                 return self.given
         return self.path
 
     def remove(self) -> None:
-        """Remove it with all that is in it, where it still is the folder that was made, and what was made for it."""
+        """Remove the folder with its contents and created parents, unless another folder has taken its path."""
         if _identity(self.path) != self.identity:
             return
-        # Half a folder would look like a run; the process may end in the middle of this.
+        # Rename first: the process may end during the removal, and a partial folder would look like a run.
         hidden = self.path.with_name(f".{self.path.name[:100]}.{secrets.token_hex(4)}{PART}")
         with contextlib.suppress(OSError):
             os.rename(self.path, hidden)
         for path in (hidden, self.path):
             if _identity(path) == self.identity:
                 shutil.rmtree(path, ignore_errors=True)
-        _remove_empty(self.made_for_it)
+        _remove_empty(self.created_parents)
 
-    def require_in_place(self, lost: str, held: int | None = None) -> None:
-        """Raise PathreplayError if the folder is no longer where it was; ``lost`` names what was not saved.
+    def require_in_place(self, lost: str, descriptor: int | None = None) -> None:
+        """Raise PathreplayError if the path (or the open ``descriptor``) is no longer this folder.
 
-        Or if one that is ``held`` is not this.
+        ``lost`` names what was not saved, with its verb: "iterations 3 to 5 are".
         """
-        if _identity(self.path if held is None else held) != self.identity:
+        if _identity(self.path if descriptor is None else descriptor) != self.identity:
             raise PathreplayError(
-                f"Run folder {self.name} was removed or renamed during the run, which ends here: {lost} lost; if it "
-                "was renamed, go on with: pathreplay optimize --resume NEW_NAME, else start the job again"
+                f"Run folder {self.name} was removed or renamed during the run, so the run ends: {lost} lost; if it "
+                "was renamed, resume with: pathreplay optimize --resume NEW_NAME, otherwise start the job again"
             )
 
     def write(self, files: Mapping[str, Content]) -> None:
-        """Write all files or none: each goes to a temporary name first, and all are renamed once all are on the disk.
+        """Write all files or none: each is written under a temporary name, then all are renamed.
 
-        Links are not followed: a link in the place of a file is replaced.
+        Links are not followed: a link in the place of a file is replaced. Contents that are generated while they are
+        written (see `Content`) are in memory only during that time.
 
-        What is made while it is written is not held before, and not after.
+        Args:
+            files: content by file name relative to the folder; folders in the name are created.
 
         Raises:
-            PathreplayError: the disk is full, the folder is gone or cannot be written, or a folder in it is a link that
-                leads elsewhere. Temporary files are removed, and so are folders that were made for them.
+            PathreplayError: the disk is full, the folder is gone or cannot be written, or a folder in it is a link to
+                somewhere else. Temporary files are removed, and so are folders that were created for them.
         """
         parts: list[str] = []
-        made: list[str] = []
-        lost = "what was not yet written is"
-        with _held(self.path) as held:
-            self.require_in_place(lost, held)
-            # By the folder itself: another one, or a link, may get its name meanwhile.
-            base = self.path if held is None else Path()
+        created: list[str] = []
+        lost = "unwritten data is"
+        with _opened(self.path) as descriptor:
+            self.require_in_place(lost, descriptor)
+            # Paths are relative to the open folder: another folder, or a link, may take its name meanwhile.
+            base = self.path if descriptor is None else Path()
             try:
                 for name, content in files.items():
-                    self._make_parent(name, made, held)
+                    self._make_parent(name, created, descriptor)
                     parts.append(name)
-                    _write_through(base / f"{name}{PART}", content, held)
+                    _write_through(base / f"{name}{PART}", content, descriptor)
                 self.require_in_place(lost)
-                with undisturbed():  # all or none: a second Ctrl-C waits
+                with undisturbed():  # a second Ctrl-C must not leave only some files renamed
                     for name in parts:
-                        os.replace(base / f"{name}{PART}", base / name, src_dir_fd=held, dst_dir_fd=held)
-            except BaseException as error:  # a second Ctrl-C, too
-                for remove, name in (*((os.unlink, f"{name}{PART}") for name in parts), *((os.rmdir, n) for n in made)):
+                        os.replace(base / f"{name}{PART}", base / name, src_dir_fd=descriptor, dst_dir_fd=descriptor)
+            except BaseException as error:  # including a second Ctrl-C
+                leftovers = [(os.unlink, f"{name}{PART}") for name in parts] + [(os.rmdir, name) for name in created]
+                for remove, name in leftovers:
                     with contextlib.suppress(OSError):
-                        remove(base / name, dir_fd=held)
+                        remove(base / name, dir_fd=descriptor)
                 if isinstance(error, OSError):
                     raise PathreplayError(self._failure(error)) from error
                 raise
 
     def discard(self, names: Iterable[str]) -> None:
-        """Remove files of it, where it still is the folder that was made. Links to folders are not followed.
+        """Remove files of the folder, unless another folder has taken its path. Links to folders are not followed.
 
         Raises nothing.
         """
-        with _held(self.path) as held:
-            if _identity(self.path if held is None else held) != self.identity:
+        with _opened(self.path) as descriptor:
+            if _identity(self.path if descriptor is None else descriptor) != self.identity:
                 return
-            base = self.path if held is None else Path()
+            base = self.path if descriptor is None else Path()
             for name in names:
                 parent = os.path.dirname(name)
                 with contextlib.suppress(OSError):
-                    if not (parent and _is_link(base / parent, held)):
-                        os.unlink(base / name, dir_fd=held)
+                    if not (parent and _is_link(base / parent, descriptor)):
+                        os.unlink(base / name, dir_fd=descriptor)
 
-    def _make_parent(self, name: str, made: list[str], held: int | None) -> None:
+    def _make_parent(self, name: str, created: list[str], descriptor: int | None) -> None:
         parent = os.path.dirname(name)
         if not parent:
             return
-        folder = self.path / parent if held is None else Path(parent)
+        folder = self.path / parent if descriptor is None else Path(parent)
         try:
-            if _is_link(folder, held):
+            if _is_link(folder, descriptor):
                 what = f"{self.path / parent} is a link that may lead out of the run folder"
-                raise PathreplayError(f"{what}; replace it by the folder that it leads to")
+                raise PathreplayError(f"{what}; replace it with the folder that it points to")
         except FileNotFoundError:
-            os.mkdir(folder, dir_fd=held)
-            made.append(parent)
+            os.mkdir(folder, dir_fd=descriptor)
+            created.append(parent)
 
     def _failure(self, error: OSError) -> str:
         if (self.path / CHECKPOINT).exists():
-            rescue = f"then go on with: pathreplay optimize --resume {self.name}"
+            remedy = f"then resume with: pathreplay optimize --resume {self.name}"
         else:
-            rescue = "or give --output elsewhere, then start again (this folder was removed)"
+            remedy = "or choose another --output, then start again (this folder was removed)"
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return f"No space left on the disk for run folder {self.name}: free some space, {rescue}"
-        return f"Run folder {self.name} cannot be written ({error.strerror}): mend that, {rescue}"
+            return f"No space left on the disk for run folder {self.name}: free some space, {remedy}"
+        return f"Run folder {self.name} cannot be written ({error.strerror}): fix this, {remedy}"
 
 
 def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home: Path | None = None) -> RunFolder:
-    """Make ``output``, or ``output-2``, ``-3``, … where that exists, and put the job and its first files into it.
+    """Create a run folder with the job and its first files; a failure leaves no folder behind.
 
-    A relative ``output`` starts at ``home`` (default: the current folder).
+    Args:
+        output: path of the folder. If it exists, the first free one of ``output-2``, ``output-3``, … is created.
+        job: its config is copied as written (``config.toml`` or ``.yaml``), or as JSON if it came from Python or was
+            changed.
+        files: content of further files by name.
+        home: folder that a relative ``output`` starts at (default: the current folder).
 
-    The config is copied as it was written (``config.toml`` or ``.yaml``), or as JSON where it came from Python or was
-    changed. What fails leaves no folder behind. Raises PathreplayError where the folder cannot be made or written.
+    Raises:
+        PathreplayError: the folder cannot be created or written.
     """
     if job.source is not None and job.source.suffix != ".json" and not job.changes:
         name = "config.yaml" if job.source.suffix.lower() in YAML else "config.toml"
@@ -189,7 +200,7 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
         part = _make_part(output, home)
         undo.callback(shutil.rmtree, part, ignore_errors=True)
         run = RunFolder(part)
-        run.given, run.home, run.made_for_it = _free(output, home), home, missing
+        run.given, run.home, run.created_parents = _free(output, home), home, missing
         undo.callback(run.lock.close)
         run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
         run.given = _claim(part, output, home)
@@ -199,7 +210,7 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
 
 
 class _Origin(BaseModel):
-    """run.json: where relative paths of the config start, the config that the run was started with, and `changes`."""
+    """Content of run.json: base of the config's relative paths, path of the config file, and `Job.changes`."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
@@ -209,11 +220,10 @@ class _Origin(BaseModel):
 
 
 def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
-    """The job of an existing run folder, and that folder, locked.
+    """Open and lock an existing run folder; returns its job and the folder.
 
-    What a killed run has left half written in it is removed.
-
-    Raises PathreplayError if it is no run folder, holds no checkpoint to go on from, is damaged, or is in use.
+    Temporary files of a killed run are removed. Raises PathreplayError if ``path`` is not a run folder, has no
+    checkpoint, is damaged, or is in use.
     """
     require_writable_name(path, "--resume")
     copy = _config_in(path)
@@ -225,7 +235,7 @@ def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
 
 
 def _remove_parts(path: Path) -> None:
-    """Remove what a killed run has half written, in the folder and in those that a run makes in it. Raises nothing."""
+    """Remove temporary files of a killed run from the folder and its subfolders. Raises nothing."""
     for folder in (path, *(path / name for name in _FOLDERS)):
         if folder.is_symlink():
             continue
@@ -235,24 +245,26 @@ def _remove_parts(path: Path) -> None:
 
 
 def read_job(path: Path) -> Job:
-    """The job of an existing run folder, which may be in use. Raises PathreplayError if it is none, or damaged."""
+    """Read the job of a run folder, even if in use. Raises PathreplayError if it is not a run folder or damaged."""
     return _job(path, _config_in(path))
 
 
 def _config_in(path: Path) -> Path:
     copy = next((path / name for name in _CONFIGS if (path / name).is_file()), None)
     if copy is None or not (path / "run.json").is_file():
-        raise PathreplayError(f"{path} is no run folder (no config, no run.json); give a folder that optimize has made")
+        raise PathreplayError(
+            f"{path} is not a run folder (config or run.json missing); give a folder that optimize has created"
+        )
     return copy
 
 
 def _job(path: Path, copy: Path) -> Job:
     try:
-        if problem := file_problem(path / "run.json", 2**20):  # far above what two paths take
+        if problem := file_problem(path / "run.json", 2**20):  # far more than two paths need
             raise ValueError(f"it {problem}")
         origin = _Origin.model_validate_json((path / "run.json").read_bytes())
         if "\0" in origin.base + (origin.config or ""):
-            raise ValueError("a path with a null character")
+            raise ValueError("a path contains a null character")
     except (OSError, ValueError) as error:
         what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
         raise PathreplayError(f"{path / 'run.json'} cannot be used ({what}); start the job from its config") from None
@@ -261,9 +273,9 @@ def _job(path: Path, copy: Path) -> Job:
 
 
 def new_output(output: str | Path | None, source: Path | None) -> Path:
-    """The path of a new run folder: ``output``, or one in ``runs`` with the name of the config file.
+    """Path of a new run folder: ``output``, or ``runs/NAME`` with the name of the config file ``source``.
 
-    A file that is called config gives the name of its folder. Raises PathreplayError if no folder can be there.
+    A file named ``config`` stands for its folder's name. Raises PathreplayError if ``output`` cannot be a folder.
     """
     if output is None:
         named = "optimize" if source is None else source.stem
@@ -271,14 +283,14 @@ def new_output(output: str | Path | None, source: Path | None) -> Path:
     path = Path(output)
     require_writable_name(path, "--output")
     if not str(output) or path.name in ("", ".."):
-        raise PathreplayError(f"Run folder '{output}' has no name of its own; give --output a new folder, as runs/mine")
+        raise PathreplayError(f"Run folder '{output}' has no name of its own; give --output a new name, as runs/mine")
     if os.path.lexists(path) and not path.is_dir():
-        raise PathreplayError(f"Run folder {path} cannot be made: there is a file of that name; give another --output")
+        raise PathreplayError(f"Run folder {path} cannot be created: a file has that name; give another --output")
     return path
 
 
 def require_writable_name(path: Path, option: str) -> None:
-    """Raise PathreplayError if the path cannot be written into reports, or is none at all."""
+    """Raise PathreplayError if the path is not UTF-8, as reports need it, or is not a valid path."""
     try:
         str(path).encode()
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -291,14 +303,14 @@ def require_writable_name(path: Path, option: str) -> None:
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
-    """Remove folders in which nothing is; who put something into one meanwhile keeps it."""
+    """Remove those folders that are empty; another process may have put files into one."""
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()
 
 
 def _make_part(output: Path, home: Path) -> Path:
-    """A folder beside the one that is wanted, which takes its place when it is whole: a process may end at any time."""
+    """Create a hidden folder beside ``output``; it is renamed when complete, since a process may end at any time."""
     wanted = home / output
     part = wanted.with_name(f".{wanted.name[:100]}.{secrets.token_hex(4)}{PART}")
     try:
@@ -311,63 +323,66 @@ def _make_part(output: Path, home: Path) -> Path:
 
 def _free(output: Path, home: Path) -> Path:
     """``output``, or the first of ``output-2``, ``-3``, … that does not exist."""
-    number, found = 1, output
-    while os.path.lexists(home / found):
+    number, path = 1, output
+    while os.path.lexists(home / path):
         number += 1
-        found = output.with_name(f"{output.name}-{number}")
-    return found
+        path = output.with_name(f"{output.name}-{number}")
+    return path
 
 
 def _claim(part: Path, output: Path, home: Path) -> Path:
-    """Give the folder the first name that is free; two runs at once cannot get the same one, since none is empty."""
+    """Rename the folder to the first free name.
+
+    Two concurrent runs cannot get the same name: the folders are not empty, so the second rename fails.
+    """
     while True:
-        found = _free(output, home)
+        path = _free(output, home)
         try:
-            os.rename(part, home / found)
-            return found
+            os.rename(part, home / path)
+            return path
         except OSError as error:
             if error.errno not in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
                 raise PathreplayError(_not_made(output, error)) from error
 
 
 def _not_made(output: Path, error: OSError) -> str:
-    return f"Run folder {output} cannot be made ({error.strerror}); give another with --output"
+    return f"Run folder {output} cannot be created ({error.strerror}); give another --output"
 
 
 @contextlib.contextmanager
-def _held(folder: Path) -> Iterator[int | None]:
-    """The folder itself, whatever it may be called meanwhile; None where it cannot be held (Windows, no right)."""
+def _opened(folder: Path) -> Iterator[int | None]:
+    """Descriptor of the folder, valid even if it is renamed; None if it cannot be opened (Windows, no permission)."""
     with contextlib.ExitStack() as stack:
-        held = None
+        descriptor = None
         if os.unlink in os.supports_dir_fd:
             with contextlib.suppress(OSError):
-                held = os.open(folder, os.O_RDONLY)
-                stack.callback(os.close, held)
-        yield held
+                descriptor = os.open(folder, os.O_RDONLY)
+                stack.callback(os.close, descriptor)
+        yield descriptor
 
 
 def _identity(path: Path | int) -> tuple[int, int] | None:
-    """Device and number of a folder, given by its path or its descriptor; None if there is none."""
+    """Device and inode of a folder, given by path or descriptor; None if it does not exist."""
     try:
-        about = os.stat(path)
+        status = os.stat(path)
     except OSError:
         return None
-    return about.st_dev, about.st_ino
+    return status.st_dev, status.st_ino
 
 
-def _is_link(path: Path, held: int | None) -> bool:
-    """Raises OSError if there is nothing of that name."""
-    return stat.S_ISLNK(os.stat(path, dir_fd=held, follow_symlinks=False).st_mode)
+def _is_link(path: Path, descriptor: int | None) -> bool:
+    """Whether the path, relative to the open folder if there is one, is a link. Raises OSError if it does not exist."""
+    return stat.S_ISLNK(os.stat(path, dir_fd=descriptor, follow_symlinks=False).st_mode)
 
 
-def _write_through(path: Path, content: Content, held: int | None) -> None:
-    """Write a file and wait until it is on the disk; the path is one in a folder that is ``held``, if there is one."""
-    # What a killed run has left is removed, and a link by that name is not followed.
+def _write_through(path: Path, content: Content, descriptor: int | None) -> None:
+    """Write a file and wait until it is on disk; the path is relative to the open folder if there is one."""
+    # Remove what a killed run has left; a link of that name is not followed.
     with contextlib.suppress(FileNotFoundError):
-        os.unlink(path, dir_fd=held)
-    with open(path, "xb", opener=lambda name, flags: os.open(name, flags, 0o666, dir_fd=held)) as file:
+        os.unlink(path, dir_fd=descriptor)
+    with open(path, "xb", opener=lambda name, flags: os.open(name, flags, 0o666, dir_fd=descriptor)) as file:
         for chunk in chunks(content):
             file.write(chunk)
             del chunk
         file.flush()
-        os.fsync(file.fileno())  # some file systems report a full disk only when the data are written out
+        os.fsync(file.fileno())  # some file systems report a full disk only at this point

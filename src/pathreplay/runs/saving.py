@@ -1,4 +1,4 @@
-"""A run in its folder: what is written of it at the start and now and then, and how it goes on from that."""
+"""Saves a run in its folder: first files, periodic checkpoints, and restoring from them."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from pathreplay.platform.files import file_problem
 from pathreplay.runs.run_folder import BASELINE_CHECKPOINT, CHECKPOINT, RunFolder
 
 CAPTURE = "capture.sha256"
-"""What tells the cameras of a run from those of a capture that was changed since."""
+"""Hash of the capture's cameras, by which a later change is detected."""
 
 
 class Saving:
-    """Writes the checkpoints of a run into the folder, after every so many iterations (``every``) and at the end."""
+    """Writes checkpoints of a run into its folder after ``every`` iterations and at the end."""
 
     def __init__(self, folder: RunFolder, run: Run, every: int) -> None:
         self.folder, self.run, self.every = folder, run, every
         self.saved = 0
 
     def observe(self, event: Event) -> None:
-        """Raises PathreplayError where the folder is gone, or cannot be written."""
+        """Write a checkpoint if one is due. Raises PathreplayError if the folder is gone or cannot be written."""
         if isinstance(event, Started):
             self.saved = event.done
         elif isinstance(event, Stepped):
@@ -44,15 +44,15 @@ class Saving:
             self._write(event.done)
 
     def close(self) -> None:
-        """Write what is not yet saved. Raises as `observe` does."""
+        """Save iterations that are not saved yet. Raises as `observe` does."""
         if self._runs_are_whole() and len(self.run.history) > self.saved:
             self._write(len(self.run.history))
 
     def rescued(self) -> bool:
-        """Write what is not yet saved after an error of the run; whether all that was done is saved now."""
+        """Save the remaining iterations after an error of the run; returns whether all iterations are saved now."""
         if not self._runs_are_whole() or not self.run.history:
             return False
-        with contextlib.suppress(PathreplayError):  # the first error is the one to tell
+        with contextlib.suppress(PathreplayError):  # the first error is the one to report
             self.close()
         return self.saved == len(self.run.history)
 
@@ -65,7 +65,10 @@ class Saving:
 
 
 def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict[str, Content]:
-    """What a run goes on from, by name: targets, pictures of its start (by view), their checksums, checkpoints."""
+    """Files from which a run can be resumed, by name: targets, initial images, their checksums, and checkpoints.
+
+    ``before`` are the images of the initial values by view name.
+    """
     pictures = {_picture("target", view.name): view.target for view in problem.views}
     pictures |= {_picture("weight", view.name): view.weight for view in problem.views if view.weight is not None}
     pictures |= {_picture("start", name): image for name, image in before.items()}
@@ -76,7 +79,7 @@ def first_files(problem: Problem, before: Mapping[str, Image], run: Run) -> dict
 
 
 def saved_targets(folder: Path) -> Targets:
-    """The targets in a run folder. Raises PathreplayError where one is not what was written."""
+    """Read the targets of a run folder. Raises PathreplayError if one differs from its checksum."""
     sums = Sums(folder)
     images, weights = (
         {path.stem.removeprefix(f"{kind}-"): _read(path, sums) for path in sorted(folder.glob(_picture(kind, "*")))}
@@ -86,32 +89,32 @@ def saved_targets(folder: Path) -> Targets:
 
 
 def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) -> dict[str, Image]:
-    """Bring a run to where the folder's checkpoint was; returns the pictures of its start.
+    """Restore a run from the folder's checkpoint; returns the images of its initial values by view name.
 
-    ``held`` are variables that some stages do not step.
+    ``held`` are variables that some stages keep fixed.
 
-    Raises PathreplayError where a picture or a checkpoint is missing, damaged, or cannot be what this run has written.
+    Raises PathreplayError if an image or a checkpoint is missing, damaged, or does not fit this run.
     """
     _require_capture(folder / CAPTURE, problem)
     keep, sums = problem.album.keep, Sums(folder)
     before = {view.name: keep(_read(folder / _picture("start", view.name), sums)) for view in problem.views}
     for view in problem.views:
         wanted = picture_shape(problem.scene.sensors()[view.sensor])
-        for kind, found in (("target", view.target), ("start", before[view.name])):
+        for kind, image in (("target", view.target), ("start", before[view.name])):
             path = folder / _picture(kind, view.name)
-            if found.shape != wanted:
+            if image.shape != wanted:
                 raise PathreplayError(
-                    f"{path} has shape {found.shape} (height, width, channels), sensor '{view.name}' renders {wanted}; "
+                    f"{path} has shape {image.shape} (height, width, channels), sensor '{view.name}' renders {wanted}; "
                     "start the job from its config"
                 )
-            require_finite_array(str(path), found)
-    for name, each in _runs(run).items():
-        checkpoint.restore(folder / name, each, {v.key: v.levels for v in problem.variables}, held)
+            require_finite_array(str(path), image)
+    for name, saved in _runs(run).items():
+        checkpoint.restore(folder / name, saved, {v.key: v.levels for v in problem.variables}, held)
     return before
 
 
 def _require_capture(path: Path, problem: Problem) -> None:
-    """Raise PathreplayError if the cameras of the capture are no longer those that the run was started with."""
+    """Raise PathreplayError if the capture's cameras have changed since the start of the run."""
     if problem.capture is None:
         return
     try:
@@ -119,8 +122,8 @@ def _require_capture(path: Path, problem: Problem) -> None:
     except (OSError, UnicodeDecodeError):
         saved = ""
     if saved != problem.capture:
-        changed = "has other cameras than when this run was started" if saved else f"has no mark in {path}"
-        raise PathreplayError(f"The capture {changed}; put it back as it was, or start a new run")
+        changed = "has other cameras than when this run was started" if saved else f"has no hash in {path}"
+        raise PathreplayError(f"The capture {changed}; restore it, or start a new run")
 
 
 def _runs(run: Run) -> dict[str, Run]:
@@ -128,7 +131,7 @@ def _runs(run: Run) -> dict[str, Run]:
 
 
 def _checkpoints(run: Run) -> dict[str, Content]:
-    return {name: checkpoint.save(each) for name, each in _runs(run).items()}
+    return {name: checkpoint.save(part) for name, part in _runs(run).items()}
 
 
 def _picture(kind: str, view: str) -> str:

@@ -72,7 +72,9 @@ def pasts(folders: list[Path]) -> list[Past]:
     found = []
     for folder, name in zip(folders, names, strict=True):
         if not (folder / "run.json").is_file():
-            raise PathreplayError(f"{folder} is no run folder (no run.json); give a folder that optimize has made")
+            raise PathreplayError(
+                f"{folder} is not a run folder (no run.json); give a folder that optimize has created"
+            )
         found.append(Past(folder, name if names.count(name) == 1 else str(folder)))
     if len({past.folder.resolve() for past in found}) < len(found):
         raise PathreplayError("A run is named twice; name different ones")

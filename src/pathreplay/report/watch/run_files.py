@@ -28,7 +28,7 @@ def require_run(run: Path) -> None:
     if not run.is_dir():
         raise PathreplayError(f"No run folder {run}; give a folder that optimize has made")
     if not (run / "run.json").is_file():
-        raise PathreplayError(f"{run} is no run folder (no run.json); give a folder that optimize has made")
+        raise PathreplayError(f"{run} is not a run folder (no run.json); give a folder that optimize has created")
     if not (run / PAGE).is_file() and not (run / REPORT).is_file():
         raise PathreplayError(f"Run folder {run} shows nothing yet: there is no {PAGE} and no {REPORT}; wait for one")
 
