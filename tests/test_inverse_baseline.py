@@ -46,7 +46,7 @@ def test_rival_gets_the_same_time_and_both_are_shown() -> None:
     assert values[TEXTURE].shape == result.parameters[TEXTURE].shape
 
     html = result.report.read_text()
-    assert "Next to prb (baseline), in the same time" in html  # the job has prb as well
+    assert "Comparison with prb (baseline) at equal time" in html  # the job has prb as well
     assert len(re.findall(r"<figcaption>recovered by prb \(baseline\)</figcaption>", html)) == 2  # of both views
     assert (result.folder / "comparison.svg").exists() and (result.folder / "images/baseline-left.png").exists()
 

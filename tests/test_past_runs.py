@@ -70,7 +70,7 @@ def test_a_table_has_what_runs_came_to_and_where_they_differ(tmp_path: Path) -> 
 def test_a_page_has_curves_of_both_and_pictures_that_can_be_wiped(tmp_path: Path) -> None:
     page = compare.page(pasts([a_run(tmp_path / "a"), a_run(tmp_path / "b", (1.0, 0.1), loss="l1")]))
     assert [picture.kind for picture in page.views[0].pictures] == ["target", "a", "b"] and page.views[1].is_test
-    assert (page.left, page.right) == ("a", "b") and "different kinds (l1, l2)" in page.notices[0]
+    assert (page.left, page.right) == ("a", "b") and "different losses (l1, l2)" in page.notices[0]
     by_seconds = page.plots[1]
     assert by_seconds.along == "second" and [s.x for s in by_seconds.series] == [(0.5, 1.0, 1.5), (0.5, 1.0)]
     assert [p.kind for p in page.parameters[0].pictures] == ["a", "b"]
@@ -80,7 +80,7 @@ def test_a_page_has_curves_of_both_and_pictures_that_can_be_wiped(tmp_path: Path
 def test_runs_of_one_name_are_told_apart(tmp_path: Path) -> None:
     folders = [a_run(tmp_path / one / "run") for one in ("x", "y")]
     assert [past.name for past in pasts(folders)] == [str(folder) for folder in folders]
-    with pytest.raises(PathreplayError, match="named twice"):
+    with pytest.raises(PathreplayError, match="given twice"):
         pasts([folders[0], folders[0]])
 
 
@@ -107,7 +107,7 @@ DAMAGE = {
         ),
         "its history is damaged",
     ),
-    "views that are none": (lambda run: (run / "views.json").write_text("{"), "is no JSON"),
+    "views that are none": (lambda run: (run / "views.json").write_text("{"), "is not JSON"),
     "a picture that is none": (lambda run: (run / "images/result-left.png").write_text("x"), "cannot be read"),
     "no config": (lambda run: (run / "config.json").unlink(), "config or run.json missing"),
     "no run": (lambda run: (run / "run.json").unlink(), "is not a run folder"),
@@ -135,7 +135,7 @@ def test_the_command_prints_the_table_and_writes_the_page(tmp_path: Path, capsys
     app(["compare", *runs, "--output", str(tmp_path / "both.html")], standalone_mode=False)
     out = capsys.readouterr().out
     assert "[bold]a" in out and "32" in out and (tmp_path / "both.html").read_bytes().startswith(b"<!doctype html>")
-    with pytest.raises(PathreplayError, match="two runs or more"):
+    with pytest.raises(PathreplayError, match="at least two runs"):
         app(["compare", runs[0]], standalone_mode=False)
     with pytest.raises(PathreplayError, match="cannot be written"):
         app(["compare", *runs, "--output", str(tmp_path / "none/both.html")], standalone_mode=False)

@@ -1,4 +1,4 @@
-"""What the user sees while a job runs, on stderr: a bar on a terminal, plain lines now and then everywhere else."""
+"""Shows the progress of a job on stderr: a bar on a terminal, periodic lines otherwise."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from rich.console import Console
 from pathreplay.errors import plain_line
 from pathreplay.inverse.loop.events import Event, Notes, Started, Stepped
 
-# Between two lines, where there is no bar: a log of a long run stays readable.
+# Minimum time between two lines without a bar, so that the log of a long run stays readable.
 _SECONDS = 10.0
 
 
 class _Forgiving:
-    """Stderr, or silence once it is gone: a terminal that closes may not end the writing of what was found.
+    """Stderr that ignores write errors: a closed terminal must not prevent the results from being written.
 
-    Silence, too, where there is none (a program without a console has None in its place), and where a signal comes
-    while something is printed, and its handler prints: Python raises RuntimeError.
+    It also ignores a missing stderr (None in a program without a console), and the RuntimeError that Python raises if
+    a signal handler prints while the interrupted code is printing.
     """
 
     def __init__(self) -> None:
@@ -42,9 +42,9 @@ class _Forgiving:
 
 
 class Progress:
-    """Progress of a job, or silence; use as a context manager.
+    """Shows the progress of a job, or nothing if not ``shown``; a context manager.
 
-    Never rich's own bar for notebooks, which needs ipywidgets, and shows nothing without them: see `NotebookPanel`.
+    It never uses rich's notebook bar, which needs ipywidgets and shows nothing without them; see `NotebookPanel`.
     """
 
     def __init__(self, shown: bool) -> None:
@@ -52,7 +52,7 @@ class Progress:
         console = Console(file=self._stream, force_jupyter=False)
         self._shown, self._lines = shown, shown and not console.is_terminal
         self._notes = Notes()
-        self._told, self._begin, self._before = time.monotonic(), time.monotonic(), 0
+        self._printed, self._begin, self._before = time.monotonic(), time.monotonic(), 0
         self._bar = rich.progress.Progress(
             rich.progress.TextColumn("{task.description}"),
             rich.progress.BarColumn(),
@@ -74,28 +74,28 @@ class Progress:
         self._bar.stop()
 
     def say(self, text: str) -> None:
-        """Name what is going on now."""
+        """Show the current phase of the job."""
         self._bar.update(self._task, description=text)
         if self._lines:
             self._print(text)
 
     def status(self, text: str) -> None:
-        """What is so for a moment, where there is a bar."""
+        """Show a transient status, if there is a bar."""
         self._bar.update(self._task, description=f"optimizing: {text}")
 
     def remark(self, text: str) -> None:
-        """One line that stays, for who looks on."""
+        """Print a permanent line if progress is shown."""
         if self._shown:
             self.note(text)
 
     def note(self, text: str) -> None:
-        """One line that stays, above the bar."""
+        """Print a permanent line above the bar."""
         self._bar.console.print(
             f"pathreplay: {plain_line(text)}", markup=False, highlight=False, soft_wrap=True, emoji=False
         )
 
     def observe(self, event: Event) -> None:
-        """Show what the run tells."""
+        """Show an event of the run."""
         if isinstance(event, Started):
             self.start(event.done, event.wanted)
         elif isinstance(event, Stepped):
@@ -104,23 +104,23 @@ class Progress:
             self.note(note)
 
     def start(self, done: int, total: int) -> None:
-        """Begin to count iterations."""
+        """Start counting iterations."""
         self._bar.reset(self._task, total=total, completed=done, description="optimizing", loss="")
         self._begin, self._before = time.monotonic(), done
         if self._lines:
             self._print(f"optimizing, iterations {done} to {total}")
 
     def advance(self, loss: float) -> None:
-        """One iteration is done."""
+        """Count one completed iteration."""
         self._bar.update(self._task, advance=1, loss=f"loss {loss:.4g}")
         if not self._lines:
             return
         task = self._bar.tasks[0]
         done, total = int(task.completed), int(task.total or 0)
-        if done == self._before + 1 or done == total or time.monotonic() - self._told >= _SECONDS:
+        if done == self._before + 1 or done == total or time.monotonic() - self._printed >= _SECONDS:
             left = (time.monotonic() - self._begin) / max(1, done - self._before) * (total - done)
             self._print(f"iteration {done} of {total}, loss {loss:.4g}, about {left:.0f} s left")
 
     def _print(self, text: str) -> None:
-        self._told = time.monotonic()
+        self._printed = time.monotonic()
         print(f"pathreplay: {text}", file=self._stream, flush=True)

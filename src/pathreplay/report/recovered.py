@@ -1,4 +1,4 @@
-"""Where the parameters of a run are, each with its start and its truth: as people see them, and as scenes do."""
+"""Collects the parameters of a run as decoded values, each with its initial value and truth."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ VERTICES = ".vertex_positions"
 
 
 def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
-    """The parameters that are no poses, those that are derived behind those that they are derived from."""
+    """The parameters that are not poses; derived parameters come last."""
     parts = {name for pose in problem.poses for name in pose.of}
-    known = [(v.key, v.truth) for v in problem.variables if v.key not in parts and v.key != EXPOSURE]
-    made = {each.key: each.truth for each in problem.derived}
-    known += made.items()
+    truths = [(v.key, v.truth) for v in problem.variables if v.key not in parts and v.key != EXPOSURE]
+    derived = {parameter.key: parameter.truth for parameter in problem.derived}
+    truths += derived.items()
     starts = with_scene(problem, {v.key: v.start for v in problem.variables})
     values = with_scene(problem, run.values)
-    theirs = with_scene(problem, run.baseline.values) if run.baseline else {}
-    files_of = file_names([*(v.key for v in problem.variables), *made])
+    baselines = with_scene(problem, run.baseline.values) if run.baseline else {}
+    names = file_names([*(v.key for v in problem.variables), *derived])
     return tuple(
-        Recovered(key, files_of[key], starts[key], values[key], truth, theirs.get(key), derived=key in made)
-        for key, truth in known
+        Recovered(key, names[key], starts[key], values[key], truth, baselines.get(key), derived=key in derived)
+        for key, truth in truths
     )
 
 
 def with_faces(problem: Problem, items: tuple[Recovered, ...]) -> tuple[Recovered, ...]:
-    """The vertices of a mesh among these are given its faces."""
+    """Add the faces of the mesh to parameters that are mesh vertices."""
     params = mi.traverse(problem.scene) if any(item.key.endswith(VERTICES) for item in items) else {}
-    faces = {item.key: item.key.removesuffix(VERTICES) + ".faces" for item in items if item.key.endswith(VERTICES)}
-    found = {key: np.array(params[name]) for key, name in faces.items() if name in params}
-    return tuple(replace(item, faces=found.get(item.key)) for item in items)
+    names = {item.key: item.key.removesuffix(VERTICES) + ".faces" for item in items if item.key.endswith(VERTICES)}
+    faces = {key: np.array(params[name]) for key, name in names.items() if name in params}
+    return tuple(replace(item, faces=faces.get(item.key)) for item in items)
 
 
 def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:
@@ -56,13 +56,13 @@ def poses_of(problem: Problem, run: Run) -> tuple[RecoveredPose, ...]:
 
 
 def with_scene(problem: Problem, values: Arrays) -> dict[str, Array]:
-    """The values of the variables, and what they make of poses and of derived parameters, as people see it."""
-    used = {name for each in problem.made() for name in each.of}
-    if not used:
+    """Decoded values of the variables, and of the poses and derived parameters that are computed from them."""
+    inputs = {name for computed in problem.made() for name in computed.of}
+    if not inputs:
         return dict(values)
-    few = replace(problem, variables=tuple(v for v in problem.variables if v.key in used))
-    variables = variables_of(few, values)
-    return {each.key: get_array(each.value(variables)) for each in problem.made()} | dict(values)
+    reduced = replace(problem, variables=tuple(v for v in problem.variables if v.key in inputs))
+    variables = variables_of(reduced, values)
+    return {computed.key: get_array(computed.value(variables)) for computed in problem.made()} | dict(values)
 
 
 def _parts(pose: Pose, values: Arrays) -> dict[str, Array]:

@@ -1,4 +1,4 @@
-"""The report: what was asked, what came out, how far it is from the truth, as one HTML file that needs nothing else."""
+"""The report: the job, its results and their errors, as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -38,23 +38,26 @@ from pathreplay.report.page_parts import (
 from pathreplay.report.pages.document import document
 from pathreplay.report.pages.page import Comparison, Head, Mesh, Page, Parameter, Picture, Row, Still, Table, View
 
-# Colours that read on light and dark ground alike.
-OURS, RIVAL, GREY = "#3b82f6", "#e07b39", "#808080"
+# Colours that are readable on light and dark backgrounds.
+JOB, BASELINE, GREY = "#3b82f6", "#e07b39", "#808080"
 
-# A report is opened in a mail, too: pictures of so many views, of so many pixels in all (a noisy one takes about four
-# bytes of the page). The others, and the whole ones, are files in the run folder.
+# Limits of views and of pixels in all images: a report may be sent by mail, and a noisy pixel takes about four bytes of
+# the page. All views at full resolution are files in the run folder.
 MOST_VIEWS, MOST_PIXELS = 24, 6_000_000
-# Of a mesh that can be turned about: some 3 MB of the page.
+# Limit of faces of an interactive mesh: about 3 MB of the page.
 MOST_FACES = 50_000
 
 Film = tuple[Still, ...]
 
-# So many parameters get a panel of their own beside that of the pictures.
+# Number of parameters with a panel of their own in the comparison, beside the panel of the images.
 PANELS = 2
 
 
 def report_files(outcome: Outcome, films: Mapping[str, Film] | None = None) -> dict[str, bytes]:
-    """report.html, the curves (SVG, PNG) and summary.png, as file name -> content; ``films`` are by view and key."""
+    """Content of report.html, of the curves (SVG, PNG) and of summary.png, by file name.
+
+    ``films`` are by view and parameter; see `films` in `live_page`.
+    """
     contestants = outcome.comparison()
     with own_settings():
         curves = {"loss": loss_figure(outcome.run.history)}
@@ -70,11 +73,11 @@ def report_files(outcome: Outcome, films: Mapping[str, Film] | None = None) -> d
 def report_page(
     outcome: Outcome, contestants: Sequence[Contestant], drawings: Mapping[str, str], films: Mapping[str, Film]
 ) -> Page:
-    """What the report says; ``drawings`` are the addresses of the curves by name."""
+    """The report as a page; ``drawings`` are the data URIs of the curves by name."""
     config, history = outcome.config, outcome.run.history
     ended = f"Stopped after {len(history)} of {config.iterations} iterations."
     if why := outcome.run.optimiser.finished:
-        ended = f"No more steps after {len(history)} of {config.iterations} iterations: {why}."
+        ended = f"Terminated after {len(history)} of {config.iterations} iterations: {why}."
     test_views, count = len(outcome.test_views()), number_of(outcome.recovered) + len(outcome.poses)
     exposure = common_exposure([view.target for view in outcome.views])
     return Page(
@@ -86,7 +89,7 @@ def report_page(
         views=_views(outcome, exposure, films),
         likeness=_likeness(outcome),
         likeness_note=_likeness_note(outcome),
-        views_note="Difference: red where the result is brighter than the target, blue where it is darker."
+        views_note="Difference: red where the result is brighter than the target, blue where darker."
         + _left_out(outcome),
         exposure=exposure,
         plots=plots(history),
@@ -104,39 +107,40 @@ def report_page(
 
 
 def _verdict(outcome: Outcome) -> tuple[str, ...]:
-    said = str(outcome.verdict)
-    return (f"{said[0].upper()}{said[1:]}.",)
+    verdict = str(outcome.verdict)
+    return (f"{verdict[0].upper()}{verdict[1:]}.",)
 
 
 def _comparison(outcome: Outcome, contestants: Sequence[Contestant], drawing: str) -> Comparison:
     judge = (outcome.config.target.integrator or outcome.config.integrator).type
-    heads = [Head(text) for text in ("", "iterations", "seconds", "error of the pictures")]
+    heads = [Head(text) for text in ("", "iterations", "seconds", "image error")]
     heads += [Head("error of", key) for key in contestants[0].errors]
     rows = []
-    for each in contestants:
-        measured = (each.run.picture_error(), *each.errors.values())
-        cells = (str(len(each.run.history)), f"{each.run.seconds():.0f}", *(f"{error:.4g}" for error in measured))
-        rows.append(Row(each.name, cells))
+    for contestant in contestants:
+        run, errors = contestant.run, (contestant.run.picture_error(), *contestant.errors.values())
+        cells = (str(len(run.history)), f"{run.seconds():.0f}", *(f"{error:.4g}" for error in errors))
+        rows.append(Row(contestant.name, cells))
     note = (
-        "Root mean square errors. Those of the pictures are without the noise of rendering them; "
-        f"{judge} rendered them for both. The baseline started from the same values and had the same samples per step "
-        "and seeds. Both took turns: after each step the baseline took as many as brought it to the same time, with "
-        "the learning rate and resolution of the other. Compiling counts, judging does not."
+        "Root mean square errors. Image errors exclude render noise; "
+        f"{judge} rendered the images of both. The baseline started from the same values, with the same samples per "
+        "step and the same seeds. The two runs alternated: after each step of the job, the baseline took steps until "
+        "it had used the same time, with the job's learning rate and resolution. The time includes compilation, but "
+        "not the evaluation of the errors."
     )
-    title = f"Next to {contestants[1].name}, in the same time"
+    title = f"Comparison with {contestants[1].name} at equal time"
     return Comparison(title, drawing, Table(tuple(heads), tuple(rows)), note)
 
 
 def _likeness(outcome: Outcome) -> Table:
-    heads = ["", "PSNR at the start", "in the result", "SSIM at the start", "in the result"]
+    heads = ["", "PSNR, initial", "PSNR, result", "SSIM, initial", "SSIM, result"]
     flips, exposed = outcome.has_flip(), any(view.factors for view in outcome.views)
-    heads += ["FLIP at the start", "in the result"] * flips + ["exposure found"] * exposed
+    heads += ["FLIP, initial", "FLIP, result"] * flips + ["recovered exposure"] * exposed
     rows = []
     for view in outcome.views:
         before, after = view.likenesses["start"], view.likenesses["result"]
         cells = [f"{before.psnr:.2f} dB", f"{after.psnr:.2f} dB", f"{before.ssim:.4f}", f"{after.ssim:.4f}"]
         if flips:
-            cells += ["" if each.flip is None else f"{each.flip:.4f}" for each in (before, after)]
+            cells += ["" if likeness.flip is None else f"{likeness.flip:.4f}" for likeness in (before, after)]
         if exposed:
             cells.append("× " + ", ".join(f"{factor:.3f}" for factor in view.factors))
         rows.append(Row(view.name + " (held out)" * view.is_test, tuple(cells)))
@@ -144,16 +148,16 @@ def _likeness(outcome: Outcome) -> Table:
 
 
 def _likeness_note(outcome: Outcome) -> str:
-    said = "Of what a display shows of each view at an exposure of its own, noise included."
+    note = "Metrics of the displayed image of each view at its own exposure, including render noise."
     if outcome.test_views():
-        said += " Nothing was learned from views that are held out"
-        said += "; their exposures are fitted to their pictures at the end." if outcome.config.exposure else "."
-        said += "" if outcome.has_flip() else " FLIP of them comes with: pip install 'pathreplay[flip]'."
-    return said
+        note += " Held-out views are excluded from the optimization"
+        note += "; their exposures are fitted to their targets at the end." if outcome.config.exposure else "."
+        note += "" if outcome.has_flip() else " FLIP of held-out views needs: pip install 'pathreplay[flip]'."
+    return note
 
 
 def _shown(outcome: Outcome) -> tuple[list[ViewPictures], float]:
-    """The views whose pictures are in the report, and by how much these are made smaller, for it to stay a page."""
+    """The views whose images are in the report, and the factor by which these are scaled to limit its size."""
     views = list(outcome.views)
     if len(views) > MOST_VIEWS:
         views = [views[i * len(views) // MOST_VIEWS] for i in range(MOST_VIEWS)]
@@ -163,16 +167,16 @@ def _shown(outcome: Outcome) -> tuple[list[ViewPictures], float]:
 
 def _left_out(outcome: Outcome) -> str:
     views, scale = _shown(outcome)
-    said = ""
+    note = ""
     if len(views) < len(outcome.views):
-        said += f" Pictures of {len(views)} of the {len(outcome.views)} views are here, of all of them in images/."
+        note += f" {len(views)} of the {len(outcome.views)} views are shown; images/ has all of them."
     if scale < 1:
-        said += f" Pictures are {100 * scale:.0f} % as wide and high as those in images/."
-    return said
+        note += f" Images are scaled to {100 * scale:.0f} % of the width and height of those in images/."
+    return note
 
 
 def _views(outcome: Outcome, exposure: float, films: Mapping[str, Film]) -> tuple[View, ...]:
-    found = []
+    sections = []
     views, scale = _shown(outcome)
     for view in views:
         stored = min(exposure, view.exposure)
@@ -180,18 +184,19 @@ def _views(outcome: Outcome, exposure: float, films: Mapping[str, Film]) -> tupl
             Picture(kind, outcome.caption(kind), uri("image/png", png_bytes(_smaller(image, scale), stored)))
             for kind, image in view.pictures().items()
         )
-        mask = ", where its mask is" if view.weight is not None else ""
+        mask = " and weighted by the mask" if view.weight is not None else ""
         note = (
-            f"Root mean square difference from the target: {view.error(view.start):.4g} at the start, "
-            f"{view.error(view.result):.4g} in the result, noise included{mask}. Shown at exposure {stored:.3g}."
+            f"RMS difference from the target: {view.error(view.start):.4g} initially, "
+            f"{view.error(view.result):.4g} in the result, including render noise{mask}. Shown at exposure "
+            f"{stored:.3g}."
         )
         film = films.get(f"view-{view.name}", ())
-        found.append(View(view.name, pictures, stored, view.exposure, view.is_test, note, film))
-    return tuple(found)
+        sections.append(View(view.name, pictures, stored, view.exposure, view.is_test, note, film))
+    return tuple(sections)
 
 
 def _mesh(item: Recovered) -> Mesh | None:
-    """The meshes of start, result and truth to turn about, where there are not too many faces for a page."""
+    """Interactive mesh of initial value, result and truth; None without faces or with too many for a page."""
     if item.faces is None or item.faces.size > 3 * MOST_FACES:
         return None
     known = {
@@ -208,11 +213,12 @@ def _smaller(image: Image, scale: float) -> Image:
 
 
 def _parameters(outcome: Outcome, films: Mapping[str, Film]) -> tuple[Parameter, ...]:
-    """Textures, volumes, numbers, poses, and what is none of these."""
+    """Sections of textures, volumes, numbers, poses and other parameters, in this order."""
 
     def pictures(images: Mapping[str, Image]) -> tuple[Picture, ...]:
-        made = {kind: uri("image/png", png_bytes(image)) for kind, image in images.items()}
-        return tuple(Picture(kind, outcome.caption(kind), source) for kind, source in made.items())
+        return tuple(
+            Picture(kind, outcome.caption(kind), uri("image/png", png_bytes(image))) for kind, image in images.items()
+        )
 
     baseline = outcome.names()[1]
     kinds: list[list[Parameter]] = [[], [], [], []]
@@ -232,10 +238,10 @@ def _parameters(outcome: Outcome, films: Mapping[str, Film]) -> tuple[Parameter,
 
 
 def loss_figure(history: Sequence[Entry]) -> Figure:
-    """Loss against iteration, logarithmic."""
+    """Plot the loss against the iteration, on a logarithmic scale if any loss is positive."""
     figure = Figure(figsize=(7, 2.6), layout="constrained")
     axes = figure.add_subplot()
-    axes.plot([entry.iteration for entry in history], [entry.loss for entry in history], color=OURS, linewidth=1.5)
+    axes.plot([entry.iteration for entry in history], [entry.loss for entry in history], color=JOB, linewidth=1.5)
     if any(entry.loss > 0 for entry in history):
         axes.set_yscale("log")
     axes.set_ylabel("loss")
@@ -244,32 +250,32 @@ def loss_figure(history: Sequence[Entry]) -> Figure:
 
 
 def comparison_figure(contestants: Sequence[Contestant]) -> Figure:
-    """Errors against seconds of two runs: of the pictures, and of the first keys; of poses on a logarithmic scale."""
+    """Plot errors of two runs against seconds: of images and of the first keys; errors of poses are logarithmic."""
     panels = [None, *list(contestants[0].errors)[:PANELS]]
     figure = Figure(figsize=(4.4 * len(panels), 3.0), layout="constrained")
     for axes, key in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        for contestant, colour in zip(contestants, (OURS, RIVAL), strict=True):
+        for contestant, colour in zip(contestants, (JOB, BASELINE), strict=True):
             history = contestant.run.history
             seconds = np.cumsum([entry.seconds for entry in history])
             errors = [entry.picture_error if key is None else entry.errors.get(key) for entry in history]
-            found = [(s, error) for s, error in zip(seconds, errors, strict=True) if error is not None]
+            points = [(s, error) for s, error in zip(seconds, errors, strict=True) if error is not None]
             marker = "o" if key is None else None
-            points = zip(*found, strict=True)
-            axes.plot(*points, color=colour, linewidth=1.5, marker=marker, markersize=3, label=contestant.name)
+            x, y = [s for s, _ in points], [error for _, error in points]
+            axes.plot(x, y, color=colour, linewidth=1.5, marker=marker, markersize=3, label=contestant.name)
         if key is not None and key.endswith(error_names("")):
             axes.set_yscale("log")
         else:
             axes.set_ylim(bottom=0)
-        axes.set_title("error of the pictures" if key is None else f"error of {key}", fontsize=9, color=GREY)
+        axes.set_title("image error" if key is None else f"error of {key}", fontsize=9, color=GREY)
         _plain(axes, "seconds")
     axes.legend(frameon=False, labelcolor=GREY)
     return figure
 
 
 def drawn(figure: Figure, kind: str) -> bytes:
-    """The figure as the bytes of an image file ('svg', with a transparent ground, or 'png')."""
+    """Encode the figure as 'svg' with a transparent background, or as 'png'."""
     buffer = io.BytesIO()
-    # No date in the file: the same run gives the same bytes.
+    # Omit the date, so that the same run gives the same bytes.
     metadata = {"Date": None} if kind == "svg" else None
     figure.savefig(buffer, format=kind, transparent=kind == "svg", metadata=metadata)
     return buffer.getvalue()
@@ -287,19 +293,19 @@ def _plain(axes: Any, along: str) -> None:
         axes.spines[side].set_visible(False)
 
 
-# At most so many views and textures in summary.png: it is an overview, the report has them all.
+# Maximum number of views, and of grids, in summary.png; the report has all of them.
 SUMMARY_ROWS = 3
 SUMMARY_SIDE = 512
-"""Pixels along a side of one of them, which is 210 wide: more would only take memory."""
+"""Maximum pixels along a side before an image is drawn 210 pixels wide; more would only take memory."""
 
 
 def summary(outcome: Outcome) -> bytes:
-    """One PNG with everything side by side: a row per view (target, start, result, difference), texture and volume."""
+    """Draw the overview PNG: a row of images per view (target, initial, result, difference), texture and volume."""
     rows = [(v.name, v.pictures(), v.exposure) for v in outcome.views[:SUMMARY_ROWS]]
     grids = [(r.key, r.textures() or r.volumes()) for r in outcome.recovered]
     rows += [(key, images, 1.0) for key, images in [row for row in grids if row[1]][:SUMMARY_ROWS]]
     columns = max(len(images) for _, images, _ in rows)
-    # As high as its picture, which is 2.1 wide, and 0.2 for the title.
+    # Row heights in inches: images are 2.1 wide, and titles take 0.2.
     heights = [0.2 + 2.1 * image.shape[0] / image.shape[1] for _, images, _ in rows for image in [images["start"]]]
     figure = Figure(figsize=(2.1 * columns, sum(heights)), layout="constrained", dpi=100)
     grid = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
@@ -310,9 +316,10 @@ def summary(outcome: Outcome) -> bytes:
             pixels = displayed(shown(image, SUMMARY_SIDE), exposure)
             line[column].imshow(pixels, interpolation="nearest", vmin=0, vmax=1, cmap="gray")
             label = outcome.caption(kind)
-            short = name if len(name) <= 24 else f"…{name[-23:]}"  # what fits over a picture
+            short = name if len(name) <= 24 else f"…{name[-23:]}"  # must fit above an image
             line[column].set_title(label if column else f"{short}: {label}", fontsize=8)
-    # 256 colours: fewer bytes for noisy pictures, fit for a README or a mail. With a palette given, Pillow dithers.
+    # Reduce to 256 colours, which keeps noisy images small enough for a README or a mail. Pillow dithers if it is given
+    # a palette.
     picture = PIL.Image.open(io.BytesIO(drawn(figure, "png"))).convert("RGB")
     buffer = io.BytesIO()
     picture.quantize(palette=picture.quantize(256)).save(buffer, "png", optimize=True)
@@ -320,7 +327,7 @@ def summary(outcome: Outcome) -> bytes:
 
 
 def versions() -> dict[str, str]:
-    """What a run depends on besides its config."""
+    """Versions and system properties that a run depends on besides its config."""
     return {
         "pathreplay": version("pathreplay"),
         "Mitsuba": version("mitsuba"),

@@ -1,4 +1,4 @@
-"""The end of a run: its outcome, the files of it, and what Python gets."""
+"""The result of a run: its outcome, its files, and the `RunResult` of the Python API."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from pathreplay.scenes.volume_files import vol_bytes
 
 @dataclass(frozen=True, repr=False)
 class RunResult:
-    """What a run came to; everything in it is also in ``folder``."""
+    """Result of a run; everything in it is also in ``folder``."""
 
     folder: Path
     report: Path
@@ -42,42 +42,42 @@ class RunResult:
     history: tuple[Entry, ...]
     parameters: dict[str, Array]
     errors: dict[str, float]
-    """Root mean square error of each parameter whose truth is known; poses are told apart."""
+    """Root mean square error of each parameter whose truth is known; poses are in ``poses``."""
     poses: dict[str, PoseError]
-    """How far each pose whose truth is known is from it."""
+    """Error of each pose whose truth is known."""
     views: dict[str, Likeness]
-    """How alike each view is to its target."""
+    """Image metrics of each view against its target."""
     test_views: tuple[str, ...]
-    """The views that were not learned from."""
+    """The views that were excluded from the optimization."""
     verdict: Verdict
-    """Which values still move, have arrived, or are not determined by the pictures."""
+    """Which values are still moving, have converged, or are not determined by the images."""
 
     def __repr__(self) -> str:
-        """Short: a notebook prints it, and the history may have thousands of entries."""
+        """A short form, since a notebook prints it and the history may have thousands of entries."""
         loss = f", loss {self.history[-1].loss:.4g}" if self.history else ""
         stopped = ", stopped early" if self.stopped else ""
         count = f"{len(self.parameters)} parameters"
         return f"<RunResult: {self.iterations} iterations{loss}{stopped}, {count}, {self.report}>"
 
     def describe(self) -> str:
-        """A few lines for the terminal: loss, errors, where the report is, how to go on; the verdict on the values."""
+        """Lines for the terminal: loss, errors, path of the report, command to resume, and the verdict."""
         lines = []
         if self.history:
             first, last = self.history[0].loss, self.history[-1].loss
             lines.append(f"loss {first:.4g} -> {last:.4g} in {self.iterations} iterations")
         for key, error in self.errors.items():
             value = self.parameters[key]
-            found = f"{value.item():.5g}, " if value.size == 1 else ""
-            lines.append(f"{key}: {found}root mean square error {error:.4g}")
+            number = f"{value.item():.5g}, " if value.size == 1 else ""
+            lines.append(f"{key}: {number}RMS error {error:.4g}")
         lines += [f"{key}: {error}" for key, error in self.poses.items()]
         if self.test_views:
             psnr, ssim = (np.mean([getattr(self.views[v], kind) for v in self.test_views]) for kind in ("psnr", "ssim"))
             flips = [flip for v in self.test_views if (flip := self.views[v].flip) is not None]
-            told = f", FLIP {np.mean(flips):.4f}" if flips else ""
-            lines.append(f"held-out views ({len(self.test_views)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}{told}")
+            mean_flip = f", FLIP {np.mean(flips):.4f}" if flips else ""
+            lines.append(f"held-out views ({len(self.test_views)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}{mean_flip}")
         lines.append(f"report: {self.report}")
         if self.stopped:
-            lines.append(f"stopped early by {self.stopped_by}; go on with: {resume_command(self.folder)}")
+            lines.append(f"stopped early by {self.stopped_by}; resume with: {resume_command(self.folder)}")
         lines.append(str(self.verdict))
         return "\n".join(lines)
 
@@ -92,7 +92,11 @@ def outcome_of(
     baselines: dict[str, Image],
     verdict: Verdict,
 ) -> Outcome:
-    """All that is told of a run; ``before``, ``after`` and the ``baselines`` are pictures by view."""
+    """Collect the outcome of a run.
+
+    ``before``, ``after`` and ``baselines`` are the images of the initial values, the result and the baseline's result
+    by view name.
+    """
     views = tuple(
         ViewPictures(
             v.name,
@@ -115,7 +119,7 @@ def outcome_of(
 
 
 def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Content]:
-    """All files of the end of a run, the report with its ``films`` among them, by name in the run folder."""
+    """All files of a finished run, including the report with its ``films``, by name in the run folder."""
     table = {item.key: item.as_dict() for item in outcome.recovered}
     table |= {item.pose.key: item.as_dict() for item in outcome.poses}
     files: dict[str, Content] = {"parameters.json": (json.dumps(table, indent=2) + "\n").encode()}
@@ -139,7 +143,7 @@ def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Conte
 
 
 def result_of(outcome: Outcome, stopped_by: str | None) -> RunResult:
-    """What Python gets; ``stopped_by`` is the name of a signal, say, which may have come too late to stop anything."""
+    """The `RunResult`; ``stopped_by`` names what asked to stop, and is ignored if the run was already complete."""
     stopped = not outcome.complete
     return RunResult(
         folder=outcome.folder,

@@ -1,1 +1,1 @@
-"""The pages that people look at: what one says, as plain data, and the document that a browser shows."""
+"""Pages for the browser: their content as plain data, and the HTML document made from it."""

@@ -1,4 +1,4 @@
-"""A page as one HTML document with its own style and script: it asks no other host for anything, and says so by CSP."""
+"""Renders a page as one HTML document with its own style and script; a CSP forbids requests to other hosts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _file(name: str) -> str:
 
 @cache
 def template(name: str) -> jinja2.Template:
-    """One of this package's templates; texts that are put into it are escaped."""
+    """Load one of this package's templates, which escape inserted texts."""
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(_file),
         autoescape=True,
@@ -33,9 +33,10 @@ def template(name: str) -> jinja2.Template:
 
 
 def document(page: Page, live: bool = False) -> bytes:
-    """The page as HTML in UTF-8; a ``live`` one is served, looks for news of itself, and has a button to stop the run.
+    """Render the page as HTML in UTF-8.
 
-    One that is saved carries its policy itself; for one that is served, `policy` is that of the header.
+    A ``live`` page is served: it polls for updates and has a button to stop the run. A saved page contains its content
+    security policy; for a served page, the server sends `policy` in a header.
     """
     html = template("page.html.j2").render(
         page=page, live=live, policy="" if live else policy("data:"), data=_data(page, live),
@@ -45,7 +46,7 @@ def document(page: Page, live: bool = False) -> bytes:
 
 
 def policy(pictures: str, connect: str = "'none'") -> str:
-    """A Content-Security-Policy that lets our style and script run, and pictures of ``pictures`` be shown."""
+    """Content-Security-Policy that allows our style and script, and images from the source ``pictures``."""
     rules = {
         "default-src": "'none'",
         "script-src": _hash("page.js"),
@@ -63,7 +64,7 @@ def _hash(name: str) -> str:
 
 
 def _data(page: Page, live: bool) -> str:
-    """What the script needs beyond the document itself, as JSON that cannot end the element that it stands in."""
+    """Data of the script, as JSON that cannot close the enclosing HTML element."""
     data = {
         "live": live,
         "exposure": page.exposure,

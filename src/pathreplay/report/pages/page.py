@@ -1,20 +1,20 @@
-"""What a page about a run says, as plain data: whoever knows the run fills it in, and `document` makes HTML of it.
+"""The content of a page about a run as plain data, from which `document` makes HTML.
 
-Texts are texts: whatever they hold, the document shows it letter by letter. A ``src`` is a data URI in a page that is
-one file, and a relative address in one that is served.
+The document shows all texts literally. A ``src`` is a data URI in a self-contained page, and a relative address in a
+served page.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-# A curve of more points is no better to look at; every so many of a longer one are taken.
+# Maximum points of a curve; longer curves are subsampled.
 MOST_POINTS = 1500
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of one kind ('target', 'result', ...), with what stands below it."""
+    """An image of one kind, as 'target' or 'result', with its caption."""
 
     kind: str
     caption: str
@@ -23,7 +23,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Still:
-    """One picture of a film: how something looked after so many iterations."""
+    """One frame of a film: an image after a number of iterations."""
 
     iteration: int
     src: str
@@ -31,7 +31,7 @@ class Still:
 
 @dataclass(frozen=True)
 class View:
-    """Pictures of one view. ``stored`` is the exposure that they have, ``own`` the one that suits this view best."""
+    """Images of one view. ``stored`` is the exposure of the stored images, ``own`` the view's own best exposure."""
 
     name: str
     pictures: tuple[Picture, ...]
@@ -44,7 +44,7 @@ class View:
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table: its name, what stands there, and a colour (#rrggbb) to show, or ""."""
+    """A table row: its name, its cells, and a colour swatch (#rrggbb) or ""."""
 
     name: str
     cells: tuple[str, ...]
@@ -53,7 +53,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Head:
-    """What stands over a column: words, and a key after them."""
+    """A column header: words, optionally followed by a parameter key."""
 
     text: str
     code: str = ""
@@ -61,7 +61,7 @@ class Head:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under heads, of which the first is over the names."""
+    """Rows under column headers; the first header is that of the row names."""
 
     heads: tuple[Head, ...]
     rows: tuple[Row, ...]
@@ -69,7 +69,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh to turn about: vertices by kind (3 n float32, base64), and faces (3 m uint32, base64)."""
+    """An interactive mesh: vertices by kind (3 n float32, base64), and faces (3 m uint32, base64)."""
 
     vertices: dict[str, str]
     faces: str
@@ -77,7 +77,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Parameter:
-    """What is told of one parameter: pictures, a table, a line, how it changed, a mesh; whatever there is."""
+    """The section of one parameter: any of images, table rows, a note, a film and a mesh."""
 
     key: str
     pictures: tuple[Picture, ...] = ()
@@ -90,7 +90,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Series:
-    """A line of a plot, named where there are several. What is not known at an x is None."""
+    """A line of a plot, named if there are several. Unknown values are None."""
 
     name: str
     x: tuple[float, ...]
@@ -99,20 +99,20 @@ class Series:
 
 @dataclass(frozen=True)
 class Plot:
-    """Curves, over iterations as a rule, on a logarithmic scale where all are above zero and ``log`` says so."""
+    """Curves, usually over iterations; on a logarithmic scale if ``log`` is set and all values are positive."""
 
     title: str
     series: tuple[Series, ...]
     log: bool = True
     code: str = ""
-    """A key that ends the title."""
+    """Parameter key at the end of the title."""
     along: str = "iteration"
-    """What x counts."""
+    """Unit of x."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A run next to another one that had the same time: a drawing, a table and what they mean."""
+    """Comparison of a run with its baseline at equal time: a plot, a table and an explanation."""
 
     title: str
     src: str
@@ -122,11 +122,11 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Page:
-    """Everything that a page says, from top to bottom."""
+    """All content of a page, from top to bottom."""
 
     title: str
     lead: tuple[str, str, str]
-    """Words, a name in the letters of code, and words."""
+    """Text, a name in a monospace font, and text."""
     notices: tuple[str, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
     comparison: Comparison | None = None
@@ -135,23 +135,23 @@ class Page:
     likeness_note: str = ""
     views_note: str = ""
     exposure: float = 1.0
-    """The one under which all views are shown, unless someone wants a view's own."""
+    """Common exposure of all views, unless the reader chooses a view's own."""
     left: str = "target"
     right: str = "result"
-    """Which pictures the wipe begins with."""
+    """Initial images of the wipe comparison."""
     plots: tuple[Plot, ...] = ()
     plots_note: str = ""
     drawing: str = ""
-    """The first plot as a picture, for readers without JavaScript."""
+    """The first plot as an image, for readers without JavaScript."""
     parameters: tuple[Parameter, ...] = ()
     command: str = ""
     how: tuple[Row, ...] = ()
     log: tuple[str, ...] = ()
     titles: dict[str, str] = field(default_factory=dict)
-    """Other words for the headings: 'views', 'plots', 'parameters', 'how'."""
+    """Replacements of the headings 'views', 'plots', 'parameters' and 'how'."""
 
 
 def thinned(count: int, most: int = MOST_POINTS) -> list[int]:
-    """The places of a sequence that a curve takes: all, or every so many, and the last."""
+    """Indices of the drawn points of a sequence: all, or evenly subsampled ones and the last."""
     step = -(-count // most) or 1
     return [*range(0, count - 1, step), count - 1] if count else []

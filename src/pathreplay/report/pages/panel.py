@@ -1,4 +1,4 @@
-"""What a notebook shows of a run while it is under way, as a piece of HTML that needs no script."""
+"""The progress panel of a run in a notebook, as HTML that needs no script."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from pathreplay.report.pages.document import template
 from pathreplay.report.pages.page import View, thinned
 
 WIDTH, HEIGHT, BORDER = 480, 120, 4
-"""Of the curve, in pixels."""
+"""Size of the curve in pixels."""
 MOST_POINTS = 240
 
 
 @dataclass(frozen=True)
 class Panel:
-    """Everything that it says, from top to bottom. Texts are shown letter by letter."""
+    """All content of the panel, from top to bottom. Texts are shown literally."""
 
     title: str
     status: str
     done: int = 0
     wanted: int = 0
     left: str = ""
-    """How long it may still take, in words."""
+    """Estimated remaining time, in words."""
     losses: tuple[float, ...] = ()
     views: tuple[View, ...] = ()
     notes: tuple[str, ...] = ()
 
     def html(self) -> str:
-        """The curve is logarithmic where all losses are above zero; of many iterations it takes every so many."""
+        """Render the panel. The curve is subsampled, and logarithmic if all losses are positive."""
         losses = [self.losses[i] for i in thinned(len(self.losses), MOST_POINTS)]
         log = bool(losses) and min(losses) > 0
         return template("panel.html.j2").render(
@@ -38,7 +38,7 @@ class Panel:
 
 
 def _points(values: list[float]) -> str:
-    """The corners of a line through values, in pixels; none where there is no line."""
+    """Points of a polyline through the values, in pixels; "" for fewer than two values."""
     if len(values) < 2:
         return ""
     low, high = min(values), max(values)

@@ -1,1 +1,1 @@
-"""Looking at runs: a local page that follows one, runs side by side, films, and their numbers for other tools."""
+"""Inspects runs: a local page that follows a run, comparisons, films, and export to TensorBoard."""

@@ -1,4 +1,4 @@
-"""The commands that look at runs which are over, or nearly: `compare`, `timelapse` and `tensorboard`."""
+"""The commands that inspect saved runs: `compare`, `timelapse` and `tensorboard`."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders.
 
 
 def add_to(app: typer.Typer) -> None:
-    """Give the command line these commands."""
-    app.command(short_help="Put runs side by side.")(compare)
+    """Add the commands to the command line."""
+    app.command(short_help="Compare runs side by side.")(compare)
     app.command(short_help="Make a film of a run.")(timelapse)
-    app.command(short_help="Write a run's history for TensorBoard.")(tensorboard)
+    app.command(short_help="Write the history of runs for TensorBoard.")(tensorboard)
 
 
 def compare(
     runs: Runs,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE.html", help="Also write a page with curves and pictures."),
+        typer.Option("--output", "-o", metavar="FILE.html", help="Also write a page with curves and images."),
     ] = None,
 ) -> None:
-    """Print what runs came to, and where their jobs differ; --output writes a page with curves and pictures."""
+    """Print the results of runs and the differences of their jobs; --output writes a page with curves and images."""
     with interrupts.undisturbed():
         from pathreplay.platform.atomic_files import write_whole
         from pathreplay.report.pages.document import document
@@ -35,11 +35,11 @@ def compare(
         from pathreplay.report.watch.past import pasts
 
     if len(runs) < 2:
-        raise PathreplayError("compare needs two runs or more; name another")
-    found = pasts(runs)
-    comparing.print_table(comparing.table(found))
+        raise PathreplayError("compare needs at least two runs; name another")
+    compared = pasts(runs)
+    comparing.print_table(comparing.table(compared))
     if output is not None:
-        write_whole(output, document(comparing.page(found)), "--output")
+        write_whole(output, document(comparing.page(compared)), "--output")
         typer.echo(f"page: {output}")
 
 
@@ -52,9 +52,9 @@ def timelapse(
         ),
     ] = None,
     view: Annotated[str | None, typer.Option(help="Name of the view (default: the first).")] = None,
-    seconds: Annotated[float, typer.Option(min=0.1, max=600, help="How long it takes.")] = 6.0,
+    seconds: Annotated[float, typer.Option(min=0.1, max=600, help="Duration of the film.")] = 6.0,
 ) -> None:
-    """Make a film of the pictures that a run has kept: the target beside what the run saw, and textures."""
+    """Make a film of the previews of a run: the target beside the current image and textures."""
     with interrupts.undisturbed():
         from pathreplay.report.watch.timelapse import film
 
@@ -69,11 +69,11 @@ def tensorboard(
         Path, typer.Option("--output", "-o", metavar="FOLDER", help="Folder for the event files.")
     ] = Path("tensorboard"),
 ) -> None:
-    """Write loss, errors and gradients of runs as event files; then: tensorboard --logdir FOLDER."""
+    """Write loss, errors and gradient norms of runs as event files; view them with: tensorboard --logdir FOLDER."""
     with interrupts.undisturbed():
         from pathreplay.report.watch.past import pasts
         from pathreplay.report.watch.tensorboard import write_events
 
     for run in pasts(runs):
         typer.echo(f"{run.name}: {write_events(run, output)} iterations")
-    typer.echo(f"look at them with: tensorboard --logdir {output}")
+    typer.echo(f"view them with: tensorboard --logdir {output}")

@@ -1,4 +1,4 @@
-"""Runs side by side: a table of what they came to and where their jobs differ, and a page of curves and pictures."""
+"""Compares runs: a table of their results and of the differences of their jobs, and a page of curves and images."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from pathreplay.report.watch.run_files import read_own
 
 
 def table(runs: list[Past]) -> Table:
-    """A column for each run: iterations, seconds, loss, likeness, errors, and what their jobs have set differently."""
+    """One column per run: iterations, seconds, loss, image metrics, errors, and job keys whose values differ."""
     rows = [
         Row("iterations", tuple(f"{len(run.history)} of {run.config.iterations}" for run in runs)),
         Row("seconds", tuple(f"{sum(entry.seconds for entry in run.history):.1f}" for run in runs)),
         Row("loss", tuple(_loss(run) for run in runs)),
     ]
     for kind, unit in (("psnr", " dB"), ("ssim", "")):
-        for name, views in (("views that are learned from", _learned), ("held-out views", Past.test_views)):
+        for name, views in (("training views", _learned), ("held-out views", Past.test_views)):
             cells = tuple(_mean([run.likeness(view, kind) for view in views(run)], unit) for run in runs)
             if any(cells):
                 rows.append(Row(f"{kind.upper()}, {name}", cells))
@@ -38,17 +38,17 @@ def table(runs: list[Past]) -> Table:
 
 
 def page(runs: list[Past]) -> Page:
-    """What the table says, with curves, and with pictures of the views that all runs have."""
+    """A page with the table, curves, and images of the views that all runs have."""
     kinds = {run.config.loss for run in runs}
-    said = "" if len(kinds) == 1 else f"The losses are of different kinds ({', '.join(sorted(kinds))})."
+    notice = "" if len(kinds) == 1 else f"The runs minimize different losses ({', '.join(sorted(kinds))})."
     views = _views(runs)
     return Page(
         title=" and ".join(run.name for run in runs) if len(runs) < 4 else f"{len(runs)} runs",
         lead=(f"{len(runs)} runs side by side: ", ", ".join(run.config.scene for run in runs[:1]), ""),
-        notices=(said,) if said else (),
+        notices=(notice,) if notice else (),
         views=views,
         likeness=table(runs),
-        likeness_note="PSNR and SSIM are means over views, each at an exposure of its own, noise included.",
+        likeness_note="PSNR and SSIM are means over views, each at its own exposure, including render noise.",
         left=runs[0].name,
         right=runs[1].name,
         plots=_plots(runs),
@@ -81,18 +81,18 @@ def _last(run: Past) -> Mapping[str, float]:
 
 
 def _keys(tables: Iterable[Mapping[str, Any]]) -> list[str]:
-    """The keys of all tables, each once, in the order in which they come."""
+    """The distinct keys of all tables, in order of first occurrence."""
     return list(dict.fromkeys(itertools.chain.from_iterable(tables)))
 
 
 def _differences(runs: list[Past]) -> list[Row]:
-    """What the jobs say differently; but for where they write to."""
-    flat = [dict(_flattened("", run.config.model_dump())) for run in runs]
-    for each in flat:
-        each.pop("output", None)
+    """Rows of the job keys whose values differ, except for ``output``."""
+    jobs = [dict(_flattened("", run.config.model_dump())) for run in runs]
+    for job in jobs:
+        job.pop("output", None)
     rows = []
-    for key in _keys(flat):
-        values = [each.get(key) for each in flat]
+    for key in _keys(jobs):
+        values = [job.get(key) for job in jobs]
         if any(value != values[0] for value in values):
             rows.append(Row(f"job: {key}", tuple("" if value is None else shown(value, 60) for value in values)))
     return rows
@@ -100,11 +100,11 @@ def _differences(runs: list[Past]) -> list[Row]:
 
 def _flattened(name: str, value: Any) -> Iterable[tuple[str, Any]]:
     if isinstance(value, dict):
-        for key, each in value.items():
-            yield from _flattened(f"{name}.{key}" if name else str(key), each)
-    elif isinstance(value, list) and any(isinstance(each, dict) for each in value):
-        for i, each in enumerate(value):
-            yield from _flattened(f"{name}.{i}", each)
+        for key, entry in value.items():
+            yield from _flattened(f"{name}.{key}" if name else str(key), entry)
+    elif isinstance(value, list) and any(isinstance(entry, dict) for entry in value):
+        for i, entry in enumerate(value):
+            yield from _flattened(f"{name}.{i}", entry)
     else:
         yield name, value
 
@@ -120,15 +120,15 @@ def _plots(runs: list[Past]) -> tuple[Plot, ...]:
             series.append(Series(run.name, x, y))
         return Plot(title, tuple(series), code=code, along="second" if seconds else "iteration")
 
-    found = [plot("loss by iterations", "", _loss_of), plot("loss by seconds", "", _loss_of, seconds=True)]
+    plots = [plot("loss by iterations", "", _loss_of), plot("loss by seconds", "", _loss_of, seconds=True)]
     lasts = [run.history[-1] for run in runs if run.history]
     for key in _keys(entry.gradient_norms | entry.errors for entry in lasts):
         if any(key in entry.errors for entry in lasts):
-            found.append(plot("error of", key, lambda entry, key=key: entry.errors.get(key)))  # type: ignore[misc]
+            plots.append(plot("error of", key, lambda entry, key=key: entry.errors.get(key)))  # type: ignore[misc]
         if any(key in entry.gradient_norms for entry in lasts):
             norm = lambda entry, key=key: entry.gradient_norms.get(key)  # noqa: E731
-            found.append(plot("gradient norm of", key, norm))
-    return tuple(found)
+            plots.append(plot("gradient norm of", key, norm))
+    return tuple(plots)
 
 
 def _loss_of(entry: Entry) -> float:
@@ -137,24 +137,24 @@ def _loss_of(entry: Entry) -> float:
 
 def _views(runs: list[Past]) -> tuple[View, ...]:
     names = [name for name in runs[0].views if all(name in run.views for run in runs)][:MOST_VIEWS]
-    share = MOST_PIXELS / max(1, len(names) * (len(runs) + 1))
-    found = []
+    most_pixels = MOST_PIXELS / max(1, len(names) * (len(runs) + 1))
+    sections = []
     for name in names:
-        pictures = [_picture(runs[0], "target", "target", f"target-{name}", share)]
+        pictures = [_picture(runs[0], "target", "target", f"target-{name}", most_pixels)]
         for run in runs:
             psnr = run.likeness(name, "psnr")
             caption = run.name if psnr is None else f"{run.name}, {psnr:.2f} dB"
-            pictures.append(_picture(run, run.name, caption, f"result-{name}", share))
+            pictures.append(_picture(run, run.name, caption, f"result-{name}", most_pixels))
         is_test = any(name in run.test_views() for run in runs)
         shown = tuple(picture for picture in pictures if picture is not None)
         if len(shown) > 1:
-            found.append(View(name, shown, is_test=is_test))
-    return tuple(found)
+            sections.append(View(name, shown, is_test=is_test))
+    return tuple(sections)
 
 
 def _parameters(runs: list[Past]) -> tuple[Parameter, ...]:
     keys = [key for run in runs if run.history for key in run.history[-1].gradient_norms]
-    found = []
+    sections = []
     for key in dict.fromkeys(keys):
         for what, columns in (("texture", 3), ("volume", 2)):
             pictures = []
@@ -166,12 +166,12 @@ def _parameters(runs: list[Past]) -> tuple[Parameter, ...]:
             truth = [_picture(runs[0], "truth", "truth", f"{what}-truth-{file_names([key])[key]}", MOST_PIXELS / 16)]
             shown = tuple(picture for picture in (*pictures, *truth) if picture is not None)
             if shown:
-                found.append(Parameter(key, shown, columns))
-    return tuple(found)
+                sections.append(Parameter(key, shown, columns))
+    return tuple(sections)
 
 
 def _picture(run: Past, kind: str, caption: str, file: str, most_pixels: float) -> Picture | None:
-    """A picture among a run's images, made smaller where it has too many pixels; None where there is none."""
+    """Read one of a run's images, downscaled to ``most_pixels``; None if it does not exist."""
     data = read_own(run.folder / "images" / f"{file}.png")
     if data is None:
         return None
@@ -188,12 +188,12 @@ def _picture(run: Past, kind: str, caption: str, file: str, most_pixels: float) 
                 data = buffer.getvalue()
     except (OSError, ValueError, PIL.Image.DecompressionBombError) as error:
         path = run.folder / "images" / f"{file}.png"
-        raise PathreplayError(f"Picture {path} cannot be read ({error}); give the folder of a whole run") from None
+        raise PathreplayError(f"Image {path} cannot be read ({error}); give the folder of a complete run") from None
     return Picture(kind, caption, uri("image/png", data))
 
 
 def print_table(it: Table) -> None:
-    """The table on the terminal; whatever stands in it is text."""
+    """Print the table on the terminal, without interpreting its texts as markup."""
     from rich.console import Console
     from rich.table import Table as Drawn
     from rich.text import Text

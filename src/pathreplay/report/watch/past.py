@@ -1,4 +1,4 @@
-"""What a run folder tells of a run, whether it has ended or not: its job, its history, and what it came to."""
+"""Reads a finished or active run from its folder: job, history and results."""
 
 from __future__ import annotations
 
@@ -22,35 +22,37 @@ _HISTORY = TypeAdapter(list[Entry])
 
 @dataclass(frozen=True)
 class Past:
-    """A run by its folder; ``name`` tells it from others that are looked at beside it."""
+    """A run in a folder; ``name`` distinguishes it from the other inspected runs."""
 
     folder: Path
     name: str
 
     @cached_property
     def config(self) -> Config:
-        """Raises PathreplayError where it cannot be read."""
+        """Config of the job. Raises PathreplayError if it cannot be read."""
         return read_job(self.folder).config
 
     @cached_property
     def history(self) -> list[Entry]:
-        """Up to the last checkpoint. Raises PathreplayError where that is missing or damaged."""
+        """Iterations up to the last checkpoint. Raises PathreplayError if that is missing or damaged."""
         path = self.folder / CHECKPOINT
         try:
             with safetensors.safe_open(str(path), framework="numpy") as file:
                 return _HISTORY.validate_json((file.metadata() or {}).get("history", ""), strict=True)
         except (OSError, safetensors.SafetensorError, ValidationError) as error:
             why = "its history is damaged" if isinstance(error, ValidationError) else str(error)
-            raise PathreplayError(f"Checkpoint {path} cannot be read ({why}); give the folder of a whole run") from None
+            raise PathreplayError(
+                f"Checkpoint {path} cannot be read ({why}); give the folder of a complete run"
+            ) from None
 
     @cached_property
     def views(self) -> dict[str, dict[str, Any]]:
-        """What views.json says of each view; empty before the end of the run."""
+        """Entries of views.json by view; empty before the end of the run."""
         table = self._json("views.json")
         return table if all(isinstance(view, dict) for view in table.values()) else {}
 
     def likeness(self, view: str, kind: str) -> float | None:
-        """PSNR or SSIM of a view in the result."""
+        """PSNR or SSIM of a view in the result; None if unknown."""
         result = self.views.get(view, {}).get("result")
         value = result.get(kind) if isinstance(result, dict) else None
         return float(value) if isinstance(value, (int, float)) else None
@@ -62,20 +64,20 @@ class Past:
         try:
             table = json.loads(read_own(self.folder / name) or b"{}")
         except (ValueError, RecursionError):
-            raise PathreplayError(f"{self.folder / name} is no JSON; give the folder of a whole run") from None
+            raise PathreplayError(f"{self.folder / name} is not JSON; give the folder of a complete run") from None
         return table if isinstance(table, dict) else {}
 
 
 def pasts(folders: list[Path]) -> list[Past]:
-    """The runs in these folders, by names that differ. Raises PathreplayError where one is no run."""
+    """The runs in these folders, with distinct names. Raises PathreplayError if a folder is not a run folder."""
     names = [folder.resolve().name for folder in folders]
-    found = []
+    runs = []
     for folder, name in zip(folders, names, strict=True):
         if not (folder / "run.json").is_file():
             raise PathreplayError(
                 f"{folder} is not a run folder (no run.json); give a folder that optimize has created"
             )
-        found.append(Past(folder, name if names.count(name) == 1 else str(folder)))
-    if len({past.folder.resolve() for past in found}) < len(found):
-        raise PathreplayError("A run is named twice; name different ones")
-    return found
+        runs.append(Past(folder, name if names.count(name) == 1 else str(folder)))
+    if len({run.folder.resolve() for run in runs}) < len(runs):
+        raise PathreplayError("A run is given twice; give different runs")
+    return runs

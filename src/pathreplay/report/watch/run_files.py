@@ -1,4 +1,4 @@
-"""What a run folder shows to who looks at it: its page or its report, its pictures, and whether it is under way."""
+"""Files of a run folder that `watch` serves: its live page or report and its images; and the run's process."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from pathreplay.report.pages.page import Page
 from pathreplay.runs.folder_lock import LOCK
 
 REPORT = "report.html"
-# Far above what any of these takes.
+# Far more than any of these files needs.
 MOST_BYTES = 256 * 2**20
 PICTURES = {".png": "image/png", ".webp": "image/webp"}
 
 
 def require_run(run: Path) -> None:
-    """Raise PathreplayError where there is nothing to look at."""
+    """Raise PathreplayError if the folder has nothing to show."""
     if not run.is_dir():
-        raise PathreplayError(f"No run folder {run}; give a folder that optimize has made")
+        raise PathreplayError(f"No run folder {run}; give a folder that optimize has created")
     if not (run / "run.json").is_file():
         raise PathreplayError(f"{run} is not a run folder (no run.json); give a folder that optimize has created")
     if not (run / PAGE).is_file() and not (run / REPORT).is_file():
-        raise PathreplayError(f"Run folder {run} shows nothing yet: there is no {PAGE} and no {REPORT}; wait for one")
+        raise PathreplayError(f"Run folder {run} has no {PAGE} and no {REPORT} yet; wait until it has one")
 
 
 def read_own(path: Path) -> bytes | None:
-    """The content of a regular file of the run; None where there is none, or a link is in its place."""
+    """Content of a regular file of the run; None if it does not exist, is a link, or is too large."""
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
         with open(os.open(path, flags), "rb") as file:
@@ -45,7 +45,7 @@ def read_own(path: Path) -> bytes | None:
 
 
 def picture(run: Path, name: str) -> tuple[str, bytes] | None:
-    """Kind and content of a picture among the previews; None for whatever is not there, or somewhere else."""
+    """Media type and content of a preview image; None if it does not exist or is outside the previews."""
     kind = PICTURES.get(Path(name).suffix)
     if kind is None or not re.fullmatch(r"[\w.-]+", name) or (run / FOLDER).is_symlink():
         return None
@@ -54,7 +54,7 @@ def picture(run: Path, name: str) -> tuple[str, bytes] | None:
 
 
 def report(run: Path) -> bytes | None:
-    """The report, where the run has ended with one: then it is newer than the page that followed the run."""
+    """The report, if the run has ended with one, which is then newer than the live page."""
     with contextlib.suppress(OSError):
         written = (run / REPORT).stat().st_mtime_ns
         with contextlib.suppress(FileNotFoundError):
@@ -65,7 +65,7 @@ def report(run: Path) -> bytes | None:
 
 
 def page(run: Path) -> Page:
-    """What the page of the run says. Raises PathreplayError where it is damaged."""
+    """Read the live page of the run. Raises PathreplayError if it is damaged."""
     path = run / PAGE
     if problem := file_problem(path, MOST_BYTES):
         raise PathreplayError(f"{path} {problem}; wait for the run to write it")
@@ -78,7 +78,7 @@ def page(run: Path) -> Page:
 
 
 def holder(run: Path) -> str | None:
-    """The process that holds the run, as far as this machine can tell; None where it has ended."""
+    """The process that holds the run's lock, as far as this machine can tell; None if it has ended."""
     data = read_own(run / LOCK) or b""
     match = re.fullmatch(r"(\d+) ([\w.-]+)\s*", data.decode("ascii", "replace"))
     if match is None:
@@ -94,8 +94,8 @@ def holder(run: Path) -> str | None:
 
 
 def ask_to_stop(run: Path) -> None:
-    """Leave the wish to stop where the loop looks for it. Raises PathreplayError where that cannot be written."""
-    # A pipe that nobody reads, say, must not keep us waiting.
+    """Create the file that asks the run to stop. Raises PathreplayError if it cannot be written."""
+    # Opening must not block, even if the name belongs to a pipe that nobody reads.
     flags = os.O_WRONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
         os.close(os.open(run / STOP, flags, 0o644))

@@ -1,7 +1,7 @@
-"""A small server for one run: its page, the pictures of that, and a button that asks it to stop; nothing else.
+"""A small server for one run: its page, the images of the page, and a request to stop the run.
 
-All addresses begin with a token that only who started the server knows. A page of another host that has its own name
-lead here (DNS rebinding) is refused by the name that it asks for.
+All addresses begin with a token that only the user who started the server knows. Requests by a page of another host
+whose name resolves to this machine (DNS rebinding) are refused by their Host header.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from pathreplay.report.live_page import FOLDER
 from pathreplay.report.pages.document import document, policy
 from pathreplay.report.watch import run_files
 
-# Seconds after which a client is left that has not said what it wants, or not taken what it is sent.
+# Seconds within which a client must send its request and receive the answer.
 PATIENCE = 30
-# Connections at once: several browsers. More get no answer.
+# Maximum concurrent connections, enough for several browsers. Further ones are closed.
 MOST = 32
 
 
@@ -38,18 +38,18 @@ class RunServer(ThreadingHTTPServer):
     request_queue_size = MOST
 
     def __init__(self, run: Path, host: str, port: int, token: str | None = None) -> None:
-        """Raises PathreplayError where the address cannot be listened at."""
+        """Raises PathreplayError if the server cannot listen at the address."""
         self.run = run
         self.room = threading.BoundedSemaphore(MOST)
         self.token = token or secrets.token_urlsafe(18)
         try:
-            found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-            self.address_family = found[0]
-            super().__init__(found[4], Handler)  # type: ignore[arg-type]
+            info = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+            self.address_family = info[0]
+            super().__init__(info[4], Handler)  # type: ignore[arg-type]
         except (OSError, OverflowError, UnicodeError) as error:
             why = getattr(error, "strerror", None) or error
             raise PathreplayError(
-                f"Nothing can be served at {host}, port {port} ({why}); give another --port or --host"
+                f"Cannot listen on {host}, port {port} ({why}); give another --port or --host"
             ) from None
         self.names = {"localhost", host.lower(), socket.gethostname().lower(), socket.getfqdn().lower()}
         everywhere = host in ("", "0.0.0.0", "::")
@@ -57,26 +57,26 @@ class RunServer(ThreadingHTTPServer):
         self.address = f"http://{shown}:{self.server_address[1]}/{self.token}/"
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """In a thread of its own, where there is room for one more."""
+        """Answer in a thread of its own, or close the connection if there are too many."""
         if not self.room.acquire(blocking=False):
             self.shutdown_request(request)
             return
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer, and make room again."""
+        """Answer, then release the connection's slot."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self.room.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that goes away is no error of ours."""
+        """Ignore clients that disconnect; report other errors."""
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
             super().handle_error(request, client_address)
 
     def knows(self, host: str) -> bool:
-        """Whether a request for this name may be answered: an address in numbers, or a name of this machine."""
+        """Whether a request with this Host header may be answered: a numeric address, or a name of this machine."""
         try:
             name = urlsplit(f"//{host}").hostname or ""
         except ValueError:
@@ -88,17 +88,17 @@ class RunServer(ThreadingHTTPServer):
 
 
 class _Within(io.RawIOBase):
-    """What a client sends until a moment; then reading raises TimeoutError, however many bytes still drip."""
+    """Reads from a client up to a deadline, after which it raises TimeoutError even if bytes keep arriving slowly."""
 
     def __init__(self, connection: socket.socket, seconds: float) -> None:
         self.connection, self.end = connection, time.monotonic() + seconds
 
     def readable(self) -> bool:
-        """It is."""
+        """Return True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Wait for bytes as long as there is time."""
+        """Wait for bytes until the deadline."""
         if (left := self.end - time.monotonic()) <= 0:
             raise TimeoutError
         self.connection.settimeout(left)
@@ -109,7 +109,7 @@ class _Within(io.RawIOBase):
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Answers one request, the only one of its connection: what is sent behind it is never read."""
+    """Answers one request per connection; anything sent after it is never read."""
 
     server: RunServer
     timeout = PATIENCE
@@ -117,29 +117,29 @@ class Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "pathreplay", ""
 
     def setup(self) -> None:
-        """Give the client a time in which to say what it wants."""
+        """Set the deadline for the request."""
         super().setup()
         self.rfile = io.BufferedReader(_Within(self.connection, PATIENCE))
 
     def do_GET(self) -> None:
-        """The page, or one of its pictures."""
+        """Serve the page or one of its images."""
         place = self._place()
         if place is None:
             return
         if place == "":
             self._page()
-        elif place.startswith(f"{FOLDER}/") and (found := run_files.picture(self.server.run, place[len(FOLDER) + 1 :])):
-            self._answer(200, *found)
+        elif place.startswith(f"{FOLDER}/") and (image := run_files.picture(self.server.run, place[len(FOLDER) + 1 :])):
+            self._answer(200, *image)
         else:
-            self._answer(404, "text/plain", b"not here\n")
+            self._answer(404, "text/plain", b"not found\n")
 
     def do_POST(self) -> None:
-        """A wish to stop the run."""
+        """Ask the run to stop."""
         place = self._place()
         if place is None:
             return
         if place != "stop" or not self._from_our_page():
-            self._answer(404 if place != "stop" else 403, "text/plain", b"not here\n")
+            self._answer(404 if place != "stop" else 403, "text/plain", b"not found\n")
             return
         try:
             run_files.ask_to_stop(self.server.run)
@@ -149,28 +149,28 @@ class Handler(BaseHTTPRequestHandler):
             self._answer(200, "text/plain", b"stopping\n")
 
     def _from_our_page(self) -> bool:
-        """Whether no page of another origin asks."""
+        """Whether the request does not come from a page of another origin."""
         origin = self.headers.get("Origin")
-        with contextlib.suppress(ValueError):  # what is no URL
+        with contextlib.suppress(ValueError):  # not a URL
             return origin is None or urlsplit(origin).netloc == self.headers.get("Host")
         return False
 
     def _place(self) -> str | None:
-        """What is asked for behind the token; None where the request was refused."""
+        """Requested path behind the token; None if the request was refused."""
         if not self.server.knows(self.headers.get("Host", "")):
-            self._answer(403, "text/plain", b"this server is not called that\n")
+            self._answer(403, "text/plain", b"unknown host name\n")
             return None
         try:
             path = urlsplit(self.path).path
         except ValueError:
-            self._answer(404, "text/plain", b"this is no address\n")
+            self._answer(404, "text/plain", b"invalid address\n")
             return None
         token, slash, place = unquote(path).lstrip("/").partition("/")
         if not secrets.compare_digest(token.encode("utf-8", "replace"), self.server.token.encode()):
-            self._answer(403, "text/plain", b"give the whole address that pathreplay watch printed\n")
+            self._answer(403, "text/plain", b"use the full address that pathreplay watch printed\n")
             return None
-        if not slash:  # what the page names would be looked for beside it
-            self._answer(404, "text/plain", b"the address ends with a /\n")
+        if not slash:  # relative addresses of the page would not resolve
+            self._answer(404, "text/plain", b"the address must end with a /\n")
             return None
         return place
 
@@ -200,7 +200,7 @@ class Handler(BaseHTTPRequestHandler):
             self.wfile.write(data)
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Says nothing: the terminal belongs to the address."""
+        """Log nothing, so that the address stays visible in the terminal."""
 
 
 SAFE = {
@@ -214,7 +214,7 @@ SAFE = {
 
 
 def serve(server: RunServer) -> None:
-    """Answer until a signal ends the command; the port is free then."""
+    """Answer requests until a signal ends the command, then free the port."""
     try:
         server.serve_forever(poll_interval=0.2)
     finally:

@@ -1,4 +1,4 @@
-"""The history of a run for TensorBoard: loss, errors and norms of gradients, by iteration, at the times they had."""
+"""Writes the history of a run for TensorBoard: loss, errors and gradient norms per iteration, with their times."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathreplay.report.watch.past import Past
 
 
 def write_events(run: Past, output: Path) -> int:
-    """Write event files into ``output``, a folder of its own for each run; returns how many iterations there are.
+    """Write event files into a folder in ``output`` that is named like the run; returns the number of iterations.
 
-    Raises PathreplayError where the package tensorboard is absent, or the folder cannot be written.
+    Raises PathreplayError if the package tensorboard is missing, or the folder exists or cannot be written.
     """
     try:
         from tensorboard.summary import Writer
     except ImportError:
         raise PathreplayError(
-            "TensorBoard is not installed; pip install 'pathreplay[tensorboard]', or tensorboard by itself"
+            "TensorBoard is not installed; pip install 'pathreplay[tensorboard]', or tensorboard alone"
         ) from None
     history = run.history
     folder = output / Path(run.name).name

@@ -1,4 +1,4 @@
-"""A film of a recovery: the target beside what the run saw of it, iteration by iteration, as WebP or as MP4."""
+"""Makes a film of a run: the target beside the current image, iteration by iteration, as WebP or MP4."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from pathreplay.errors import PathreplayError
 from pathreplay.report.live_page import FOLDER, frames
 from pathreplay.report.watch.run_files import read_own
 
-# Pixels: of the pictures, and of the line of text below them.
+# Heights in pixels: of the images, and of the line of text below them.
 HEIGHT, TEXT = 288, 24
-# Textures and volumes beside the view.
+# Maximum number of textures and volumes beside the view.
 MOST_BESIDE = 2
 KINDS = (".webp", ".mp4")
 
 
 def film(run: Path, output: Path, view: str | None = None, seconds: float = 6.0) -> int:
-    """Write the film of a view (the first, if none is named) to ``output``; returns how many frames it has.
+    """Write a film of ``view`` (default: the first) that takes ``seconds`` to ``output``; returns its frame count.
 
-    Raises PathreplayError where the run has no frames, the kind of file is unknown, or ffmpeg is wanted and absent.
+    Raises PathreplayError if the run has no frames, the file type is unknown, or MP4 is requested without ffmpeg.
     """
     if output.suffix.lower() not in KINDS:
-        raise PathreplayError(f"--output {output} is neither .webp nor .mp4; give a name that ends so")
+        raise PathreplayError(f"--output {output} is neither .webp nor .mp4; give a name with one of these endings")
     pictures = _pictures(run, view)
     pause = max(20, round(1000 * seconds / len(pictures)))
     part = output.with_name(f".{output.stem}.part{output.suffix}")
@@ -65,24 +65,24 @@ def _pictures(run: Path, view: str | None) -> list[PIL.Image.Image]:
     target = _opened(run / FOLDER / f"target-{chosen}.png")
     whole = [i for i in by_what[f"view-{chosen}"] if all(i in by_what[what] for what in beside)]
     if not whole:
-        raise PathreplayError(f"Run {run} has no frames of '{chosen}' and its textures at one time; make a new run")
+        raise PathreplayError(f"Run {run} has no iteration with frames of '{chosen}' and its textures; start a new run")
     sheets = []
     for i in whole:
         now = {"target": target, f"after {i} iterations": _opened(by_what[f"view-{chosen}"][i])}
         now |= {what.split("-", 1)[1]: _opened(by_what[what][i]) for what in beside}
         sheets.append(now)
-    # Grids that were refined had other sizes before; a film has one.
+    # Refined grids had lower resolutions before; all frames of a film have the same size.
     sizes = [(max(2, round(p.width * HEIGHT / p.height)), HEIGHT) for p in sheets[-1].values()]
     return [_side_by_side(now, sizes) for now in sheets]
 
 
 def _side_by_side(pictures: Mapping[str, PIL.Image.Image], sizes: list[tuple[int, int]]) -> PIL.Image.Image:
-    """Pictures in these sizes with a line of text below each; the sides are even numbers, as videos need them."""
+    """Images in these sizes with a label below each; the frame's sides are even, as video encoders require."""
     width = sum(w for w, _ in sizes) + 4 * (len(sizes) - 1)
     sheet = PIL.Image.new("RGB", (width + width % 2, HEIGHT + TEXT), (20, 23, 27))
     draw, font, x = PIL.ImageDraw.Draw(sheet), PIL.ImageFont.load_default(14), 0
     for (name, picture), size in zip(pictures.items(), sizes, strict=True):
-        # Texels stay squares; what is made smaller is averaged.
+        # Enlarged texels stay square; reduced images are averaged.
         kind = PIL.Image.Resampling.NEAREST if picture.height <= HEIGHT else PIL.Image.Resampling.BOX
         sheet.paste(picture.resize(size, kind), (x, 0))
         draw.text((x + 4, HEIGHT + 3), name[: max(4, size[0] // 8)], fill=(231, 234, 238), font=font)
@@ -94,7 +94,7 @@ def _opened(path: Path) -> PIL.Image.Image:
     try:
         return PIL.Image.open(io.BytesIO(read_own(path) or b"")).convert("RGB")
     except (OSError, ValueError, PIL.Image.DecompressionBombError):
-        raise PathreplayError(f"Picture {path} is missing or damaged; start the job from its config") from None
+        raise PathreplayError(f"Image {path} is missing or damaged; start the job from its config") from None
 
 
 def _mp4(pictures: list[PIL.Image.Image], path: Path, rate: float) -> None:
@@ -113,5 +113,5 @@ def _mp4(pictures: list[PIL.Image.Image], path: Path, rate: float) -> None:
     if done.returncode:
         said = done.stderr.decode(errors="replace").strip().splitlines()
         raise PathreplayError(
-            f"ffmpeg failed ({said[-1] if said else done.returncode}); take an --output that ends in .webp"
+            f"ffmpeg failed ({said[-1] if said else done.returncode}); use an --output that ends in .webp"
         )
