@@ -166,7 +166,7 @@ def test_a_scene_from_xml_comes_out_with_its_files_names_and_numbers(many: Path,
     }
     found = exported(Source(many, {"res": "12"}, {}, {}), values)
     same_pictures(found, tmp_path / "out")
-    assert found.notes == ("'path' renders the exported scene in the place of 'prb', which is made for gradients",)
+    assert found.notes == ("'path' renders the exported scene instead of 'prb', a differentiable integrator",)
     keys = set(mi.traverse(mi.load_file(str(tmp_path / "out/scene.xml"), optimize=False)).keys())
     assert set(values) <= keys and "wedge.vertex_positions" in keys
     assert (tmp_path / "out/files/wedge.ply").read_bytes() == (many.parent / "meshes/wedge.ply").read_bytes()
@@ -183,7 +183,7 @@ def test_what_nobody_knows_the_making_of_is_told(tmp_path: Path) -> None:
     scene = mi.cornell_box()
     scene["floor"]["bsdf"] = mi.load_dict({"type": "roughplastic"})
     with pytest.raises(
-        PathreplayError, match=r"'bsdf' of rectangle 'floor' is a RoughPlastic .* cannot be exported; describe"
+        PathreplayError, match=r"'bsdf' of rectangle 'floor' is an existing RoughPlastic .* cannot be exported; describe"
     ):
         exported(Source(scene, {}, {}, {}), {})
 
@@ -195,7 +195,7 @@ def test_a_value_that_does_not_come_back_is_told(tmp_path: Path) -> None:
     params = mi.traverse(found.scene)
     params["red.emitter.radiance.value"] = mi.Color3f(0.5, 0.2, 0.1)
     params.update()
-    with pytest.raises(PathreplayError, match=r"'red\.emitter\.radiance\.value' of SRGB.* does not come back"):
+    with pytest.raises(PathreplayError, match=r"'red\.emitter\.radiance\.value' of SRGB.* is missing or different"):
         require_same(found.scene, tmp_path / "out")
 
 
@@ -298,7 +298,7 @@ def test_what_cannot_be_exported_is_told_and_leaves_nothing(trouble: str, run: P
         "no run": "is not a run folder",
         "no result": "has no result yet",
         "a result that is none": "cannot be read",
-        "no scene": "is no longer there; put it back",
+        "no scene": "no longer exists; restore it",
         "a full folder": "exists already; give -o a new folder",
     }[trouble]
     if trouble == "no result":

@@ -69,7 +69,7 @@ def test_channels_of_an_aov_have_their_names(tmp_path: Path) -> None:
     render_to_file("cornell-box", path, integrator="aov", options=["aovs=far:depth"], **SIZE)
     with OpenEXR.File(str(path)) as file:
         assert [name for name in file.channels()] == ["far.T"]
-    with pytest.raises(PathreplayError, match=r"'far\.T'; take \.exr"):
+    with pytest.raises(PathreplayError, match=r"'far\.T'; use \.exr"):
         render_to_file("cornell-box", tmp_path / "image.png", integrator="aov", options=["aovs=far:depth"], **SIZE)
     assert not (tmp_path / "image.png").exists()
 
@@ -118,11 +118,11 @@ def test_passes_add_up_to_one_picture(monkeypatch: pytest.MonkeyPatch) -> None:
         ("nowhere/image.exr", {}, "nowhere for image.exr does not exist; make it first"),
         ("image.exr", {"sensor": "back"}, "No sensor 'back' in the scene; it has sensor"),
         ("image.exr", {"sensor": "1"}, "No sensor '1'"),
-        ("image.exr", {"size": "12x"}, "--size '12x' is no size"),
-        ("image.exr", {"size": "99999999"}, "is no size"),
-        ("image.exr", {"spp": 0}, "--spp 0 is no number of samples"),
-        ("image.exr", {"spp": 10**7}, "give one from 1 to 1000000"),
-        ("image.exr", {"seed": -1}, "--seed -1 is no seed"),
+        ("image.exr", {"size": "12x"}, "--size '12x' is not a size"),
+        ("image.exr", {"size": "99999999"}, "is not a size"),
+        ("image.exr", {"spp": 0}, "--spp 0 is out of range"),
+        ("image.exr", {"spp": 10**7}, "samples from 1 to 1000000"),
+        ("image.exr", {"seed": -1}, "--seed -1 is out of range"),
         ("image.exr", {"integrator": "paht"}, "Integrator 'paht' cannot be made"),
         ("image.exr", {"integrator": "path", "options": ["max_depth=deep"]}, "max_depth"),
         ("image.exr", {"integrator": "path", "options": ["a.b=1"]}, "-I a is {'b': 1}; give a number"),

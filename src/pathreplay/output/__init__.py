@@ -1,1 +1,1 @@
-"""What leaves the program: pictures of scenes, and what a run has recovered as files that other programs read."""
+"""Output files: rendered images, and the results of a run in formats that other programs read."""

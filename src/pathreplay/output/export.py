@@ -1,4 +1,4 @@
-"""The command `pathreplay export`: what a run has recovered, as files that other programs read, and the whole scene."""
+"""The command `pathreplay export`: writes the results of a run, and the whole scene, in standard formats."""
 
 from __future__ import annotations
 
@@ -38,13 +38,21 @@ _OPTION = "-o"
 
 
 def export_run(run: Path, output: Path | None = None) -> str:
-    """Write the scene of a run with the values that it ended with; returns what is to be said, in lines.
+    """Export the scene of a run with its final values.
 
-    Into ``output``, or the folder ``export`` of the run, which must be new or empty: `scene.xml` with its files
-    (textures as EXR, grids as `.vol`, meshes as PLY), PNG and OBJ beside EXR and PLY of what was recovered, the cameras
-    as `transforms.json`, and numbers as `values.json`, many of them as NPY. The run's variant becomes the active one.
+    Writes `scene.xml` with its files (textures as EXR, grids as `.vol`, meshes as PLY), recovered textures and meshes
+    also as PNG and OBJ, the cameras as `transforms.json`, small values in `values.json`, and large ones as NPY. The
+    run's variant becomes the active one.
 
-    Raises PathreplayError for what is no run folder, holds no result, or cannot be exported; nothing is written then.
+    Args:
+        run: run folder.
+        output: new or empty folder to write to; the default is ``export`` in the run folder.
+
+    Returns:
+        Lines for the user: how to render the scene, the written files, and notes.
+
+    Raises:
+        PathreplayError: ``run`` is not a run folder, has no result, or cannot be exported. Nothing is written then.
     """
     folder = run / "export" if output is None else output
     require_writable_name(run, "RUN")
@@ -53,31 +61,31 @@ def export_run(run: Path, output: Path | None = None) -> str:
     backend.set_variant(job.config.variant)
     values = _result(run)
     source = _source(job, values)
-    of_pictures = {EXPOSURE: values.pop(EXPOSURE)} if EXPOSURE in values else {}
+    exposures = {EXPOSURE: values.pop(EXPOSURE)} if EXPOSURE in values else {}
     free = {entry.key: values.pop(entry.key) for entry in job.config.parameters if entry.shape is not None}
     given = "integrator" in job.config.model_fields_set
-    found = exported(source, values, job.config.integrator.model_dump() if given else None)
+    export = exported(source, values, job.config.integrator.model_dump() if given else None)
     with whole_folder(folder, _OPTION) as part:
-        write_files(found, part)
-        for name, data in _beside(found, values | of_pictures, free).items():
+        write_files(export, part)
+        for name, data in _beside(export, values | exposures, free).items():
             (part / name).parent.mkdir(exist_ok=True)
             (part / name).write_bytes(data)
-        require_same(found.scene, part)
-    files = sorted([*found.files, *found.copies])
-    # Not by Mitsuba's own command, which takes the system's newest LLVM, and is ended by some of them.
+        require_same(export.scene, part)
+    files = sorted([*export.files, *export.copies])
+    # Mitsuba's own command would load the system's newest LLVM, and some versions crash it.
     render = f"pathreplay render {shlex.quote(str(folder / SCENE))} -o scene.exr --variant {mi.variant()}"
     lines = [f"{folder / SCENE}: render it with `{render}`"]
     lines += [f"{folder / name}" for name in files if name != SCENE and not name.startswith("files/")]
-    return "\n".join([*lines, *(f"pathreplay: {note}" for note in found.notes)])
+    return "\n".join([*lines, *(f"pathreplay: {note}" for note in export.notes)])
 
 
-def write_files(found: Exported, folder: Path) -> None:
-    """The scene and its files, into an existing folder."""
-    for name in [*found.files, *found.copies]:
+def write_files(export: Exported, folder: Path) -> None:
+    """Write the scene and its files into an existing folder."""
+    for name in [*export.files, *export.copies]:
         (folder / name).parent.mkdir(exist_ok=True)
-    for name, data in found.files.items():
+    for name, data in export.files.items():
         (folder / name).write_bytes(data)
-    for name, path in found.copies.items():
+    for name, path in export.copies.items():
         try:
             shutil.copyfile(path, folder / name)
         except OSError as error:
@@ -85,19 +93,19 @@ def write_files(found: Exported, folder: Path) -> None:
 
 
 def _result(run: Path) -> dict[str, np.ndarray]:
-    """Values of the scene's parameters at the end of a run, as people see them."""
+    """Decoded values of the scene's parameters at the end of a run."""
     path = run / "parameters.safetensors"
     if not path.is_file():
         raise PathreplayError(
-            f"Run {run} has no result yet (no {path.name}); end it with Ctrl-C, which writes it, or go on with "
-            f"pathreplay optimize --resume {run}"
+            f"Run {run} has no result yet (no {path.name}); end it with Ctrl-C, which writes the result, or resume "
+            f"with: pathreplay optimize --resume {run}"
         )
     try:
-        found = safetensors.numpy.load_file(str(path))
+        values = safetensors.numpy.load_file(str(path))
     except (safetensors.SafetensorError, OSError, ValueError) as error:
-        raise PathreplayError(f"Result {path} cannot be read ({error}); go on with the run, which writes it") from None
-    # Parts of poses; the transform or the vertices that they make are there by their own key.
-    return {k: v for k, v in found.items() if not k.endswith(PART_NAMES)}
+        raise PathreplayError(f"Result {path} cannot be read ({error}); resume the run, which writes it") from None
+    # Omit translation and rotation of poses; the resulting transform or vertices have a key of their own.
+    return {k: v for k, v in values.items() if not k.endswith(PART_NAMES)}
 
 
 def _source(job: Job, values: Arrays) -> Source:
@@ -110,26 +118,29 @@ def _source(job: Job, values: Arrays) -> Source:
         return Source(builtin_dict(config.scene, config.scene_parameters), {}, plugins, cameras)
     path = job.base / config.scene
     if not path.is_file():
-        raise PathreplayError(f"Scene {path} of the run is no longer there; put it back")
+        raise PathreplayError(f"Scene {path} of the run no longer exists; restore it")
     source = Source(path, as_xml_has_them(config.scene_parameters), plugins, cameras)
     return replace(source, floats=_floats(source, values))
 
 
 def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
-    """The pictures whose texels the run has stored as floating-point numbers."""
+    """Image files of textures that the run has stored as floating-point numbers."""
     keys = [key for key in values if key.endswith(".data")]
     if not keys:
         return ()
     with told("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
-        found = coarse_pictures(traversed(source.load()), keys)
-    gc.collect()  # Dr.Jit traces calls through every instance alive
-    return found
+        pictures = coarse_pictures(traversed(source.load()), keys)
+    gc.collect()  # Dr.Jit traces virtual calls through every instance alive
+    return pictures
 
 
-def _beside(found: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:
-    """Files that the scene does not name: PNG, OBJ, cameras and numbers; NPY of those that are ``free`` and many."""
-    params, files = mi.traverse(found.scene), {"transforms.json": _json(_cameras(found.scene))}
-    names = file_names([*params.keys(), *(shape.id() for shape in found.scene.shapes())])
+def _beside(export: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:
+    """Files that the scene does not reference: PNG, OBJ, cameras, and numbers.
+
+    ``free`` are parameters outside the scene; large ones become NPY files.
+    """
+    params, files = mi.traverse(export.scene), {"transforms.json": _json(_cameras(export.scene))}
+    names = file_names([*params.keys(), *(shape.id() for shape in export.scene.shapes())])
     numbers: dict[str, Any] = {}
     for key, value in values.items():
         if value.ndim == 3 and value.shape[2] <= 4:
@@ -142,8 +153,8 @@ def _beside(found: Exported, values: Arrays, free: Arrays) -> dict[str, bytes]:
         else:
             files[f"values/{name}.npy"] = _npy(free[key])
     files["values.json"] = _json(numbers)
-    for shape in found.scene.shapes():
-        if shape.is_mesh() and f"meshes/{names[shape.id()]}.ply" in found.files:
+    for shape in export.scene.shapes():
+        if shape.is_mesh() and f"meshes/{names[shape.id()]}.ply" in export.files:
             files[f"meshes/{names[shape.id()]}.obj"] = obj_bytes(shape)
     return files
 
@@ -159,7 +170,7 @@ def _json(table: Any) -> bytes:
 
 
 def obj_bytes(mesh: mi.Mesh) -> bytes:
-    """The mesh as a Wavefront OBJ file: vertices, texture coordinates, normals, faces."""
+    """Encode the mesh as a Wavefront OBJ file: vertices, texture coordinates, normals, faces."""
     params = mi.traverse(mesh)
     lines, has = [], []
     for key, tag, width in (("positions", "v", 3), ("texcoords", "vt", 2), ("normals", "vn", 3)):
@@ -173,7 +184,7 @@ def obj_bytes(mesh: mi.Mesh) -> bytes:
 
 
 def _cameras(scene: mi.Scene) -> dict[str, Any]:
-    """The cameras that are pinholes, as a `transforms.json` of NeRF's has them."""
+    """The pinhole cameras in the format of NeRF's `transforms.json`."""
     frames = []
     for sensor in scene.sensors():
         params = mi.traverse(sensor)

@@ -1,7 +1,7 @@
-"""A scene as Mitsuba's parser sees it, for writing: its objects one by one, and which parameter belongs to which.
+"""The parsed description of a scene for writing: its objects, and the object that each parameter belongs to.
 
-Parameters have the names of `mi.traverse(scene)`; the parser knows objects with their properties. Each object gets a
-name of its own, the scene is made once, and each parameter's owner tells by that name where it came from.
+Parameters have the keys of `mi.traverse(scene)`, whereas the parser knows objects and their properties. To relate them,
+the scene is instantiated once with a unique id per object, and the id of a parameter's owner identifies the object.
 """
 
 from __future__ import annotations
@@ -27,33 +27,33 @@ Node = Any
 
 @dataclass(frozen=True)
 class Owner:
-    """Of a parameter: the object in the scene's description, and where in it, as 'reflectance.value' or 'data'."""
+    """Owner of a parameter: the object in the description, and the place in it, as 'reflectance.value' or 'data'."""
 
     node: Node
     place: str
 
 
 class Described:
-    """The objects of a scene; the first is the scene itself."""
+    """The objects of a scene description; the first is the scene itself."""
 
     def __init__(self, state: Any, folder: Path | None) -> None:
         self._state, self.nodes, self.folder = state, list(state.nodes), folder
 
     def add(self, properties: mi.Properties, kind: mi.ObjectType) -> Any:
-        """Add an object; returns what refers to it, as the value of a property."""
+        """Add an object; returns a reference to it for use as a property value."""
         node = mi.parser.SceneNode()
         node.props, node.type = properties, kind
         self.nodes.append(node)
         return mi.Properties.ResolvedReference(len(self.nodes) - 1)
 
     def children(self, node: Node) -> Iterator[tuple[str, Node]]:
-        """The objects in an object, and what they are called there."""
+        """The child objects of an object, with their property names."""
         for name in node.props.keys():
             if _is_reference(node, name):
                 yield name, self.nodes[node.props.get(name).index()]
 
     def find_file(self, name: str) -> Path:
-        """The file that a property names; relative names start at the scene's own folder."""
+        """Resolve a file name of a property; relative names start at the scene's folder."""
         with _resolving(self.folder):
             return Path(str(mi.file_resolver().resolve(name)))
 
@@ -82,11 +82,18 @@ def describe(
     cameras: Mapping[str, Mapping[str, Any]],
     floats: Collection[str] = (),
 ) -> tuple[Described, list[Owner]]:
-    """The objects of a scene (an XML file or a dictionary), and the owners of its parameters in their order.
+    """Parse a scene into its objects and the owners of its parameters, in the order of `mi.traverse`.
 
-    ``arguments`` replace ``$name`` in the file; plugins are exchanged (old type -> new type), cameras join and pictures
-    become ``floats`` as in `load_file_with`. Raises RuntimeError (Mitsuba's) where it cannot be read, and
-    PathreplayError as that does.
+    Args:
+        scene: path of an XML file, or a dictionary.
+        arguments: values that replace ``$name`` in the file.
+        plugins: plugin types to replace (old type -> new type).
+        cameras: dictionaries of additional sensors by id.
+        floats: image files of textures to store as floating-point numbers; see `load_file_with`.
+
+    Raises:
+        RuntimeError: Mitsuba cannot read the scene.
+        PathreplayError: as in `load_file_with`.
     """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
@@ -110,7 +117,7 @@ def describe(
 
 
 def _join(state: Any, name: str, camera: Any) -> None:
-    """Put the objects of a camera, which was parsed by itself, into the scene."""
+    """Insert the objects of a separately parsed camera into the scene."""
     offset = len(state.nodes)
     for node in camera.nodes:
         for key in node.props.keys():
@@ -122,8 +129,8 @@ def _join(state: Any, name: str, camera: Any) -> None:
 
 
 def _owners(config: Any, state: Any, nodes: list[Node]) -> list[Owner]:
-    """Of all parameters, by a scene in which each object is called otherwise."""
-    copy = mi.parser.ParserState(state)  # of which objects take the place of what is referred to
+    """Owners of all parameters, from an instance of the scene in which each object has a unique id."""
+    copy = mi.parser.ParserState(state)  # instantiation replaces references by objects
     names = {f"object {i}": i for i in range(1, len(nodes))}
     for name, i in names.items():
         copy.nodes[i].props.set_id(name)
@@ -141,12 +148,12 @@ def _owners(config: Any, state: Any, nodes: list[Node]) -> list[Owner]:
 
 
 def _deepest(described: Described, owner: Owner) -> Owner:
-    """The owner of a parameter where objects on the way to it do not keep their names, as bitmaps do not."""
+    """Follow the place of a parameter to nested objects, including bitmaps, which do not keep their ids."""
     name, dot, rest = owner.place.partition(".")
     if not dot:
         return owner
     children = dict(described.children(owner.node))
-    if name not in children:  # called otherwise in files, where it may be the only one of its kind
+    if name not in children:  # the file uses another name; a single bitmap child is unambiguous
         pictures = [child for child in children.values() if child.props.plugin_name() == "bitmap"]
         if rest.split(".")[-1] != "data" or len(pictures) != 1:
             return owner
@@ -155,7 +162,7 @@ def _deepest(described: Described, owner: Owner) -> Owner:
 
 
 def require_no_objects(described: Described) -> None:
-    """Raise PathreplayError for an object that was made before it came into the scene: nobody knows of what."""
+    """Raise PathreplayError for an object that was instantiated before parsing: its description is unknown."""
     for node in described.nodes:
         for name in node.props.keys():
             kind = node.props.type(name)
@@ -163,6 +170,6 @@ def require_no_objects(described: Described) -> None:
                 value = node.props.get(name)
                 what = value.class_name() if isinstance(value, mi.Object) else type(value).__name__
                 raise PathreplayError(
-                    f"'{name}' of {node.props.plugin_name()} '{node.props.id()}' is a {what} that was made before it "
-                    "came into the scene, and cannot be exported; describe it by a dictionary or a file"
+                    f"'{name}' of {node.props.plugin_name()} '{node.props.id()}' is an existing {what} object, which "
+                    "cannot be exported; describe it by a dictionary or a file instead"
                 )

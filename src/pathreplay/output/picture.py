@@ -1,4 +1,4 @@
-"""A picture of a scene by any integrator: in as many passes as sampler and memory ask for, and as one file."""
+"""Renders a scene with any integrator, in as many passes as sampler and memory require, and encodes the image."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from pathreplay.inverse.images.io import Image, png_bytes
 from pathreplay.platform import memory
 from pathreplay.scenes.descriptions import told
 
-# Samples of a pass: some seconds, so that a bar moves and a Ctrl-C is heard. Only where samples do not know each other.
+# Samples per pass with independent samples: a few seconds, so that the bar moves and Ctrl-C takes effect.
 _A_PASS = 2**24
-# Bytes of a sample while a pass is under way: the state of its random numbers, twice.
+# Bytes per sample during a pass: two copies of the state of its random numbers.
 _A_SAMPLE = 64
-# Larger pictures are a slip of the keyboard, and films of that size end in Mitsuba's own error at best.
+# Larger sizes are likely typing errors, and films of that size end in an error of Mitsuba at best.
 _LARGEST_SIDE = 2**16
 
 Told = Callable[[int, int], None]
-"""Is told how many passes are done, of how many."""
+"""Called with the number of completed passes and their total."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """Linear pixels (height, width, channels), and the names of the channels: R, G, B, A, Y, or those of an AOV."""
+    """Linear pixels (height, width, channels), and the channel names: R, G, B, A, Y, or those of AOVs."""
 
     image: Image
     channels: tuple[str, ...]
     spp: int
-    """Samples per pixel that were taken: samplers may round up."""
+    """Samples per pixel actually taken; samplers may round up."""
 
 
 def find_sensor(scene: mi.Scene, wanted: str | None) -> mi.Sensor:
-    """The sensor with that id or number, or the first. Raises PathreplayError where there is none."""
+    """The sensor with the given id or index, or the first. Raises PathreplayError if it does not exist."""
     sensors = scene.sensors()
     if not sensors:
         raise PathreplayError("The scene has no sensor; add one")
@@ -60,22 +60,22 @@ def find_sensor(scene: mi.Scene, wanted: str | None) -> mi.Sensor:
 
 
 def set_size(sensor: mi.Sensor, size: str) -> None:
-    """Give the sensor's film another size: 'WIDTHxHEIGHT', or 'WIDTH' alone, which keeps the proportions.
+    """Resize the sensor's film to 'WIDTHxHEIGHT', or to 'WIDTH', which keeps the aspect ratio.
 
-    Raises PathreplayError for what is no size, and where the film is cropped.
+    Raises PathreplayError if ``size`` is not a valid size, or if the film is cropped.
     """
     film = sensor.film()
     width, height = (int(n) for n in film.size())
     if (width, height) != tuple(int(n) for n in film.crop_size()):
         raise PathreplayError(f"--size {size}: the film of sensor '{sensor.id()}' is cropped; change the scene instead")
-    found = re.fullmatch(r"(\d{1,9})(?:x(\d{1,9}))?", size)
+    match = re.fullmatch(r"(\d{1,9})(?:x(\d{1,9}))?", size)
     new = (0, 0)
-    if found:
-        columns = int(found[1])
-        new = columns, int(found[2]) if found[2] else max(1, round(columns * height / width))
+    if match:
+        columns = int(match[1])
+        new = columns, int(match[2]) if match[2] else max(1, round(columns * height / width))
     if not all(1 <= n <= _LARGEST_SIDE for n in new):
         raise PathreplayError(
-            f"--size {shown(size)} is no size; give WIDTHxHEIGHT in pixels, each up to {_LARGEST_SIDE}"
+            f"--size {shown(size)} is not a size; give WIDTHxHEIGHT in pixels, each up to {_LARGEST_SIDE}"
         )
     params = mi.traverse(sensor)
     params["film.size"] = mi.ScalarVector2u(*new)
@@ -83,11 +83,12 @@ def set_size(sensor: mi.Sensor, size: str) -> None:
 
 
 def passes(sensor: mi.Sensor, spp: int) -> list[int]:
-    """Samples per pixel of each pass; together they are ``spp``, or more where the sampler rounds up.
+    """Samples per pixel of each pass; their sum is ``spp``, or more if the sampler rounds up.
 
-    Samplers other than `independent` place the samples of a pixel by each other: they are split only where Dr.Jit or
-    memory could not hold them at once, into passes of a power of four, which all of them take. Raises PathreplayError
-    for pictures that do not fit the memory.
+    Samplers other than `independent` stratify the samples of a pixel. Their samples are split only if Dr.Jit or the
+    memory cannot hold them at once, into passes of a power of four, which all samplers accept.
+
+    Raises PathreplayError for images that do not fit into memory.
     """
     require_film(sensor, f"sensor '{sensor.id()}'", {})
     pixels = math.prod(int(n) for n in sensor.film().crop_size())
@@ -100,9 +101,18 @@ def passes(sensor: mi.Sensor, spp: int) -> list[int]:
 def render(
     scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator, spp: int, seed: int = 0, tell: Told | None = None
 ) -> Rendering:
-    """The mean of all `passes`; the first has the seed itself, so that one pass is `mi.render` with that seed.
+    """Render the mean of all `passes`; a single pass equals `mi.render` with the same seed.
 
-    Raises PathreplayError for what the integrator cannot do.
+    Args:
+        scene: scene to render.
+        sensor: one of its sensors.
+        integrator: any integrator.
+        spp: samples per pixel, rounded up by some samplers.
+        seed: seed of the first pass, from which the seeds of further passes are derived.
+        tell: receives the number of completed passes and their total.
+
+    Raises:
+        PathreplayError: the integrator cannot render the scene.
     """
     counts = passes(sensor, spp)
     total: Any = 0.0
@@ -119,26 +129,24 @@ def render(
     names = tuple(field.name for field in sensor.film().bitmap().struct_())
     picture = (total / done).astype(np.float32)
     picture = picture[:, :, None] if picture.ndim == 2 else picture
-    # Of integrators that give AOVs alone the picture has no colours, and the film has.
+    # If the integrator only returns AOVs, the image has no colour channels, unlike the film.
     return Rendering(picture, names[len(names) - picture.shape[2] :], done)
 
 
 def file_bytes(rendering: Rendering, ending: str) -> bytes:
-    """The picture as a file: '.exr' (32 bit, linear, all channels by name) or '.png' (8 bit, sRGB, from 0 to 1).
+    """Encode the image as '.exr' (32 bit, linear, named channels) or '.png' (8 bit, sRGB, clipped to 0 to 1).
 
-    Raises PathreplayError for another ending, and for a PNG of more than colours and alpha.
+    Raises PathreplayError for a PNG with channels other than colour and alpha.
     """
     if ending == ".png":
         colours = [name for name in rendering.channels if name in ("R", "G", "B", "A", "Y")]
         if len(colours) != len(rendering.channels):
             other = next(name for name in rendering.channels if name not in colours)
-            raise PathreplayError(
-                f"A PNG file holds colours only, and the picture has the channel '{other}'; take .exr"
-            )
+            raise PathreplayError(f"A PNG file only holds colours, and the image has the channel '{other}'; use .exr")
         return png_bytes(rendering.image)
     channels = {n: np.ascontiguousarray(rendering.image[:, :, i]) for i, n in enumerate(rendering.channels)}
     buffer = io.BytesIO()
-    # Not by Mitsuba: see `exr_bytes`.
+    # Mitsuba's writer is not used; see `exr_bytes`.
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, channels, num_threads=0) as file:
         file.write(buffer)

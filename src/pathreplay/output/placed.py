@@ -1,4 +1,4 @@
-"""Puts values of a scene's parameters into its description: as properties, or as files that properties name."""
+"""Writes parameter values into a scene description, as properties or as files that properties reference."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from pathreplay.scenes.volume_files import UNIT_CUBE, Bounds, vol_bytes
 _PICTURES = ("bitmap", "envmap")
 _OF_A_MESH = ("vertex_", "faces", "face_")
 _MADE_BY = ("filename", "bitmap", "grid", "data", "shape_index")
-"""Properties that say where values of a texture, a grid or a mesh come from."""
+"""Properties that define the source of the values of a texture, a grid or a mesh."""
 _ALSO_PLACES = {
     "sphere": ("center", "radius"),
     "cylinder": ("p0", "p1", "radius"),
     "point": ("position",),
     "directional": ("direction",),
 }
-"""Properties that a `to_world` of `mi.traverse` has in it, by plugin."""
+"""Properties that are part of the `to_world` of `mi.traverse`, by plugin."""
 
-# Classes of objects that may come in made, on a mesh: their plugin, and the properties of which they consist.
+# Classes of existing objects that are supported on a mesh: their plugin, and their only property.
 _KNOWN = {"SmoothDiffuse": ("diffuse", "reflectance"), "AreaLight": ("area", "radiance")}
 _PLAIN_SPECTRA = ("SRGBReflectanceSpectrum", "UniformSpectrum")
 
 
 class Placing:
-    """Of the values that a scene has now, in its description; ``files`` (name -> bytes) is what it needs beside it.
+    """Writes the current values of a scene into its description; ``files`` (name -> bytes) are the files it needs.
 
-    ``names`` are names for files, by key.
+    ``names`` are file names by parameter key.
     """
 
     def __init__(self, described: Described, scene: mi.Scene, names: dict[str, str]) -> None:
@@ -46,7 +46,7 @@ class Placing:
         self._meshes: dict[str, str] = {}
 
     def put(self, key: str, owner: Owner) -> None:
-        """Put the value of a parameter where it belongs. Raises PathreplayError where nothing can hold it."""
+        """Write the value of a parameter to its owner. Raises PathreplayError if no property can hold it."""
         node, place = owner.node, owner.place
         plugin = node.props.plugin_name()
         if plugin in _PICTURES and place == "data":
@@ -62,7 +62,7 @@ class Placing:
             self._number(key, node, place)
 
     def meshes(self) -> None:
-        """Give files to meshes that came into the scene made, and properties to what is on them."""
+        """Replace existing mesh objects by files, and describe their materials and emitters by properties."""
         for parent in list(self.described.nodes):
             for name in list(parent.props.keys()):
                 value = parent.props.get(name) if parent.props.type(name) == mi.Properties.Type.Object else None
@@ -72,8 +72,8 @@ class Placing:
     def _texture(self, key: str, node: Node) -> None:
         if mi.is_spectral:
             raise PathreplayError(
-                f"Texture '{key}' is made of smooth spectra in variant {mi.variant()}, which no file of Mitsuba's "
-                "holds; recover it in an rgb variant"
+                f"Texture '{key}' consists of smooth spectra in variant {mi.variant()}, which no file format of "
+                "Mitsuba holds; recover it in an rgb variant"
             )
         value = self.params[key]
         self._from_file(
@@ -102,7 +102,7 @@ class Placing:
         node.props["filename"] = self._ply(mesh, node.props.id())
 
     def _ply(self, mesh: Any, name: str) -> str:
-        """The name of a mesh's file."""
+        """Add the file of a mesh unless it exists; returns its name."""
         if mesh.id() not in self._meshes:
             stream = mi.MemoryStream()
             mesh.write_ply(stream)
@@ -118,22 +118,22 @@ class Placing:
         properties["filename"] = self._ply(shape, name)
         if not mesh.has_vertex_normals():
             properties["face_normals"] = True
-        for part, made in (("bsdf", shape.bsdf()), ("emitter", shape.emitter())):
-            if made is not None:
+        for part, instance in (("bsdf", shape.bsdf()), ("emitter", shape.emitter())):
+            if instance is not None:
                 kind = mi.ObjectType.BSDF if part == "bsdf" else mi.ObjectType.Emitter
-                properties[part] = self.described.add(self._known(made, f"{part} of '{name}'"), kind)
+                properties[part] = self.described.add(self._known(instance, f"{part} of '{name}'"), kind)
         _remove(parent.props, name)
         parent.props[name] = self.described.add(properties, mi.ObjectType.Shape)
 
-    def _known(self, made: Any, what: str) -> mi.Properties:
-        """The properties of an object that is simple enough for its parameters to tell them all."""
-        plugin, part = _KNOWN.get(made.class_name(), ("", ""))
-        params = mi.traverse(made)
+    def _known(self, instance: Any, what: str) -> mi.Properties:
+        """Properties of an existing object that its parameters determine completely."""
+        plugin, part = _KNOWN.get(instance.class_name(), ("", ""))
+        params = mi.traverse(instance)
         owner = params.properties[f"{part}.value"][2] if f"{part}.value" in params else None
         if owner is None or owner.class_name() not in _PLAIN_SPECTRA:
             raise PathreplayError(
-                f"The {what} is a {made.class_name()} that was made before it came into the scene, and cannot be "
-                "exported; give the mesh by a file and its materials by dictionaries"
+                f"The {what} is an existing {instance.class_name()} object, which cannot be exported; give the mesh by "
+                "a file and its materials by dictionaries"
             )
         properties = mi.Properties(plugin)
         _set_colour(properties, part, get_array(params[f"{part}.value"]))
@@ -161,7 +161,7 @@ class Placing:
             node.props[place] = mi.ScalarVector3d(*(float(x) for x in value.ravel()))
         else:
             raise PathreplayError(
-                f"Parameter '{key}' of {plugin} with {value.size} numbers cannot be written into a scene file; take "
+                f"Parameter '{key}' of {plugin} with {value.size} numbers cannot be written into a scene file; read "
                 "its value from parameters.safetensors in the run folder"
             )
 
@@ -185,23 +185,23 @@ def _set_colour(properties: mi.Properties, name: str, value: np.ndarray) -> None
 
 
 def made_otherwise(node: Node) -> bool:
-    """Whether the values of a texture or grid came into the scene as an object or an array, and not by a file."""
+    """Whether the values of a texture or grid were given as an object or an array instead of a file."""
     return any(name in node.props for name in ("bitmap", "grid", "data"))
 
 
 def copied_files(described: Described, placed: dict[str, bytes]) -> dict[str, Path]:
-    """Files that the scene names beside those ``placed``: new name -> where it is. The scene is given the new name."""
-    found: dict[str, Path] = {}
+    """Files that the scene references besides those ``placed``: new name -> path. The scene gets the new names."""
+    copies: dict[str, Path] = {}
     for node in described.nodes:
         name = node.props.get("filename", None)
         if not isinstance(name, str) or name in placed:
             continue
         path = described.find_file(name).resolve()
-        known = next((new for new, old in found.items() if old == path), None)
-        if known is None:
-            known = f"files/{path.name}"
-            if known in found:
-                known = f"files/{path.stem}-{len(found)}{path.suffix}"
-            found[known] = path
-        node.props["filename"] = known
-    return found
+        new_name = next((new for new, old in copies.items() if old == path), None)
+        if new_name is None:
+            new_name = f"files/{path.name}"
+            if new_name in copies:
+                new_name = f"files/{path.stem}-{len(copies)}{path.suffix}"
+            copies[new_name] = path
+        node.props["filename"] = new_name
+    return copies

@@ -1,4 +1,4 @@
-"""The command `pathreplay render`: checks what was asked for, renders with a bar on stderr, and writes one file."""
+"""The command `pathreplay render`: checks its arguments, renders with a bar on stderr, and writes one file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pathreplay.scenes.loading import load_scene
 
 _OPTION = "-o"
 _SECONDS = 10.0
-# A slip of the keyboard beyond: the noise of a picture is then below what single precision tells apart.
+# More is likely a typing error: the noise of an image is then below single precision.
 _MOST_SPP = 10**6
 
 
@@ -37,19 +37,31 @@ def render_to_file(
     define: Sequence[str] = (),
     progress: bool = True,
 ) -> str:
-    """Render a scene into a file, and return a line about it. Needs an active variant.
+    """Render a scene to a file in the active variant; returns a line about it.
 
-    ``options`` are NAME=VALUE of the integrator, ``define`` those of the scene; everything else is as on the command
-    line. Raises PathreplayError for what cannot be done; the file is then what it was.
+    Args:
+        scene: path of an XML file, or name of a built-in scene.
+        output: .exr or .png file.
+        integrator: plugin name; the default is the scene's integrator, else ``path``.
+        options: integrator properties, each ``NAME=VALUE``.
+        sensor: id or index; the default is the first sensor.
+        size: film size, ``WIDTHxHEIGHT`` or ``WIDTH``.
+        spp: samples per pixel; the default is the sensor's.
+        seed: seed of all random numbers.
+        define: scene parameters, each ``NAME=VALUE``.
+        progress: show a bar on stderr.
+
+    Raises:
+        PathreplayError: an argument is invalid, or the scene cannot be rendered; the file is unchanged then.
     """
     ending = output.suffix.lower()
     if ending not in (".exr", ".png"):
         raise PathreplayError(f"{output} ends in {shown(ending)}; give {_OPTION} a name that ends in .exr or .png")
     require_writable(output, _OPTION)
     if spp is not None and not 1 <= spp <= _MOST_SPP:
-        raise PathreplayError(f"--spp {spp} is no number of samples; give one from 1 to {_MOST_SPP}")
+        raise PathreplayError(f"--spp {spp} is out of range; give a number of samples from 1 to {_MOST_SPP}")
     if not 0 <= seed < 2**32:
-        raise PathreplayError(f"--seed {seed} is no seed; give one from 0 to {2**32 - 1}")
+        raise PathreplayError(f"--seed {seed} is out of range; give a seed from 0 to {2**32 - 1}")
     given = {} if integrator is None else {"type": integrator}
     described = _flat("-I", given, options)
     if integrator is None and options:
@@ -70,17 +82,17 @@ def render_to_file(
 
 
 def _flat(option: str, table: dict[str, Any], changes: Sequence[str]) -> dict[str, Any]:
-    """The table with each NAME=VALUE put into it."""
-    found: dict[str, Any] = defined(table, changes, option)
-    for name, value in found.items():
+    """Add each NAME=VALUE to the table. Raises PathreplayError for nested values."""
+    result: dict[str, Any] = defined(table, changes, option)
+    for name, value in result.items():
         if isinstance(value, (dict, list)):
-            raise PathreplayError(f"{option} {name} is {shown(value)}; give a number, a text, true or false")
-    return found
+            raise PathreplayError(f"{option} {name} is {shown(value)}; give a number, a string, true or false")
+    return result
 
 
 @contextmanager
 def _bar(shown: bool) -> Iterator[Told | None]:
-    """A bar on stderr that goes when all is done; lines now and then where that is no terminal."""
+    """A transient bar on stderr, or periodic lines if stderr is not a terminal."""
     console = Console(stderr=True, force_jupyter=False)
     columns = (TextColumn("rendering, pass"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not (shown and console.is_terminal)) as bar:

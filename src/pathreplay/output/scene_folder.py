@@ -1,4 +1,4 @@
-"""A scene as a folder: Mitsuba XML and the files that it names, which `mitsuba` renders to the same picture."""
+"""Exports a scene as a folder: Mitsuba XML and the files it references, which `mitsuba` renders to the same image."""
 
 from __future__ import annotations
 
@@ -31,35 +31,35 @@ from pathreplay.scenes.substitute import load_dict_with, load_file_with
 SCENE = "scene.xml"
 
 _STANDS_IN = {"dielectric_ad": "dielectric"}
-"""What Mitsuba's own scenes have in the place of our plugins."""
+"""Mitsuba's equivalents of our plugins."""
 _DEPTHS = {"direct_projective": 2} | dict.fromkeys(
     ("pathreplay", "prb", "prb_basic", "prb_projective", "rb", "prbvolpath"), 6
 )
-"""Integrators made for gradients, in whose place `path` or `volpath` renders, and their depth where none is said."""
+"""Differentiable integrators, which `path` or `volpath` replaces, and their default depth."""
 _KEPT = ("max_depth", "rr_depth", "hide_emitters")
-"""Options that `path` and `volpath` share with integrators made for gradients."""
+"""Properties that `path` and `volpath` share with differentiable integrators."""
 
-# An address in memory: what Mitsuba calls an object without id.
+# A memory address, which Mitsuba uses as the name of an object without id.
 _ADDRESS = re.compile(r"object_\d+")
 
 
 @dataclass(frozen=True)
 class Source:
-    """A scene as it is asked for, before values are given to it."""
+    """The source of a scene, before values are assigned."""
 
     scene: str | Path | Mapping[str, Any]
-    """Path of an XML file, or a dictionary of Mitsuba's."""
+    """Path of an XML file, or a Mitsuba dictionary."""
     arguments: Mapping[str, str]
-    """What replaces ``$name`` in the file."""
+    """Values that replace ``$name`` in the file."""
     plugins: Mapping[str, str]
-    """Plugins that were exchanged, old type -> new type."""
+    """Replaced plugin types, old -> new."""
     cameras: Mapping[str, Mapping[str, Any]]
-    """Sensors that join the scene, by id."""
+    """Additional sensors by id."""
     floats: Collection[str] = ()
-    """Files of textures that are floating-point numbers here: see `load_file_with`."""
+    """Image files of textures that are stored as floating-point numbers; see `load_file_with`."""
 
     def load(self) -> mi.Scene:
-        """The scene. Raises what Mitsuba and `load_file_with` raise."""
+        """Load the scene. Raises what Mitsuba and `load_file_with` raise."""
         if isinstance(self.scene, Mapping):
             return load_dict_with(self.scene, self.plugins, self.cameras, self.floats)[0]
         return load_file_with(self.scene, self.plugins, self.arguments, self.cameras, self.floats)[0]
@@ -67,23 +67,31 @@ class Source:
 
 @dataclass(frozen=True)
 class Exported:
-    """A scene with its values, and the files that hold it."""
+    """A scene with its values, and its files."""
 
     scene: mi.Scene
     files: dict[str, bytes]
-    """Name -> bytes."""
+    """Content by name."""
     copies: dict[str, Path]
-    """Name -> the file that it is a copy of."""
+    """Files to copy: name -> original."""
     notes: tuple[str, ...]
-    """What is not as it was."""
+    """Differences from the original scene."""
 
 
 def exported(source: Source, values: Arrays, integrator: Mapping[str, Any] | None = None) -> Exported:
-    """The files of a scene in which parameters have these values (as people see them), by their keys.
+    """Export a scene with the given parameter values.
 
-    ``integrator`` is what shall render it, instead of the scene's own; of those made for gradients `path` or `volpath`
-    takes the place. Where the scene has none, `pathreplay` counts as its own. Raises PathreplayError for what no scene
-    file of Mitsuba's can hold.
+    Args:
+        source: the scene.
+        values: decoded values by parameter key.
+        integrator: dictionary of the integrator; the default is the scene's, else `pathreplay`. `path` or `volpath`
+            replaces a differentiable integrator.
+
+    Returns:
+        The scene with these values, and the content of its files.
+
+    Raises:
+        PathreplayError: the scene has something that no scene file of Mitsuba can hold.
     """
     with told("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene = source.load()
@@ -91,10 +99,10 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, Any] | Non
         described, owners = describe(source.scene, source.arguments, source.plugins, source.cameras, source.floats)
     keys = list(params.keys())
     if len(keys) != len(owners):
-        raise PathreplayError("The scene is another one at every loading, and cannot be exported")
+        raise PathreplayError("The scene differs each time it is loaded, and cannot be exported")
     placing = Placing(described, scene, _file_names(keys, scene))
     for key, owner in zip(keys, owners, strict=True):
-        if owner.node is described.nodes[0]:  # of a mesh that came in made; `meshes` sees to it
+        if owner.node is described.nodes[0]:  # belongs to an existing mesh object, which `meshes` handles
             continue
         if key in values or (owner.place == "data" and made_otherwise(owner.node)):
             placing.put(key, owner)
@@ -107,12 +115,12 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, Any] | Non
 
 
 def require_same(original: mi.Scene, folder: Path) -> None:
-    """Raise PathreplayError unless the scene in a folder has the parameters of the original, up to rounding."""
+    """Raise PathreplayError unless the exported scene has the parameters of the original, up to rounding."""
     gc.collect()
     with told(f"The exported scene {folder / SCENE} cannot be loaded"), spare_thread():
         copy = mi.load_file(str(folder / SCENE), optimize=False)
     ours, theirs = traversed(original), traversed(copy)
-    # Those without a name come in the same order.
+    # Objects without id are in the same order in both scenes.
     waiting: defaultdict[str, list[str]] = defaultdict(list)
     for key in theirs.keys():
         waiting[_ADDRESS.sub("object", key)].append(key)
@@ -120,7 +128,7 @@ def require_same(original: mi.Scene, folder: Path) -> None:
         others = waiting[_ADDRESS.sub("object", key)]
         if not others or not _alike(ours[key], theirs[others.pop(0)]):
             raise PathreplayError(
-                f"Parameter '{key}' of {ours.properties[key][2].class_name()} does not come back from the exported "
+                f"Parameter '{key}' of {ours.properties[key][2].class_name()} is missing or different in the exported "
                 "scene; it cannot be exported"
             )
 
@@ -129,13 +137,15 @@ def _alike(value: Any, other: Any) -> bool:
     if isinstance(value, (bool, int, str)) or isinstance(other, (bool, int, str)):
         return bool(value == other)
     try:
-        a, b = (_numbers(each) for each in (value, other))
+        a, b = (_numbers(x) for x in (value, other))
     except (TypeError, ValueError):
-        return True  # nothing that can be compared: scalar vectors and the like, which are never recovered
+        return True  # not comparable, for example scalar vectors, which are never recovered
     if a.size == 0 or b.size == 0:
         return a.size == b.size
     a, b = (x.astype(np.float64).ravel() for x in (a, b))
-    a, b = (np.full(max(a.size, b.size), x[0]) if x.size == 1 else x for x in (a, b))  # a grey colour is a number
+    a, b = (
+        np.full(max(a.size, b.size), x[0]) if x.size == 1 else x for x in (a, b)
+    )  # a grey colour is a single number
     return a.shape == b.shape and np.allclose(a, b, rtol=1e-5, atol=1e-6 * (1 + np.abs(a).max()))
 
 
@@ -151,7 +161,7 @@ def _set(scene: mi.Scene, values: Arrays) -> mi.SceneParameters:
     params = traversed(scene)
     for key, value in values.items():
         if key not in params:
-            raise PathreplayError(f"The scene has no parameter '{key}' any more; export with the scene of the run")
+            raise PathreplayError(f"The scene no longer has the parameter '{key}'; export with the scene of the run")
         form = form_of(params, key)
         seen = form.see(params[key])
         array = np.ascontiguousarray(value, np.float32)
@@ -165,26 +175,26 @@ def _file_names(keys: list[str], scene: mi.Scene) -> dict[str, str]:
 
 
 def _plain_plugins(described: Described) -> list[str]:
-    """Mitsuba's own plugins in the place of ours; what is to be said of it."""
+    """Replace our plugins by Mitsuba's; returns notes on plugins without equivalent."""
     notes = []
     for node in described.nodes:
         name = node.props.plugin_name()
         if name in _STANDS_IN:
             node.props.set_plugin_name(_STANDS_IN[name])
         elif name in PLUGINS and node.type != mi.ObjectType.Integrator:
-            notes.append(f"the scene needs '{name}' of this package: import pathreplay before it is loaded")
+            notes.append(f"the scene needs the plugin '{name}' of pathreplay: import pathreplay before loading it")
     return notes
 
 
 def _plain_integrator(described: Described, wanted: Mapping[str, Any] | None) -> list[str]:
-    """The integrator that is wanted, else the scene's own, as one for pictures; what is to be said of it."""
+    """Set the wanted integrator, else the scene's; replaces a differentiable one, and returns a note about it."""
     root = described.nodes[0]
     children = dict(described.children(root))
     own = next((name for name, node in children.items() if node.type == mi.ObjectType.Integrator), None)
     if wanted is not None:
         options = dict(wanted)
     elif own is None:
-        options = {"type": "pathreplay"}  # as a job that names none
+        options = {"type": "pathreplay"}  # the default integrator of jobs
     else:
         props = children[own].props
         options = {"type": props.plugin_name(), **{name: props.get(name) for name in _KEPT if name in props}}
@@ -204,4 +214,4 @@ def _plain_integrator(described: Described, wanted: Mapping[str, Any] | None) ->
     if depth is None:
         return []
     stands_in = properties.plugin_name()
-    return [f"'{stands_in}' renders the exported scene in the place of '{name}', which is made for gradients"]
+    return [f"'{stands_in}' renders the exported scene instead of '{name}', a differentiable integrator"]

@@ -1,7 +1,7 @@
-"""A described scene as Mitsuba XML, whose numbers are those of the scene to the last digit and whose names stay.
+"""Writes a scene description as Mitsuba XML with exact numbers and preserved ids.
 
-Mitsuba's own writer (`mi.parser.write_file`) takes transforms apart into angles, leaves out the names of what is
-referenced nowhere, and turns sizes into defaults.
+Mitsuba's own writer (`mi.parser.write_file`) decomposes transforms into angles, omits the ids of objects without
+references, and replaces sizes by defaults.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ _TAGS = {
     "Integrator": "integrator", "PhaseFunction": "phase", "ReconstructionFilter": "rfilter",
 }  # fmt: skip
 _UNNAMED = "_arg_"
-"""How the parser begins the names of objects that have none in the file."""
+"""Prefix of the names that the parser gives to unnamed objects."""
 
 
 def scene_xml(described: Described, from_file: bool) -> bytes:
-    """The scene as the bytes of an XML file; ``from_file``: it comes from one, where an id is a name of the user's.
+    """Encode the scene as an XML file.
 
-    Raises PathreplayError for values that XML cannot hold.
+    ``from_file`` says that it was read from a file, where the user has chosen the ids. Raises PathreplayError for
+    values that XML cannot hold.
     """
     uses = Counter(id(child) for node in described.nodes for _, child in described.children(node))
     names = _Names(described, uses, from_file)
@@ -39,7 +40,7 @@ def scene_xml(described: Described, from_file: bool) -> bytes:
 
 
 class _Names:
-    """The ids that objects get: those that are used for references, or are part of the names of parameters."""
+    """The ids that objects get: only those that are referenced, or are part of parameter keys."""
 
     def __init__(self, described: Described, uses: Counter[int], from_file: bool) -> None:
         top = {id(child) for _, child in described.children(described.nodes[0])}
@@ -68,7 +69,7 @@ def _element(described: Described, node: Node, name: str, names: _Names, written
     written.add(id(node))
     kind = str(node.type).rsplit(".", 1)[-1]
     if kind not in _TAGS:
-        raise PathreplayError(f"{node.props.plugin_name()} '{node.props.id()}' is a {kind}, and cannot be exported")
+        raise PathreplayError(f"{node.props.plugin_name()} '{node.props.id()}' is a {kind}, which cannot be exported")
     element = ElementTree.Element(_TAGS[kind])
     if kind != "Scene":
         element.set("type", node.props.plugin_name())
@@ -86,29 +87,29 @@ def _element(described: Described, node: Node, name: str, names: _Names, written
 def _property(node: Node, key: str) -> ElementTree.Element:
     value, kind = node.props.get(key), str(node.props.type(key)).rsplit(".", 1)[-1]
     if kind == "Bool":
-        return _made("boolean", key, value=str(value).lower())
+        return _tag("boolean", key, value=str(value).lower())
     if kind in ("Integer", "Float"):
-        return _made(kind.lower(), key, value=repr(value))
+        return _tag(kind.lower(), key, value=repr(value))
     if kind == "String":
-        return _made("string", key, value=str(value))
+        return _tag("string", key, value=str(value))
     if kind == "Vector":
-        return _made("vector", key, **{axis: repr(float(value[i])) for i, axis in enumerate("xyz")})
+        return _tag("vector", key, **{axis: repr(float(value[i])) for i, axis in enumerate("xyz")})
     if kind == "Color":
-        return _made("rgb", key, value=" ".join(repr(float(value[i])) for i in range(3)))
+        return _tag("rgb", key, value=" ".join(repr(float(value[i])) for i in range(3)))
     if kind == "Spectrum":
-        return _made("spectrum", key, value=_samples(value))
+        return _tag("spectrum", key, value=_samples(value))
     if kind == "Transform":
-        element = _made("transform", key)
+        element = _tag("transform", key)
         numbers = np.array(value.matrix, np.float64).ravel()
         ElementTree.SubElement(element, "matrix", value=" ".join(repr(float(x)) for x in numbers))
         return element
     raise PathreplayError(
-        f"'{key}' of {node.props.plugin_name()} '{node.props.id()}' is of type {kind}, which XML cannot hold; describe "
-        "it otherwise"
+        f"'{key}' of {node.props.plugin_name()} '{node.props.id()}' has type {kind}, which XML cannot hold; use "
+        "another property"
     )
 
 
-def _made(tag: str, name: str, **attributes: str) -> ElementTree.Element:
+def _tag(tag: str, name: str, **attributes: str) -> ElementTree.Element:
     return ElementTree.Element(tag, {"name": name, **attributes})
 
 
