@@ -1,6 +1,6 @@
-"""Time, memory and variance of gradients next to Mitsuba's own integrators: `pathreplay bench --help`.
+"""Compares time, memory and variance of gradients with Mitsuba's own integrators: `pathreplay bench --help`.
 
-Not installed: it runs from a checkout. The commanding process stays small and measures nothing; every number comes
-from a worker process (`measures/worker.py`), so that a baseline that dies is a row of the table, and peak memory is a
-job's own.
+The benchmarks are not installed; they run from a checkout. The main process stays small and measures nothing. All
+numbers come from worker processes (`measures/worker.py`), so that a baseline that crashes becomes a table row, and peak
+memory is that of a single job.
 """

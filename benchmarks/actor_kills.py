@@ -1,11 +1,11 @@
-"""Actors killed at random moments of a run: whether it ends with the bytes of one that computes in its own process.
+"""Tests that killing actors at random moments of a run does not change its results.
 
     python -m benchmarks.actor_kills [--kills 20] [--actors 2] [--seed 0]
 
-runs a job in one process (`deterministic = true`), then by actors of Ray, of which a random one is killed (SIGKILL) now
-and then, whatever it is doing, until that has been done as often as asked. Prints what was told of it; ends with status
-1 if the run came to anything else, or ended before all kills were done (then it wants more `--iterations`). Takes
-about three minutes on two quiet cores. Wants `pip install 'pathreplay[ray]'`.
+The command runs a job in one process (`deterministic = true`), then by Ray actors. During the second run it kills
+(SIGKILL) a random actor at random moments, ``--kills`` times in all, and prints the log of the run. The exit status is
+1 if any byte of the results differs, or if the run ended before all kills were done, which needs more ``--iterations``.
+It takes about three minutes on two quiet cores, and needs `pip install 'pathreplay[ray]'`.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from pathreplay.jobs import make_config, optimize
 from .kills import JOB, outcome
 
 LONGEST_S = 6.0
-"""Between two kills; an actor is there again after about three."""
+"""Maximum time between two kills; a restarted actor is ready after about three seconds."""
 
 
 def main(
-    kills: Annotated[int, typer.Option(help="How many.")] = 20,
-    actors: Annotated[int, typer.Option(help="Actors, of one thread each.")] = 2,
-    iterations: Annotated[int, typer.Option(help="Of each of the two stages of the run.")] = 800,
-    seed: Annotated[int, typer.Option(help="Chooses the moments, and the actors.")] = 0,
+    kills: Annotated[int, typer.Option(help="Number of kills.")] = 20,
+    actors: Annotated[int, typer.Option(help="Number of actors, with one thread each.")] = 2,
+    iterations: Annotated[int, typer.Option(help="Iterations of each of the two stages.")] = 800,
+    seed: Annotated[int, typer.Option(help="Seed of the moments and of the choice of actors.")] = 0,
 ) -> None:
-    """Kill actors of a run, and compare."""
+    """Kill actors of a run, and compare the results."""
     stages = [{**stage, "iterations": iterations} for stage in JOB["stages"]]
     job: dict[str, Any] = {**JOB, "stages": stages, "checkpoint_every": iterations, "spp_shards": 2}
     with tempfile.TemporaryDirectory() as name:
@@ -51,14 +51,14 @@ def main(
             killer.over.set()
             killer.join()
         print(f"by {actors} actors: {time.perf_counter() - begin:.0f} s, {killer.done} of {kills} kills done")
-        whole, found = (outcome(Path(name) / which) for which in ("whole", "run"))
-    other = sorted(key for key in {*whole, *found} if whole.get(key) != found.get(key))
-    print(f"others in {', '.join(other)}" if other else "the same bytes")
-    raise typer.Exit(0 if killer.done == kills and not other else 1)
+        expected, result = (outcome(Path(name) / which) for which in ("whole", "run"))
+    differing = sorted(key for key in {*expected, *result} if expected.get(key) != result.get(key))
+    print(f"different bytes in {', '.join(differing)}" if differing else "the same bytes")
+    raise typer.Exit(0 if killer.done == kills and not differing else 1)
 
 
 class Killer(threading.Thread):
-    """Kills actors of this process, one after the other."""
+    """Kills actors of this process at random moments."""
 
     def __init__(self, moments: random.Random, kills: int) -> None:
         super().__init__(daemon=True)
@@ -66,18 +66,18 @@ class Killer(threading.Thread):
         self.over = threading.Event()
 
     def run(self) -> None:
-        """Until all kills are done, or the run is over."""
+        """Kill until all kills are done, or the run is over."""
         while self.done < self.kills and not self.over.wait(self.moments.uniform(0, LONGEST_S)):
-            there = [p for p in psutil.Process().children(recursive=True) if _name(p).startswith("ray::RayActor")]
-            if there:
-                self.moments.choice(sorted(there, key=lambda process: process.pid)).kill()
+            alive = [p for p in psutil.Process().children(recursive=True) if _name(p).startswith("ray::RayActor")]
+            if alive:
+                self.moments.choice(sorted(alive, key=lambda process: process.pid)).kill()
                 self.done += 1
 
 
 def _name(process: psutil.Process) -> str:
     try:
         return str(process.name())
-    except psutil.Error:  # it has just ended
+    except psutil.Error:  # the process has just ended
         return ""
 
 

@@ -1,9 +1,9 @@
-"""What the care around a pass costs in a process with a million objects: see `pathreplay.integrators.lifetimes`.
+"""Measures the cost of `pathreplay.integrators.lifetimes` around a pass in a process with a million objects.
 
     python -m benchmarks.collector
 
-prints the time of the care alone, and how much of some recorded passes the cyclic garbage collector takes: were there a
-full collection in each, it would look at all objects.
+The command prints the time of the context manager alone, and the share of the cyclic garbage collector in recorded
+passes. A full collection in each pass would traverse all objects.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ OBJECTS, ROUNDS, PASSES = 10**6, 1000, 20
 
 
 def main() -> None:
-    """Print both."""
+    """Print both measurements."""
     set_variant("llvm_ad_rgb")
     import drjit as dr
     import mitsuba as mi

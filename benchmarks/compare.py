@@ -1,8 +1,7 @@
-"""The regression guard: what is slower, noisier, heavier or wrong in one record of a task and was not in another.
+"""The regression check: finds what became slower, noisier, larger or wrong between two records of a task.
 
-Times of different days and machines differ, so that what is compared is the ratio to Mitsuba's method of the same job
-in the same run, where both runs have it. A change counts if its 95 % interval, resampled from both records, lies
-beyond a margin.
+Absolute times differ between days and machines. So the check compares ratios to Mitsuba's method of the same job in the
+same run, if both records have it. A change counts if its 95 % bootstrap interval lies outside a margin.
 """
 
 from __future__ import annotations
@@ -18,9 +17,8 @@ from .measures.job import Machine, Point, Record
 from .measures.methods import STOCK, parts
 from .tables import markdown, pooled
 
-# Two runs of the same code differ by more than each of them tells: kernels lie elsewhere in memory, baselines meet
-# other loads. In ratios to a baseline that takes turns it is a few per cent; seconds alone drift with the machine's
-# clock.
+# Two runs of the same code differ by more than their intervals: memory layouts and machine loads differ. Ratios to an
+# interleaved baseline vary by a few per cent; absolute seconds also drift with the machine's clock frequency.
 MARGIN = 0.05
 ALONE_MARGIN = 0.15
 
@@ -30,14 +28,14 @@ Key = tuple[object, ...]
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity of one method in one job, then and now."""
+    """Comparison of one quantity of one method in one job."""
 
     scene: str
     method: str
     depth: int
     quantity: str
     outcome: Outcome
-    told: str  # new over old with its interval, or the reason for the outcome
+    told: str  # new / old with its interval, or the reason for the outcome
 
 
 @dataclass(frozen=True)
@@ -48,11 +46,11 @@ class Comparison:
 
     @property
     def worse(self) -> tuple[Row, ...]:
-        """What got slower, noisier, heavier or wrong."""
+        """Rows that became slower, noisier, larger or wrong."""
         return tuple(row for row in self.rows if row.outcome == "worse")
 
     def table(self) -> str:
-        """What changed, as Markdown, the bad news first; then how much is the same."""
+        """Changes as a Markdown table, the worst outcomes first, followed by a summary."""
         order: tuple[Outcome, ...] = ("worse", "missing", "not comparable", "new", "better")
         told = [row for outcome in order for row in self.rows if row.outcome == outcome]
         same = len(self.rows) - len(told)
@@ -64,7 +62,7 @@ class Comparison:
 
 
 def compare(old: Record, new: Record) -> Comparison:
-    """Compare two records of a task; Mitsuba's own methods are the yardstick and not judged."""
+    """Compare two records of a task; Mitsuba's own methods are the reference and not judged."""
     before, now = ({_key(point): point for point in pooled(record.points)} for record in (old, new))
     same_machine = _place(old.machines) == _place(new.machines)
     rows: list[Row] = []
@@ -97,7 +95,7 @@ def _place(machines: Sequence[Machine]) -> set[tuple[str, int, int]]:
 
 
 def _yardstick(key: Key, before: dict[Key, Point], now: dict[Key, Point]) -> tuple[Point, Point] | None:
-    """Mitsuba's method of the same job in both records: that of the same stage ('prb, import') if there are stages."""
+    """Mitsuba's method of the same job in both records, of the same stage ('prb, import') if there are stages."""
     baselines = [
         other
         for other in before
@@ -151,14 +149,14 @@ def _judged(point: Point, quantity: str, change: Estimate, margin: float) -> Row
     return _row(point, quantity, "better" if change.high < 1 - margin else "same", str(change))
 
 
-def _relative_time(a: Point, b: Point, rival_of_a: Point, rival_of_b: Point) -> Estimate:
-    """Change of the time relative to a baseline's: round by round, where both have had the same number of rounds."""
-    pairs = (b, rival_of_b), (a, rival_of_a)
+def _relative_time(a: Point, b: Point, baseline_of_a: Point, baseline_of_b: Point) -> Estimate:
+    """Change of the time relative to a baseline, round by round if both have the same number of rounds."""
+    pairs = (b, baseline_of_b), (a, baseline_of_a)
     if all(len(ours.seconds) == len(theirs.seconds) for ours, theirs in pairs):
         return unpaired_ratio(*(np.divide(ours.seconds, theirs.seconds) for ours, theirs in pairs), np.median)
 
     def change(*seconds: np.ndarray, axis: int) -> np.ndarray:
-        ours, theirs, our_old, their_old = (np.median(each, axis) for each in seconds)
+        ours, theirs, our_old, their_old = (np.median(times, axis) for times in seconds)
         return ours / theirs / (our_old / their_old)
 
     return interval(change, *(point.seconds for pair in pairs for point in pair), paired=False)

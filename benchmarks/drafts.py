@@ -1,4 +1,4 @@
-"""What an interrupted run has measured so far: kept on disk job by job, so that the next run goes on from there."""
+"""Stores the finished jobs of an interrupted run on disk, so that the next run continues from there."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DRAFTS = ROOT / "benchmarks" / "results" / ".partial"
 
 @dataclass(frozen=True)
 class Done:
-    """A job that came to an end, and which of its equals it was: a task may run the same job several times, in turn."""
+    """A finished job; ``turn`` is its index among equal jobs, since a task may repeat a job."""
 
     job: Job
     turn: int
@@ -39,7 +39,7 @@ _JSON = TypeAdapter(_Contents)
 
 @dataclass
 class Draft:
-    """The jobs of one task that are done. They count only for the code, and the machine, that they were taken with."""
+    """The finished jobs of one task; only valid for the same code and the same machine."""
 
     path: Path
     contents: _Contents = field(init=False)
@@ -47,36 +47,35 @@ class Draft:
     def __post_init__(self) -> None:
         fresh = _Contents(stamp(), datetime.now(timezone.utc).isoformat(timespec="seconds"), 1, ())
         try:
-            found = _JSON.validate_json(self.path.read_bytes())
+            saved = _JSON.validate_json(self.path.read_bytes())
         except (FileNotFoundError, ValidationError):
-            found = fresh
-        if found.stamp != fresh.stamp or not found.done:
-            found = fresh
+            saved = fresh
+        if saved.stamp != fresh.stamp or not saved.done:
+            self.contents = fresh
         else:
-            found = replace(found, sittings=found.sittings + 1)
-        self.contents = found
+            self.contents = replace(saved, sittings=saved.sittings + 1)
 
     @property
     def begun(self) -> str:
-        """When the first of the jobs was begun, ISO 8601."""
+        """Start of the first job, ISO 8601."""
         return self.contents.begun
 
     @property
     def sittings(self) -> int:
-        """Runs that it took, this one included."""
+        """Number of runs so far, including this one."""
         return self.contents.sittings
 
     @property
     def stale(self) -> bool:
-        """Whether the code has changed since the jobs were begun: they are then not all of one kind."""
+        """Whether the code has changed since the start, so that the jobs are not comparable."""
         return stamp() != self.contents.stamp
 
     def find(self, job: Job, turn: int) -> Done | None:
-        """The job, if it is done."""
+        """The finished job, or None."""
         return next((done for done in self.contents.done if (done.job, done.turn) == (job, turn)), None)
 
     def add(self, done: Done) -> None:
-        """Keep a job, on disk and at once."""
+        """Save a finished job to disk atomically."""
         self.contents = replace(self.contents, done=(*self.contents.done, done))
         self.path.parent.mkdir(parents=True, exist_ok=True)
         draft = self.path.with_suffix(".tmp")
@@ -84,17 +83,17 @@ class Draft:
         draft.replace(self.path)
 
     def discard(self) -> None:
-        """The run is over: nothing is left to go on with."""
+        """Remove the draft at the end of the run."""
         self.path.unlink(missing_ok=True)
 
 
 def draft_of(task: str, quick: bool) -> Draft:
-    """The draft of a task, as far as an earlier run came."""
+    """The draft of a task, with the jobs of an interrupted run if any."""
     return Draft(DRAFTS / f"{task}{'-quick' if quick else ''}.json")
 
 
 def stamp() -> str:
-    """A word that changes with the code of the package or of the benchmarks, and with the machine."""
+    """Hash of the code of the package and the benchmarks, and of the machine."""
     words = hashlib.sha256(f"{os.uname().nodename} {os.cpu_count()}".encode())
     for path in sorted([*(ROOT / "src").rglob("*.py"), *(ROOT / "benchmarks").rglob("*.py")]):
         words.update(str(path.relative_to(ROOT)).encode() + path.read_bytes())

@@ -1,8 +1,9 @@
-"""Draws the pictures of docs/edges.md: where edges are looked for, and derivatives beside finite differences.
+"""Draws the figures of docs/edges.md: how edges are searched, and derivatives beside finite differences.
 
     python -m benchmarks.edge_pictures [FOLDER]
 
-writes `edges-seen.svg` and `edges-derivatives.png`; without a folder to docs/images. Takes some minutes.
+The command writes `edges-seen.svg` and `edges-derivatives.png` to the folder (default: docs/images). It takes some
+minutes.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ from .plots import BLUE, GREY, IMAGES, ORANGE, RED
 RESOLUTION = 96
 COLUMNS = ("picture", "finite differences", "boundary='all'", "boundary='none'")
 BRIGHTEST = 98.5
-"""Percentile of the differences at which the colours end."""
+"""Percentile of the absolute differences that bounds the colour scale."""
 
 # ------------------------------ Derivatives ------------------------------
 
 
 class Motion(NamedTuple):
-    """What moves, and how many samples show it."""
+    """A motion, and its numbers of samples."""
 
     title: str
     build: Callable[[], dict[str, Any]]
@@ -44,12 +45,12 @@ class Motion(NamedTuple):
     move: Callable[[Any, Any], Any]
     step: float
     depth: int
-    spp: int  # of differences
+    spp: int  # of finite differences
     boundary_spp: int
 
 
 def shift(x: float, y: float, z: float) -> Callable[[Any, Any], Any]:
-    """By a vector times t, of vertices or of a transformation."""
+    """Translation of vertices or of a transform by t times the vector."""
 
     def move(value: Any, t: Any) -> Any:
         by = mi.Transform4f().translate(mi.Vector3f(x, y, z) * t)
@@ -71,7 +72,7 @@ def cornell_box() -> dict[str, Any]:
 
 
 def glass_ball() -> dict[str, Any]:
-    """A ball of glass before a lamp and a painted wall."""
+    """A glass ball in front of an area light and a textured wall."""
     T, rgb = mi.ScalarTransform4f, lambda *value: {"type": "rgb", "value": list(value)}
     texels = np.random.default_rng(4).uniform(0.05, 0.8, (8, 8, 3)).astype(np.float32)
     paint = {"type": "bitmap", "raw": True, "data": mi.TensorXf(texels), "filter_type": "bilinear"}
@@ -98,13 +99,13 @@ MOTIONS = (
 
 
 def derivatives(motion: Motion) -> list[np.ndarray]:
-    """Picture, finite differences, and our derivatives with and without edges."""
+    """Image, finite differences, and our derivatives with and without boundary terms."""
     gc.collect()
     loaded = mi.load_dict(motion.build(), optimize=False)
     objective = Objective(loaded, mi.traverse(loaded), motion.key, motion.move)
     limits = {"max_depth": motion.depth, "rr_depth": 100}
     plain = mi.load_dict({"type": "path"} | limits)
-    found = [
+    images = [
         objective.image(plain, 1, motion.spp),
         objective.difference(plain, CENTRAL, motion.step, 2, motion.spp),
         *(
@@ -113,11 +114,11 @@ def derivatives(motion: Motion) -> list[np.ndarray]:
         ),
     ]
     objective.put(mi.Float(0))
-    return found
+    return images
 
 
 def draw_derivatives() -> Figure:
-    """A row for each motion; red is brighter, blue is darker, in one scale for each row."""
+    """A row for each motion, with a common colour scale: red is brighter, blue is darker."""
     figure = Figure(figsize=(9.6, 2.5 * len(MOTIONS) + 0.3), layout="constrained")
     rows = figure.subplots(len(MOTIONS), len(COLUMNS))
     for motion, row in zip(MOTIONS, rows, strict=True):
@@ -143,7 +144,7 @@ def draw_derivatives() -> Figure:
 
 
 def draw_seen() -> Figure:
-    """Three drawings: a line on the film, one among the samples of a lamp, an arc of directions."""
+    """Three drawings: a segment on the film, a segment in the samples of a light, and an arc of directions."""
     figure = Figure(figsize=(9.6, 3.6), layout="constrained")
     panels = figure.subplots(1, 3)
     for axes, draw in zip(panels, (_film_line, _square_line, _arc), strict=True):
@@ -164,7 +165,7 @@ def _ray(axes: Axes, begin: tuple[float, float], end: tuple[float, float], colou
 
 
 def _ends(axes: Axes, a: tuple[float, float], b: tuple[float, float]) -> None:
-    """The line that looks for an edge: blue at the far side, red at the near one."""
+    """The segment that is searched for an edge: the end on the far side is blue, the near end red."""
     axes.plot([a[0], b[0]], [a[1], b[1]], color="black", linewidth=1.6, zorder=3)
     axes.plot(*a, "o", color=RED, markersize=6, zorder=4)
     axes.plot(*b, "o", color=BLUE, markersize=6, zorder=4)
@@ -232,7 +233,7 @@ def _arc(axes: Axes) -> None:
 
 
 def main(folder: Path = IMAGES) -> None:
-    """Draw both."""
+    """Draw both figures."""
     set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     folder.mkdir(parents=True, exist_ok=True)

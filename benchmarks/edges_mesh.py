@@ -1,9 +1,9 @@
-"""A mesh from outlines and shadows: how far from the truth the example ends, as a surface.
+"""Measures the surface error of the example that recovers a mesh from silhouettes and shadows.
 
     python -m benchmarks.edges_mesh
 
-runs examples/mesh-by-shadows and prints root mean square distances at the start and at the end: of vertices from the
-true surface, and of points of the true surface from the vertices. The body is 1 long.
+The command runs examples/mesh-by-shadows and prints root mean square distances of the initial and the final mesh: from
+its vertices to the true surface, and from points of the true surface to its vertices. The body has length 1.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathreplay.jobs import load_config, optimize
 from pathreplay.scenes.bodies import ball, knobs
 
 EXAMPLE = Path(__file__).parent.parent / "examples/mesh-by-shadows/config.toml"
-FINE = 6  # splits: points of the true surface are 0.01 apart
+FINE = 6  # subdivisions: points of the true surface are 0.01 apart
 
 
 def distances(points: np.ndarray) -> str:
@@ -28,7 +28,7 @@ def distances(points: np.ndarray) -> str:
 
 
 def main() -> None:
-    """Run the job; print what came of it."""
+    """Run the job, and print its errors."""
     with tempfile.TemporaryDirectory() as folder:
         result = optimize(load_config(EXAMPLE), output=Path(folder) / "mesh")
     print(result.describe())

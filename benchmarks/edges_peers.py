@@ -1,10 +1,11 @@
-"""Where edges move: derivatives against finite differences, ours and those of Mitsuba's `prb_projective`.
+"""Compares derivatives with moving edges, ours and those of Mitsuba's `prb_projective`, with finite differences.
 
     python -m benchmarks.edges_peers [SCENE ...]
 
-prints a table of the scenes below. F is a weighted mean of a picture of 16 x 16 pixels, and every scene has one motion;
-references are central differences of `path` with common random numbers. `prb_projective` runs without guiding, which
-leaves its mean as it is. A derivative is wrong where it is more than four standard errors and 3 % off.
+The command prints a table of the scenes below. The objective is a weighted mean of an image of 16 x 16 pixels, and
+every scene has one motion. References are central differences of `path` with common random numbers. `prb_projective`
+runs without guiding, which does not change its mean. A derivative counts as wrong if its error exceeds both four
+standard errors and 3 %.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ RESOLUTION = 16
 SEEDS, SPP = 8, 1024
 REFERENCE_SEEDS, REFERENCE_SPP = 8, 8192
 TOLERANCE = 0.03
-"""Of the derivative: differences have an error of second order in their step."""
+"""Relative tolerance of a derivative: finite differences have an error of second order in their step."""
 METHODS = {
     "pathreplay": {"type": "pathreplay", "boundary": "all", "sampling": "scene"},
     "prb_projective": {"type": "prb_projective", "guiding": "none"},
@@ -40,12 +41,12 @@ METHODS = {
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene, and a motion with speed 1 (or angular speed 1) of what a parameter places."""
+    """A scene, and a motion of the object at a parameter with unit speed or unit angular speed."""
 
     build: Callable[[], SceneDict]
     key: str
-    move: Callable[[], Any]  # transformation by t
-    cause: str = ""  # of the error that `prb_projective` makes
+    move: Callable[[], Any]  # transform as a function of t
+    cause: str = ""  # reason for the error of `prb_projective`
     depth: int = 2
     step: float = 0.02
 
@@ -96,7 +97,7 @@ def wall(reflectance: SceneDict) -> SceneDict:
 
 
 def ceiling(radiance: float = 10.0) -> SceneDict:
-    """A lamp behind the camera, to the right."""
+    """An area light behind the camera, to the right."""
     place = T().translate([1.6, 1.2, 2.5]).look_at([0, 0, 0], [-1.6, -1.2, -3.5], [0, 1, 0]).scale([0.5, 0.5, 1])
     return lamp(place, rgb(radiance, radiance, radiance))
 
@@ -110,18 +111,18 @@ def scene(fov: float = 45, **parts: SceneDict) -> SceneDict:
 
 
 def backdrop() -> SceneDict:
-    """A textured wall that glows."""
+    """An emissive wall with a texture."""
     return lamp(T().translate([0, 0, -1]).scale([6, 6, 1]), spots())
 
 
 def box(bsdf: SceneDict) -> SceneDict:
-    """A cube of 24 vertices: faces share none."""
+    """A cube with 24 vertices, none of which are shared between faces."""
     place = T().translate([0.1, 0.1, 0]).rotate([1, 0.4, 0], 30).scale(0.4)
     return {"type": "cube", "to_world": place, "face_normals": True, "bsdf": bsdf}
 
 
 def welded_box(bsdf: SceneDict) -> mi.Mesh:
-    """The same of 8 vertices: faces share them."""
+    """The same cube with 8 shared vertices."""
     corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
     quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
     faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
@@ -155,7 +156,7 @@ def under_sky() -> SceneDict:
 
 
 def rough_mirror() -> SceneDict:
-    """What stands before a lit wall at the side, seen in a rough mirror."""
+    """An occluder in front of a lit side wall, seen in a rough mirror."""
     mirror = {"type": "twosided", "bsdf": {"type": "roughconductor", "alpha": 0.3}}
     above = T().translate([0.6, 2.6, 0.5]).look_at([0, 0, 0], [1.6, -2.4, 0], [0, 0, 1]).scale([0.4, 0.4, 1])
     return scene(
@@ -172,7 +173,7 @@ def grey_box() -> SceneDict:
 
 
 def dark_sheet() -> SceneDict:
-    """A sheet before a glow."""
+    """A black sheet in front of an emissive wall."""
     place = T().translate([0.7, 0.5, 0.9]).rotate([0, 0, 1], 20).scale([0.35, 0.3, 1])
     return scene(wall=backdrop(), sheet=sheet(place, rgb(0, 0, 0)))
 
@@ -230,14 +231,14 @@ SCENES = {
 class Estimate(NamedTuple):
     mean: float
     error: float
-    z: float  # to the reference
+    z: float  # relative to the reference
 
     def wrong(self, reference: float) -> bool:
         return abs(self.z) > Z_LIMIT and abs(self.mean - reference) > TOLERANCE * abs(reference)
 
 
 def measure(cell: Scene) -> tuple[Estimate, dict[str, Estimate | str]]:
-    """The reference, and what each method says, or why it says nothing."""
+    """The reference, and each method's estimate or error message."""
     gc.collect()
     loaded = mi.load_dict(cell.build(), optimize=False)
     by = cell.move()
@@ -251,35 +252,33 @@ def measure(cell: Scene) -> tuple[Estimate, dict[str, Estimate | str]]:
     limits = {"max_depth": cell.depth, "rr_depth": 100}
     plain = mi.load_dict({"type": "path"} | limits)
     objective.weigh(weights())
-    pictures = (
-        objective.difference(plain, CENTRAL, cell.step, 1000 + k, REFERENCE_SPP) for k in range(REFERENCE_SEEDS)
-    )
-    differences = np.array([objective.dot(picture) for picture in pictures])
-    found: dict[str, Estimate | str] = {}
+    images = (objective.difference(plain, CENTRAL, cell.step, 1000 + k, REFERENCE_SPP) for k in range(REFERENCE_SEEDS))
+    differences = np.array([objective.dot(image) for image in images])
+    estimates: dict[str, Estimate | str] = {}
     for name, plugin in METHODS.items():
         integrator = mi.load_dict(plugin | limits)
         try:
             samples = np.array([objective.backward(integrator, 1 + k, SPP) for k in range(SEEDS)])
         except Exception as error:
-            found[name] = str(error).splitlines()[0]
+            estimates[name] = str(error).splitlines()[0]
             continue
-        found[name] = Estimate(*mean_and_error(samples), gap(samples, differences).z)
+        estimates[name] = Estimate(*mean_and_error(samples), gap(samples, differences).z)
     objective.put(mi.Float(0))
-    return Estimate(*mean_and_error(differences), 0.0), found
+    return Estimate(*mean_and_error(differences), 0.0), estimates
 
 
 def weights() -> np.ndarray:
-    """Smooth, without symmetry, the same for all channels: what is grey must not cancel."""
+    """Smooth asymmetric pixel weights, equal for all channels so that grey contributions do not cancel."""
     y, x, _ = np.mgrid[0:RESOLUTION, 0:RESOLUTION, 0:3] / RESOLUTION
     w = 1 + np.cos(2 * np.pi * (1.4 * x + 0.4 * y) + 1)
     return w / w.size
 
 
-def told(found: Estimate | str, reference: float) -> str:
-    if isinstance(found, str):
+def estimate_cell(estimate: Estimate | str, reference: float) -> str:
+    if isinstance(estimate, str):
         return "raises"
-    text = f"{found.mean:+.5f} ± {found.error:.5f} (z {found.z:+.1f})"
-    return f"{text} **wrong**" if found.wrong(reference) else text
+    text = f"{estimate.mean:+.5f} ± {estimate.error:.5f} (z {estimate.z:+.1f})"
+    return f"{text} **wrong**" if estimate.wrong(reference) else text
 
 
 def main(names: list[str]) -> None:
@@ -288,9 +287,9 @@ def main(names: list[str]) -> None:
     mi.set_log_level(mi.LogLevel.Error)
     print(f"| what moves | finite differences | {' | '.join(METHODS)} | why |\n|{' --- |' * (3 + len(METHODS))}")
     for name in names or SCENES:
-        reference, found = measure(SCENES[name])
+        reference, estimates = measure(SCENES[name])
         cells = [f"{reference.mean:+.5f} ± {reference.error:.5f}"]
-        cells += [told(one, reference.mean) for one in found.values()]
+        cells += [estimate_cell(estimate, reference.mean) for estimate in estimates.values()]
         print(f"| {' | '.join([name, *cells, SCENES[name].cause])} |", flush=True)
 
 

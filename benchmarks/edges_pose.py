@@ -1,10 +1,10 @@
-"""Poses from outlines: what `pathreplay optimize` makes of the examples, beside Mitsuba's `prb_projective`.
+"""Compares poses recovered from silhouettes by `pathreplay` and by Mitsuba's `prb_projective`.
 
     python -m benchmarks.edges_pose [EXAMPLE ...]
 
-runs the jobs in examples/, each with two seeds, prints a table, and leaves reports in runs/edges-pose. Both integrators
-have the same start, targets, samples and seconds, in turns. The overlap is the dark that target and start share, over
-the dark of the target, in each view.
+The command runs jobs of examples/ with two seeds each, prints a table, and writes reports to runs/edges-pose. Both
+integrators have the same initial values, targets, samples and seconds, and run alternately. The overlap of a view is
+the fraction of the target's dark area that is also dark in the initial image.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ DARK = 0.5
 
 
 def overlap(folder: Path) -> str:
-    """Of each view."""
-    shares = []
+    """Overlap of each view."""
+    fractions = []
     for path in sorted((folder / "images").glob("target-*.exr")):
         target, start = (
             read_image(path.with_name(path.name.replace("target", kind))).mean(axis=2) < DARK
             for kind in ("target", "start")
         )
-        shares.append((target & start).sum() / target.sum())
-    return ", ".join(f"{share:.2f}" for share in shares)
+        fractions.append((target & start).sum() / target.sum())
+    return ", ".join(f"{fraction:.2f}" for fraction in fractions)
 
 
 def ended(path: Path) -> tuple[str, str, str, str]:
-    """Iterations, seconds, distance and angle from the truth of a run, by its history."""
+    """Iterations, seconds, position error and angular error of a run, from its history."""
     entries = [json.loads(line) for line in path.read_text().splitlines()]
     (position, degrees), seconds = entries[-1]["errors"].values(), sum(entry["seconds"] for entry in entries)
     return str(len(entries)), f"{seconds:.0f}", f"{position:.5f}", f"{degrees:.4f}"
 
 
 def rows(name: str, config: Config) -> None:
-    """Run the job; print a row for each of the two."""
+    """Run the job, and print a row for each integrator."""
     result = optimize(config, output=RUNS / f"{name}-seed-{config.seed}", progress=False)
     if result.stopped:
         raise SystemExit(f"stopped by {result.stopped_by}")

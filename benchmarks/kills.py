@@ -1,11 +1,11 @@
-"""Kills at random moments of a small run: whether every run goes on, and ends with the same bytes.
+"""Tests that a run that is killed at a random moment can be resumed, and ends with the same bytes.
 
     python -m benchmarks.kills [--kills 100] [--seed 0]
 
-runs a job in one thread (`deterministic = true`) undisturbed, then kills it (SIGKILL) as often as asked, each time at
-a moment that is uniform over the time in which its run folder is there, and a little before. What was killed is gone on
-with by `--resume`, or begun again where nothing was saved yet. Prints a table, and what was not as it should be; ends
-with status 1 if anything was not. With 100 kills it takes about a quarter of an hour on a quiet core.
+The command runs a small job in one thread (`deterministic = true`) undisturbed. Then it kills (SIGKILL) ``--kills``
+runs of the job, each at a random moment between shortly before the creation of its run folder and its end. A killed run
+is resumed with `--resume`, or started again if nothing was saved. The command prints a table and all differences; the
+exit status is 1 if there are any. 100 kills take about a quarter of an hour on a quiet core.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ LIMIT_S = 600
 
 
 def main(
-    kills: Annotated[int, typer.Option(help="How many.")] = 100,
-    seed: Annotated[int, typer.Option(help="Chooses the moments.")] = 0,
+    kills: Annotated[int, typer.Option(help="Number of kills.")] = 100,
+    seed: Annotated[int, typer.Option(help="Seed of the moments.")] = 0,
 ) -> None:
-    """Kill a small run at random moments, go on, and compare."""
+    """Kill a small run at random moments, resume it, and compare the results."""
     moments = random.Random(seed)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -87,9 +87,9 @@ def _job_in(folder: Path) -> None:
 
 
 def _undisturbed(folder: Path) -> tuple[dict[str, Any], float, float]:
-    """What a run comes to, and seconds: until there is a folder, and in all."""
+    """Outcome of an undisturbed run, seconds until its folder exists, and total seconds."""
     _job_in(folder)
-    _finish(_start(folder, "job.json"))  # kernels are compiled once, and then found in Dr.Jit's cache
+    _finish(_start(folder, "job.json"))  # fill Dr.Jit's cache of compiled kernels
     shutil.rmtree(folder / "run")
     begin, process = time.perf_counter(), _start(folder, "job.json")
     while not (folder / "run").exists() and process.poll() is None:
@@ -101,13 +101,13 @@ def _undisturbed(folder: Path) -> tuple[dict[str, Any], float, float]:
 
 
 def _finish(process: subprocess.Popen[str]) -> str:
-    """Wait for the end; what went wrong, if something did."""
+    """Wait for the end of a run; returns its error, or ""."""
     _, err = process.communicate(timeout=LIMIT_S)
     return "" if process.returncode == 0 else f"status {process.returncode}, {err.strip()[-300:]}"
 
 
 def _one(folder: Path, whole: dict[str, Any], after: float) -> tuple[str, str]:
-    """Kill a run so many seconds after its start; when that was, and what came of it."""
+    """Kill a run ``after`` seconds and resume it; returns the phase of the kill, and the verdict."""
     _job_in(folder)
     process = _start(folder, "job.json")
     time.sleep(after)
@@ -145,7 +145,7 @@ def _history(run: Path) -> list[Any]:
 
 
 def outcome(run: Path) -> dict[str, Any]:
-    """All that has to be the same: values, pictures, what goes into a checkpoint, and the history but for seconds."""
+    """Everything that must not differ: values, images, checkpoint, and the history except for its seconds."""
     tensors = safetensors.numpy.load_file(run / CHECKPOINT)
     lines = [json.loads(line) for line in (run / "history.jsonl").read_text().splitlines()]
     names = ["parameters.safetensors", "parameters.json", "views.json"]

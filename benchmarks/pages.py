@@ -1,4 +1,4 @@
-"""Fills the pages: pictures and tables between markers are made from the records under benchmarks/results/."""
+"""Updates the pages: figures and tables between markers are generated from the records in benchmarks/results/."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .tables import brief_footnote, footnote
 MARKED = re.compile(r"(<!-- begin (?P<name>[\w-]+) -->\n).*?(<!-- end (?P=name) -->)", re.DOTALL)
 NOT_MEASURED = "*Not measured yet.*"
 
-#: By task: the pictures above its table, as name of the file and what it shows.
+#: Figures above the table of a task: caption by file name.
 PICTURES = {
     "depth": {
         "depth-time": "Seconds of a gradient pass against path length",
@@ -27,14 +27,14 @@ PICTURES = {
 
 
 def pages() -> list[Path]:
-    """Where marked parts are looked for."""
+    """Pages that are searched for marked parts."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def fill(tables: Mapping[str, Callable[[Record], str]], among: Sequence[Path]) -> list[str]:
-    """Rewrite the marked parts of these pages; returns the tasks, in alphabetical order, that have no record yet.
+    """Rewrite the marked parts of these pages; returns the sorted names of tasks without a record.
 
-    A part is marked by the name of a task, for its table and pictures, or of a summary.
+    The marker of a part names a task, for its table and figures, or a summary.
     """
     missing: set[str] = set()
 

@@ -1,6 +1,6 @@
-"""Draws the pictures of docs/evidence.md from the saved records: log-log, error bars, every line labelled at its end.
+"""Draws the figures of docs/evidence.md from the saved records: log-log plots with error bars and labelled lines.
 
-Colours are those of Okabe and Ito, which differ for colour-blind eyes; markers differ as well, for print.
+Colours are those of Okabe and Ito, which colour-blind readers can distinguish; markers differ as well, for print.
 """
 
 from __future__ import annotations
@@ -45,19 +45,19 @@ LOOKS = {
 }
 TITLES = {depth.SURFACES: "surfaces: a closed box", depth.MEDIA: "media: a sealed room of fog"}
 LABEL_SIZE = 9
-# Share of the variance of a pass above which |bias|² is told: it outweighs the noise after twenty passes.
+# Fraction of a pass's variance above which |bias|² is reported: it exceeds the noise of a mean over twenty passes.
 BIASED = 0.05
-# Least distance of two labels, as a share of the height of the axes.
+# Minimum distance of two labels, as a fraction of the height of the axes.
 APART = 0.055
 
 
 def draw_all(folder: Path = IMAGES, load: Callable[[str], Record | None] = records.load) -> list[Path]:
-    """Draw every picture for which there is a record; returns the files, SVG and PNG."""
+    """Draw every figure that has a record; returns the SVG and PNG files."""
     drawn: list[Path] = []
     for task, pictures in PICTURES.items():
         record = load(task)
         if record is not None:
-            # The same record gives the same file: element names from a fixed salt, and no date.
+            # A fixed hash salt and no date make the file a function of the record.
             with mpl.rc_context({"svg.hashsalt": "pathreplay", "font.size": 10}):
                 for name in pictures:
                     drawn += _write(DRAW[name](record), folder / name)
@@ -76,7 +76,7 @@ def _write(figure: Figure, stem: Path) -> list[Path]:
 
 
 def _depth_time(record: Record) -> Figure:
-    """Fastest round, with a bar up to the slowest."""
+    """Seconds of the fastest round, with an error bar up to the slowest."""
 
     def seconds(point: Point) -> tuple[float, float, float]:
         return min(point.seconds), 0.0, max(point.seconds) - min(point.seconds)
@@ -89,7 +89,7 @@ def _depth_memory(record: Record) -> Figure:
 
 
 def _against_depth(record: Record, value: Callable[[Point], tuple[float, float, float]], name: str) -> Figure:
-    """A panel for each scene: value, and how far the bar goes down and up, by depth, a line for each method."""
+    """Plot ``value`` (with the lengths of its error bar down and up) against depth, one panel per scene."""
     scenes = list(dict.fromkeys(point.scene for point in record.points))
     figure, panels = _panels(len(scenes), width=5.0)
     for axes, scene in zip(panels, scenes, strict=True):
@@ -106,7 +106,7 @@ def _against_depth(record: Record, value: Callable[[Point], tuple[float, float, 
             labels.append((x[-1], y[-1], method, colour))
         axes.set(xscale="log", yscale="log", xlabel="path length (max_depth)", title=TITLES.get(scene, scene))
         low, high = axes.get_ylim()
-        if high < 100 * low:  # too little for powers of ten; and lines that are flat want room below
+        if high < 100 * low:  # too small a range for powers of ten, and flat lines need space below
             axes.set_ylim(low / 2, max(1.2 * high, 4 * low))
             axes.set_yticks(ticks := _powers(2, *axes.get_ylim()), [f"{n}" for n in ticks])
         axes.set_xticks(ticks := _powers(4, *axes.get_xlim()), [f"{n}" for n in ticks])
@@ -175,7 +175,7 @@ def _efficiencies(methods: dict[str, Point]) -> dict[str, Estimate]:
 
 
 def _replay_noise(record: Record) -> Figure:
-    """Error against noise level, a panel for each kind of bookkeeping, a line for each number of diffuse bounces."""
+    """Plot the error against the noise level: a panel per kind of bookkeeping, a line per number of bounces."""
     scene = "diffuse sheets"
     points = [point for point in record.points if point.scene == scene and not point.error]
     depths = sorted({point.max_depth for point in points})
@@ -214,7 +214,7 @@ def _replay_noise(record: Record) -> Figure:
                 )
                 monte_carlo.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
         axes.set(xscale="log", yscale="log", title=kind, xlabel="noise put into the Jacobians")
-    # Only now are the limits known that the panels share.
+    # The shared axis limits are only known after all lines are drawn.
     for axes, labels in zip(panels, ends, strict=True):
         _label_ends(axes, labels, "left")
     panels[0].set_ylabel("error of the gradient, relative to the sweep")
@@ -240,7 +240,7 @@ def _panels(count: int, width: float, height: float = 3.8, share: bool = False) 
 
 
 def _label_ends(axes: Axes, labels: Sequence[tuple[float, float, str, str]], side: str = "right") -> None:
-    """Write names (x, y, name, colour) beside the ends of their lines, pushed apart where they would meet."""
+    """Write labels (x, y, name, colour) beside the ends of their lines, moved apart where they would overlap."""
     low, high = np.log(axes.get_ylim())
     left, right = axes.get_xlim()
     room = (right / left) ** (0.28 if side == "right" else 0.5)
@@ -256,7 +256,7 @@ def _label_ends(axes: Axes, labels: Sequence[tuple[float, float, str, str]], sid
 
 
 def _spread(heights: np.ndarray) -> np.ndarray:
-    """Heights in increasing order, moved no more than it takes to be APART, each cluster about its middle."""
+    """Move increasing heights as little as possible to be APART; each cluster keeps its mean."""
     clusters = [[height] for height in heights]
     k = 1
     while k < len(clusters):
@@ -272,7 +272,7 @@ def _spread(heights: np.ndarray) -> np.ndarray:
 
 
 def _beside(side: str) -> dict[str, Any]:
-    """Arguments of `annotate`: the text on this side of the point."""
+    """Arguments of `annotate` that place the text on this side of the point."""
     sign, align = (1, "left") if side == "right" else (-1, "right")
     return {"xytext": (7 * sign, 0), "textcoords": "offset points", "ha": align}
 

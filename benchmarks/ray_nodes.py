@@ -1,11 +1,11 @@
-"""The example for clusters on three nodes that are all on this machine: whether it comes to the same bytes.
+"""Tests that the cluster example gives the same bytes on several Ray nodes as in one process.
 
     python -m benchmarks.ray_nodes [--nodes 3] [--iterations 6]
 
-starts the nodes as processes of their own (`ray start`, own ports, own folders, one core each, a token that only they
-know), runs examples/cluster there with an actor on each, and once more in a process of its own, and compares what came
-out. Ends with status 1 if that differs. Nodes listen at this machine's address while it runs. Takes about a minute on
-two quiet cores. Wants `pip install 'pathreplay[ray]'`.
+The command starts all nodes on this machine (`ray start`, with own ports, own folders, one core each, and a common
+secret token). It runs examples/cluster with an actor on each node, and once more in one process, and compares the
+results. The exit status is 1 if they differ. The nodes listen at this machine's address during the run. It takes about
+a minute on two quiet cores, and needs `pip install 'pathreplay[ray]'`.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ JOINED = """import ray, sys, time
 ray.init(address=sys.argv[1], log_to_driver=False, logging_level="error")
 while sum(node["Alive"] for node in ray.nodes()) < int(sys.argv[2]):
     time.sleep(0.2)"""
-"""Ends when so many nodes are there: of two that start at once, one may take the other's ports, and never come."""
+"""Waits until a number of nodes have joined. Nodes start one by one: concurrent ones may take each other's ports."""
 
 
 def main(
-    nodes: Annotated[int, typer.Option(help="Nodes of the cluster.")] = 3,
-    iterations: Annotated[int, typer.Option(help="Of the example, which has 40.")] = 6,
+    nodes: Annotated[int, typer.Option(help="Number of nodes.")] = 3,
+    iterations: Annotated[int, typer.Option(help="Iterations of the example, which has 40 by default.")] = 6,
 ) -> None:
-    """Start the nodes, run the example, compare."""
-    shorter = [f"-Diterations={iterations}", f"-Dparameters.0.refine_at=[{iterations // 2}]"]
+    """Start the nodes, run the example, and compare the results."""
+    shorter = [f"--set=iterations={iterations}", f"--set=parameters.0.refine_at=[{iterations // 2}]"]
     token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_USAGE_STATS_ENABLED": "0"}
     environment = {**os.environ, **token}
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
@@ -54,18 +54,18 @@ def main(
             joined = [sys.executable, "-c", JOINED, address, str(number + 1)]
             subprocess.run(joined, env=environment, check=True, timeout=START_S)
         begin = time.perf_counter()
-        ray = [f"-Dray.address={address}", f"-Dray.actors={nodes}"]
+        ray = [f"--set=ray.address={address}", f"--set=ray.actors={nodes}"]
         _run([*shorter, *ray, "--output", f"{name}/cluster"], environment)
         print(f"by {nodes} actors on {nodes} nodes: {time.perf_counter() - begin:.0f} s", flush=True)
         _run([*shorter, "--executor", "local", "--output", f"{name}/whole"], environment)
-        whole, found = (outcome(folder / which) for which in ("whole", "cluster"))
-    other = sorted(key for key in {*whole, *found} if whole.get(key) != found.get(key))
-    print(f"others in {', '.join(other)}" if other else "the same bytes as in one process")
-    raise typer.Exit(1 if other else 0)
+        expected, result = (outcome(folder / which) for which in ("whole", "cluster"))
+    differing = sorted(key for key in {*expected, *result} if expected.get(key) != result.get(key))
+    print(f"different bytes in {', '.join(differing)}" if differing else "the same bytes as in one process")
+    raise typer.Exit(1 if differing else 0)
 
 
 def _address() -> str:
-    """The address of this machine: Ray's nodes find each other by one that is no loopback."""
+    """Address of this machine other than loopback, which Ray's nodes need to find each other."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(("192.0.2.1", 9))  # sends nothing
         return str(probe.getsockname()[0])
@@ -83,7 +83,7 @@ def _node(what: list[str], environment: dict[str, str]) -> subprocess.Popen[byte
 
 
 def _wait_for(host: str, port: int) -> None:
-    """Until the first node listens; the others need it."""
+    """Wait until the first node listens, which the others connect to."""
     end = time.monotonic() + START_S
     while time.monotonic() < end:
         with socket.socket() as probe:

@@ -1,4 +1,4 @@
-"""Records of whole runs: made with the facts of the moment, kept as JSON under benchmarks/results/, read back."""
+"""Records of complete runs: created with their circumstances, saved as JSON in benchmarks/results/, and read back."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from .measures.job import Record
 from .runner import Measured
 
 RESULTS = ROOT / "benchmarks" / "results"
-_LONGEST = 2**28  # bytes, a hundred times the longest there is
+_LONGEST = 2**28  # bytes, a hundred times the largest record
 _JSON = TypeAdapter(Record)
 
 
 def load_average() -> float:
-    """Processes that wanted a processor during the last minute, on average."""
+    """Load average of the last minute."""
     return round(os.getloadavg()[0], 2)
 
 
@@ -47,7 +47,7 @@ def make_record(task: str, command: str, load_before: float, measured: Measured,
 
 
 def save(record: Record, folder: Path) -> Path:
-    """Write TASK.json in the folder, all at once."""
+    """Write TASK.json in the folder atomically."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{record.task}.json"
     draft = path.with_suffix(".json.tmp")
@@ -57,16 +57,16 @@ def save(record: Record, folder: Path) -> Path:
 
 
 def load(task: str) -> Record | None:
-    """The saved record of a task, if there is one."""
+    """The saved record of a task, or None."""
     path = RESULTS / f"{task}.json"
     return read(path) if path.exists() else None
 
 
 def read(path: Path) -> Record:
-    """The record in a file.
+    """Read a record from a file.
 
     Raises:
-        PathreplayError: there is no such file, or it holds something else.
+        PathreplayError: the file does not exist, or is not a record.
     """
     if problem := file_problem(path, _LONGEST):
         raise PathreplayError(f"{path} cannot be read: it {problem}; give a file that --save wrote")
@@ -76,5 +76,5 @@ def read(path: Path) -> Record:
         raise PathreplayError(f"{path} cannot be read: {error.strerror}; give a file that --save wrote") from None
     except ValidationError as error:
         raise PathreplayError(
-            f"{path} is no record of a benchmark ({error.error_count()} faults); give a file that --save wrote"
+            f"{path} is not a benchmark record ({error.error_count()} errors); give a file that --save wrote"
         ) from None

@@ -1,4 +1,4 @@
-"""Runs jobs in worker processes and gathers their samples; what goes wrong in a worker becomes a row."""
+"""Runs jobs in worker processes and collects their samples; an error in a worker becomes a table row."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WORKER = (sys.executable, "-m", "benchmarks.measures.worker")
 
 @dataclass
 class _Samples:
-    """What a worker has said about one method so far."""
+    """What a worker has reported about one method so far."""
 
     seeds: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
@@ -32,7 +32,7 @@ class _Samples:
     error: str | None = None
 
     def add(self, seed: int, seconds: float, finite: bool) -> None:
-        """Take in one gradient pass."""
+        """Add one gradient pass."""
         self.seeds.append(seed)
         self.seconds.append(seconds)
         self.not_finite += [] if finite else [seed]
@@ -40,14 +40,14 @@ class _Samples:
 
 @dataclass
 class Measured:
-    """Points of all jobs that were run, and the distinct machines (they differ by thread count at most)."""
+    """Points of all measured jobs, and the distinct machines, which differ at most in their thread count."""
 
     points: list[Point] = field(default_factory=list)
     machines: list[Machine] = field(default_factory=list)
 
 
 def run_jobs(title: str, jobs: list[Job], draft: Draft) -> Measured:
-    """Run the jobs that the draft lacks one after another, with a progress bar on stderr; keep each in the draft."""
+    """Run the jobs that the draft lacks, with a progress bar on stderr, and add each to the draft."""
     measured = Measured()
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
     with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
@@ -62,9 +62,9 @@ def run_jobs(title: str, jobs: list[Job], draft: Draft) -> Measured:
                     text = f"{title}: {job.scene}, depth {job.max_depth}, {method}"
                     progress.update(bar, description=text, completed=passed + min(passes, job.passes))
 
-                found = Measured()
-                _run_job(job, found, show)
-                done = Done(job, turn, tuple(found.points), tuple(found.machines))
+                result = Measured()
+                _run_job(job, result, show)
+                done = Done(job, turn, tuple(result.points), tuple(result.machines))
                 draft.add(done)
             measured.points += done.points
             measured.machines += [machine for machine in done.machines if machine not in measured.machines]
@@ -74,7 +74,7 @@ def run_jobs(title: str, jobs: list[Job], draft: Draft) -> Measured:
 
 
 def _run_job(job: Job, measured: Measured, show: Callable[[str, int], None]) -> None:
-    """Run a job, and once more without the method that killed its process, until all are told."""
+    """Run a job; if a method kills the process, run the job again without this method."""
     methods = job.methods
     while methods:
         killer = _attempt(replace(job, methods=methods), measured, show)
@@ -82,15 +82,15 @@ def _run_job(job: Job, measured: Measured, show: Callable[[str, int], None]) -> 
 
 
 def _attempt(job: Job, measured: Measured, show: Callable[[str, int], None]) -> str | None:
-    """One worker process. Returns the method that killed it; the points of the others are then not kept."""
+    """Run one worker process. Returns the method that killed it, if any; points of the others are discarded then."""
     samples = {name: _Samples() for name in job.methods}
     running, peak, passes = job.methods[0], None, 0
-    # An empty home has an empty kernel cache: compiling is in the peak memory of every job or, by chance, of some.
-    with tempfile.TemporaryDirectory() as home, tempfile.TemporaryFile("w+") as complaints:
+    # With an empty kernel cache, the peak memory of every job includes compilation, not only that of some jobs.
+    with tempfile.TemporaryDirectory() as home, tempfile.TemporaryFile("w+") as stderr:
         command = [*WORKER, job.encode()]
         environment = os.environ | {"HOME": home, "DRJIT_CACHE_DIR": home}
         with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=complaints, text=True, cwd=ROOT, env=environment
+            command, stdout=subprocess.PIPE, stderr=stderr, text=True, cwd=ROOT, env=environment
         ) as worker:
             try:
                 for event in _events(worker):
@@ -115,12 +115,12 @@ def _attempt(job: Job, measured: Measured, show: Callable[[str, int], None]) -> 
                 raise
         died = worker.returncode != 0
         if died:
-            complaints.seek(0)
-            samples[running].error = _cause_of_death(worker.returncode, complaints.read())
+            stderr.seek(0)
+            samples[running].error = _cause_of_death(worker.returncode, stderr.read())
     alone = len(job.methods) == 1
-    for method, told in samples.items():
+    for method, collected in samples.items():
         if not died or method == running:
-            measured.points.append(_point(job, method, told, peak if alone else None))
+            measured.points.append(_point(job, method, collected, peak if alone else None))
     return running if died else None
 
 
@@ -131,27 +131,27 @@ def _events(worker: subprocess.Popen[str]) -> Iterator[dict[str, Any]]:
             yield json.loads(line)
 
 
-def _cause_of_death(status: int, complaints: str) -> str:
+def _cause_of_death(status: int, stderr: str) -> str:
     if status < 0:
         return f"died: {signal.Signals(-status).name}"
-    lines = [line for line in complaints.splitlines() if line.strip()]
+    lines = [line for line in stderr.splitlines() if line.strip()]
     return f"ended with status {status}: {lines[-1].strip()[:200] if lines else 'no message'}"
 
 
-def _point(job: Job, method: str, told: _Samples, peak: float | None) -> Point:
-    facts: dict[str, Any] = {name: tuple(f) if isinstance(f, list) else f for name, f in told.facts.items()}
+def _point(job: Job, method: str, samples: _Samples, peak: float | None) -> Point:
+    facts: dict[str, Any] = {name: tuple(f) if isinstance(f, list) else f for name, f in samples.facts.items()}
     return Point(
         scene=job.scene,
         parameters=job.parameters,
         method=method,
         max_depth=job.max_depth,
         paths=job.resolution**2 * job.spp,
-        seeds=tuple(told.seeds),
-        seconds=tuple(told.seconds),
+        seeds=tuple(samples.seeds),
+        seconds=tuple(samples.seconds),
         squared_errors=facts.pop("squared_errors", ()),
-        not_finite=tuple(told.not_finite),
+        not_finite=tuple(samples.not_finite),
         peak_mib=peak,
-        error=told.error,
+        error=samples.error,
         measure=job.measure,
         **facts,
     )

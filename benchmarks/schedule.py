@@ -1,11 +1,11 @@
-"""How steps scale to many devices: a model on paper, and a simulation of the schedule with stragglers and failures.
+"""Models how a step scales to many devices, and simulates the schedule with stragglers and failures.
 
     python -m benchmarks.schedule [--measure]
 
-prints seconds of a step for 1 to 1000 devices and 10^6 to 10^9 parameters, for three ways to bring gradients together,
-and then what the schedule that jobs use (`pathreplay.distributed.scheduler`) makes of the first of them: devices that
-are slower and faster, shards that get stuck, devices that are lost. With `--measure` the costs of this machine are
-measured first and used; without it, those below, which were measured so. Takes a minute.
+The command prints the modelled seconds of a step for 1 to 1000 devices, 10^6 to 10^9 parameters, and three ways to sum
+gradients. Then it simulates the first way with the scheduler of jobs (`pathreplay.distributed.scheduler`), for devices
+of different speeds, shards that get stuck, and devices that are lost. `--measure` first measures the costs on this
+machine; otherwise the constants below are used, which were measured in the same way. It takes a minute.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ from pathreplay.inverse.objective.evaluate import Shard
 
 DEVICES, PARAMETERS = (1, 10, 100, 1000), (10**6, 10**7, 10**8, 10**9)
 BYTES = 4
-"""Of a value, and of an entry of a gradient."""
+"""Bytes of a value, and of an entry of a gradient."""
 STEPS, COUNTED = 12, 8
-"""Of a simulation, and how many of them count: in the first ones nothing is known yet."""
+"""Steps of a simulation, and how many at its end count: in the first steps no durations are known."""
 
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds. Compute and network are assumptions, which options change; the others were measured (`--measure`)."""
+    """Costs in seconds. Compute and network are assumptions set by options; the others are measured (`--measure`)."""
 
     shard: float = 1.0
     """Compute of a shard."""
     network: float = 1.25e9
-    """Bytes a second, each way, of every machine: 10 gigabit Ethernet."""
+    """Bytes per second and direction of every machine: 10 gigabit Ethernet."""
     add: float = 4.2e-10
-    """To add an entry of a gradient to the sum."""
+    """Adding an entry of a gradient to the sum."""
     step: float = 9.1e-10
-    """Of the optimiser, for a parameter."""
+    """Optimizer step per parameter."""
     latency: float = 7.5e-4
-    """To hand out a shard, and to hear of its end."""
+    """Round trip of a request for a shard."""
 
     def send(self, parameters: float) -> float:
-        """Values or a gradient, between two machines."""
+        """Seconds to send values or a gradient between two machines."""
         return BYTES * parameters / self.network
 
 
 def built(costs: Costs, shards: int, devices: int, parameters: float) -> float:
-    """As jobs do it: values go out along a tree, each shard's gradient comes to one process, which adds and steps.
+    """Seconds of a step of a job: values are broadcast along a tree, and one process sums all gradients and steps.
 
-    Gradients are fetched while other shards are computed: what is longer counts, and one more of the other.
+    Gradients are fetched while other shards are computed, so the longer of the two counts, plus one of the other.
     """
     out = np.ceil(np.log2(devices + 1)) * costs.send(parameters) if devices > 1 else 0.0
     one_back = (costs.send(parameters) if devices > 1 else 0.0) + costs.add * parameters
@@ -61,44 +61,44 @@ def built(costs: Costs, shards: int, devices: int, parameters: float) -> float:
 
 
 def summed(costs: Costs, shards: int, devices: int, parameters: float) -> float:
-    """Each device adds up its shards, of which it always has the same; then sums meet in a ring, each steps for all."""
+    """Seconds with an all-reduce: each device sums its fixed shards, a ring reduces the sums, and all devices step."""
     compute = np.ceil(shards / devices) * (costs.shard + costs.latency + costs.add * parameters)
     ring = 2 * (devices - 1) / devices * costs.send(parameters)
     return float(compute + ring + costs.step * parameters)
 
 
 def sharded(costs: Costs, shards: int, devices: int, parameters: float) -> float:
-    """As `summed`, and each device steps for its part of the parameters, whose optimiser state it alone holds."""
+    """Seconds as in `summed` with a sharded optimizer: each device steps its part of the parameters."""
     return summed(costs, shards, devices, parameters) - costs.step * parameters * (1 - 1 / devices)
 
 
 @dataclass(frozen=True)
 class Trouble:
-    """What befalls devices."""
+    """Disturbances of devices."""
 
     spread: float = 0.0
-    """Of the logarithm of their speeds."""
+    """Standard deviation of the logarithm of their speeds."""
     stuck: float = 0.0
-    """Of all shards, how many take ten times as long."""
+    """Fraction of shards that take ten times as long."""
     lost_after: float = np.inf
-    """Seconds of work after which a device is lost, on average."""
+    """Mean seconds of work until a device is lost."""
     back_after: float = 30.0
-    """Seconds after which another one has taken its place, scene and kernels loaded."""
+    """Seconds until a replacement is ready, with scene and kernels loaded."""
 
 
 def simulated(costs: Costs, shards: int, devices: int, parameters: float, trouble: Trouble, seed: int = 0) -> float:
-    """Mean seconds of a step as built, by the schedule of jobs, event by event; and what was done twice."""
+    """Mean seconds of a step in an event-based simulation of the scheduler of jobs."""
     random = np.random.default_rng(seed)
     speeds = np.exp(trouble.spread * random.standard_normal(devices))
-    speeds *= devices / speeds.sum()  # as much in all as without
-    sharing, work = Scheduler(), [Shard((view,), 1, (view,)) for view in range(shards)]
-    devices_ = _Devices(costs, parameters, trouble, random, speeds, free=[0.0] * devices)
-    return mean([devices_.step(Step(sharing, work)) for _ in range(STEPS)][-COUNTED:])
+    speeds *= devices / speeds.sum()  # the same total speed as without spread
+    scheduler, work = Scheduler(), [Shard((view,), 1, (view,)) for view in range(shards)]
+    simulation = _Devices(costs, parameters, trouble, random, speeds, free=[0.0] * devices)
+    return mean([simulation.step(Step(scheduler, work)) for _ in range(STEPS)][-COUNTED:])
 
 
 @dataclass
 class _Devices:
-    """Devices from step to step: one may still be at a shard that another has done."""
+    """State of the devices between steps: one may still compute a shard that another has finished."""
 
     costs: Costs
     parameters: float
@@ -106,25 +106,25 @@ class _Devices:
     random: np.random.Generator
     speeds: np.ndarray
     free: list[float]
-    """When each has nothing to do any more."""
+    """Time at which each device becomes idle."""
     now: float = 0.0
 
     def step(self, step: Step) -> float:
-        """Seconds of it."""
+        """Simulate a step; returns its seconds."""
         begin, costs, n = self.now, self.costs, len(self.speeds)
         self.now += float(np.ceil(np.log2(n + 1))) * costs.send(self.parameters) if n > 1 else 0.0
         one_back = (costs.send(self.parameters) if n > 1 else 0.0) + costs.add * self.parameters
         idle = [k for k in range(n) if self.free[k] <= self.now]
-        # When, who, which shards (none: it is ready for any), in how many seconds, and whether it lives.
+        # Time, device, shards (none: the device becomes idle), seconds, and whether the device survives.
         events: list[tuple[float, int, list[int], float, bool]]
         events = [(self.free[k], k, [], 0.0, True) for k in range(n) if self.free[k] > self.now]
         heapq.heapify(events)
-        fetched, asleep = self.now, np.inf  # when the process that adds has added what it was given
+        fetched, asleep = self.now, np.inf  # time at which all received gradients are added
         while len(step.done) < len(step.kinds):
             waiting = list(idle)
             for k in step.in_turn(idle):
                 if (index := step.next(k, self.now, idle)) is None:
-                    break  # as jobs do it
+                    break  # as in `RayExecutor`
                 waiting.remove(k)
                 indices = [index, *step.along(k, int(BYTES * self.parameters), n)]
                 seconds, lives = self._seconds(k, len(indices))
@@ -151,7 +151,7 @@ class _Devices:
         return self.now - begin
 
     def _seconds(self, k: int, shards: int) -> tuple[float, bool]:
-        """Of so many shards by a device, and whether that lives to see their end."""
+        """Seconds of a request for ``shards`` shards, and whether the device survives it."""
         times = sum(10.0 if self.random.random() < self.trouble.stuck else 1.0 for _ in range(shards))
         seconds = self.costs.latency + self.costs.shard * times / float(self.speeds[k])
         lost = (
@@ -161,7 +161,7 @@ class _Devices:
 
 
 def measured(costs: Costs, size: int = 2 * 10**7) -> Costs:
-    """The costs of this machine, in one thread; the optimiser's with its values in memory of Dr.Jit's."""
+    """Measure the costs on this machine in one thread; the optimizer's values are in Dr.Jit's memory."""
     from pathreplay.platform import backend
 
     backend.set_variant("llvm_ad_rgb")
@@ -175,7 +175,7 @@ def measured(costs: Costs, size: int = 2 * 10**7) -> Costs:
 
 
 def measured_ray(costs: Costs, size: int = 10**7) -> Costs:
-    """The latency of a call of an actor here; prints how fast gradients come back from one on this machine, too."""
+    """Measure the latency of a call of a local actor; also prints the bandwidth of gradients."""
     from pathreplay.distributed.cluster import connected
     from pathreplay.inverse.config.executor_options import RayOptions
 
@@ -211,10 +211,10 @@ TROUBLES = {
 
 
 def main(
-    measure: Annotated[bool, typer.Option("--measure", help="Measure adding and stepping here first.")] = False,
-    shards: Annotated[int, typer.Option(help="Of a step.")] = 4000,
-    seconds: Annotated[float, typer.Option(help="Compute of a shard.")] = 1.0,
-    gigabits: Annotated[float, typer.Option(help="Network of each machine.")] = 10.0,
+    measure: Annotated[bool, typer.Option("--measure", help="Measure the costs on this machine first.")] = False,
+    shards: Annotated[int, typer.Option(help="Shards per step.")] = 4000,
+    seconds: Annotated[float, typer.Option(help="Compute time of a shard.")] = 1.0,
+    gigabits: Annotated[float, typer.Option(help="Network bandwidth of each machine in Gbit/s.")] = 10.0,
 ) -> None:
     """Print the tables."""
     costs = Costs(shard=seconds, network=gigabits * 1e9 / 8)
@@ -228,8 +228,8 @@ def main(
     for parameters in PARAMETERS:
         for name, way in ways.items():
             cells = [way(costs, shards, n, parameters) for n in DEVICES]
-            told = " | ".join(f"{s:.4g} s ({cells[0] / (n * s):.0%})" for n, s in zip(DEVICES, cells, strict=True))
-            print(f"| {parameters:.0e} | {told} | {name} |")
+            row = " | ".join(f"{s:.4g} s ({cells[0] / (n * s):.0%})" for n, s in zip(DEVICES, cells, strict=True))
+            print(f"| {parameters:.0e} | {row} | {name} |")
     print("\nas built, no more than half of the devices' time is waiting up to:")
     for parameters in PARAMETERS:
         limit = max((n for n in range(2, 4001) if _efficiency(costs, shards, n, parameters) >= 0.5), default=1)

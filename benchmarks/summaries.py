@@ -1,4 +1,4 @@
-"""Short tables for pages that tell the story and not the details: marked `<!-- begin TASK-summary -->` there."""
+"""Short tables for overview pages, which mark their place by `<!-- begin TASK-summary -->`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .tasks import attached, depth, edges, iteration, media, surface, truth
 
 
 def _surface(record: Record) -> str:
-    """The sweep next to `prb`, and what is done where only lights have gradients; then the same with even numbers."""
+    """Compare with `prb`: the sweep, the automatic choice if only emitters are optimized, and Sobol sampling."""
     rows = [
         [f"{key.scene}, {surface.what(key.parameters)}", sampling, str(v.time()), str(v.variance())]
         for sampling, ours in (("scene", "sweep"), ("scene", "auto"), ("sobol", "sobol"))
@@ -22,7 +22,7 @@ def _surface(record: Record) -> str:
 
 
 def _attached(record: Record) -> str:
-    """The sweep next to `prb`, which leaves out most of these gradients."""
+    """Compare the time of the sweep with `prb`, which omits most of these gradients."""
     rows = [
         [", ".join(key.parameters), str(key.max_depth), str(versus.time())]
         for key, versus in _pairs(record, "sweep", "prb")
@@ -32,7 +32,7 @@ def _attached(record: Record) -> str:
 
 
 def _iteration(record: Record) -> str:
-    """Our own loop, with the random numbers of the scene and with even ones, next to the usual one with Mitsuba's."""
+    """Compare our optimization loop, with the scene's sampler and with Sobol sampling, with a loop over Mitsuba's."""
     rows = [
         [key.scene, sampling, str(versus.time()), str(versus.cost())]
         for (theirs, *_, own, sobol) in (iteration.SURFACE, iteration.MEDIA)
@@ -43,7 +43,7 @@ def _iteration(record: Record) -> str:
 
 
 def _media(record: Record) -> str:
-    """How many times less (time x variance) the default needs than `prbvolpath`."""
+    """Efficiency gain (time x variance) of the default over `prbvolpath`."""
     rows = [
         [f"{media.WHAT[key.parameters[0]]}: {key.scene}", str(versus.efficiency())]
         for key, versus in _pairs(record, "score", media.RIVAL)
@@ -52,12 +52,12 @@ def _media(record: Record) -> str:
 
 
 def _edges(record: Record) -> str:
-    """What edges cost, scene by scene."""
+    """Cost of boundary terms by scene."""
     return edges.costs(edges.by_job([point for point in edges.timed(record) if ", " not in point.method]))
 
 
 def _depth(record: Record) -> str:
-    """Exponent of time and growth of memory from the smallest depth to the largest, by scene and method."""
+    """Exponent of time, and growth of memory from the smallest depth to the largest, by scene and method."""
     rows = []
     for scene in dict.fromkeys(point.scene for point in record.points):
         part = depth.of_scene(record, scene)
@@ -70,7 +70,7 @@ def _depth(record: Record) -> str:
 
 
 def _truth(record: Record) -> str:
-    """How many cells each method gets right."""
+    """Number of gradients that each method has right."""
     counts: dict[str, Counter[str]] = {}
     for point in record.points:
         if point.method not in truth.STEPS:
@@ -82,24 +82,24 @@ def _truth(record: Record) -> str:
 
 
 def _wrong(record: Record) -> str:
-    """Gradients of media that `prbvolpath` has wrong, next to ours."""
+    """Gradients of media that are wrong in `prbvolpath`, beside ours."""
     rows = []
-    for (scene, *_), found in groups(record.points).items():
-        theirs = found.get(media.RIVAL)
-        if theirs is not None and theirs.verdict == "fail":
-            rows.append([scene, *(truth.told(found.get(name)) for name in (truth.STEPS[1], "score", media.RIVAL))])
+    for (scene, *_), points in groups(record.points).items():
+        baseline = points.get(media.RIVAL)
+        if baseline is not None and baseline.verdict == "fail":
+            rows.append([scene, *(truth.told(points.get(name)) for name in (truth.STEPS[1], "score", media.RIVAL))])
     return markdown(["gradient by", "finite differences of `volpath`", "`pathreplay`", "`prbvolpath`"], rows)
 
 
 def _pairs(record: Record, ours: str, theirs: str) -> Iterator[tuple[Turns, Versus]]:
-    """Both methods, where both have come to an end with finite gradients."""
-    for key, found in groups(record.points).items():
-        a, b = found.get(ours), found.get(theirs)
+    """Comparisons of two methods, for jobs in which both have finite gradients."""
+    for key, points in groups(record.points).items():
+        a, b = points.get(ours), points.get(theirs)
         if a is not None and b is not None and a.squared_errors and b.squared_errors:
             yield key, Versus(a, b)
 
 
-#: By the name of its marker: the task, and its summary.
+#: Task and summary by the name of the marker.
 SUMMARIES: dict[str, tuple[str, Callable[[Record], str]]] = {
     f"{task}-summary": (task, summary)
     for task, summary in (

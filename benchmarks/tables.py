@@ -12,7 +12,7 @@ from .measures.job import Point, Record
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table: the first column to the left, the others to the right."""
+    """Format a Markdown table whose first column is left-aligned, and the others right-aligned."""
     lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
@@ -22,13 +22,13 @@ def median_seconds(point: Point) -> str:
 
 
 def method_cell(point: Point) -> str:
-    """Name of the method, and how often it failed without raising."""
+    """Name of the method, and its number of non-finite gradients."""
     broken = len(point.not_finite)
     return point.method + (f" ({broken} of {len(point.seeds)} not finite)" if broken else "")
 
 
 class Turns(NamedTuple):
-    """What points have in common that were measured in turn."""
+    """Key of points that were measured alternately."""
 
     scene: str
     parameters: tuple[str, ...]
@@ -37,24 +37,26 @@ class Turns(NamedTuple):
 
 
 def groups(points: Iterable[Point]) -> dict[Turns, dict[str, Point]]:
-    """Points that were measured in turn, by method."""
-    found: dict[Turns, dict[str, Point]] = {}
+    """Group points that were measured alternately, by method."""
+    by_turns: dict[Turns, dict[str, Point]] = {}
     for point in points:
-        found.setdefault(Turns(point.scene, point.parameters, point.max_depth, point.paths), {})[point.method] = point
-    return found
+        by_turns.setdefault(Turns(point.scene, point.parameters, point.max_depth, point.paths), {})[point.method] = (
+            point
+        )
+    return by_turns
 
 
 def pooled(points: Iterable[Point]) -> list[Point]:
-    """One point for jobs that came several times, in turn: the seconds of all. Their errors are alike, as are seeds."""
-    found: dict[tuple[object, ...], Point] = {}
+    """Merge the points of repeated jobs: seconds are joined; gradient errors are equal, since the seeds are."""
+    merged: dict[tuple[object, ...], Point] = {}
     for point in points:
         key = (point.scene, point.parameters, point.method, point.max_depth, point.paths, point.measure)
-        before = found.get(key)
+        before = merged.get(key)
         if before is not None:
             error = before.error or point.error
             point = replace(before, seconds=before.seconds + point.seconds, error=error)
-        found[key] = point
-    return list(found.values())
+        merged[key] = point
+    return list(merged.values())
 
 
 def time_cells(point: Point, baseline: Point | None) -> list[str]:
@@ -69,7 +71,7 @@ def time_cells(point: Point, baseline: Point | None) -> list[str]:
 def comparison(point: Point, baseline: Point | None) -> list[str]:
     """Cells: those of `time_cells`, then variance and time x variance relative to a baseline."""
     times = time_cells(point, baseline)
-    # Both have squared errors, or (a single round) neither.
+    # Either both have squared errors, or, after a single round, neither.
     if point.error or baseline is None or baseline is point or not (point.squared_errors and baseline.squared_errors):
         return [*times, *["1" if baseline is point and not point.error else ""] * 2]
     versus = Versus(point, baseline)
@@ -77,12 +79,12 @@ def comparison(point: Point, baseline: Point | None) -> list[str]:
 
 
 def brief_footnote(record: Record) -> str:
-    """The command, for summaries: the pages with the full tables tell the rest."""
+    """Command and date, for summaries; pages with the full tables have the other circumstances."""
     return f"`{record.command}`, {record.date[:10]}."
 
 
 def footnote(record: Record) -> str:
-    """Where, when and with what the numbers were taken."""
+    """Circumstances of the measurement: command, date, commit, machine, versions and load."""
     machine = record.machines[0]
     counts = sorted({len(point.seconds) for point in record.points if not point.error}) or [0]
     rounds = str(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"

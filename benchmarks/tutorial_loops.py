@@ -1,7 +1,7 @@
-"""The loops of Mitsuba's tutorials as users write them, with their settings, for the scenes in examples/tutorials.
+"""The optimization loops of Mitsuba's tutorials with their settings, for the scenes in examples/tutorials.
 
-Each function loads a scene, renders what is to be matched, calls ``ready`` (where the clock starts), and returns the
-values that it ends with, by key. ``few`` replaces the numbers of iterations, for trials.
+Each function loads a scene, renders the targets, calls ``ready``, which starts the clock, and returns the final values
+by key. ``few`` replaces the number of iterations, for trials.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Parameters = Mapping[str, str]
 def colour(
     scene_file: str, parameters: Parameters, key: str, start: list[float], ready: Ready, few: int | None
 ) -> Found:
-    """`gradient_based_opt`, with its colour and its start as arguments."""
+    """`gradient_based_opt`, with the parameter and its initial value as arguments."""
     scene = mi.load_file(scene_file, **parameters)
     integrator = mi.load_dict({"type": "prb", "max_depth": 6})
     reference = mi.render(scene, spp=512)
@@ -44,7 +44,7 @@ def colour(
 
 
 def volume(scene_file: str, parameters: Parameters, ready: Ready, few: int | None) -> Found:
-    """`volume_optimization`: a step for each view, at 16 voxels a side, then at 64 with eight times the samples."""
+    """`volume_optimization`: a step per view with 16^3 voxels, then with 64^3 voxels and eight times the samples."""
     key = "object.interior_medium.sigma_t.data"
     scene = mi.load_file(scene_file, **parameters)
     integrator = mi.load_dict({"type": "prbvolpath", "max_depth": 6})
@@ -76,7 +76,7 @@ def volume(scene_file: str, parameters: Parameters, ready: Ready, few: int | Non
 
 
 def pose(scene_file: str, parameters: Parameters, ready: Ready, few: int | None) -> Found:
-    """`object_pose_estimation`: two shifts and an angle about y, by edges of `direct_projective`."""
+    """`object_pose_estimation`: two translations and an angle about y, by boundary terms of `direct_projective`."""
     key = "body.vertex_positions"
     scene = mi.load_file(scene_file, **parameters)
     integrator = mi.load_dict({"type": "direct_projective"})
@@ -108,7 +108,7 @@ def pose(scene_file: str, parameters: Parameters, ready: Ready, few: int | None)
 
 
 def shape(scene_file: str, parameters: Parameters, target: str, spp: int, ready: Ready, few: int | None) -> Found:
-    """`shape_optimization` before it remeshes: Large Steps from a ball, a step for each view."""
+    """`shape_optimization` before remeshing: Large Steps from a ball, with a step per view."""
     key = "shape.vertex_positions"
     integrator = mi.load_dict({"type": "direct_projective", "sppi": 0})
     truth = mi.load_file(scene_file, **{**parameters, "mesh": target})
@@ -144,4 +144,4 @@ LOOPS: dict[str, tuple[Callable[..., Found], dict[str, Any]]] = {
     "shape_optimization": (shape, {"spp": 16}),
     "forward_inverse_rendering": (colour, {"key": "green.reflectance.value", "start": [0.1, 0.25, 0.4]}),
 }
-"""The loop of each tutorial, and arguments of it. (The last one has none of its own: it recovers nothing.)"""
+"""Loop of each tutorial and its arguments; the last tutorial has no loop of its own, since it recovers nothing."""

@@ -1,14 +1,14 @@
-"""Mitsuba's tutorials that recover something: a plain loop with their settings, and our config, one after the other.
+"""Compares Mitsuba's inverse rendering tutorials, as plain loops with their settings, with our configs.
 
     python -m benchmarks.tutorials [NAME ...] [--quick] [--scenes FOLDER]
 
-prints a table: errors of parameter and picture at the end, seconds of all iterations (with the tracing of kernels,
-without loading and target pictures), and lines of code. The scenes are those of examples/tutorials; with --scenes, a
-folder `scenes` of mitsuba-tutorials, their own meshes, volume and sky take the place of ours. --quick takes few
-iterations, to see that it works. Dr.Jit keeps compiled kernels on the disk: run it twice.
+The command prints a table: final errors of parameter and image, seconds of all iterations (including kernel tracing,
+without loading and rendering targets), and lines of code. The scenes are those of examples/tutorials; with --scenes,
+the folder `scenes` of mitsuba-tutorials, their meshes, volume and sky replace ours. --quick runs few iterations, as a
+test. Dr.Jit caches compiled kernels on disk, so run it twice for comparable times.
 
-Pictures are judged without their noise, by two renderings of each view and two of its target (by `path` or `volpath`).
-Lines are those that are not empty and no comment: of the loop without its head, and of the config.
+Image errors exclude render noise; they need two renderings of each view and two of its target (by `path` or `volpath`).
+Lines of code are those of the loop without its head, and of the config, without empty lines and comments.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from .tutorial_loops import LOOPS  # noqa: E402
 EXAMPLES = Path(__file__).parent.parent / "examples/tutorials"
 JUDGED_SPP = 1024
 WAYS = ("plain loop", "pathreplay")
-#: Files of the tutorials, by tutorial: what replaces the scene's own.
+#: Scene parameters with the tutorials' own files, by tutorial.
 THEIRS = {
     "volume_optimization": {"volume": "volume.vol", "turn": "-90"},
     "object_pose_estimation": {"body": "meshes/bunny.ply", "scale": "6.5"},
@@ -54,7 +54,7 @@ THEIR_TARGETS = {"shape_optimization": {"mesh": "meshes/suzanne.ply"}}
 
 
 def job(name: str, scenes: Path | None) -> Config:
-    """The config of a tutorial, with all its files in absolute paths."""
+    """The config of a tutorial with absolute paths."""
     config = load_config(EXAMPLES / f"{name}.toml").model_dump(exclude_unset=True)
     places = (
         (config, THEIRS),
@@ -63,8 +63,8 @@ def job(name: str, scenes: Path | None) -> Config:
     for table, files in places:
         given = dict(table.get("scene_parameters") or {})
         if scenes is not None:
-            found = files.get(name, {})
-            given |= {k: str(scenes / v) if (scenes / v).is_file() else v for k, v in found.items()}
+            own = files.get(name, {})
+            given |= {k: str(scenes / v) if (scenes / v).is_file() else v for k, v in own.items()}
         table["scene_parameters"] = {k: _absolute(v) for k, v in given.items()}
         table["scene"] = str(EXAMPLES / table["scene"])
     return make_config(config)
@@ -79,14 +79,14 @@ def texts(parameters: dict[str, Any]) -> dict[str, str]:
 
 
 def run(name: str, way: str, scenes: Path | None, quick: bool) -> dict[str, Any]:
-    """Errors and seconds of one way through one tutorial."""
+    """Errors and seconds of one way to run one tutorial."""
     config = job(name, scenes)
     if way == WAYS[0]:
         loop, options = LOOPS[name]
         begin: list[float] = []
         if name == "shape_optimization":
             options = {**options, "target": str((config.target.scene_parameters or {})["mesh"])}
-        found = loop(
+        recovered = loop(
             config.scene, texts(config.scene_parameters), **options, few=2 if quick else None,
             ready=lambda: begin.append(time.perf_counter()),
         )  # fmt: skip
@@ -102,16 +102,16 @@ def run(name: str, way: str, scenes: Path | None, quick: bool) -> dict[str, Any]
         result = optimize(make_config(table), output=Path("runs/tutorials") / name)
         seconds = sum(entry.seconds for entry in result.history)
         keys = [entry.key for entry in config.parameters]
-        found = {key: result.parameters[key] for key in keys}
-    return {"seconds": seconds, **errors(name, config, found)}
+        recovered = {key: result.parameters[key] for key in keys}
+    return {"seconds": seconds, **errors(name, config, recovered)}
 
 
-def errors(name: str, config: Config, found: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Of the picture, and of the parameter in the tutorial's measure."""
+def errors(name: str, config: Config, recovered: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Errors of the image, and of the parameter in the tutorial's measure."""
     scene = load_scene(config.scene, **config.scene_parameters)
     truth = load_scene(str(config.target.scene), **(config.target.scene_parameters or {}))
     params, true = mi.traverse(scene), mi.traverse(truth)
-    ((key, value),) = found.items()
+    ((key, value),) = recovered.items()
     params[key] = mi.TensorXf(value) if value.ndim > 2 else to_value(params[key], value)
     params.update()
     judge = mi.load_dict((config.target.integrator or config.integrator).model_dump())
@@ -131,8 +131,8 @@ def measure(name: str, key: str, value: np.ndarray, truth: np.ndarray, like: Any
     if name == "volume_optimization":
         return f"{rmse(value, truth):.4f} root mean square"
     if name == "object_pose_estimation":
-        made = make_pose(key, like, "rigid", None, None)
-        error = type(made)(made.key, made.kind, made.base, made.pivot, None, truth).error(value)
+        pose = make_pose(key, like, "rigid", None, None)
+        error = type(pose)(pose.key, pose.kind, pose.base, pose.pivot, None, truth).error(value)
         return f"{error.position:.4f}, {error.degrees:.2f}°" if error else ""
     if name == "shape_optimization":
         ours, theirs = value.reshape(-1, 3), truth.reshape(-1, 3)
@@ -142,7 +142,7 @@ def measure(name: str, key: str, value: np.ndarray, truth: np.ndarray, like: Any
 
 
 def lines(name: str) -> tuple[int, int]:
-    """Of the loop (without head, description and what is there for the benchmark), and of the config."""
+    """Lines of the loop (without head, docstring and the call of ``ready``), and of the config."""
     source = inspect.getsource(LOOPS[name][0]).split('"""', 2)[2].splitlines()
     config = (EXAMPLES / f"{name}.toml").read_text().splitlines()
     plain = [line for line in source if line.strip() not in ("", "ready()")]
@@ -150,7 +150,7 @@ def lines(name: str) -> tuple[int, int]:
 
 
 def main() -> None:
-    """Run each way in a process of its own, and print the table."""
+    """Run each tutorial both ways in separate processes, and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(LOOPS))
     parser.add_argument("--quick", action="store_true")

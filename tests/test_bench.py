@@ -336,7 +336,7 @@ def test_summaries_count_and_compare() -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ({"tasks": ["nonsense"]}, "there is no task 'nonsense': use "),
+        ({"tasks": ["nonsense"]}, "there is no task 'nonsense'; use "),
         ({"quick": True, "save": True}, "--save and --into keep full runs only"),
         ({"quick": True, "into": Path("folder")}, "--save and --into keep full runs only"),
         ({"against": Path("none.json")}, "none.json cannot be read"),
@@ -366,7 +366,7 @@ def test_two_records_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[
     (tmp_path / "new.json").write_text("{}")
     wrong = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert (wrong.returncode, wrong.stdout) == (2, "")
-    assert "new.json is no record of a benchmark" in wrong.stderr and wrong.stderr.count("\n") == 1
+    assert "new.json is not a benchmark record" in wrong.stderr and wrong.stderr.count("\n") == 1
 
 
 def test_actors_are_compared_with_one_of_them() -> None:
