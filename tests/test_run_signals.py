@@ -28,7 +28,7 @@ def test_first_signal_stops_with_everything_written(number: signal.Signals, tmp_
     status, out, err = ended(process)
     name = "Ctrl-C" if number == signal.SIGINT else number.name
     assert (status, err) == (0, "")
-    assert f"stopped early by {name}; go on with: pathreplay optimize --resume run" in out
+    assert f"stopped early by {name}; resume with: pathreplay optimize --resume run" in out
     assert (tmp_path / "run/report.html").is_file()
 
 
