@@ -337,8 +337,8 @@ def test_summaries_count_and_compare() -> None:
     ("arguments", "told"),
     [
         ({"tasks": ["nonsense"]}, "there is no task 'nonsense'; use "),
-        ({"quick": True, "save": True}, "--save and --into keep full runs only"),
-        ({"quick": True, "into": Path("folder")}, "--save and --into keep full runs only"),
+        ({"quick": True, "save": True}, "--save and --into need a full run"),
+        ({"quick": True, "into": Path("folder")}, "--save and --into need a full run"),
         ({"against": Path("none.json")}, "none.json cannot be read"),
         ({"against": records.RESULTS / "surface.json", "tasks": ["depth"]}, "is a record of task 'surface'"),
         (

@@ -74,7 +74,7 @@ def test_where_ray_is_not_installed_a_line_says_so(
 
 
 def test_an_executor_that_is_none_is_refused() -> None:
-    with pytest.raises(PathreplayError, match="executor is 'dask'; give one of local, ray"):
+    with pytest.raises(PathreplayError, match="executor is 'dask'; use one of local, ray"):
         optimize(make_config(JOB), executor="dask")
     with pytest.raises(PathreplayError, match="'executor' is 'dask'"):
         make_config({**JOB, "executor": "dask"})

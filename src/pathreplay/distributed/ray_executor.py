@@ -247,7 +247,7 @@ class RayExecutor:
             late = len(step.again)
             first = step.next(number, time.monotonic(), idle)
             if first is None:
-                break  # the other idle actors, of which there may be many, hardly find a shard either
+                break  # the other idle actors, possibly many, would hardly get a shard either
             self.pool.counts.twice += len(step.again) - late
             indices = (first, *step.along(number, size, len(self.pool.ready)))
             self.pool.ask(
