@@ -179,7 +179,7 @@ def test_curves_are_drawn_and_tell_what_is_under_the_pointer(show: Any) -> None:
     first.scroll_into_view_if_needed()
     box = first.locator("svg").bounding_box()
     seen.tab.mouse.move(box["x"] + 58 + (box["width"] - 66) * 10 / 48, box["y"] + 60)
-    assert "iteration 10: 0.5" in first.locator(".told").inner_text()
+    assert "iteration 10: 0.5" in first.locator(".legend").inner_text()
     assert seen.tab.locator("#plots img").count() == 0  # what stands for readers without JavaScript
 
 

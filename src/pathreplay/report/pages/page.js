@@ -1,4 +1,4 @@
-// What moves in a page about a run: wipe and zoom, exposures, curves under the pointer, films, meshes, news of a run.
+// Interactive parts of a page about a run: wipe and zoom, exposure, curves, films, meshes, and live updates.
 "use strict";
 
 const SVG = document.getElementById("exposures").namespaceURI;
@@ -18,7 +18,7 @@ function make(tag, attributes = {}, ...children) {
 const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
 const short = (x) => (x === null ? "unknown" : Math.abs(x) >= 1e5 || (x !== 0 && Math.abs(x) < 1e-3) ? x.toExponential(2) : String(+x.toPrecision(4)));
 
-// ---------- Exposure: pictures hold sRGB of 8 bits, and a table says how each of its values looks times a factor ----------
+// ---------- Exposure: images are 8-bit sRGB, and a filter table maps each value to the value at another exposure ----------
 
 const look = { stops: 0, own: new Set() };
 const linear = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
@@ -29,7 +29,7 @@ function factorOf(view) {
   return ((look.own.has(name) ? own : run.exposure) / stored) * 2 ** look.stops;
 }
 
-// The CSS filter of a view; "" where pictures are shown as they are.
+// The CSS filter of a view; "" at the stored exposure.
 function exposureOf(view) {
   const factor = factorOf(view), id = `exposure-${view}`;
   byId(id)?.remove();
@@ -49,7 +49,7 @@ function expose() {
   });
 }
 
-// ---------- The viewer: two pictures of a view, a border between them that can be moved, and a zoom ----------
+// ---------- The viewer: two images of a view with a movable border between them, and a zoom ----------
 
 function viewer(place) {
   const state = { view: 0, left: run.left, right: run.right, wipe: 0.5, zoom: 1, x: 0, y: 0, still: -1 };
@@ -95,7 +95,7 @@ function viewer(place) {
     }
     node.value = chosen;
   }
-  function zoomTo(zoom, atX = 0.5, atY = 0.5) { // the place under the pointer stays
+  function zoomTo(zoom, atX = 0.5, atY = 0.5) { // keep the point under the pointer fixed
     const next = clamp(zoom, 1, 32);
     state.x = atX - ((atX - state.x) / state.zoom) * next;
     state.y = atY - ((atY - state.y) / state.zoom) * next;
@@ -217,12 +217,12 @@ function ticks(low, high, log) {
 }
 
 function plot(spec, first) {
-  const told = make("div", { class: "told" }), holder = make("div");
+  const text = make("div", { class: "legend" }), holder = make("div");
   const title = make("figcaption", {}, spec.title, ...(spec.code ? [" ", make("code", {}, spec.code)] : []));
-  const figure = make("figure", { class: first ? "plot first" : "plot" }, title, holder, told);
+  const figure = make("figure", { class: first ? "plot first" : "plot" }, title, holder, text);
   const points = spec.series.map((series) => series.x.map((x, i) => [x, series.y[i]]).filter(([, y]) => y !== null));
   const all = points.flat();
-  if (!all.length) { told.textContent = "nothing yet"; return figure; }
+  if (!all.length) { text.textContent = "no data yet"; return figure; }
   let [lowX, highX, lowY, highY] = all.reduce(([a, b, c, d], [x, y]) => [Math.min(a, x), Math.max(b, x), Math.min(c, y), Math.max(d, y)],
     [Infinity, -Infinity, Infinity, -Infinity]);
   const log = spec.log && lowY > 0;
@@ -238,7 +238,7 @@ function plot(spec, first) {
       return name || value ? make("span", {}, ...(series.name ? [make("b", { class: `c${s % 8}` }, "● ")] : []), `${name}${value}  `) : "";
     });
     const where = at !== null && spec.series.length > 1 ? [`${spec.along} ${short(Math.round(at))}: `] : [];
-    told.replaceChildren(...where, ...parts);
+    text.replaceChildren(...where, ...parts);
   }
   function draw() {
     const width = holder.clientWidth || 300, height = first ? 240 : 150, left = 58, right = 8, top = 6, bottom = 22;
@@ -281,7 +281,7 @@ function plots() {
 // ---------- Films of textures and volumes ----------
 
 function film(place, stills) {
-  const image = make("img", { alt: "through time" }), told = make("output");
+  const image = make("img", { alt: "through time" }), label = make("output");
   let timer = 0, all = stills;
   const range = make("input", { type: "range", min: 0, max: all.length - 1, step: 1, value: all.length - 1, "aria-label": "iteration", oninput: () => { show(); } });
   const play = make("button", { type: "button", onclick: () => {
@@ -292,9 +292,9 @@ function film(place, stills) {
   function show() {
     const still = all[clamp(+range.value, 0, all.length - 1)];
     if (image.getAttribute("src") !== still.src) image.src = still.src;
-    told.textContent = `after ${still.iteration} iterations`;
+    label.textContent = `after ${still.iteration} iterations`;
   }
-  place.append(make("div", { class: "film" }, make("div", { class: "tools" }, play, range, told), image));
+  place.append(make("div", { class: "film" }, make("div", { class: "tools" }, play, range, label), image));
   show();
   return (next) => { const end = +range.value >= all.length - 1; all = next; range.max = all.length - 1; if (end) range.value = all.length - 1; show(); };
 }
@@ -309,7 +309,7 @@ function extras() {
   });
 }
 
-// ---------- Meshes: triangles under a light at the eye, turned by dragging ----------
+// ---------- Meshes: triangles lit from the viewpoint, rotated by dragging ----------
 
 const VERTEX = `attribute vec3 place, normal; uniform mat3 turn; uniform vec3 middle; uniform float scale; varying vec3 n;
 void main() { n = turn * normal; vec3 p = turn * (place - middle) * scale; gl_Position = vec4(0.75 * p.x, p.y, -0.01 * p.z, 1.0); }`;
@@ -348,7 +348,7 @@ function mesh(place, data) {
   const extent = Math.hypot(...[0, 1, 2].map((k) => bounds[1][k] - bounds[0][k])) || 1;
   let around = 0.6, up = 0.4, zoom = 1;
 
-  function fill() { // corners one by one, each with the normal of its face
+  function fill() { // unshared vertices, each with the normal of its face
     const all = numbers(data.vertices[choice.value], Float32Array), places = new Float32Array(3 * faces.length), normals = new Float32Array(3 * faces.length);
     for (let f = 0; f < faces.length; f += 3) {
       const [a, b, c] = [0, 1, 2].map((k) => all.subarray(3 * faces[f + k], 3 * faces[f + k] + 3));
@@ -367,7 +367,7 @@ function mesh(place, data) {
   function draw() {
     const [ca, sa, cu, su] = [Math.cos(around), Math.sin(around), Math.cos(up), Math.sin(up)];
     const uniform = (name) => gl.getUniformLocation(program, name);
-    // Columns: about y, then about x; the eye looks along -z.
+    // Columns of the rotation about y, then about x; the view direction is -z.
     gl.uniformMatrix3fv(uniform("turn"), false, [ca, su * sa, -cu * sa, 0, cu, su, sa, -su * ca, cu * ca]);
     gl.uniform3fv(uniform("middle"), middle);
     gl.uniform1f(uniform("scale"), (1.8 * zoom) / extent);
@@ -397,16 +397,16 @@ function mesh(place, data) {
   draw();
 }
 
-// ---------- News of a run that is under way ----------
+// ---------- Live updates of an active run ----------
 
 async function news() {
   const alive = byId("alive");
   try {
     const answer = await fetch("./", { cache: "no-store" });
-    if (!answer.ok) throw new Error(`the server says ${answer.status}`);
+    if (!answer.ok) throw new Error(`server status ${answer.status}`);
     const fresh = new DOMParser().parseFromString(await answer.text(), "text/html");
     const same = fresh.documentElement.hasAttribute("data-live") && fresh.querySelectorAll("[data-part]").length === document.querySelectorAll("[data-part]").length;
-    if (!same) return location.reload(); // it has ended: here is its report
+    if (!same) return location.reload(); // the run has ended, and the server sends its report
     for (const part of fresh.querySelectorAll("[data-part]")) {
       const old = byId(part.id);
       if (old.outerHTML !== part.outerHTML) old.replaceWith(part);
@@ -415,7 +415,7 @@ async function news() {
     refresh();
     alive.textContent = "following";
   } catch (error) {
-    alive.textContent = `no news (${error.message}): is the command still running?`;
+    alive.textContent = `no updates (${error.message}): is pathreplay watch still running?`;
   }
   setTimeout(news, 2000);
 }
@@ -427,7 +427,7 @@ async function stop() {
     byId("stop").textContent = answer.ok ? "Stopping after this iteration" : await answer.text();
   } catch (error) {
     byId("stop").disabled = false;
-    byId("alive").textContent = `not stopped (${error.message})`;
+    byId("alive").textContent = `the run was not stopped (${error.message})`;
   }
 }
 
