@@ -111,7 +111,7 @@ def test_a_pinhole_that_turns_leaves_no_rest(pose: str, rest: bool, tmp_path: Pa
     dr.enable_grad(t)
     objective.put(t)
     with dr.suspend_grad():
-        *_, terms = integrator._planned(Pass.of(objective.scene, 0, 1, 1))
+        *_, terms = integrator._planned(Pass.of(objective.scene, 0, 1, 1), integrator.begin(objective.scene))
     objective.put(dr.opaque(mi.Float, 0))
     assert [type(term).__name__ for term in terms] == ["PathReplay", "Boundary"] * rest + ["FilmMotion"]
 

@@ -49,8 +49,8 @@ def steps(scene: mi.Scene, key: str, integrator: dict, recorded: bool) -> np.nda
         params.update()
         step = recordings.differentiate if recorded and i > 0 else differentiate
         seed = dr.opaque(mi.UInt32, i)
-        loss, deferred, _ = step(params, scene, 0, made, target, None, seed, SPP, l2, 1.0, False)
-        made.tell(deferred, 16 * 16 * SPP)
+        loss, state, _ = step(params, scene, 0, made, target, None, seed, SPP, l2, 1.0, False)
+        made.keep(scene, state)
         parts = [loss, dr.grad(value).array if dr.is_tensor_v(value) else dr.grad(value), *made.state_dict().values()]
         found.append(np.concatenate([np.ravel(part) for part in parts]))
     assert {each.n_recordings for each in recordings._frozen.values()} == ({1} if recorded else set())

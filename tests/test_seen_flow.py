@@ -130,7 +130,7 @@ def test_nothing_slides_whose_edges_are_not_found(name: str) -> None:
     dr.enable_grad(params["ball.to_world"])
     params.update()
     with dr.suspend_grad():
-        view, _, terms = integrator._planned(Pass.of(scene, 0, 1, 1))
+        view, _, terms = integrator._planned(Pass.of(scene, 0, 1, 1), integrator.begin(scene))
     assert (view.flow is not None) is follows
     assert [type(term).__name__ for term in terms] == ["PathReplay", "Boundary"] + ["FilmMotion"] * follows
 

@@ -63,7 +63,7 @@ def test_a_term_has_the_methods_of_the_protocol_and_gives_what_it_says(plugin: s
     view = Pass.of(scene, 0, 1, SPP)
     adjoint = dr.ones(mi.TensorXf, (16, 16, 3))
     with dr.suspend_grad():
-        view, trace, terms = integrator._planned(view)
+        view, trace, terms = integrator._planned(view, integrator.begin(scene))
     for term in terms:
         for name in METHODS:
             promised = list(inspect.signature(getattr(Term, name)).parameters)[1:]

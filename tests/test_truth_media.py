@@ -253,7 +253,7 @@ def test_any_baseline_leaves_the_mean_alone(name: str, σ_t: np.ndarray, keys: t
     found = []
     for b in (0.0, 2.0):
         integrator = mi.load_dict({"type": "pathreplay", "max_depth": 4, "null_branching": True})
-        integrator._learned = lambda view, trace, b=b: Fixed(scene, b)
+        integrator._learned = lambda view, trace, state, b=b: Fixed(scene, b)
         sums = []
         for seed in range(1, 17):
             dr.clear_grad(params[DENSITY])

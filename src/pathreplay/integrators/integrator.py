@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 from operator import add
 from typing import Any
@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.adjoint.baseline import SLOTS, Baseline, BaselineState, BaselineStats
+from pathreplay.adjoint.baseline import Baseline, BaselineState
 from pathreplay.adjoint.ray_jacobian import Recovery
 from pathreplay.adjoint.record import MAX_DEPTH
 from pathreplay.errors import PathreplayError
@@ -26,7 +26,8 @@ from pathreplay.integrators.film.pixel_passes import among, obstacle, pixel_loss
 from pathreplay.integrators.film.surface_flow import SeenFlow, can_follow
 from pathreplay.integrators.interior import PathReplay
 from pathreplay.integrators.lifetimes import is_recording
-from pathreplay.integrators.path_integrator import UNBOUNDED, FrozenInputs, PathIntegrator, reached
+from pathreplay.integrators.pass_state import PassState
+from pathreplay.integrators.path_integrator import UNBOUNDED, PathIntegrator, reached
 from pathreplay.integrators.properties import choice, deviation, whole_number
 from pathreplay.integrators.scene_facts import SceneFacts, facts_of
 from pathreplay.integrators.term import Term, TermResult
@@ -47,7 +48,7 @@ NULL_BRANCHING = ("auto", True, False)
 SAMPLING = ("scene", "sobol")
 BOUNDARIES = ("auto", "none", "primary", "all")
 EDGES = "edges"
-"""In `told`: what there is to say of edges that move has been said."""
+"""In `warned`: what there is to say of edges that move has been said."""
 
 
 def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
@@ -68,15 +69,6 @@ def _interior(name: str, props: mi.Properties, max_depth: int) -> PathReplay:
     if auto:
         adjoint = "recorded" if max_depth <= MAX_DEPTH else "replay"
     return PathReplay(adjoint, auto, branch, recovery)
-
-
-@dataclass
-class DeferredDiagnostics:
-    """What is to be told of passes that a frozen function has made."""
-
-    lost: mi.UInt32 | None = None  # how many paths lost a part of their gradient, if they were counted
-    sums: mi.Float | None = None  # those of `BaselineStats`
-    nulls: mi.Float | None = None  # if they were counted
 
 
 class PathReplayIntegrator(PathIntegrator):
@@ -108,7 +100,6 @@ class PathReplayIntegrator(PathIntegrator):
 
     name = "pathreplay"
     interior: PathReplay
-    recordable = True  # it looks at nothing on the host while it renders
 
     def __init__(self, props: mi.Properties) -> None:
         PathIntegrator.__init__(self, props)
@@ -128,8 +119,6 @@ class PathReplayIntegrator(PathIntegrator):
                 f"{self.name}: boundary = '{self.boundary}' with attach = '{self.attach}': edges know what moves with "
                 "attach = 'delta' only: use that, or boundary = 'none'"
             )
-        self.told: set[str] = set()  # what has been said in the log
-        self.deferred = TermResult()  # of passes whose lost paths have not been told
         self.baseline: tuple[ReferenceType[SceneFacts], BaselineState] | None = None  # and the scene that it belongs to
 
     @property
@@ -139,13 +128,13 @@ class PathReplayIntegrator(PathIntegrator):
             return (self.interior,)
         return self.interior, Boundary(inner=self.boundary != "primary", spp=self.boundary_spp)
 
-    def _planned(self, view: Pass, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
+    def _planned(self, view: Pass, state: PassState, follow: bool = True) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
         """See `PathIntegrator`. What moves over the film has a term of its own, and the others what that leaves.
 
         Where it may, the film's flow is to ``follow`` what is seen. Edges are left out where none move, and where
         `auto` finds that they cannot be done; the interior, where the film's term is all.
         """
-        view, trace, terms = PathIntegrator._planned(self, view)
+        view, trace, terms = PathIntegrator._planned(self, view, state)
         if self.boundary == "none":
             return view, trace, terms
         view = replace(view, flow=CameraFlow.of(view.scene, view.sensor))
@@ -157,8 +146,9 @@ class PathReplayIntegrator(PathIntegrator):
         if not needs_edges:
             terms = tuple(term for term in terms if term is self.interior or not isinstance(term, Boundary))
             return view, trace, motion if view.flow is not None and view.flow.is_all else (*terms, *motion)
-        if is_recording():
-            trace = replace(trace, traits=replace(trace.traits, tables=self._tables(facts_of(view.scene), edges=True)))
+        if not state.is_complete:
+            tables = facts_of(view.scene).recorded_tables(state.tables, edges=True)
+            trace = replace(trace, traits=replace(trace.traits, tables=tables))
         return view, replace(trace, edges=self.boundary != "primary" and trace.media is None), (*terms, *motion)
 
     def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:
@@ -172,9 +162,13 @@ class PathReplayIntegrator(PathIntegrator):
         why = Boundary.obstacle(view) if self.boundary == "auto" else ""
         if why:
             self._tell_once(f"{why}; they are left out here")
-        elif self.boundary == "auto" and EDGES not in self.told:
+        elif self.boundary == "auto" and EDGES not in self.warned:
             self._tell_once(COST_OF_EDGES)
         return not why
+
+    def is_recordable(self, has_media: bool) -> bool:
+        """Always: it looks at nothing on the host while it renders."""
+        return True
 
     def supports_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
         """Whether `render_value_and_grad` can be used, for all pixels or for ``some``: see `pixel_obstacle`."""
@@ -218,17 +212,25 @@ class PathReplayIntegrator(PathIntegrator):
         number of samples does not, a tensor has another shape, there are no such pixels, or no parameter with gradients
         reaches the paths.
         """
-        self._require_active(scene)
-        view = Pass.of(scene, sensor, seed, spp, self.even)
+        view = self.pass_of(scene, sensor, seed, spp)
+        image, state = self.pixel_pass(view, (offset, slope), pixels, self.begin(scene))
+        self.keep(scene, state)
+        return image
+
+    def pixel_pass(
+        self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
+    ) -> tuple[mi.TensorXf, PassState]:
+        """Image and state of a pass: see `render_value_and_grad`, whose offset and slope are the ``derivative``."""
+        offset, slope = derivative
         some = None if pixels is None else mi.UInt32(pixels)
-        with reached(scene, sensor, zero_is_told=True), self._passing(), dr.isolate_grad():
+        with reached(view.scene, view.sensor, zero_is_told=True), self._passing(), dr.isolate_grad():
             loss = pixel_loss(view, self.max_depth, offset, slope, some)
-            view, trace, (_, *edges) = self._planned(view, follow=False)
+            view, trace, (_, *edges) = self._planned(view, state, follow=False)
             if view.flow is not None:
                 raise PathreplayError(
                     f"pathreplay: sensor '{view.sensor.id()}' moves, and cannot be swept: hold it, or use mi.render"
                 )
-            self._learned(view, trace)
+            self._learned(view, trace, state)
             found = self.interior.pixels(view, trace, loss, some)
             if edges:
                 wanted = offset + slope * found.image
@@ -236,29 +238,43 @@ class PathReplayIntegrator(PathIntegrator):
                     wanted = among(some, wanted, view.size)
                 found = reduce(add, [term.backward(view, trace, wanted, None) for term in edges], found)
         self._told(view, trace, found)
-        return found.image
+        return found.image, state.after(found)
 
-    def _learned(self, view: Pass, trace: TraceConfig) -> Baseline | None:
-        """What was learned of this scene so far; another scene starts anew, and nothing is its own judge."""
+    def begin(self, scene: mi.Scene) -> PassState:
+        """See `PathIntegrator`; with what is known of media, but in a user's recording, which would not learn."""
+        state = PathIntegrator.begin(self, scene)
+        if not state.is_complete or not facts_of(scene).has_media:
+            return state
+        known = self._known(scene)
+        return replace(state, guess=known.guess, passes=known.passes)
+
+    def keep(self, scene: mi.Scene, state: PassState) -> None:
+        """See `PathIntegrator`. Nothing in a user's recording, which cannot look at what was found."""
+        if is_recording():
+            return
+        found = state.found
+        if found.lost is not None and found.lost[0] > 0:
+            mi.Log(mi.LogLevel.Warn, f"pathreplay: {lost_note(found.lost[0], found.paths)}")
+        if state.guess is not None:
+            known = self._known(scene)
+            self.baseline = ref(facts_of(scene)), known if found.seen is None else known.after(found.seen)
+
+    def _known(self, scene: mi.Scene) -> BaselineState:
+        """What is known of the media of a scene: of another than the last, nothing."""
+        if self.baseline is None or self.baseline[0]() is not facts_of(scene):
+            return BaselineState.fresh(scene.bbox())
+        return self.baseline[1]
+
+    def _learned(self, view: Pass, trace: TraceConfig, state: PassState) -> Baseline | None:
+        """What was learned of this scene so far; nothing is its own judge."""
         for doubt in filter(None, (*doubts(trace), *(term.note(trace) for term in self.terms))):
             self._tell_once(doubt)
-        if trace.media is None:
+        if trace.media is None or state.guess is None:
             return None
-        if is_recording():
-            return None if self.frozen_inputs is None else self.frozen_inputs.guess
-        facts = facts_of(trace.scene)
-        if self.baseline is None or self.baseline[0]() is not facts:
-            self.baseline = ref(facts), BaselineState.fresh(trace.scene.bbox())
-        baseline = self.baseline[1]
-        if baseline.passes.intersection(view.keys):
+        if state.passes.intersection(view.keys):
             self._tell_once(used_before_note(view.keys[0][0]))
             return None
-        return baseline.guess
-
-    def inputs_to_freeze(self, scene: mi.Scene) -> FrozenInputs:
-        """See `PathIntegrator`."""
-        frozen_inputs = PathIntegrator.inputs_to_freeze(self, scene)
-        return frozen_inputs if self.baseline is None else replace(frozen_inputs, guess=self.baseline[1].guess)
+        return state.guess
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """What gradient passes have learned of media, as arrays by name; empty where there is nothing to learn."""
@@ -271,53 +287,19 @@ class PathReplayIntegrator(PathIntegrator):
         self.baseline = ref(facts_of(scene)), baseline
 
     def _told(self, view: Pass, trace: TraceConfig, found: TermResult) -> None:
-        """Report what went wrong, and keep what was learned.
-
-        A frozen function defers both: see `take_deferred`.
-        """
-        if found.moves:
-            self._tell_edges(trace, view.sensor)
-        frozen = is_recording()
-        self.deferred = self.deferred + replace(found, image=None) if frozen else TermResult()
-        if not frozen:
-            self._keep(found)
-
-    def _keep(self, found: TermResult) -> None:
-        if found.lost is not None and found.lost[0] > 0:
-            mi.Log(mi.LogLevel.Warn, f"pathreplay: {lost_note(found.lost[0], found.paths)}")
-        if found.seen is not None and self.baseline is not None:
-            self.baseline = self.baseline[0], self.baseline[1].after(found.seen)
-
-    def _tell_edges(self, trace: TraceConfig, sensor: mi.Sensor) -> None:
-        if EDGES in self.told or self.boundary in ("auto", "all"):
+        """See `PathIntegrator`: of edges that move."""
+        if not found.moves or EDGES in self.warned or self.boundary in ("auto", "all"):
             return
-        note, named = missing_edges(trace, sensor, self.boundary)
+        note, named = missing_edges(trace, view.sensor, self.boundary)
         if named:
-            self.told.add(EDGES)
+            self.warned.add(EDGES)
         if note:
             self._tell_once(note)
 
     def _tell_once(self, message: str) -> None:
-        if message not in self.told:
-            self.told.add(message)
+        if message not in self.warned:
+            self.warned.add(message)
             mi.Log(mi.LogLevel.Warn, f"pathreplay: {message}")
-
-    def take_deferred(self) -> DeferredDiagnostics:
-        """What passes in a frozen function found out, which cannot look at it itself; nothing of others."""
-        found, self.deferred = self.deferred, TermResult()
-        if found.seen is None:
-            return DeferredDiagnostics(found.lost)
-        return DeferredDiagnostics(found.lost, found.seen.sums, found.seen.nulls if found.seen.paths else None)
-
-    def tell(self, deferred: DeferredDiagnostics, paths: int) -> None:
-        """Warn, and keep what was learned, as passes themselves do; there were so many ``paths``."""
-        found = TermResult(lost=deferred.lost, paths=paths)
-        if deferred.sums is not None and self.baseline is not None:
-            counted = deferred.nulls is not None
-            nulls = deferred.nulls if counted else dr.zeros(mi.Float, SLOTS)
-            seen = BaselineStats(self.baseline[1].cells, deferred.sums, nulls, paths if counted else 0, frozenset())
-            found = replace(found, seen=seen)
-        self._keep(found)
 
     def options(self) -> dict[str, Any]:
         """The properties that this one was made of, beside those that all integrators of paths share."""

@@ -8,6 +8,8 @@ samples are added up before that, and no more: neither the sum of a pixel nor th
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -88,6 +90,17 @@ class Sums:
         """Give the parameters what was added up."""
         for value, total in zip(self._values, self._sums, strict=True):
             dr.set_grad(value, total)
+
+
+@contextmanager
+def summed(scene: mi.Scene, of_parts: Sequence[Pass]) -> Iterator[Callable[[], None]]:
+    """Within this block, which back-propagates parts one by one, gradients add up: call what it gives after each."""
+    sums = Sums(scene) if len(of_parts) > 1 else None
+    try:
+        yield (lambda: None) if sums is None else sums.take
+    finally:
+        if sums is not None:  # also of a view that no parameter reaches: what others gave stays
+            sums.give()
 
 
 def _arrays(value: Any) -> list[Any]:

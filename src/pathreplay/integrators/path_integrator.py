@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from pathreplay.adjoint.autodiff import Unreached
 from pathreplay.adjoint.baseline import Baseline
@@ -19,10 +19,12 @@ from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass, Seed, Which
 from pathreplay.integrators.interior import image
 from pathreplay.integrators.lifetimes import careful, is_recording
-from pathreplay.integrators.parts import Sums, parts
+from pathreplay.integrators.parts import parts, summed
+from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.properties import flag, whole_number
 from pathreplay.integrators.reach import unreached_note
-from pathreplay.integrators.scene_facts import SceneFacts, facts_of
+from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.integrators.stateful import Learned, require_nothing_learned, whole_pictures
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.platform.registration import mitsuba_integrator
 from pathreplay.transport.facts.traits import Tables
@@ -57,27 +59,21 @@ def reached(scene: mi.Scene, sensor: Which, zero_is_told: bool = False) -> Itera
             raise Unreached(note or str(error)) from error
 
 
-@dataclass
-class FrozenInputs:
-    """What a pass in a frozen function cannot find out, and has to be handed."""
-
-    tables: Tables  # of the scene
-    branches: bool  # see `Media`
-    constants: tuple[object, ...]  # other passes than those with the same have to be recorded anew
-    guess: Baseline | None = None  # of what is known of its media
-
-
 class PathIntegrator:
     """A template of an integrator (see `on_base`), for those of ours.
 
     Properties ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5) and ``hide_emitters`` (False).
     Classes below have a ``name`` (the plugin's), ``attach`` (as `TraceConfig` has it) and the term ``interior``. Raises
     PathreplayError for unusable properties and in polarised variants.
+
+    Methods whose names end in ``_pass`` take a `PassState`. Mitsuba's methods have no place for one: they `begin` a
+    state for each pass and `keep` what it found.
     """
 
     name = ""
     attach = "none"
     even = False  # whether even numbers take the place of independent ones
+    boundary = "none"  # which boundary terms are estimated
     interior: Term
     max_depth: int  # these are Mitsuba's
     rr_depth: int
@@ -95,8 +91,8 @@ class PathIntegrator:
         hide_emitters = flag(props, self.name, "hide_emitters", False)
         mitsuba_integrator().__init__(self, props)
         self.hide_emitters = hide_emitters
-        self.frozen_inputs: FrozenInputs | None = None  # in a frozen function
-        self.tables: Tables | None = None  # of the scene that was rendered last: there `dr.freeze` finds them
+        self.warned: set[str] = set()  # what has been said in the log
+        self.tables: Tables | None = None  # of the scene that was rendered last: there a user's `dr.freeze` finds them
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -115,11 +111,7 @@ class PathIntegrator:
         """Render an image: see Mitsuba's ADIntegrator. Nothing is differentiated: use `mi.render` for that."""
         if not develop:
             raise PathreplayError(f"{self.name}: develop = False is not supported: leave it out")
-        made = None
-        for part in self._parts(scene, sensor, seed, spp):
-            with self._passing():
-                made = _sum(made, image(part, self._walk(scene, part.sensor)), part.share)
-        return made
+        return self.image_pass(self.pass_of(scene, sensor, seed, spp), PathIntegrator.begin(self, scene))
 
     def render_forward(
         self, scene: mi.Scene, params: object, sensor: Which = 0, seed: Seed = 0, spp: int = 0
@@ -130,15 +122,17 @@ class PathIntegrator:
         from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
         """
         tangent = None
-        for part in self._parts(scene, sensor, seed, spp):
+        for part in parts(self.pass_of(scene, sensor, seed, spp)):
+            state = self.begin(scene)
             with self._passing():
-                part, trace, terms = self._planned(part)
-                learned = self._learned(part, trace)
+                part, trace, terms = self._planned(part, state)
+                learned = self._learned(part, trace, state)
                 if part.flow is not None:
                     part.flow.carry_tangents()
                 found = reduce(add, [term.forward(part, trace, learned) for term in terms])
                 tangent = _sum(tangent, found.image, part.share)
             self._told(part, trace, found)
+            self.keep(scene, state.after(found))
         return tangent
 
     def render_backward(
@@ -149,27 +143,36 @@ class PathIntegrator:
         Warns of what terms tell: a part of the gradient was not finite and had to be left out, edges move. Raises
         PathreplayError where no parameter with gradients reaches the paths, unless all are those of other cameras.
         """
-        with reached(scene, sensor):
-            self._backward(scene, grad_in, sensor, seed, spp)
-
-    def _backward(self, scene: mi.Scene, grad_in: mi.TensorXf, sensor: Which, seed: Seed, spp: int) -> None:
-        # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass, too.
-        of_parts = self._parts(scene, sensor, seed, spp)
-        sums = Sums(scene) if len(of_parts) > 1 else None
-        try:
+        of_parts = parts(self.pass_of(scene, sensor, seed, spp))
+        with summed(scene, of_parts) as add_up:
             for part in of_parts:
+                self.keep(scene, self.gradient_pass(part, grad_in, self.begin(scene)))
+                add_up()
+
+    def image_pass(self, view: Pass, state: PassState) -> mi.TensorXf:
+        """The image of a pass, detached."""
+        made = None
+        for part in parts(view):
+            with self._passing():
+                made = _sum(made, image(part, self._walk(part.scene, part.sensor, state)), part.share)
+        return made
+
+    def gradient_pass(self, view: Pass, grad_in: mi.TensorXf, state: PassState) -> PassState:
+        """Back-propagate an image gradient into the parameters: see `render_backward`."""
+        of_parts = parts(view)
+        with reached(view.scene, view.sensor), summed(view.scene, of_parts) as add_up:
+            for part in of_parts:
+                # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass.
                 with self._passing(), dr.isolate_grad():
-                    part, trace, terms = self._planned(part)
-                    learned = self._learned(part, trace)
+                    part, trace, terms = self._planned(part, state)
+                    learned = self._learned(part, trace, state)
                     wanted = grad_in if part.share == 1 else grad_in * part.share
                     with dr.isolate_grad():  # of terms, one by one, from the flow that they share
                         found = reduce(add, [term.backward(part, trace, wanted, learned) for term in terms])
                 self._told(part, trace, found)
-                if sums is not None:
-                    sums.take()
-        finally:
-            if sums is not None:  # also of a view that no parameter reaches: what others gave stays
-                sums.give()
+                state = state.after(found)
+                add_up()
+        return state
 
     def sample(
         self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool = True, **_: Any
@@ -182,21 +185,36 @@ class PathIntegrator:
             raise PathreplayError(f"{self.name}: sample() is not differentiated: use mi.render, or render_backward")
         return *primal(self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
 
-    def _planned(self, view: Pass) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
-        """A gradient pass as terms see it, how it walks, and the terms that it adds up."""
-        return view, self._walk(view.scene, view.sensor), self.terms
+    def begin(self, scene: mi.Scene) -> PassState:
+        """The state with which a pass over a scene begins.
 
-    def _learned(self, view: Pass, trace: TraceConfig) -> Baseline | None:
+        A pass that a user's `dr.freeze` records finds as much in the scene as a recording can.
+        """
+        with careful():
+            facts = facts_of(scene)
+            if is_recording():
+                return PassState(facts.recorded_tables(self.tables, edges=False))
+            self.tables = facts.tables()
+            return PassState(self.tables, facts.branches())
+
+    def keep(self, scene: mi.Scene, state: PassState) -> None:
+        """Report what passes found that began with the state of this integrator, and learn from it."""
+
+    def _planned(self, view: Pass, state: PassState) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
+        """A gradient pass as terms see it, how it walks, and the terms that it adds up."""
+        return view, self._walk(view.scene, view.sensor, state), self.terms
+
+    def _learned(self, view: Pass, trace: TraceConfig, state: PassState) -> Baseline | None:
         """What earlier passes found out that this one may use."""
         return None
 
     def _told(self, view: Pass, trace: TraceConfig, found: TermResult) -> None:
-        """What is done with what terms have found."""
+        """Say what there is to say of a pass whose kernels have been launched."""
 
-    def _parts(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> list[Pass]:
-        """The pass that is asked for, in parts where its samples are too many for one: see `parts`."""
+    def pass_of(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Pass:
+        """The pass that is asked for."""
         self._require_active(scene)
-        return parts(Pass.of(scene, sensor, seed, spp, self.even))
+        return Pass.of(scene, sensor, seed, spp, self.even)
 
     def _require_active(self, scene: mi.Scene) -> None:
         """Raise PathreplayError if scene or integrator are none of the active variant."""
@@ -212,29 +230,19 @@ class PathIntegrator:
         with careful(), dr.suspend_grad():
             yield
 
-    def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None) -> TraceConfig:
-        """How the scene is walked through; the sensor may be in a medium."""
-        facts = facts_of(scene)
-        branches = None if self.frozen_inputs is None else self.frozen_inputs.branches
+    def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
+        """How the scene is walked through; the sensor may be in a medium. Without a ``state``, as the scene is now."""
+        facts, state = facts_of(scene), PathIntegrator.begin(self, scene) if state is None else state
         return TraceConfig(
             scene=scene,
-            traits=facts.traits(self._tables(facts)),
-            media=facts.media(sensor, branches),  # type: ignore[arg-type]
+            traits=facts.traits(state.tables),
+            media=facts.media(sensor, state.branches),  # type: ignore[arg-type]
             attach=self.attach,
             hide_emitters=self.hide_emitters,
             max_depth=self.max_depth,
             rr_depth=self.rr_depth,
             skip_area_emitters=self.skip_area_emitters,
         )
-
-    def _tables(self, facts: SceneFacts, edges: bool = False) -> Tables:
-        """Those of a pass; while `dr.freeze` records, with all that is asked for ``edges``."""
-        if self.frozen_inputs is not None:
-            return self.frozen_inputs.tables
-        if is_recording():
-            return facts.recorded_tables(self.tables, edges)
-        self.tables = facts.tables()
-        return self.tables
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:
         """Whether a parameter with gradients reaches the paths of a sensor; where there are media, this is assumed.
@@ -249,11 +257,35 @@ class PathIntegrator:
             at = PathState.begin(trace, start).at
             return path_moves(trace, start, at) or weights_vary(trace, at)
 
-    def inputs_to_freeze(self, scene: mi.Scene) -> FrozenInputs:
-        """What passes over this scene are to be handed if they are recorded."""
-        facts = facts_of(scene)
-        self.tables = facts.tables()  # now, since a recording wants all that integrators hold to stay as it is
-        return FrozenInputs(self.tables, facts.branches(), facts.constants())
+    def is_recordable(self, has_media: bool) -> bool:
+        """See `StatefulIntegrator`."""
+        return False
+
+    def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
+        """Why there is no image with a gradient in one pass, with the way out; "" where there is."""
+        return whole_pictures(type(self).__name__)
+
+    def pixel_pass(
+        self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
+    ) -> tuple[mi.TensorXf, PassState]:
+        """There is none. Raises PathreplayError."""
+        raise PathreplayError(self.why_no_pixel_sweep(view.scene))
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        """What gradient passes have learned: nothing."""
+        return {}
+
+    def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None:
+        """Go on with what `state_dict` told. Raises PathreplayError where that was something."""
+        require_nothing_learned(learned)
+
+    def options(self) -> dict[str, Any]:
+        """See `StatefulIntegrator`."""
+        return {}
+
+    def silence(self, notes: Iterable[str]) -> None:
+        """Say nothing of these in the log."""
+        self.warned.update(notes)
 
     def _described(self, **more: Any) -> str:
         depth = -1 if self.max_depth == UNBOUNDED else self.max_depth

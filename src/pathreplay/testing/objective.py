@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.integrators.stateful import stateful
 from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.parameters import get_array
 from pathreplay.testing.direction import Line
@@ -181,5 +182,5 @@ def integrator_name(integrator: mi.Integrator) -> str:
     # For Python plugins Mitsuba's class_name() is that of the C++ base.
     name = type(integrator).__name__ if isinstance(integrator, mi.CppADIntegrator) else str(integrator.class_name())
     name = name.removesuffix("Integrator").replace("VolumetricPath", "Volpath").lower()
-    edges = getattr(integrator, "boundary", "auto")
+    edges = stateful(integrator).options().get("boundary", "auto")
     return name if edges == "auto" else f"{name}, boundary {edges}"

@@ -14,6 +14,7 @@ import mitsuba as mi
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.path_limits import read_limits
 from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.integrators.stateful import stateful
 from pathreplay.scenes.descriptions import load_integrator
 
 Spec: TypeAlias = "mi.Integrator | Mapping[str, Any] | str | None"
@@ -53,8 +54,8 @@ def integrator_under_test(
     else:
         limits = None if own is None else read_limits(own)
         description = {"type": spec or "pathreplay", **({} if limits is None else vars(limits))}
-        if description["type"] == "pathreplay" and hasattr(own, "boundary_spp"):
-            description |= {"boundary": own.boundary, "boundary_spp": own.boundary_spp}
+        options = {} if own is None or description["type"] != "pathreplay" else stateful(own).options()
+        description |= {name: options[name] for name in ("boundary", "boundary_spp") if name in options}
     if max_depth is not None:
         description["max_depth"] = max_depth
     if boundary and description.get("type") != "pathreplay":

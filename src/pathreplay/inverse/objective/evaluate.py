@@ -12,10 +12,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from pathreplay.errors import PathreplayError
 from pathreplay.integrators.film.image import make_ready
 from pathreplay.integrators.lifetimes import plain_errors
 from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.losses.pixelwise import ELSEWHERE
 from pathreplay.inverse.objective.frozen import NotRecordable, Recordings, differentiate, is_recordable
@@ -182,13 +182,13 @@ class Evaluator:
         record: bool = True,
         moving: Collection[str] | None = None,
     ) -> None:
-        self.problem, self.integrator = problem, integrator
+        self.problem, self.integrator = problem, stateful(integrator)
         self._moving = frozenset((v.key for v in problem.variables) if moving is None else moving)
         self._reached = problem.reached(self._moving)
         has_media = facts_of(problem.scene).has_media
         # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
-        self.freezes = known and record and is_recordable(integrator, has_media) and problem.loss not in ELSEWHERE
+        self.freezes = known and record and is_recordable(self.integrator, has_media) and problem.loss not in ELSEWHERE
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
         # Of each view and number of samples that was seen, whole or a batch of it: whether pixels can be swept.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
@@ -213,11 +213,6 @@ class Evaluator:
         """Go on with what an evaluation has learned. Raises PathreplayError if it is none of this integrator's."""
         if learned is self._learned or not (learned or self._learned):
             return
-        if not hasattr(self.integrator, "load_state_dict"):
-            raise PathreplayError(
-                "The checkpoint holds what another integrator has learned of media; set the config's 'integrator' "
-                "back, or start a new run"
-            )
         self.integrator.load_state_dict(self.problem.scene, learned)
         self._learned = learned
 
@@ -250,8 +245,7 @@ class Evaluator:
         dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
         for key in broken:
             gradients[key] = np.where(np.isfinite(gradients[key]), gradients[key], 0)
-        if hasattr(self.integrator, "state_dict"):
-            self._learned = self.integrator.state_dict()
+        self._learned = self.integrator.state_dict()
         return Evaluation(loss, gradients, dropped, self._learned)
 
     def _differentiated(self, view: int, seed: int, spp: int, factor: Any, batch: Batch | None) -> tuple[float, Any]:
@@ -274,12 +268,11 @@ class Evaluator:
         share = about.share / len(problem.trained())
         problem.album.rest()
         with plain_errors():
-            value, deferred, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
+            value, state, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
                 problem.params, problem.scene, sensor, self.integrator, target, weight, number, spp,
                 problem.loss, share, self._sweeps[which], factor, batch,
             )  # fmt: skip
-        if deferred is not None:
-            self.integrator.tell(deferred, target.shape[0] * target.shape[1] * spp)
+        self.integrator.keep(problem.scene, state)
         return float(value[0]) if dr.width(value) else float("nan"), by_factor
 
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.integrators.stateful import StatefulIntegrator
 from pathreplay.inverse.config.schema import BATCH
 from pathreplay.inverse.losses.pixelwise import QUADRATIC
 from pathreplay.inverse.parameters.values import Array
@@ -43,13 +44,11 @@ class Batch:
         return picture.reshape(-1, 1, picture.shape[2])[np.array(self.pixels)]
 
 
-def obstacle(problem: Problem, integrator: mi.Integrator, sensor: int, spp: int, some: bool) -> str:
+def obstacle(problem: Problem, integrator: StatefulIntegrator, sensor: int, spp: int, some: bool) -> str:
     """Why paths cannot be walked once for picture and gradient, of all pixels or of ``some``; "" where they can."""
     if problem.loss not in QUADRATIC:
         return "its loss is none of l2 and relative-l2; take one of these"
-    if not hasattr(integrator, "why_no_pixel_sweep"):
-        return f"{type(integrator).__name__} renders whole pictures; take the integrator 'pathreplay'"
-    return str(integrator.why_no_pixel_sweep(problem.scene, problem.scene.sensors()[sensor], spp, some))
+    return integrator.why_no_pixel_sweep(problem.scene, problem.scene.sensors()[sensor], spp, some)
 
 
 def refused(view: str, why: str) -> PathreplayError:

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.film.image import picture_shape
+from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.config.stage_options import begins
 from pathreplay.inverse.objective.stages import Part, part_at
@@ -44,7 +45,7 @@ def _require_differentiated(part: Part, sensor: int, where: str) -> None:
     problem.params.update(scene_values(problem, variables))
     try:
         for integrator in filter(None, (problem.integrator, problem.baseline)):
-            if hasattr(integrator, "is_reached") and not integrator.is_reached(problem.scene, sensor):
+            if not stateful(integrator).is_reached(problem.scene, sensor):
                 nothing = dr.zeros(mi.TensorXf, picture_shape(problem.scene.sensors()[sensor]))
                 integrator.render_backward(problem.scene, problem.params, nothing, sensor, spp=1)
     except PathreplayError as error:

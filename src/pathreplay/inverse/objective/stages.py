@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
+from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config, Plugin
 from pathreplay.inverse.config.stage_options import Stage, place
 from pathreplay.inverse.dataset.views import View
@@ -119,7 +120,7 @@ def _require_single_pixels(part: Part, integrator: mi.Integrator) -> None:
     problem, spp = part.problem, int(part.config.spp)  # which is not "auto" there
     for view in problem.trained().values():
         camera = f"{problem.scene.sensors()[view.sensor].id()}."
-        why = obstacle(problem, integrator, view.sensor, spp // part.config.parts, some=True)
+        why = obstacle(problem, stateful(integrator), view.sensor, spp // part.config.parts, some=True)
         if moves := sorted(key for key in problem.moves(part.moving) if key.startswith(camera)):
             why = f"its camera moves; hold '{moves[0]}'"
         if why:
@@ -190,7 +191,6 @@ class Staged:
         part = _part(self.problem, self.config, number, stage)
         if stage.max_depth is not None:
             integrator = _integrator(self.plugin, stage.max_depth)
-            if hasattr(integrator, "told"):  # what has been said need not be said again
-                integrator.told |= self.integrator.told
+            stateful(integrator).silence(stateful(self.integrator).warned)  # what has been said need not be said again
         views = tuple(scaled(view, stage.downscale) if not view.is_test else view for view in part.problem.views)
         return Evaluator(replace(part.problem, views=views), integrator, self.record, part.moving)

@@ -8,6 +8,7 @@ import mitsuba as mi
 
 from pathreplay.integrators.path_limits import Limits, read_limits
 from pathreplay.integrators.scene_facts import facts_of
+from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.config.tables import Plugin
 from pathreplay.scenes.descriptions import load_integrator
@@ -50,8 +51,8 @@ def _options(own: Any) -> dict[str, Any]:
     limits = None if own is None else read_limits(own)
     if limits is None:
         return {}
-    if hasattr(own, "options"):
-        return vars(limits) | own.options()
+    if options := stateful(own).options():
+        return vars(limits) | options
     # An unbounded max_depth, Mitsuba's default, is not copied, since `pathreplay` would trace unbounded paths twice.
     return {name: value for name, value in vars(limits).items() if name != "max_depth" or value >= 0}
 

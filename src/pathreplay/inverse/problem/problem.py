@@ -19,6 +19,7 @@ from pathreplay.integrators.edge_notes import edges_note, moves_edges
 from pathreplay.integrators.film.image import fit_film
 from pathreplay.integrators.integrator import EDGES
 from pathreplay.integrators.reach import reached_sensors
+from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.config.tables import Plugin
 from pathreplay.inverse.config.user_functions import Modules
@@ -385,10 +386,9 @@ def _edges(params: mi.SceneParameters, keys: Iterable[str], integrator: mi.Integ
     This also suppresses the integrator's own note.
     """
     moving = [key for key in keys if moves_edges(params, key)]
-    edges = getattr(integrator, "boundary", "none")
-    # Mitsuba's projective integrators have boundary terms; they are recognised by name.
-    if not moving or "Projective" in type(integrator).__name__ or edges == "all":
+    known = stateful(integrator)
+    edges = known.boundary
+    if not moving or edges == "all":
         return ()
-    if hasattr(integrator, "told"):
-        integrator.told.add(EDGES)
+    known.silence([EDGES])
     return (COST_OF_EDGES if edges == "auto" else edges_note(moving, edges),)
