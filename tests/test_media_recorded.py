@@ -12,7 +12,7 @@ import pytest
 
 from media_scenes import checkers, cloud, constant, grid, heterogeneous, homogeneous, inside, lit_floor, smooth
 from pathreplay.inverse.losses.pixelwise import l2
-from pathreplay.inverse.objective.frozen import Recordings, differentiate
+from pathreplay.inverse.objective.frozen import Recordings, RenderRequest, ViewLoss, ViewTarget, differentiate
 from pathreplay.scenes.parameters import keep_only
 
 # Denser than any step before, and emptier: bounds of the extinction have to follow.
@@ -49,9 +49,13 @@ def steps(scene: mi.Scene, key: str, integrator: dict, recorded: bool) -> np.nda
         params.update()
         step = recordings.differentiate if recorded and i > 0 else differentiate
         seed = dr.opaque(mi.UInt32, i)
-        loss, state, _ = step(params, scene, 0, made, target, None, seed, SPP, l2, 1.0, False)
-        made.keep(scene, state)
-        parts = [loss, dr.grad(value).array if dr.is_tensor_v(value) else dr.grad(value), *made.state_dict().values()]
+        result = step(params, scene, made, RenderRequest(0, seed, SPP), ViewTarget(target), ViewLoss(l2, 1.0, False))
+        made.keep(scene, result.state)
+        parts = [
+            result.loss,
+            dr.grad(value).array if dr.is_tensor_v(value) else dr.grad(value),
+            *made.state_dict().values(),
+        ]
         found.append(np.concatenate([np.ravel(part) for part in parts]))
     assert {each.n_recordings for each in recordings._frozen.values()} == ({1} if recorded else set())
     params[key] = start

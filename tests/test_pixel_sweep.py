@@ -232,6 +232,7 @@ def test_two_swept_views_add_up(changes: dict, tmp_path) -> None:
         pytest.param(GLASS, True, id="index of a plugin in Python", marks=SLOW),
         pytest.param(BOXED, True, id="box filter"),
         pytest.param(BOXED | {"loss": "log"}, False, id="box filter, log"),
+        pytest.param(BOXED | {"exposure": {}}, True, id="exposures"),
         pytest.param(BOXED | {"integrator": {"type": "prb", "max_depth": 3}}, False, id="box filter, prb", marks=SLOW),
     ],
 )

@@ -13,9 +13,10 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.integrators.boundary_term import Boundary
+from pathreplay.integrators.stateful import stateful
 from pathreplay.integrators.term import TermResult
 from pathreplay.inverse.losses.pixelwise import l2
-from pathreplay.inverse.objective.frozen import Recordings, differentiate
+from pathreplay.inverse.objective.frozen import Recordings, RenderRequest, ViewLoss, ViewTarget, differentiate
 from pathreplay.testing.objective import Objective, smooth_weights
 from pathreplay.testing.stencil import CENTRAL
 
@@ -99,7 +100,8 @@ class EdgePass:
         self.passes[method] += 1
         run = self.recordings[method].differentiate if records else differentiate
         number = dr.opaque(mi.UInt32, seed)
-        return run(self.params, self.scene, 0, integrator, self.target, None, number, self.job.spp, l2, 1.0, False)
+        request, loss = RenderRequest(0, number, self.job.spp), ViewLoss(l2, 1.0, False)
+        return run(self.params, self.scene, stateful(integrator), request, ViewTarget(self.target), loss).loss
 
     def _integrator(self, name: str) -> Any:
         if name not in self.integrators:

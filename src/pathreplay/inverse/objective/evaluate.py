@@ -18,7 +18,15 @@ from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.losses.pixelwise import ELSEWHERE
-from pathreplay.inverse.objective.frozen import NotRecordable, Recordings, differentiate, is_recordable
+from pathreplay.inverse.objective.frozen import (
+    NotRecordable,
+    Recordings,
+    RenderRequest,
+    ViewLoss,
+    ViewTarget,
+    differentiate,
+    is_recordable,
+)
 from pathreplay.inverse.objective.pixel_batches import Batch, obstacle, refused
 from pathreplay.inverse.parameters.exposures import EXPOSURE, factor_of
 from pathreplay.inverse.parameters.exposures import gradient as exposure_gradient
@@ -227,9 +235,7 @@ class Evaluator:
         try:
             factor = factor_of(values, view, about.target.shape[2])
             batch = None if pixels is None else Batch.of(about.weight, about.target.shape[:2], pixels, seed)
-            loss, by_factor = self._differentiated(
-                view, seed, spp, None if factor is None else mi.TensorXf(factor), batch
-            )
+            loss, by_factor = self._differentiated(view, seed, spp, factor, batch)
         except NotRecordable:  # a part of the gradient may be there: once more, with variables of its own
             self.freezes = False
             return self._view(values, view, seed, spp, pixels)
@@ -248,13 +254,15 @@ class Evaluator:
         self._learned = self.integrator.state_dict()
         return Evaluation(loss, gradients, dropped, self._learned)
 
-    def _differentiated(self, view: int, seed: int, spp: int, factor: Any, batch: Batch | None) -> tuple[float, Any]:
+    def _differentiated(
+        self, view: int, seed: int, spp: int, factor: Array | None, batch: Batch | None
+    ) -> tuple[float, Any]:
         """What the view adds to the loss, and the derivative by its ``factor``; the rest is added to the parameters."""
         problem, about = self.problem, self.problem.views[view]
         sensor, picture, counts = about.sensor, about.target, about.weight
         if batch is not None:
             picture, counts = batch.rows(picture), None if counts is None else batch.rows(counts)
-        target, weight = held_tensor(picture), None if counts is None else held_tensor(counts)
+        target = ViewTarget(*(None if part is None else held_tensor(part) for part in (picture, counts, factor)))
         # The first call is not recorded: scenes make some of their parts when they are first rendered.
         which = view, spp, batch is not None
         records = self.freezes and which in self._sweeps
@@ -265,15 +273,14 @@ class Evaluator:
             self._sweeps[which] = not why and view in self._reached
         # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
-        share = about.share / len(problem.trained())
+        request = RenderRequest(sensor, number, spp, batch)
+        loss = ViewLoss(problem.loss, about.share / len(problem.trained()), self._sweeps[which])
         problem.album.rest()
         with plain_errors():
-            value, state, by_factor = (self._recordings[spp].differentiate if records else differentiate)(
-                problem.params, problem.scene, sensor, self.integrator, target, weight, number, spp,
-                problem.loss, share, self._sweeps[which], factor, batch,
-            )  # fmt: skip
-        self.integrator.keep(problem.scene, state)
-        return float(value[0]) if dr.width(value) else float("nan"), by_factor
+            step = self._recordings[spp].differentiate if records else differentiate
+            found = step(problem.params, problem.scene, self.integrator, request, target, loss)
+        self.integrator.keep(problem.scene, found.state)
+        return float(found.loss[0]) if dr.width(found.loss) else float("nan"), found.by_factor
 
 
 @contextmanager

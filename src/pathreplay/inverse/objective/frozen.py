@@ -10,7 +10,7 @@ from __future__ import annotations
 import gc
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -35,6 +35,49 @@ _OTHER = 0x5EED
 """Makes another seed of one."""
 
 
+@dataclass(frozen=True)
+class ViewTarget:
+    """What the picture of a view is to be, as tensors."""
+
+    target: mi.TensorXf
+    weight: mi.TensorXf | None = None  # how much pixels count, see `mean_loss`
+    factor: mi.TensorXf | None = None  # on the picture that is rendered, see `exposures`
+
+    def compared(self, loss: Loss, image: mi.TensorXf) -> mi.Float:
+        """The mean loss of a picture as it is rendered."""
+        return mean_loss(loss, _times(image, self.factor), self.target, self.weight).array
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """Which paths of a view are walked."""
+
+    sensor: int
+    seed: int | mi.UInt32
+    spp: int
+    batch: Batch | None = (
+        None  # of pixels, the rows of the target, by which the loss is an estimate; only if it is swept
+    )
+
+
+@dataclass(frozen=True)
+class ViewLoss:
+    """How a view is judged: ``share`` times its mean ``loss``; ``swept``: image and gradient in one pass."""
+
+    loss: Loss
+    share: float
+    swept: bool
+
+
+@dataclass(frozen=True)
+class ViewResult:
+    """The loss of a view, the state of the integrator after it, and a derivative."""
+
+    loss: mi.Float
+    state: PassState
+    by_factor: mi.TensorXf | None  # by the logarithm of the target's factor, for each channel, if there is one
+
+
 class NotRecordable(Exception):
     """A plugin of the scene keeps Dr.Jit from recording a pass."""
 
@@ -54,12 +97,18 @@ class Recordings:
         self._made: Counter[Any] = Counter()  # of each view with such shapes
 
     def differentiate(
-        self, params: mi.SceneParameters, scene: mi.Scene, sensor: int, integrator: StatefulIntegrator, *args: Any
-    ) -> tuple[Any, PassState, Any]:
+        self,
+        params: mi.SceneParameters,
+        scene: mi.Scene,
+        integrator: StatefulIntegrator,
+        request: RenderRequest,
+        target: ViewTarget,
+        loss: ViewLoss,
+    ) -> ViewResult:
         """As the function of that name. Raises NotRecordable; a part of the gradient may be there, then."""
         keys = list(params.keys())
         # By view, since Dr.Jit thinks that something is wrong with a function that it has to record often.
-        view = (sensor, *(dr.shape(params[key]) for key in keys))
+        view = (request.sensor, *(dr.shape(params[key]) for key in keys))
         which = view, facts_of(scene).constants()
         if which not in self._frozen:
             self._made[view] += 1
@@ -68,7 +117,7 @@ class Recordings:
             gc.collect()  # scenes of the past would be traced, too
             self._frozen[which] = _recording(keys)
         try:
-            return self._frozen[which](scene, integrator.begin(scene).to_record(), sensor, integrator, *args)
+            return self._frozen[which](scene, integrator, integrator.begin(scene).to_record(), request, target, loss)
         except RuntimeError as error:
             if _RECORDING not in str(error):
                 raise
@@ -78,7 +127,7 @@ class Recordings:
 def _recording(keys: list[str]) -> Callable[..., Any]:
     """`differentiate` as a frozen function, which holds neither scene nor problem when the run is over."""
 
-    def frozen(scene: Any, *args: Any) -> tuple[Any, PassState, Any]:
+    def frozen(scene: mi.Scene, *args: Any) -> ViewResult:
         params = mi.traverse(scene)
         keep_only(params, keys)
         return _differentiate(params, scene, *args)
@@ -87,61 +136,51 @@ def _recording(keys: list[str]) -> Callable[..., Any]:
 
 
 def differentiate(
-    params: mi.SceneParameters, scene: mi.Scene, sensor: int, integrator: StatefulIntegrator, *args: Any
-) -> tuple[Any, PassState, Any]:
-    """The loss of a view and its gradient, traced anew: see `_differentiate`."""
-    return _differentiate(params, scene, integrator.begin(scene), sensor, integrator, *args)
+    params: mi.SceneParameters,
+    scene: mi.Scene,
+    integrator: StatefulIntegrator,
+    request: RenderRequest,
+    target: ViewTarget,
+    loss: ViewLoss,
+) -> ViewResult:
+    """The loss of a view, traced anew; its gradient is added to the parameters."""
+    return _differentiate(params, scene, integrator, integrator.begin(scene), request, target, loss)
 
 
 def _differentiate(
     params: mi.SceneParameters,
     scene: mi.Scene,
-    state: PassState,
-    sensor: int,
     integrator: StatefulIntegrator,
-    target: mi.TensorXf,
-    weight: mi.TensorXf | None,
-    seed: int | mi.UInt32,
-    spp: int,
-    loss: Loss,
-    share: float,
-    sweeps: bool,
-    factor: mi.TensorXf | None = None,
-    batch: Batch | None = None,
-) -> tuple[Any, PassState, Any]:
-    """``share`` times the loss of a view, whose gradient is added to the parameters; ``sweeps``: in one pass.
-
-    With a ``batch``, which only sweeps take, target and weight are its rows, and so is the loss an estimate by them.
-    Also returns the ``state`` after it, and the derivative by the logarithm of the ``factor`` on the picture (see
-    `exposures`) for each channel, if there is one.
-    """
-    view = integrator.pass_of(scene, sensor, seed, spp)
-    share *= 1 if batch is None else batch.share
-
-    def shared(image: mi.TensorXf) -> mi.Float:
-        return mean_loss(loss, _times(image, factor), target, weight).array * share
-
-    if sweeps:
-        offset, slope = (term * share for term in linear_derivative(loss, target, weight))
+    state: PassState,
+    request: RenderRequest,
+    target: ViewTarget,
+    loss: ViewLoss,
+) -> ViewResult:
+    """See `differentiate`; the passes begin with the ``state``."""
+    view = integrator.pass_of(scene, request.sensor, request.seed, request.spp)
+    batch, factor = request.batch, target.factor
+    share = loss.share if batch is None else loss.share * batch.share
+    if loss.swept:
+        offset, slope = (term * share for term in linear_derivative(loss.loss, target.target, target.weight))
         # By the chain rule, of what is linear in the factor times the image.
         wanted = _times(offset, factor), _times(_times(slope, factor), factor)
         image, state = integrator.pixel_pass(view, wanted, None if batch is None else batch.pixels, state)
-        value = shared(image)
+        value = target.compared(loss.loss, image) * share
     else:
         image = integrator.image_pass(view, state)
         if dr.grad_enabled(dict(params)):
             dr.enable_grad(image)
-        value = shared(image)
+        value = target.compared(loss.loss, image) * share
         if dr.grad_enabled(value):
             dr.backward(value)
-            apart = replace(view, seed=mi.sample_tea_32(seed, 1)[0])  # as `mi.render` has it
+            apart = replace(view, seed=mi.sample_tea_32(view.seed, 1)[0])  # as `mi.render` has it
             state = integrator.gradient_pass(apart, dr.grad(image), state)
     by_factor = None
     if factor is not None:
-        other: Any = mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(_OTHER))[0]
+        other: Any = mi.sample_tea_32(mi.UInt32(view.seed), mi.UInt32(_OTHER))[0]
         again = integrator.image_pass(replace(view, seed=other), state)
-        by_factor = derivative(loss, image, again, factor, target, weight) * share
-    return dr.detach(value), state, by_factor
+        by_factor = derivative(loss.loss, image, again, factor, target.target, target.weight) * share
+    return ViewResult(dr.detach(value), state, by_factor)
 
 
 def _times(tensor: Any, factor: Any) -> Any:
