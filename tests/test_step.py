@@ -14,12 +14,12 @@ import pytest
 from media_scenes import constant, grid
 from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative
 from pathreplay.adjoint.record import Layout, record_type, room_for
-from pathreplay.adjoint.two_passes import first_walk, walk_back
+from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, first_walk, walk_back
 from pathreplay.integrators.lifetimes import careful
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
-from pathreplay.transport.step import choose_step, repeat_step
+from pathreplay.transport.step import Visit, choose_step, repeat_step
 from pathreplay.transport.vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples
 
 
@@ -75,7 +75,7 @@ def first_step(trace: TraceConfig, ctx: mi.BSDFContext | None = None) -> tuple[A
     if trace.media is not None:
         at.medium = mi.MediumPtr(next(filter(None, (shape.interior_medium() for shape in trace.scene.shapes()))))
     u = VertexSamples.draw(drawn)
-    return at, u, choose_step(trace, at, u, drawn, mi.Spectrum(1), on, on, ctx=ctx)
+    return at, u, choose_step(trace, Visit(at, mi.Spectrum(1), on, on), u, drawn, ctx=ctx)
 
 
 def replayed(trace: TraceConfig, at: Arrival, u: VertexSamples, chosen: SampledStep) -> VertexRecord:
@@ -151,7 +151,7 @@ def test_signatures_tell_the_edge_of_a_shape() -> None:
         drawn, on = mi.load_dict({"type": "independent"}), mi.Bool(True)
         drawn.seed(0, 4)
         at = CameraStart(down, drawn, on).choose(trace, on)
-        step = choose_step(trace, at, VertexSamples.draw(drawn), drawn, mi.Spectrum(1), on, on)
+        step = choose_step(trace, Visit(at, mi.Spectrum(1), on, on), VertexSamples.draw(drawn), drawn)
     shape = np.array(step.signature.shape)
     assert shape[0] == shape[1] != shape[2]
     assert list(step.signature.met) == [True, True, True, False]
@@ -171,8 +171,8 @@ def back(scene: mi.Scene, L: float, q: RayDerivative, δL: float) -> mi.Spectrum
         records = dr.alloc_local(record_type(layout), room_for(trace))
         lost, first = NonFiniteCounter(), mi.UInt32(0)
         records, count, _, _, _ = first_walk(trace, start.sampler, path, layout, records, first, lost)
-        given = mi.Spectrum(δL), mi.Spectrum(L), q
-        L, _ = walk_back(trace, layout, records, first, mi.UInt32(1), count - 1, dr.detach(ray), *given, lost)
+        recorded = RecordedPath(layout, records, first, mi.UInt32(1), count - 1, dr.detach(ray))
+        L = walk_back(trace, recorded, PathAdjoint(mi.Spectrum(δL), mi.Spectrum(L), q), lost).L
         dr.eval(L)
     return L
 

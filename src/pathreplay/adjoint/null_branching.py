@@ -15,7 +15,7 @@ import mitsuba as mi
 from pathreplay.adjoint.autodiff import backward
 from pathreplay.adjoint.primal import walk_on
 from pathreplay.transport.path import PathState, next_arrival
-from pathreplay.transport.step import choose_step
+from pathreplay.transport.step import Visit, choose_step
 from pathreplay.transport.vertex import Arrival, Flight, SampledStep, TraceConfig, VertexSamples
 from pathreplay.transport.volume.media import interaction, majorant
 
@@ -74,7 +74,8 @@ def branch_term(trace: TraceConfig, branch: Branch, sampler: mi.Sampler, ray: mi
         one = mi.Spectrum(1)
         flight = Flight(event=active, t=mi.Float(0), density=mi.Float(1), W=one, along=mi.Float(0), σ_s=one)
         u = VertexSamples.draw(sampler)
-        step = choose_step(onward, at, u, sampler, one, branch.depth + 1 < trace.max_depth, active, flight)
+        visit = Visit(at, one, branch.depth + 1 < trace.max_depth, active)
+        step = choose_step(onward, visit, u, sampler, flight)
         at_next = next_arrival(onward, at, step, step.active)
         L, _ = walk_on(onward, sampler, PathState(at_next, one, None, branch.η, branch.depth + 1, step.active))
         L_s = step.e + step.w * L

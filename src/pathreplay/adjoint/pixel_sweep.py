@@ -24,7 +24,7 @@ import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative
 from pathreplay.adjoint.record import Layout, record_type, room_for
-from pathreplay.adjoint.two_passes import first_walk, walk_back
+from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, first_walk, walk_back
 from pathreplay.samplers.pixel_samples import PixelSamples
 from pathreplay.transport.motion import path_moves
 from pathreplay.transport.path import PathState
@@ -85,7 +85,8 @@ def pixel_sweep(
         s -= 1
         others = mi.Float(paths - dr.minimum(size, paths - s // size * size))
         δL = (loss.offset + loss.slope * ((total - sets[s // size]) / others)) / paths
-        first, count, still = s * room, mi.UInt32(counts[s]), RayDerivative.zero()
-        walk_back(trace, layout, records, first, count, first + count - 1, ray0, δL, mi.Spectrum(ends[s]), still, lost)
+        first, count = s * room, mi.UInt32(counts[s])
+        recorded = RecordedPath(layout, records, first, count, first + count - 1, ray0)
+        walk_back(trace, recorded, PathAdjoint(δL, mi.Spectrum(ends[s]), RayDerivative.zero()), lost)
 
     return layout.moves, total / paths

@@ -89,6 +89,16 @@ class Linearised:
     frame_next: RayFrame  # of the next ray
 
 
+@dataclass
+class PeeledPath:
+    """What the first pass of attached replay knows of a path; the second peels it from vertex to vertex."""
+
+    δL: mi.Spectrum
+    L: mi.Spectrum  # β_i L_i
+    q: mi.Vector4f  # adjoint of the ray
+    overflow: mi.Bool  # q was not finite
+
+
 def has_smooth_lobes(trace: TraceConfig) -> bool:
     """Whether any BSDF of the scene has a lobe other than delta lobes."""
     return bool(trace.traits.detached_names or trace.traits.attachables)

@@ -15,7 +15,15 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import NonFiniteCounter, backward
-from pathreplay.adjoint.ray_jacobian import RayFrame, Recovery, length_scale, linearise, local_terms, random_sign
+from pathreplay.adjoint.ray_jacobian import (
+    PeeledPath,
+    RayFrame,
+    Recovery,
+    length_scale,
+    linearise,
+    local_terms,
+    random_sign,
+)
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
@@ -42,7 +50,7 @@ def replay_attached(
             x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
             backward(sum(q0[k] * x[k] for k in range(4)))
-    _peel(trace, again, path, δL, L, q, overflow, lost, recovery, scale)
+    _peel(trace, again, path, PeeledPath(δL, L, q, overflow), lost, recovery, scale)
 
 
 @dr.syntax
@@ -76,15 +84,13 @@ def _peel(
     trace: TraceConfig,
     sampler: mi.Sampler,
     path: PathState,
-    δL: mi.Spectrum,
-    L: mi.Spectrum,
-    q: mi.Vector4f,
-    overflow: mi.Bool,
+    peeled: PeeledPath,
     lost: NonFiniteCounter,
     recovery: Recovery,
     scale: float,
 ) -> None:
     """Second pass: peel L and q, feed the parameters."""
+    δL, L, q, overflow = peeled.δL, peeled.L, peeled.q, peeled.overflow
     Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
     broken = mi.Bool(False)  # this path has been counted as lost
 

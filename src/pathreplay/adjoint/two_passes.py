@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -64,27 +64,42 @@ def first_walk(
     return records, count, L, beyond, branch
 
 
+@dataclass
+class RecordedPath:
+    """A path of which ``count`` vertices, from ``first`` on, stand in the records."""
+
+    layout: Layout
+    records: Any
+    first: mi.UInt32
+    count: mi.UInt32
+    last: mi.UInt32  # index of its last record, where the ray that leaves those vertices arrived or beyond
+    ray0: mi.Ray3f  # has time and wavelengths
+
+
+@dataclass
+class PathAdjoint:
+    """The radiance along a ray of a path, and adjoints."""
+
+    δL: mi.Spectrum  # of the radiance of the whole path
+    L: mi.Spectrum
+    q: RayDerivative  # of the ray; zero where a path ends
+
+
 @dr.syntax
 def walk_back(
     trace: TraceConfig,
-    layout: Layout,
-    records: Any,
-    first: mi.UInt32,
-    count: mi.UInt32,
-    last: mi.UInt32,
-    ray0: mi.Ray3f,
-    δL: mi.Spectrum,
-    L: mi.Spectrum,
-    q: RayDerivative,
+    path: RecordedPath,
+    adjoint: PathAdjoint,
     lost: NonFiniteCounter,
     seen: BaselineStats | None = None,
     rays_only: bool = False,
-) -> tuple[mi.Spectrum, RayDerivative]:
-    """Back-propagate from the last of ``count`` records to the first; gives radiance and ray adjoint there.
+) -> PathAdjoint:
+    """Back-propagate from the last vertex of a path to the first; gives what there is along the ray that arrives there.
 
-    ``L`` is the radiance along the ray that leaves those records, and ``q`` its adjoint: zero where the path ends with
-    them. ``last`` is the index of the path's last record, where that ray arrived or beyond.
+    ``adjoint`` is what there is along the ray that leaves the last.
     """
+    layout, records, first, count, last = path.layout, path.records, path.first, path.count, path.last
+    ray0, δL, L, q = path.ray0, adjoint.δL, adjoint.L, adjoint.q
     broken = mi.Bool(False)  # a part of the adjoint was not finite
 
     while dr.hint(count > 0, exclude=[trace, layout, ray0, lost, seen, rays_only], label="pathreplay: sweep"):
@@ -97,4 +112,4 @@ def walk_back(
             lost.add(breaks & ~broken)
             broken |= breaks
 
-    return L, q
+    return PathAdjoint(δL, L, q)

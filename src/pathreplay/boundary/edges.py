@@ -25,7 +25,7 @@ from pathreplay.adjoint.autodiff import (
     tangents,
 )
 from pathreplay.adjoint.record import Layout, read_back
-from pathreplay.adjoint.two_passes import walk_back
+from pathreplay.adjoint.two_passes import PathAdjoint, RecordedPath, walk_back
 from pathreplay.transport.vertex import TraceConfig
 
 
@@ -100,9 +100,7 @@ def ray_to_camera(
     rays_only: bool = False,
 ) -> RayDerivative:
     """The adjoint of the camera ray, from that of the ray that sees the edge; ``rays_only``: reaching no parameter."""
-    none, k = mi.Spectrum(0), found.k
+    k, none = found.k, mi.Spectrum(0)
     ray0 = dr.detach(places.ray(found.s, found.key)[0])
-    first, count, last = mi.UInt32(0), mi.UInt32(k), mi.UInt32(k)
-    return walk_back(
-        trace, found.layout, found.records, first, count, last, ray0, none, none, q, lost, rays_only=rays_only
-    )[1]
+    path = RecordedPath(found.layout, found.records, mi.UInt32(0), mi.UInt32(k), mi.UInt32(k), ray0)
+    return walk_back(trace, path, PathAdjoint(none, none, q), lost, rays_only=rays_only).q

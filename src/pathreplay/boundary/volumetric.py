@@ -29,7 +29,7 @@ from pathreplay.transport.meet import meet
 from pathreplay.transport.path import PathState
 from pathreplay.transport.signature import edge_normal, outline_gap
 from pathreplay.transport.start import CameraStart
-from pathreplay.transport.step import choose_step
+from pathreplay.transport.step import Visit, choose_step
 from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, VertexSamples
 from pathreplay.transport.volume.media import interaction
 from pathreplay.transport.volume.passage import skip_null, transmittance_past_edge, transmittance_up_to
@@ -176,7 +176,7 @@ def _to_particle(
         here = Flight.none(trace.media)
         here.event, here.t = event, dr.select(event, line.τ - gone, 0)
         u = VertexSamples.draw(numbers)
-        step = choose_step(trace, path.at, u, numbers, path.β, mi.Bool(False), path.active, here)
+        step = choose_step(trace, Visit(path.at, path.β, mi.Bool(False), path.active), u, numbers, here)
         onward, v = path.advance(trace, u, step)
         records[count] = record(layout, v)
         at, k = dr.select(event, path.at, at), dr.select(event, count, k)

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from pathreplay.transport.meet import meet
 from pathreplay.transport.start import CameraStart, behind_emitters
-from pathreplay.transport.step import choose_step
+from pathreplay.transport.step import Visit, choose_step
 from pathreplay.transport.vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples, reciprocal
 from pathreplay.transport.volume.passage import skip_null
 
@@ -40,7 +40,7 @@ class PathState:
         """The random numbers of this vertex, and the step that they choose."""
         u = VertexSamples.draw(sampler)
         β = self.β if self.β_alive is None else self.β_alive
-        return u, choose_step(trace, self.at, u, sampler, β, self.depth + 1 < trace.max_depth, self.active)
+        return u, choose_step(trace, Visit(self.at, β, self.depth + 1 < trace.max_depth, self.active), u, sampler)
 
     def leave(self) -> tuple[PathState, mi.Bool]:
         """The path, ended where the ray that arrives has hit nothing, and where that is so. ``at`` stays what it is."""

@@ -6,6 +6,8 @@ their gradients are their callers' business.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
@@ -26,26 +28,33 @@ from pathreplay.transport.vertex import (
 )
 
 
+@dataclass
+class Visit:
+    """A path that comes to a vertex."""
+
+    at: Arrival
+    β: mi.Spectrum  # throughput, by which real collisions are chosen
+    go_on: mi.Bool  # this is not the last vertex that ``max_depth`` allows
+    active: mi.Bool
+
+
 def choose_step(
     trace: TraceConfig,
-    at: Arrival,
+    visit: Visit,
     u: VertexSamples,
     sampler: mi.Sampler,
-    β: mi.Spectrum,
-    go_on: mi.Bool,
-    active: mi.Bool,
     flight: Flight | None = None,
     ctx: mi.BSDFContext | None = None,
 ) -> SampledStep:
     """The step of a first walk, which draws emitter sample and continuation from the numbers ``u``.
 
-    With media also the flight, choosing real collisions by the throughput ``β``, unless ``flight`` is given, and the
-    shadow ray, both from ``sampler``; null boundaries come back as ``null`` steps, which are not counted as vertices.
-    ``go_on`` is False at the last vertex that ``max_depth`` allows. ``ctx`` has the transport mode (radiance), and
+    With media also the flight, unless ``flight`` is given, and the shadow ray, both from ``sampler``; null boundaries
+    come back as ``null`` steps, which are not counted as vertices. ``ctx`` has the transport mode (radiance), and
     Mitsuba's number of a lobe where surfaces are to scatter by that one alone.
     """
     ctx = mi.BSDFContext() if ctx is None else ctx
-    v = arrive.choose(trace, at, sampler, β, active, flight)
+    at, go_on, active = visit.at, visit.go_on, visit.active
+    v = arrive.choose(trace, at, sampler, visit.β, active, flight)
     link = connect.choose(trace, v, at.medium, u, sampler, go_on)
     to = scatter.choose(trace, v, at, u, ctx, link.light.d, link.lit, go_on)
     reached = link.reaches(to.pdf_light, False)
