@@ -11,11 +11,15 @@ import pytest
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.io import read_image
 from pathreplay.output import picture
-from pathreplay.output.render import render_to_file
+from pathreplay.output.render import RenderOptions, render_to_file
 from pathreplay.platform import memory
 from pathreplay.scenes.loading import load_scene
 
-SIZE = {"size": "12x8", "spp": 4, "seed": 5, "progress": False}
+SIZE = {"size": "12x8", "spp": 4, "seed": 5}
+
+
+def to_file(scene: str, path: Path, **asked: object) -> str:
+    return render_to_file(scene, path, RenderOptions(**asked), progress=False)
 
 
 def direct(integrator: dict, spp: int = 4, seed: int = 5) -> np.ndarray:
@@ -31,7 +35,7 @@ def direct(integrator: dict, spp: int = 4, seed: int = 5) -> np.ndarray:
 )
 def test_it_is_the_picture_of_mitsuba(tmp_path: Path, integrator: str, options: list[str]) -> None:
     path = tmp_path / "image.exr"
-    told = render_to_file("cornell-box", path, integrator=integrator, options=options, **SIZE)
+    told = to_file("cornell-box", path, integrator=integrator, options=options, **SIZE)
     own = {name: int(value) for name, value in (each.split("=") for each in options)}
     np.testing.assert_allclose(read_image(path), direct({"type": integrator, **own}), rtol=1e-5, atol=1e-6)
     assert told.startswith(f"{path}: 12 x 8, 4 samples per pixel")
@@ -39,14 +43,14 @@ def test_it_is_the_picture_of_mitsuba(tmp_path: Path, integrator: str, options: 
 
 
 def test_without_an_integrator_it_is_the_scenes(tmp_path: Path) -> None:
-    render_to_file("cornell-box", tmp_path / "image.exr", **SIZE)
+    to_file("cornell-box", tmp_path / "image.exr", **SIZE)
     expected = direct({"type": "path", "max_depth": 8})
     np.testing.assert_allclose(read_image(tmp_path / "image.exr"), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_a_png_is_srgb(tmp_path: Path) -> None:
     for name in ("image.exr", "image.png"):
-        render_to_file("cornell-box", tmp_path / name, **SIZE)
+        to_file("cornell-box", tmp_path / name, **SIZE)
     linear, decoded = (read_image(tmp_path / name) for name in ("image.exr", "image.png"))
     assert decoded.shape == (8, 12, 3)
     np.testing.assert_allclose(decoded, np.clip(linear, 0, 1), atol=0.006)
@@ -54,8 +58,8 @@ def test_a_png_is_srgb(tmp_path: Path) -> None:
 
 def test_sensors_are_named_or_counted_and_the_scene_takes_parameters(tmp_path: Path) -> None:
     for name, sensor in (("a", "closeup"), ("b", "1"), ("c", "overview")):
-        render_to_file(
-            "cornell-box-photo", tmp_path / f"{name}.exr", sensor=sensor, spp=1, progress=False,
+        to_file(
+            "cornell-box-photo", tmp_path / f"{name}.exr", sensor=sensor, spp=1,
             define=["resolution=8", "texture=4"],
         )  # fmt: skip
     a, b, c = (read_image(tmp_path / f"{name}.exr") for name in "abc")
@@ -66,11 +70,11 @@ def test_channels_of_an_aov_have_their_names(tmp_path: Path) -> None:
     import OpenEXR
 
     path = tmp_path / "image.exr"
-    render_to_file("cornell-box", path, integrator="aov", options=["aovs=far:depth"], **SIZE)
+    to_file("cornell-box", path, integrator="aov", options=["aovs=far:depth"], **SIZE)
     with OpenEXR.File(str(path)) as file:
         assert [name for name in file.channels()] == ["far.T"]
     with pytest.raises(PathreplayError, match=r"'far\.T'; use \.exr"):
-        render_to_file("cornell-box", tmp_path / "image.png", integrator="aov", options=["aovs=far:depth"], **SIZE)
+        to_file("cornell-box", tmp_path / "image.png", integrator="aov", options=["aovs=far:depth"], **SIZE)
     assert not (tmp_path / "image.png").exists()
 
 
@@ -138,7 +142,7 @@ def test_what_cannot_be_is_told_and_leaves_the_file(
     if path.parent == tmp_path:
         path.write_bytes(b"old")
     with pytest.raises(PathreplayError, match=line):
-        render_to_file("cornell-box", path, **{**SIZE, **changes})
+        to_file("cornell-box", path, **{**SIZE, **changes})
     if path.parent == tmp_path:
         assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
@@ -152,5 +156,5 @@ def test_an_interrupt_leaves_the_file(tmp_path: Path, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr("pathreplay.platform.atomic_files.os.replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        render_to_file("cornell-box", path, **SIZE)
+        to_file("cornell-box", path, **SIZE)
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

@@ -238,15 +238,12 @@ def render(
 ) -> None:
     """Render a scene with any integrator to one file, which is written atomically."""
     with interrupts.undisturbed():  # as in `optimize`
-        from pathreplay.output.render import render_to_file
+        from pathreplay.output.render import RenderOptions, render_to_file
         from pathreplay.platform import backend
 
         backend.set_variant(variant)
-    line = render_to_file(
-        scene, output, integrator=integrator, options=option or (), sensor=sensor, size=size, spp=spp, seed=seed,
-        define=define or (), progress=not quiet,
-    )  # fmt: skip
-    typer.echo(line)
+    asked = RenderOptions(integrator, option or (), sensor, size, spp, seed, define or ())
+    typer.echo(render_to_file(scene, output, asked, progress=not quiet))
 
 
 @app.command(short_help="Export what a run recovered.")

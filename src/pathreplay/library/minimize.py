@@ -80,7 +80,7 @@ class Result:
         return self.problem.render({v.key: self.values[v.key] for v in self.problem.built.variables}, view, spp)
 
 
-def minimize(
+def minimize(  # noqa: PLR0913 (of which most are keywords)
     problem: Problem,
     optimizer: str | Mapping[str, Any] | Stepper | Any = "adam",
     steps: int = 200,

@@ -126,7 +126,7 @@ class Problem:
         PathreplayError: for whatever cannot work, before anything is rendered.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 (of which most are keywords)
         self,
         scene: mi.Scene | Mapping[str, Any] | str | Path,
         parameters: Mapping[str, Parameter | None] | Sequence[str] | str,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,36 +25,32 @@ _SECONDS = 10.0
 _MOST_SPP = 10**6
 
 
-def render_to_file(
-    scene: str,
-    output: Path,
-    *,
-    integrator: str | None = None,
-    options: Sequence[str] = (),
-    sensor: str | None = None,
-    size: str | None = None,
-    spp: int | None = None,
-    seed: int = 0,
-    define: Sequence[str] = (),
-    progress: bool = True,
-) -> str:
+@dataclass(frozen=True)
+class RenderOptions:
+    """What to render. None means the scene's own setting."""
+
+    integrator: str | None = None  # plugin name; without one in the scene: path
+    options: Sequence[str] = ()  # integrator properties, each NAME=VALUE
+    sensor: str | None = None  # id or index
+    size: str | None = None  # WIDTHxHEIGHT or WIDTH
+    spp: int | None = None
+    seed: int = 0
+    define: Sequence[str] = ()  # scene parameters, each NAME=VALUE
+
+
+def render_to_file(scene: str, output: Path, asked: RenderOptions, progress: bool = True) -> str:
     """Render a scene to a file in the active variant; returns a line about it.
 
     Args:
         scene: path of an XML file, or name of a built-in scene.
         output: .exr or .png file.
-        integrator: plugin name; the default is the scene's integrator, else ``path``.
-        options: integrator properties, each ``NAME=VALUE``.
-        sensor: id or index; the default is the first sensor.
-        size: film size, ``WIDTHxHEIGHT`` or ``WIDTH``.
-        spp: samples per pixel; the default is the sensor's.
-        seed: seed of all random numbers.
-        define: scene parameters, each ``NAME=VALUE``.
+        asked: integrator, sensor, film size and samples.
         progress: show a bar on stderr.
 
     Raises:
         PathreplayError: an argument is invalid, or the scene cannot be rendered; the file is unchanged then.
     """
+    integrator, options, spp, seed = asked.integrator, asked.options, asked.spp, asked.seed
     ending = output.suffix.lower()
     if ending not in (".exr", ".png"):
         raise PathreplayError(f"{output} ends in {shown(ending)}; give {_OPTION} a name that ends in .exr or .png")
@@ -66,11 +63,11 @@ def render_to_file(
     described = _flat("-I", given, options)
     if integrator is None and options:
         raise PathreplayError(f"-I {shown(options[0])} is an option of an integrator; name it with --integrator")
-    loaded = load_scene(scene, **_flat("-D", {}, define))
+    loaded = load_scene(scene, **_flat("-D", {}, asked.define))
     renderer = load_integrator(described) if given else loaded.integrator() or load_integrator({"type": "path"})
-    camera = find_sensor(loaded, sensor)
-    if size is not None:
-        set_size(camera, size)
+    camera = find_sensor(loaded, asked.sensor)
+    if asked.size is not None:
+        set_size(camera, asked.size)
     samples = camera.sampler().sample_count() if spp is None else spp
     begin = time.perf_counter()
     with _bar(progress) as tell:

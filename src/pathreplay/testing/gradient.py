@@ -67,7 +67,7 @@ class GradientCheck(Judgement):
         return "\n".join([f"{self.key} ({self.direction})", *(f"  {name:<{width}}  {value}" for name, value in rows)])
 
 
-def check_gradient(
+def check_gradient(  # noqa: PLR0913 (of which most are keywords)
     scene: mi.Scene,
     key: str,
     *,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
 from types import MappingProxyType
@@ -117,37 +117,40 @@ def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], a
     return targets
 
 
+@dataclass(frozen=True)
+class Reading:
+    """How image files of targets are read."""
+
+    alpha: str
+    """Treatment of the alpha channel, see `Target.alpha`."""
+    hidden: bool = False
+    """Whether the integrator hides directly visible emitters."""
+    resize: bool = False
+    """Whether images are resampled to the size of the film."""
+    lenses: Mapping[str, Lens] = field(default_factory=dict)
+    """Lens distortions to remove, by view."""
+
+
 def read_targets(
-    files: Mapping[str, str],
-    alpha: str,
-    scene: mi.Scene,
-    sensors: dict[str, int],
-    base: Path,
-    *,
-    resize: bool = False,
-    lenses: Mapping[str, Lens] = MappingProxyType({}),
-    hidden: bool = False,
-    album: Album,
+    files: Mapping[str, str], how: Reading, scene: mi.Scene, sensors: dict[str, int], base: Path, album: Album
 ) -> tuple[Targets, tuple[str, ...]]:
     """Read target images from files.
 
     Args:
         files: image file of each view.
-        alpha: treatment of the alpha channel, see `Target.alpha`.
+        how: what is done to the images.
         scene: scene of the job.
         sensors: index of the sensor of each view.
         base: folder that relative paths start from.
-        resize: whether to resample images to the size of the film.
-        lenses: lens distortions to remove, by view.
-        hidden: whether the integrator hides directly visible emitters.
         album: store of the images.
 
     Returns:
         The targets, with weights for alpha = 'mask' and for undistorted images, and notes for the user.
 
     Raises:
-        PathreplayError: an image cannot be read, or does not fit its sensor or ``alpha``.
+        PathreplayError: an image cannot be read, or does not fit its sensor or ``how.alpha``.
     """
+    alpha, lenses = how.alpha, how.lenses
     targets: dict[str, Image] = {}
     weights: dict[str, Image] = {}
     notes: list[str] = []
@@ -155,7 +158,7 @@ def read_targets(
     for name, file in files.items():
         path, what = find_image(file, base), f"Target image '{file}'"
         shape = picture_shape(scene.sensors()[sensors[name]])
-        image = _read(what, path, name, shape, resize)
+        image = _read(what, path, name, shape, how.resize)
         for oddity in oddities(path):
             odd.setdefault(oddity, []).append(file)
         _require_alpha(what, image, alpha, name, shape)
@@ -171,7 +174,7 @@ def read_targets(
             opaque = image[:, :, -1:] * weights.get(name, np.float32(1))
             weights[name] = as_weight(f"the alpha of '{file}'", opaque, name)
             image = unpremultiplied(image)
-        elif alpha == "scene" and not hidden:
+        elif alpha == "scene" and not how.hidden:
             image = over(image, background(scene, sensors[name]))
         targets[name] = album.keep(adapted_image(what, image, f"sensor '{name}' renders", shape[2]))
         if name in weights:

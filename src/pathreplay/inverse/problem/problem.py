@@ -25,6 +25,7 @@ from pathreplay.inverse.config.tables import Plugin
 from pathreplay.inverse.config.user_functions import Modules
 from pathreplay.inverse.dataset.capture import Shot, fingerprint, read_capture
 from pathreplay.inverse.dataset.targets import (
+    Reading,
     Targets,
     by_view,
     masked,
@@ -247,7 +248,7 @@ def build_problem(
     derived = make_derived(params, derivations, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
-    targets, truth, messages = _seen(config, targets, used, scene, params, sensors, keys, base, album)
+    targets, truth, messages = _seen(config, targets, used, _Opened(scene, params, keys, sensors), base, album)
     notes += messages
     if missing := set(sensors) - set(targets.images):
         raise PathreplayError(f"The run folder has no target image of sensor '{missing.pop()}'; start a new run")
@@ -290,16 +291,18 @@ def _loaded(
     return scene, config, notes + differences
 
 
+@dataclass(frozen=True)
+class _Opened:
+    """The scene of a job, the parameters that it recovers, and its sensors by view."""
+
+    scene: mi.Scene
+    params: mi.SceneParameters
+    keys: list[str]
+    sensors: dict[str, int]
+
+
 def _seen(
-    config: Config,
-    targets: Targets | None,
-    shots: Mapping[str, Shot],
-    scene: mi.Scene,
-    params: mi.SceneParameters,
-    sensors: dict[str, int],
-    keys: list[str],
-    base: Path,
-    album: Album,
+    config: Config, targets: Targets | None, shots: Mapping[str, Shot], opened: _Opened, base: Path, album: Album
 ) -> tuple[Targets, dict[str, Array], tuple[str, ...]]:
     """Read or render the targets unless they are given; returns them, true values by key, and notes for the user."""
     truth: dict[str, Array] = {}
@@ -307,18 +310,18 @@ def _seen(
     first = targets is None
     if not config.brings_pictures:
         other = target_scene(config, base)
-        truth = truth_of(other, params, keys)
+        truth = truth_of(other, opened.params, opened.keys)
         if targets is None:
             with one_thread(config.deterministic):
-                targets = Targets(rendered_targets(config, other, sensors, album), {})
+                targets = Targets(rendered_targets(config, other, opened.sensors, album), {})
         # Dr.Jit traces virtual calls through all live instances, so a live target scene would enlarge every kernel.
         del other
         gc.collect()
     elif targets is None:
-        targets, notes = _pictures(config, shots, scene, sensors, base, album)
+        targets, notes = _pictures(config, shots, opened.scene, opened.sensors, base, album)
     if first and config.target.masks is not None:
-        masks = by_view("masks", config.target.masks, sensors, base)
-        targets = masked(targets, read_masks(masks, scene, sensors, base))
+        masks = by_view("masks", config.target.masks, opened.sensors, base)
+        targets = masked(targets, read_masks(masks, opened.scene, opened.sensors, base))
     return targets, truth, notes
 
 
@@ -352,20 +355,19 @@ def _pictures(
     config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path, album: Album
 ) -> tuple[Targets, tuple[str, ...]]:
     """Read the targets from the files of a capture, or from files that the job names; returns notes, too."""
-    alpha, hidden = config.target.alpha, bool((config.integrator.model_extra or {}).get("hide_emitters"))
+    how = Reading(config.target.alpha, hidden=bool((config.integrator.model_extra or {}).get("hide_emitters")))
     if config.capture is None:
         files = by_view("target images", config.target.images or [], sensors, base)
-        return read_targets(files, alpha, scene, sensors, base, hidden=hidden, album=album)
+        return read_targets(files, how, scene, sensors, base, album)
     if other := set(sensors) - set(shots):
         raise PathreplayError(f"sensors: '{min(other)}' is not a camera of the capture and has no image; remove it")
     pictures = {name: str(shot.image.resolve()) for name, shot in shots.items()}
     masks = {name: str(shot.mask.resolve()) for name, shot in shots.items() if shot.mask is not None}
-    if masks and alpha == "mask":
+    if masks and how.alpha == "mask":
         raise PathreplayError("target: the capture has masks, which exclude alpha = 'mask'; remove one of them")
     lenses = {name: shot.lens for name, shot in shots.items() if shot.lens is not None}
-    targets, notes = read_targets(
-        pictures, alpha, scene, sensors, base, resize=True, lenses=lenses, hidden=hidden, album=album
-    )
+    how = replace(how, resize=True, lenses=lenses)
+    targets, notes = read_targets(pictures, how, scene, sensors, base, album)
     return masked(targets, read_masks(masks, scene, sensors, base, resize=True, lenses=lenses)), notes
 
 
