@@ -5,7 +5,7 @@ What is remembered stands in one table, from which the type of a record, its wri
 
 from __future__ import annotations
 
-from dataclasses import dataclass, make_dataclass, replace
+from dataclasses import dataclass, fields, make_dataclass, replace
 from functools import cache, reduce
 from typing import Any
 
@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.platform.device import Device, device_of
+from pathreplay.transport import vertex
 from pathreplay.transport.vertex import (
     Arrival,
     Flight,
@@ -149,25 +150,43 @@ BITS = (
 LOBE_SHIFT = 16
 
 
+def _require_known(place: str, remembered: str) -> None:
+    """Raise TypeError for a place that no `VertexRecord` has, or a condition that no layout decides."""
+    kind: Any = VertexRecord
+    for name in place.split("."):
+        types = {each.name: str(each.type).split(" ")[0] for each in fields(kind)}
+        if name not in types:
+            raise TypeError(f"{kind.__name__} has no '{name}': '{place}' cannot be recorded")
+        kind = getattr(vertex, types[name], None)
+        if kind is None:  # a class of Mitsuba's or Dr.Jit's
+            break
+    if remembered not in {each.name for each in fields(Layout)} | {"varies"}:
+        raise TypeError(f"Layout has no '{remembered}', on which '{place}' depends")
+
+
+for _place, *_, _remembered in (*FIELDS, *BITS):  # what is renamed is noticed here, and not in a kernel
+    _require_known(_place, _remembered)
+
+
 @cache
 def record_type(layout: Layout) -> type:
     """The dataclass that holds a vertex."""
-    fields = {_name(place): _plain(kind) for place, kind, remembered in FIELDS if getattr(layout, remembered)}
-    return make_dataclass("Record", [*fields.items(), ("word", mi.UInt32)])
+    kept = {_name(place): _plain(kind) for place, kind, remembered in FIELDS if getattr(layout, remembered)}
+    return make_dataclass("Record", [*kept.items(), ("word", mi.UInt32)])
 
 
 def record(layout: Layout, v: VertexRecord) -> Any:
     """A vertex, to be written."""
-    fields = {}
+    kept = {}
     for place, kind, remembered in FIELDS:
         if getattr(layout, remembered):
             value = reduce(getattr, place.split("."), v)
-            fields[_name(place)] = dr.reinterpret_array(mi.UInt32, value) if kind.endswith("Ptr") else value
+            kept[_name(place)] = dr.reinterpret_array(mi.UInt32, value) if kind.endswith("Ptr") else value
     word = v.kept.lobe << LOBE_SHIFT
     for k, (place, remembered) in enumerate(BITS):
         if getattr(layout, remembered):
             word |= dr.select(reduce(getattr, place.split("."), v), mi.UInt32(1 << k), 0)
-    return record_type(layout)(**fields, word=word)
+    return record_type(layout)(**kept, word=word)
 
 
 def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, ray0: mi.Ray3f) -> VertexRecord:
