@@ -91,12 +91,12 @@ class Linearised:
 
 @dataclass
 class PeeledPath:
-    """What the first pass of attached replay knows of a path; the second peels it from vertex to vertex."""
+    """Result of the first pass of attached replay, which the second updates from vertex to vertex."""
 
-    δL: mi.Spectrum
+    δL: mi.Spectrum  # adjoint of the radiance of the path
     L: mi.Spectrum  # β_i L_i
-    q: mi.Vector4f  # adjoint of the ray
-    overflow: mi.Bool  # q was not finite
+    q: mi.Vector4f  # adjoint of the ray, in the coordinates of its `RayFrame`
+    overflow: mi.Bool  # q was not finite, and is zero
 
 
 def has_smooth_lobes(trace: TraceConfig) -> bool:

@@ -151,7 +151,7 @@ LOBE_SHIFT = 16
 
 
 def _require_known(place: str, remembered: str) -> None:
-    """Raise TypeError for a place that no `VertexRecord` has, or a condition that no layout decides."""
+    """Raise TypeError if `VertexRecord` has no such field, or `Layout` no such condition."""
     kind: Any = VertexRecord
     for name in place.split("."):
         types = {each.name: str(each.type).split(" ")[0] for each in fields(kind)}
@@ -164,7 +164,7 @@ def _require_known(place: str, remembered: str) -> None:
         raise TypeError(f"Layout has no '{remembered}', on which '{place}' depends")
 
 
-for _place, *_, _remembered in (*FIELDS, *BITS):  # what is renamed is noticed here, and not in a kernel
+for _place, *_, _remembered in (*FIELDS, *BITS):  # fails at import, rather than in a kernel, after a rename
     _require_known(_place, _remembered)
 
 

@@ -66,23 +66,23 @@ def first_walk(
 
 @dataclass
 class RecordedPath:
-    """A path of which ``count`` vertices, from ``first`` on, stand in the records."""
+    """``count`` consecutive vertices of a path in the records, from index ``first`` on."""
 
     layout: Layout
     records: Any
     first: mi.UInt32
     count: mi.UInt32
-    last: mi.UInt32  # index of its last record, where the ray that leaves those vertices arrived or beyond
-    ray0: mi.Ray3f  # has time and wavelengths
+    last: mi.UInt32  # index of the last record of the whole path
+    ray0: mi.Ray3f  # provides time and wavelengths
 
 
 @dataclass
 class PathAdjoint:
-    """The radiance along a ray of a path, and adjoints."""
+    """Radiance along a ray of a path, and adjoints."""
 
-    δL: mi.Spectrum  # of the radiance of the whole path
-    L: mi.Spectrum
-    q: RayDerivative  # of the ray; zero where a path ends
+    δL: mi.Spectrum  # adjoint of the radiance of the path
+    L: mi.Spectrum  # radiance along the ray
+    q: RayDerivative  # adjoint of the ray; zero where the path ends
 
 
 @dr.syntax
@@ -94,9 +94,10 @@ def walk_back(
     seen: BaselineStats | None = None,
     rays_only: bool = False,
 ) -> PathAdjoint:
-    """Back-propagate from the last vertex of a path to the first; gives what there is along the ray that arrives there.
+    """Back-propagate from the last of the recorded vertices to the first.
 
-    ``adjoint`` is what there is along the ray that leaves the last.
+    Takes the ``adjoint`` along the ray that leaves the last vertex, and returns that along the ray that arrives at the
+    first.
     """
     layout, records, first, count, last = path.layout, path.records, path.first, path.count, path.last
     ray0, δL, L, q = path.ray0, adjoint.δL, adjoint.L, adjoint.q

@@ -167,7 +167,7 @@ class PathReplayIntegrator(PathIntegrator):
         return not why
 
     def is_recordable(self, has_media: bool) -> bool:
-        """Always: it looks at nothing on the host while it renders."""
+        """Always: rendering reads nothing on the host."""
         return True
 
     def supports_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
@@ -220,7 +220,7 @@ class PathReplayIntegrator(PathIntegrator):
     def pixel_pass(
         self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
     ) -> tuple[mi.TensorXf, PassState]:
-        """Image and state of a pass: see `render_value_and_grad`, whose offset and slope are the ``derivative``."""
+        """Return image and state of `render_value_and_grad`, whose offset and slope are the ``derivative``."""
         offset, slope = derivative
         some = None if pixels is None else mi.UInt32(pixels)
         with reached(view.scene, view.sensor, zero_is_told=True), self._passing(), dr.isolate_grad():
@@ -241,7 +241,7 @@ class PathReplayIntegrator(PathIntegrator):
         return found.image, state.after(found)
 
     def begin(self, scene: mi.Scene) -> PassState:
-        """See `PathIntegrator`; with what is known of media, but in a user's recording, which would not learn."""
+        """See `PathIntegrator`. Adds the control variate of media, except in a user's recording, which cannot learn."""
         state = PathIntegrator.begin(self, scene)
         if not state.is_complete or not facts_of(scene).has_media:
             return state
@@ -249,7 +249,7 @@ class PathReplayIntegrator(PathIntegrator):
         return replace(state, guess=known.guess, passes=known.passes)
 
     def keep(self, scene: mi.Scene, state: PassState) -> None:
-        """See `PathIntegrator`. Nothing in a user's recording, which cannot look at what was found."""
+        """See `PathIntegrator`. Does nothing in a user's recording, which cannot read results."""
         if is_recording():
             return
         found = state.found
@@ -260,13 +260,13 @@ class PathReplayIntegrator(PathIntegrator):
             self.baseline = ref(facts_of(scene)), known if found.seen is None else known.after(found.seen)
 
     def _known(self, scene: mi.Scene) -> BaselineState:
-        """What is known of the media of a scene: of another than the last, nothing."""
+        """Return what is known of the media of a scene; nothing unless it is the last one that was differentiated."""
         if self.baseline is None or self.baseline[0]() is not facts_of(scene):
             return BaselineState.fresh(scene.bbox())
         return self.baseline[1]
 
     def _learned(self, view: Pass, trace: TraceConfig, state: PassState) -> Baseline | None:
-        """What was learned of this scene so far; nothing is its own judge."""
+        """See `PathIntegrator`. A pass never uses a control variate that it contributed to, which would bias it."""
         for doubt in filter(None, (*doubts(trace), *(term.note(trace) for term in self.terms))):
             self._tell_once(doubt)
         if trace.media is None or state.guess is None:
@@ -287,7 +287,7 @@ class PathReplayIntegrator(PathIntegrator):
         self.baseline = ref(facts_of(scene)), baseline
 
     def _told(self, view: Pass, trace: TraceConfig, found: TermResult) -> None:
-        """See `PathIntegrator`: of edges that move."""
+        """Note moving edges that are not differentiated: see `PathIntegrator`."""
         if not found.moves or EDGES in self.warned or self.boundary in ("auto", "all"):
             return
         note, named = missing_edges(trace, view.sensor, self.boundary)

@@ -94,12 +94,12 @@ class Sums:
 
 @contextmanager
 def summed(scene: mi.Scene, of_parts: Sequence[Pass]) -> Iterator[Callable[[], None]]:
-    """Within this block, which back-propagates parts one by one, gradients add up: call what it gives after each."""
+    """Add up the gradients of parts that are back-propagated one by one; yields a function to call after each."""
     sums = Sums(scene) if len(of_parts) > 1 else None
     try:
         yield (lambda: None) if sums is None else sums.take
     finally:
-        if sums is not None:  # also of a view that no parameter reaches: what others gave stays
+        if sums is not None:  # also if no parameter reaches this view: gradients of others stay
             sums.give()
 
 

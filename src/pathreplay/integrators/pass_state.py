@@ -1,4 +1,4 @@
-"""The state of a pass: what it is given of its scene and of earlier passes, and what it has found."""
+"""The state of a pass: its inputs from the scene and from earlier passes, and its results."""
 
 from __future__ import annotations
 
@@ -12,26 +12,32 @@ from pathreplay.transport.facts.traits import Tables
 
 @dataclass(frozen=True)
 class PassState:
-    """A pass takes a state and returns it with what it found; see `PathIntegrator.begin` and `PathIntegrator.keep`.
+    """Passed to a pass, and returned by it with the results added.
 
-    A function that `dr.freeze` records takes the state as an argument, since it cannot look at the scene on the host.
+    `PathIntegrator.begin` makes one, `PathIntegrator.keep` reports the results and learns from them. A function that is
+    recorded by `dr.freeze` takes the state as an argument, since it cannot inspect the scene on the host.
     """
 
-    tables: Tables | None = None  # of the scene
-    branches: bool | None = None  # see `Media`; None: found out by the pass
-    guess: Baseline | None = None  # of the radiance in media
-    passes: frozenset[Hashable] = frozenset()  # keys of those that the guess was learned from
+    tables: Tables | None = None
+    """Lookup tables of the scene."""
+    branches: bool | None = None
+    """`Media.branches`; None: determined by the pass."""
+    guess: Baseline | None = None
+    """Control variate for the radiance in media."""
+    passes: frozenset[Hashable] = frozenset()
+    """Keys of the passes that ``guess`` was learned from."""
     found: TermResult = field(default_factory=TermResult)
+    """Sum of the results of the passes since `begin`, without images."""
 
     @property
     def is_complete(self) -> bool:
-        """Whether all of the scene was looked at that a pass may need: a recording cannot do that."""
+        """Whether the scene was inspected outside of a recording."""
         return self.branches is not None
 
     def after(self, found: TermResult) -> PassState:
-        """The state after a pass that found so much; images are not kept."""
+        """Return the state with the result of a pass added."""
         return replace(self, found=self.found + replace(found, image=None))
 
     def to_record(self) -> PassState:
-        """The state for passes that `dr.freeze` records: these cannot read their keys."""
+        """Return the input of a recorded pass, which cannot read its own key and compare it with ``passes``."""
         return replace(self, passes=frozenset())

@@ -66,8 +66,8 @@ class PathIntegrator:
     Classes below have a ``name`` (the plugin's), ``attach`` (as `TraceConfig` has it) and the term ``interior``. Raises
     PathreplayError for unusable properties and in polarised variants.
 
-    Methods whose names end in ``_pass`` take a `PassState`. Mitsuba's methods have no place for one: they `begin` a
-    state for each pass and `keep` what it found.
+    Methods whose names end in ``_pass`` take a `PassState`. Mitsuba's methods, which have no such parameter, `begin` a
+    state for each pass and `keep` its results.
     """
 
     name = ""
@@ -91,7 +91,7 @@ class PathIntegrator:
         hide_emitters = flag(props, self.name, "hide_emitters", False)
         mitsuba_integrator().__init__(self, props)
         self.hide_emitters = hide_emitters
-        self.warned: set[str] = set()  # what has been said in the log
+        self.warned: set[str] = set()  # notes that were logged or silenced
         self.tables: Tables | None = None  # of the scene that was rendered last: there a user's `dr.freeze` finds them
 
     @property
@@ -150,7 +150,7 @@ class PathIntegrator:
                 add_up()
 
     def image_pass(self, view: Pass, state: PassState) -> mi.TensorXf:
-        """The image of a pass, detached."""
+        """Render the image of a pass, detached."""
         made = None
         for part in parts(view):
             with self._passing():
@@ -186,9 +186,9 @@ class PathIntegrator:
         return *primal(self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
 
     def begin(self, scene: mi.Scene) -> PassState:
-        """The state with which a pass over a scene begins.
+        """Make the state of a pass over a scene.
 
-        A pass that a user's `dr.freeze` records finds as much in the scene as a recording can.
+        In a recording by a user's `dr.freeze` it holds what a recording can find out.
         """
         with careful():
             facts = facts_of(scene)
@@ -198,7 +198,7 @@ class PathIntegrator:
             return PassState(self.tables, facts.branches())
 
     def keep(self, scene: mi.Scene, state: PassState) -> None:
-        """Report what passes found that began with the state of this integrator, and learn from it."""
+        """Report the results of passes whose state came from `begin`, and learn from them."""
 
     def _planned(self, view: Pass, state: PassState) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
         """A gradient pass as terms see it, how it walks, and the terms that it adds up."""
@@ -209,10 +209,10 @@ class PathIntegrator:
         return None
 
     def _told(self, view: Pass, trace: TraceConfig, found: TermResult) -> None:
-        """Say what there is to say of a pass whose kernels have been launched."""
+        """Log notes about a pass, after its kernels were launched."""
 
     def pass_of(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Pass:
-        """The pass that is asked for."""
+        """Make a pass from the arguments of Mitsuba's methods."""
         self._require_active(scene)
         return Pass.of(scene, sensor, seed, spp, self.even)
 
@@ -262,21 +262,21 @@ class PathIntegrator:
         return False
 
     def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
-        """Why there is no image with a gradient in one pass, with the way out; "" where there is."""
+        """Return why `pixel_pass` cannot be used, with the remedy; "" if it can."""
         return whole_pictures(type(self).__name__)
 
     def pixel_pass(
         self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
     ) -> tuple[mi.TensorXf, PassState]:
-        """There is none. Raises PathreplayError."""
+        """Not available. Raises PathreplayError."""
         raise PathreplayError(self.why_no_pixel_sweep(view.scene))
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """What gradient passes have learned: nothing."""
+        """Return what gradient passes have learned: nothing."""
         return {}
 
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None:
-        """Go on with what `state_dict` told. Raises PathreplayError where that was something."""
+        """Restore the result of `state_dict`. Raises PathreplayError unless it is empty."""
         require_nothing_learned(learned)
 
     def options(self) -> dict[str, Any]:
@@ -284,7 +284,7 @@ class PathIntegrator:
         return {}
 
     def silence(self, notes: Iterable[str]) -> None:
-        """Say nothing of these in the log."""
+        """Do not log these notes."""
         self.warned.update(notes)
 
     def _described(self, **more: Any) -> str:

@@ -1,7 +1,4 @@
-"""Integrators as objectives use them: passes take a `PassState` and return it with what they found.
-
-Ours do. `stateful` makes such integrators of Mitsuba's own.
-"""
+"""The interface of integrators whose passes take and return a `PassState`, and an adapter for Mitsuba's integrators."""
 
 from __future__ import annotations
 
@@ -19,28 +16,28 @@ from pathreplay.integrators.pass_state import PassState
 
 Learned = Mapping[str, np.ndarray]
 _RECORDABLE = frozenset({"PRBIntegrator", "BasicPRBIntegrator"})
-"""Mitsuba's that look at nothing on the host while they render, by class."""
+"""Classes of Mitsuba's integrators that `dr.freeze` can record."""
 _PROJECTIVE = "Projective"
-"""In the class names of Mitsuba's that sample edges."""
+"""Part of the class names of Mitsuba's integrators that have boundary terms."""
 
 
 @runtime_checkable
 class StatefulIntegrator(Protocol):
-    """An integrator whose passes take a state and return it: see `PathIntegrator`, which documents the methods."""
+    """An integrator whose passes take and return a `PassState`; `PathIntegrator` documents the other methods."""
 
     @property
     def boundary(self) -> str:
-        """Boundary terms that are estimated, as the property of `pathreplay` has it."""
+        """Estimated boundary terms, as in the property ``boundary`` of `pathreplay`."""
 
     @property
     def warned(self) -> Collection[str]:
-        """What has been said in the log."""
+        """Notes that were logged or silenced."""
 
     def silence(self, notes: Iterable[str]) -> None:
-        """Say nothing of these in the log."""
+        """Do not log these notes."""
 
     def is_recordable(self, has_media: bool) -> bool:
-        """Whether `dr.freeze` can record its passes in a scene with or without media, as far as that is known."""
+        """Return whether `dr.freeze` can record its passes, as far as is known beforehand."""
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool: ...
 
@@ -65,18 +62,18 @@ class StatefulIntegrator(Protocol):
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None: ...
 
     def options(self) -> dict[str, Any]:
-        """The properties of `pathreplay` that stand for this one, beside those that all integrators of paths share."""
+        """Return the properties of a `pathreplay` that estimates the same, beyond those of all path integrators."""
 
 
 @dataclass(frozen=True)
 class Stateless:
-    """An integrator of Mitsuba's as a `StatefulIntegrator`: it takes nothing from a state, and learns nothing."""
+    """Adapter of an integrator of Mitsuba's: its passes return the state as it is, and learn nothing."""
 
     integrator: mi.Integrator
 
     @property
     def name(self) -> str:
-        """Its class."""
+        """Name of its class."""
         return type(self.integrator).__name__
 
     @property
@@ -88,13 +85,13 @@ class Stateless:
         return frozenset()
 
     def silence(self, notes: Iterable[str]) -> None:
-        """Nothing is said."""
+        """Nothing is logged."""
 
     def is_recordable(self, has_media: bool) -> bool:
         return self.name in _RECORDABLE and not has_media
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:
-        """Not known, and so assumed."""
+        """Unknown, hence assumed."""
         return True
 
     def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
@@ -107,7 +104,7 @@ class Stateless:
         return PassState()
 
     def keep(self, scene: mi.Scene, state: PassState) -> None:
-        """Nothing."""
+        """Nothing is reported."""
 
     def image_pass(self, view: Pass, state: PassState) -> mi.TensorXf:
         with dr.suspend_grad():
@@ -122,7 +119,7 @@ class Stateless:
     def pixel_pass(
         self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
     ) -> tuple[mi.TensorXf, PassState]:
-        """There is none. Raises PathreplayError."""
+        """Not available. Raises PathreplayError."""
         raise PathreplayError(whole_pictures(self.name))
 
     def state_dict(self) -> dict[str, np.ndarray]:
@@ -136,17 +133,17 @@ class Stateless:
 
 
 def stateful(integrator: mi.Integrator) -> StatefulIntegrator:
-    """The integrator itself if it is one of ours, else as such a one."""
+    """Return the integrator itself if it has the interface, otherwise with an adapter."""
     return integrator if isinstance(integrator, StatefulIntegrator) else Stateless(integrator)
 
 
 def whole_pictures(name: str) -> str:
-    """Why an integrator of this class sweeps no pixels, with the way out."""
+    """Return why an integrator of this class has no pixel sweep, with the remedy."""
     return f"{name} renders whole pictures; take the integrator 'pathreplay'"
 
 
 def require_nothing_learned(learned: Learned) -> None:
-    """Raise PathreplayError where an integrator that learns nothing is to go on with what was learned."""
+    """Raise PathreplayError if an integrator without learned state is given one."""
     if learned:
         raise PathreplayError(
             "The checkpoint holds what another integrator has learned of media; set the config's 'integrator' "

@@ -30,11 +30,11 @@ from pathreplay.transport.vertex import (
 
 @dataclass
 class Visit:
-    """A path that comes to a vertex."""
+    """State of a path that arrives at a vertex."""
 
     at: Arrival
-    β: mi.Spectrum  # throughput, by which real collisions are chosen
-    go_on: mi.Bool  # this is not the last vertex that ``max_depth`` allows
+    β: mi.Spectrum  # throughput; real collisions are sampled in proportion to it
+    go_on: mi.Bool  # False at the last vertex that ``max_depth`` allows
     active: mi.Bool
 
 

@@ -37,45 +37,48 @@ _OTHER = 0x5EED
 
 @dataclass(frozen=True)
 class ViewTarget:
-    """What the picture of a view is to be, as tensors."""
+    """Target of a view, as tensors."""
 
     target: mi.TensorXf
-    weight: mi.TensorXf | None = None  # how much pixels count, see `mean_loss`
-    factor: mi.TensorXf | None = None  # on the picture that is rendered, see `exposures`
+    weight: mi.TensorXf | None = None
+    """Weights of the pixels, see `mean_loss`."""
+    factor: mi.TensorXf | None = None
+    """Factor on the rendered image, see `exposures`."""
 
     def compared(self, loss: Loss, image: mi.TensorXf) -> mi.Float:
-        """The mean loss of a picture as it is rendered."""
+        """Return the mean loss of an image as rendered."""
         return mean_loss(loss, _times(image, self.factor), self.target, self.weight).array
 
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """Which paths of a view are walked."""
+    """Sampling of a view."""
 
     sensor: int
     seed: int | mi.UInt32
     spp: int
-    batch: Batch | None = (
-        None  # of pixels, the rows of the target, by which the loss is an estimate; only if it is swept
-    )
+    batch: Batch | None = None
+    """Pixels that are rendered, which are the rows of the target (None: all). Requires ``ViewLoss.swept``."""
 
 
 @dataclass(frozen=True)
 class ViewLoss:
-    """How a view is judged: ``share`` times its mean ``loss``; ``swept``: image and gradient in one pass."""
+    """Loss of a view: ``share`` times the mean ``loss``."""
 
     loss: Loss
     share: float
     swept: bool
+    """Whether image and gradient come from one pixel sweep; the loss is quadratic then."""
 
 
 @dataclass(frozen=True)
 class ViewResult:
-    """The loss of a view, the state of the integrator after it, and a derivative."""
+    """Loss of a view, and the state of the integrator after the passes."""
 
     loss: mi.Float
     state: PassState
-    by_factor: mi.TensorXf | None  # by the logarithm of the target's factor, for each channel, if there is one
+    by_factor: mi.TensorXf | None
+    """Derivative by the logarithm of the target's factor, per channel."""
 
 
 class NotRecordable(Exception):
@@ -143,7 +146,7 @@ def differentiate(
     target: ViewTarget,
     loss: ViewLoss,
 ) -> ViewResult:
-    """The loss of a view, traced anew; its gradient is added to the parameters."""
+    """Compute the loss of a view, and add its gradient to the parameters."""
     return _differentiate(params, scene, integrator, integrator.begin(scene), request, target, loss)
 
 
@@ -156,7 +159,7 @@ def _differentiate(
     target: ViewTarget,
     loss: ViewLoss,
 ) -> ViewResult:
-    """See `differentiate`; the passes begin with the ``state``."""
+    """Compute loss and gradient by passes that begin with the ``state``: see `differentiate`."""
     view = integrator.pass_of(scene, request.sensor, request.seed, request.spp)
     batch, factor = request.batch, target.factor
     share = loss.share if batch is None else loss.share * batch.share
