@@ -1,4 +1,4 @@
-"""Draws the figures of docs/edges.md: how edges are searched, and derivatives beside finite differences.
+"""Draws the figures of docs/boundary.md: how edges are searched, and derivatives beside finite differences.
 
     python -m benchmarks.edge_pictures [FOLDER]
 

@@ -124,7 +124,7 @@ def test_a_check_of_an_outline_passes_with_edges_and_fails_without() -> None:
 def test_a_job_says_what_its_edges_leave_out_or_cost(edges: str, told: str) -> None:
     job = {**JOB, "integrator": {**JOB["integrator"], "boundary": edges}}
     notes = " ".join(build_problem(make_config(job), Path.cwd()).notes)
-    assert notes.count("docs/edges.md") == bool(told) and told in notes
+    assert notes.count("docs/boundary.md") == bool(told) and told in notes
 
 
 @pytest.mark.slow

@@ -118,7 +118,7 @@ def test_a_job_is_told_in_its_report_and_not_in_the_log_too(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.xml").write_text(XML)
     html = run(parameter, integrator).report.read_text()
-    assert html.count("moving edges") == html.count("docs/edges.md") == told
+    assert html.count("moving edges") == html.count("docs/boundary.md") == told
     assert not [line for line in log.lines if "edges" in line]
 
 

@@ -13,7 +13,7 @@ from pathreplay.transport.vertex import TraceConfig
 COST_OF_EDGES = (
     "edges move with the parameters (silhouettes, shadows, borders of lights) and are differentiated in a pass of "
     "their own, which may take several times as long as the rest: boundary = 'none' of the integrator leaves them out, "
-    "boundary = 'primary' those that only surfaces see; see docs/edges.md"
+    "boundary = 'primary' those that only surfaces see; see docs/boundary.md"
 )
 """One line that tells what edges cost, where nobody asked for them."""
 

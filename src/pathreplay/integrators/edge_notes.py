@@ -40,10 +40,10 @@ def edges_note(keys: Iterable[str], edges: str = "none") -> str:
     if edges == "primary":
         return (
             f"'{first}'{more} moves, and boundary = 'primary' leaves out what surfaces see of moving edges (soft "
-            "shadows, indirect light): use boundary = 'all' where that matters; see docs/edges.md"
+            "shadows, indirect light): use boundary = 'all' where that matters; see docs/boundary.md"
         )
     return (
         f"'{first}'{more} moves, and the gradient leaves out what moving edges do (silhouettes, shadows, borders of "
         "lights): use boundary = 'all' of the integrator 'pathreplay', or let paint or shading show the motion rather "
-        "than outlines, and measure what is missing with 'pathreplay check'; see docs/edges.md"
+        "than outlines, and measure what is missing with 'pathreplay check'; see docs/boundary.md"
     )
