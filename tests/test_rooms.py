@@ -66,6 +66,7 @@ ALLOWED: dict[str, set[str]] = {
         "inverse.images",
         "inverse.config",
         "integrators",
+        "samplers",
         "scenes",
         *BASE,
     },

@@ -21,6 +21,7 @@ import mitsuba as mi
 
 from pathreplay.boundary.observer import ObserverVertex
 from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.samplers.streams import Stream
 
 EVENLY = 0.25
 """Share of the arcs that are thrown evenly: those that begin below the horizon, or where lobes are weak, count, too."""
@@ -78,7 +79,7 @@ def arc(observer: ObserverVertex, l: float, narrow: bool, key: mi.UInt32, active
 
     The longest ones are ``l`` radians long; all are where no lobe may be ``narrow``.
     """
-    numbers = CounterSampler(key, mi.UInt32(0x100))
+    numbers = CounterSampler.stream(key, Stream.ARC)
     (lobe, way), turn = numbers.next_2d(), dr.two_pi * numbers.next_1d()
     d, smooth = observer.sample(lobe, numbers.next_2d())
     evenly = way < EVENLY

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from pathreplay.boundary.through_media import going_on
 from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.samplers.streams import Stream
 from pathreplay.transport import arrive, scatter
 from pathreplay.transport.facts.traits import is_null
 from pathreplay.transport.meet import meet
@@ -160,7 +161,7 @@ class ObserverVertex:
         asks = active & (~self.event | self.at.medium.use_emitter_sampling())
         ray = self.origin.spawn_ray_to(light.p)
         T = transmittance_past_edge(
-            self.trace, ray, t, self.medium(light.d), CounterSampler(key, mi.UInt32(0x60000)), asks
+            self.trace, ray, t, self.medium(light.d), CounterSampler.stream(key, Stream.TRANSMITTANCE_PAST_EDGE), asks
         )
         return dr.select(asks, T, 0)
 
@@ -170,7 +171,7 @@ class ObserverVertex:
         """Where ``active``, the arrivals as seen from ``t`` on their ray, and the transmittance up to there."""
         if self.trace.media is None:
             return mi.Spectrum(1), arrivals
-        others = CounterSampler(key, mi.UInt32(0x70000))
+        others = CounterSampler.stream(key, Stream.TRANSMITTANCE_TO_EDGE)
         T, medium = transmittance_up_to(self.trace, arrivals[0].ray, t, arrivals[0].medium, others, active)
         T = dr.select(active, T, 1)
         return T, [dr.select(active, going_on(self.trace, at, t, medium, active), at) for at in arrivals]

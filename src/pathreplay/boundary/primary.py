@@ -37,6 +37,7 @@ from pathreplay.boundary.hard_shadows import ShadowTest, light_of
 from pathreplay.boundary.segment_density import SegmentDensity, looks_of
 from pathreplay.boundary.through_media import clear, going_on, transmittance_to_split
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
+from pathreplay.samplers.streams import Stream
 from pathreplay.transport.motion import may_move
 from pathreplay.transport.path import PathState
 from pathreplay.transport.signature import edge_normal, mixed, outline_gap, place_met, shape_met, turned_away
@@ -94,7 +95,7 @@ def primary_edges(trace: TraceConfig, places: FilmDomain, lines: int, closer: in
     full, trace = trace, clear(without_roulette(trace))
 
     def line(centres: SegmentDensity, i: mi.UInt32, n: int, seed: mi.UInt32, l: float) -> FilmLine:
-        key = key_of(i, seed ^ 0x51ED270B)
+        key = key_of(i, Stream.PRIMARY_KEYS.of(seed))
         x, y, turn = quasi_random(i, n, seed, 3)
         c, density = centres.draw(mi.Point2f(x, y))
         sin, cos = dr.sincos(dr.two_pi * turn)
@@ -106,11 +107,11 @@ def primary_edges(trace: TraceConfig, places: FilmDomain, lines: int, closer: in
 
     centres = SegmentDensity.even(places.size, l)
     few = looks_of(lines, places.size)
-    first = line(centres, dr.arange(mi.UInt32, few), few, seed ^ 0x7F4A7C15, 2 * l)
+    first = line(centres, dr.arange(mi.UInt32, few), few, Stream.FIRST_LOOK.of(seed), 2 * l)
     centres = centres.refined(first.c + centres.margin, detect(probe, first, mi.Bool(True)))
     every = line(centres, dr.arange(mi.UInt32, lines), lines, seed, l)
     chosen = Resampled.of(detect(probe, every, mi.Bool(True)) / every.density, closer, seed)
-    pick = mi.PCG32(closer, initstate=seed, initseq=dr.arange(mi.UInt32, closer))
+    pick = mi.PCG32(closer, initstate=seed + int(Stream.BISECT_PRIMARY), initseq=dr.arange(mi.UInt32, closer))
     crossed = bisect(probe, line(centres, chosen.index, lines, seed, l), chosen.weight, pick)
     per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * lines))  # one kernel for all numbers of samples
     c = _weighed(trace, full, places, crossed, per_line)

@@ -48,6 +48,7 @@ from pathreplay.boundary.observer import ObserverVertex, may_see, surface_sees
 from pathreplay.boundary.segment_density import SegmentDensity, looks_of
 from pathreplay.boundary.worth import DIM, MOST, STEEP, UNFORESEEN, Worth, closeness, own_plane, radiance_of, weighed
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
+from pathreplay.samplers.streams import Stream
 from pathreplay.transport.motion import may_move
 from pathreplay.transport.path import PathState
 from pathreplay.transport.signature import edge_normal, mixed, outline_gap, place_met, shape_met, turned_away
@@ -61,9 +62,6 @@ BORDER = 1e-4
 INSIDE = 1 - 2 * BORDER
 JUMP = 4.0
 """So many times as far from an edge as its slope says is the other end of a line where a sample of an emitter jumps."""
-BEYOND = 0x20000
-"""The first of the random numbers of what comes from beyond an edge."""
-
 WIDELY = 0.8
 """Share of the lines that are thrown as if nobody had looked first: shadows are seen by way of other surfaces, too."""
 
@@ -182,7 +180,7 @@ class ShadowEdge:
 
 def emitter_line(trace: TraceConfig, x: SelectedVertex, l: float, key: mi.UInt32) -> SquareLine:
     """A line among the samples of an emitter."""
-    numbers, scene = CounterSampler(key, mi.UInt32(0)), trace.scene
+    numbers, scene = CounterSampler.of(key), trace.scene
     which, turn = numbers.next_2d()
     index, share, _ = scene.sample_emitter(which)
     sin, cos = dr.sincos(dr.two_pi * turn)
@@ -321,7 +319,7 @@ def _views(
     """What x sees along an arc, and what of it lies in the shadow of a light without extent, if any is ``hard``."""
 
     def shade(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> ShadowTest:
-        u = VertexSamples.draw(CounterSampler(key, mi.UInt32(BEYOND))).light  # as `walk_on` draws it
+        u = VertexSamples.draw(CounterSampler.stream(key, Stream.BEYOND_EDGE)).light  # as `walk_on` draws it
         return ShadowTest.of(trace, observer.arrival(ray, hit, mi.Float(1)), u, x.depth + 1, active)
 
     def probe(line: Arc, t: mi.Float, active: mi.Bool, shaded: bool = hard) -> VisibilityProbe:
@@ -416,7 +414,7 @@ def arc_edges(
     K = []
     for arrival in arrivals:
         path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < trace.max_depth))
-        L, _ = walk_on(trace, CounterSampler(key, mi.UInt32(BEYOND)), path)
+        L, _ = walk_on(trace, CounterSampler.stream(key, Stream.BEYOND_EDGE), path)
         K.append(dr.select(active, common * T * L, 0))
     return OcclusionEdge(edge, near, far, ray_near.d, ray_far.d, n, bend, border, own, steep, K[0], K[1], active)
 
@@ -469,7 +467,7 @@ def secondary_edges(
     square, arc = lengths
 
     def path(centres: SegmentDensity, i: mi.UInt32, n: int, seed: mi.UInt32, records: Any) -> tuple[Any, ...]:
-        key = key_of(i, seed ^ 0x2545F491)
+        key = key_of(i, Stream.SECONDARY_KEYS.of(seed))
         s, density = centres.draw(mi.Point2f(quasi_random(i, n, seed)))
         ray, weight = dr.detach(places.ray(s, key))
         records, x = choose_vertex(trace, CounterSampler.of(key), ray, places.flows(s), layout, records)
@@ -479,8 +477,8 @@ def secondary_edges(
     def glances(centres: SegmentDensity, n: int, seed: mi.UInt32) -> tuple[mi.Point2f, mi.Float, list[Worth]]:
         s, density, key, _, x = path(centres, dr.arange(mi.UInt32, n), n, seed, None)
         observer = ObserverVertex(trace, x.at, x.flight, x.active)
-        in_squares = emitter_edges(trace, x, observer, square, key ^ 0x1B873593, Search())
-        on_arcs = arc_edges(trace, x, observer, arc, key ^ 0x38B34AE5, Search())
+        in_squares = emitter_edges(trace, x, observer, square, Stream.EMITTER_SEGMENTS.of(key), Search())
+        on_arcs = arc_edges(trace, x, observer, arc, Stream.ARCS.of(key), Search())
         none = dr.zeros(mi.Float, n)
         density += none  # as many as lines, as all of these
         worths = [replace(w, found=w.found / density, edges=w.edges + none) for w in (in_squares, on_arcs)]
@@ -489,9 +487,9 @@ def secondary_edges(
 
     centres = SegmentDensity(int(places.size.x), int(places.size.y), 0.0)
     if shapes := casters(trace):
-        s, falls = cast_shadows(trace, shapes, places, seed ^ 0x2C1B3C6D)
+        s, falls = cast_shadows(trace, shapes, places, Stream.CAST_SHADOWS.of(seed))
         centres = centres.refined(s, dr.select(falls, mi.Float(1), 0), WIDELY)
-    s, density, first = glances(centres, looks_of(lines, places.size), seed ^ 0x7F4A7C15)
+    s, density, first = glances(centres, looks_of(lines, places.size), Stream.FIRST_LOOK.of(seed))
     radiance = radiance_of(first)
     worth = weighed(first, radiance)[1]
     of_both = mi.Point2f(dr.concat([s.x, s.x]), dr.concat([s.y, s.y]))
@@ -504,14 +502,14 @@ def secondary_edges(
 
     on_arc = chosen.index >= lines
     i = dr.select(on_arc, chosen.index - lines, chosen.index)
-    pick = mi.PCG32(closer, initstate=seed + 1, initseq=dr.arange(mi.UInt32, closer))
+    pick = mi.PCG32(closer, initstate=seed + int(Stream.BISECT_SECONDARY), initseq=dr.arange(mi.UInt32, closer))
     s, _, key, records, x = path(centres, i, lines, seed, dr.alloc_local(record_type(layout), room_for(trace)))
     x.active &= chosen.weight > 0
     of_square, of_arc = dr.select(on_arc, 0, chosen.weight), dr.select(on_arc, chosen.weight, 0)
     observer = ObserverVertex(trace, x.at, x.flight, x.active)
-    shaded = emitter_edges(trace, x, observer, square, key ^ 0x1B873593, Search(of_square, pick))
+    shaded = emitter_edges(trace, x, observer, square, Stream.EMITTER_SEGMENTS.of(key), Search(of_square, pick))
     K = shadow_weight(observer, shaded)
-    hiding = arc_edges(trace, x, observer, arc, key ^ 0x38B34AE5, Search(of_arc, pick))
+    hiding = arc_edges(trace, x, observer, arc, Stream.ARCS.of(key), Search(of_arc, pick))
 
     def motion(ray: mi.Ray3f) -> mi.Spectrum:
         return hiding_motion(trace, observer, hiding, ray) - K * shadow_gap(observer, shaded, ray, shaded.u)

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.samplers.streams import Stream
 from pathreplay.transport.meet import meet
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart, behind_emitters
@@ -34,7 +35,7 @@ def transmittance_to_split(
 ) -> tuple[mi.Spectrum, mi.MediumPtr]:
     """Transmittance of a chain up to ``reach`` after its k-th vertex, and the medium there."""
     thin = clear(trace)
-    numbers, others = CounterSampler.of(key), CounterSampler(mi.UInt32(key), mi.UInt32(0x50000))
+    numbers, others = CounterSampler.of(key), CounterSampler.stream(key, Stream.TRANSMITTANCE_OF_CHAIN)
     path = PathState.begin(thin, CameraStart(ray, numbers, active))
     T = mi.Spectrum(1)
     around = trace.media.around

@@ -24,6 +24,7 @@ from pathreplay.boundary.edges import Edges, FilmDomain
 from pathreplay.boundary.observer import ObserverVertex
 from pathreplay.boundary.segment_density import SegmentDensity
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
+from pathreplay.samplers.streams import Stream
 from pathreplay.transport.emitters import draw_emitter
 from pathreplay.transport.meet import meet
 from pathreplay.transport.path import PathState
@@ -64,11 +65,11 @@ def volumetric_edges(
     centres = SegmentDensity.even(places.size, l)
 
     def draw(i: mi.UInt32) -> tuple[BeamLine, mi.Bool]:
-        key = key_of(i, seed ^ 0x3C6EF372)
-        numbers = CounterSampler(key, mi.UInt32(0x30000))
+        key = key_of(i, Stream.VOLUMETRIC_KEYS.of(seed))
+        numbers = CounterSampler.stream(key, Stream.BEAM)
         turn = dr.two_pi * numbers.next_1d()
         w = mi.Vector2f(dr.cos(turn), dr.sin(turn))
-        c, density = centres.draw(mi.Point2f(quasi_random(i, lines, seed ^ 0x1F83D9AB)))
+        c, density = centres.draw(mi.Point2f(quasi_random(i, lines, Stream.VOLUMETRIC_CENTRES.of(seed))))
         reach = _reach(trace, dr.detach(places.ray(c - centres.margin, key)[0]))
         τ = numbers.next_1d() * reach
         ok = dr.isfinite(reach) & (reach > 0)
@@ -83,7 +84,7 @@ def volumetric_edges(
 
     every, ok = draw(dr.arange(mi.UInt32, lines))
     chosen = Resampled.of(detect(probe, every, ok) / every.density, closer, seed)
-    pick = mi.PCG32(closer, initstate=seed + 2, initseq=dr.arange(mi.UInt32, closer))
+    pick = mi.PCG32(closer, initstate=seed + int(Stream.BISECT_VOLUMETRIC), initseq=dr.arange(mi.UInt32, closer))
     line, ok = draw(chosen.index)
     found = bisect(probe, line, dr.select(ok, chosen.weight, 0), pick)
     active = found.weight > 0
@@ -101,7 +102,7 @@ def volumetric_edges(
     n = edge_normal(dark.hit, dark.ray, active)
 
     per_line = dr.opaque(mi.Float, 0.5 * dr.pi / (l * lines))
-    others = CounterSampler(line.key, mi.UInt32(0x70000))
+    others = CounterSampler.stream(line.key, Stream.TRANSMITTANCE_OF_BEAM)
     around = trace.media.around
     medium = dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)
     T = transmittance_up_to(trace, camera_ray, line.τ, medium, others, active)[0]
@@ -125,7 +126,7 @@ def volumetric_edges(
 
 def _which(line: BeamLine) -> mi.Point2f:
     """The random numbers that say which light."""
-    return CounterSampler(line.key, mi.UInt32(0x30010)).next_2d()
+    return CounterSampler.stream(line.key, Stream.BEAM_EMITTER).next_2d()
 
 
 def _particle(ray: mi.Ray3f, τ: mi.Float) -> mi.Interaction3f:

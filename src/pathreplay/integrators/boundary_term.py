@@ -21,6 +21,7 @@ from pathreplay.integrators.film.domain import FilmPlaces
 from pathreplay.integrators.film.image import MOST_SAMPLES
 from pathreplay.integrators.term import TermResult
 from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.samplers.streams import Stream
 from pathreplay.transport.motion import edges_move, moving_shapes
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
@@ -112,13 +113,13 @@ class Boundary:
             raise PathreplayError(f"{why}, or use boundary = 'none'")
         trace = self.informed(view, trace)
         lines = lines_of(view, places, self.spp)
-        seed = view.opaque_seed
+        seed = Stream.BOUNDARY.of(view.opaque_seed)
         if self.film:
-            yield primary_edges(trace, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
+            yield primary_edges(trace, places, lines, max(lines // FILM_CLOSER, 1), seed, FILM_LENGTH)
             if trace.media is not None and trace.traits.hard_lights:
-                yield volumetric_edges(trace, places, lines, max(lines // FILM_CLOSER, 1), seed ^ 0x5EED, FILM_LENGTH)
+                yield volumetric_edges(trace, places, lines, max(lines // FILM_CLOSER, 1), seed, FILM_LENGTH)
         if self.inner:
-            yield secondary_edges(trace, places, lines, max(lines // INNER_CLOSER, 1), seed ^ 0x5EED, INNER_LENGTHS)
+            yield secondary_edges(trace, places, lines, max(lines // INNER_CLOSER, 1), seed, INNER_LENGTHS)
 
 
 def lines_of(view: Pass, places: FilmPlaces, spp: int) -> int:

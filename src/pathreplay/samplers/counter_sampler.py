@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.streams import Stream
+
 STEPS = tuple(round(2**32 * (root % 1)) for root in ((1 + 5**0.5) / 2, 2**0.5))
 """Of lattices. No rational multiples of both add up to a rational number, so that they fill a square evenly, too."""
 ROUNDS = 8
@@ -24,6 +26,11 @@ class CounterSampler:
     @staticmethod
     def of(key: mi.UInt32) -> CounterSampler:
         return CounterSampler(mi.UInt32(key), mi.UInt32(0))
+
+    @staticmethod
+    def stream(key: mi.UInt32, stream: Stream) -> CounterSampler:
+        """Those of a key that a stream has for itself."""
+        return CounterSampler(mi.UInt32(key), mi.UInt32(int(stream)))
 
     @staticmethod
     def at_vertex(key: mi.UInt32, k: mi.UInt32) -> CounterSampler:

@@ -11,6 +11,7 @@ import mitsuba as mi
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.platform.registration import mitsuba_integrator
 from pathreplay.samplers.counter_sampler import CounterSampler
+from pathreplay.samplers.streams import Stream
 
 PROJECTING = frozenset({"PerspectiveCamera", "ThinLensCamera"})
 """By class: sensors that know where a point is seen."""
@@ -35,7 +36,7 @@ class FilmPlaces:
 
     def ray(self, s: mi.Point2f, key: mi.UInt32) -> tuple[mi.Ray3f, mi.Spectrum]:
         """The camera ray through a place, and its weight: see `FilmDomain`."""
-        sensor, numbers, place = self.view.sensor, CounterSampler(key, mi.UInt32(0x40000)), self.in_sensor(s)
+        sensor, numbers, place = self.view.sensor, CounterSampler.stream(key, Stream.CAMERA), self.in_sensor(s)
         time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
         wavelength, aperture = numbers.next_1d(), numbers.next_2d()
         ray, weight = self.view.camera_ray(time, wavelength, place, aperture)

@@ -22,6 +22,7 @@ from pathreplay.integrators.stateful import StatefulIntegrator
 from pathreplay.inverse.losses.pixelwise import Loss, mean_loss
 from pathreplay.inverse.objective.pixel_batches import Batch
 from pathreplay.inverse.parameters.exposures import derivative
+from pathreplay.samplers.streams import Stream
 from pathreplay.scenes.parameters import keep_only
 
 # What Dr.Jit says, whatever the cause, where a function cannot be frozen. Plugins do not show beforehand whether they
@@ -31,8 +32,6 @@ _RECORDING = "while recording a frozen function"
 
 MOST_RECORDINGS = 8
 """Of a view: where what kernels take for constants changes more often, recording is not worth its time."""
-_OTHER = 0x5EED
-"""Makes another seed of one."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +179,7 @@ def _differentiate(
             state = integrator.gradient_pass(apart, dr.grad(image), state)
     by_factor = None
     if factor is not None:
-        other: Any = mi.sample_tea_32(mi.UInt32(view.seed), mi.UInt32(_OTHER))[0]
+        other: Any = mi.sample_tea_32(mi.UInt32(view.seed), mi.UInt32(int(Stream.SECOND_IMAGE)))[0]
         again = integrator.image_pass(replace(view, seed=other), state)
         by_factor = derivative(loss.loss, image, again, factor, target.target, target.weight) * share
     return ViewResult(dr.detach(value), state, by_factor)
