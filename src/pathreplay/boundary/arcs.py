@@ -41,10 +41,8 @@ class Arc:
 
     c: mi.Vector3f
     w: mi.Vector3f  # the direction in which it leaves its centre
-    begin: mi.Float
-    end: mi.Float
-    t: mi.Float  # where the sample is on it
-    p: mi.Float  # its density
+    length: mi.Float
+    p: mi.Float  # density of the sample
     f: mi.Spectrum  # what is scattered from there
     j: mi.UInt32 | None  # of its length; None: there is one only, and the sample is the centre
 
@@ -53,18 +51,17 @@ class Arc:
 
     def weight(self, observer: ObserverVertex, p: mi.Float, active: mi.Bool) -> mi.Float:
         """What a crossing counts at a direction with so much of the samples' density."""
-        l = self.end - self.begin
         if self.j is None:
-            return dr.rcp(l * self.p)
+            return dr.rcp(self.length * self.p)
         share = _length(self.j) * probability(p, self.j) * _suits(p, self.j) / _sum(p)
-        return share / (l * self._density(observer, active))
+        return share / (self.length * self._density(observer, active))
 
     @dr.syntax
     def _density(self, observer: ObserverVertex, active: mi.Bool) -> mi.Float:
         """The mean of p P_j over all places where the sample might lie."""
         arc, i, total = self, mi.UInt32(0), mi.Float(0)
         while dr.hint(i < PLACES, exclude=[arc, observer, active], label="pathreplay: density of an arc"):
-            p = density_of_samples(observer.towards(arc.at(_place(i) * (arc.end - arc.begin)), active)[1])
+            p = density_of_samples(observer.towards(arc.at(_place(i) * arc.length), active)[1])
             total += p * probability(p, arc.j) / PLACES
             i += 1
         return total
@@ -91,12 +88,12 @@ def arc(observer: ObserverVertex, l: float, narrow: bool, key: mi.UInt32, active
     sin, cos = dr.sincos(turn)
     w = mi.Frame3f(d).to_world(mi.Vector3f(cos, sin, 0))
     if not narrow:
-        return Arc(d, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), mi.Float(0), p, f, None), ok
+        return Arc(d, w, mi.Float(l), p, f, None), ok
     j = length_drawn(p, numbers)
     full = l * _length(j)
     back = -full * _place(dr.minimum(mi.UInt32(PLACES * numbers.next_1d()), PLACES - 1))
     c, s = dr.cos(back), dr.sin(back)
-    return Arc(c * d + s * w, c * w - s * d, -0.5 * full, 0.5 * full, -back, p, f, j), ok
+    return Arc(c * d + s * w, c * w - s * d, full, p, f, j), ok
 
 
 def density_of_samples(pdf: mi.Float) -> mi.Float:

@@ -6,6 +6,7 @@ A smooth mesh goes dark where its shading normal is at right angles to the ray, 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +23,9 @@ ASIDE = 2.0
 STEEPEST = 8.0
 """Cotangent of half the angle of the sharpest corner for which that is far enough: it has 14 degrees."""
 
+Side: TypeAlias = "tuple[mi.PreliminaryIntersection3f, mi.Ray3f]"
+"""What a ray met, and the ray."""
+
 
 @dataclass
 class CreaseOrContour:
@@ -33,21 +37,21 @@ class CreaseOrContour:
     turns: mi.Bool  # it is one sheet of one surface, the shading normal of which is at right angles to the ray
 
     @staticmethod
-    def of(
-        trace: TraceConfig,
-        sides: tuple[tuple[mi.PreliminaryIntersection3f, mi.Ray3f], tuple[mi.PreliminaryIntersection3f, mi.Ray3f]],
-        active: mi.Bool,
-    ) -> CreaseOrContour:
+    def of(trace: TraceConfig, side_a: Side, side_b: Side, active: mi.Bool) -> CreaseOrContour:
         """Detached."""
-        (a, _), (b, _) = sides
+        (a, ray_a), (b, ray_b) = side_a, side_b
         both = active & a.is_valid() & b.is_valid()
         flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
-        si_a, si_b = (x.compute_surface_interaction(ray, flags, both) for x, ray in sides)
+        si_a, si_b = (hit.compute_surface_interaction(ray, flags, both) for hit, ray in (side_a, side_b))
         meets = both & at_an_angle(si_a.n, si_b.n) & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
         same = both & (place_met(trace, a, both, si_a.shape) == place_met(trace, b, both, si_b.shape))
-        dark = [turned_away(si, ray.d) for si, (_, ray) in zip((si_a, si_b), sides, strict=True)]
-        turns = same & (dark[0] != dark[1]) & ~hides_itself(si_a.p, si_a.n, si_b.p, si_b.n)
+        turns = same & (turned_away(si_a, ray_a.d) != turned_away(si_b, ray_b.d)) & ~hides_itself(si_a, si_b)
         return CreaseOrContour(a, b, meets, turns)
+
+    @property
+    def there(self) -> mi.Bool:
+        """Whether it is one of the two."""
+        return self.meets | self.turns
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
         """B: zero on the edge, and wherever there is none; differentiable in the ray and in the shapes."""

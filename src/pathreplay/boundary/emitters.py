@@ -1,10 +1,9 @@
-"""What a vertex sees where it looks for an emitter: its light, or what hides it.
+"""Emitter samples: the light of an emitter, or what hides it, as a vertex sees it at a place of the unit square.
 
-Places are in a unit square. Of most emitters it is the square of their samples. Samples of balls go around the middle
-of what is seen of them: there straight edges would be bent without bounds, and lines too long to tell; so these are
-mapped to a disk first, evenly. Samples of meshes jump in theirs from triangle to triangle; so for these it is mapped,
-evenly, to the cone of directions around a ball that holds the mesh. What follows the emitter, the point that is glued
-to it, is the same in both.
+Of most emitters it is the square of their samples. Samples of balls go around the middle of what is seen of them: there
+straight edges would be bent without bounds, and segments too long to tell; so these are mapped to a disk first, evenly.
+Samples of meshes jump in theirs from triangle to triangle; so for these it is mapped, evenly, to the cone of directions
+around a ball that holds the mesh. What follows the emitter, the point that is glued to it, is the same in both.
 """
 
 from __future__ import annotations

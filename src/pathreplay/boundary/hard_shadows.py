@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.transport.emitters import draw_emitter
 from pathreplay.transport.meet import meet
 from pathreplay.transport.signature import edge_normal, outline_gap
-from pathreplay.transport.vertex import Arrival, TraceConfig, is_smooth
+from pathreplay.transport.vertex import Arrival, TraceConfig, VertexSamples, is_smooth
 from pathreplay.transport.volume.passage import skip_null
 
 
@@ -28,8 +29,12 @@ class ShadowTest:
     uv: mi.Point2f  # place in it
 
     @staticmethod
-    def of(trace: TraceConfig, at: Arrival, u: mi.Point2f, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
-        """That of the light which ``u`` samples where a path arrives as its k-th vertex, if that has no extent."""
+    def of(trace: TraceConfig, at: Arrival, numbers: CounterSampler, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
+        """That of the light which is sampled where a path arrives as its k-th vertex, if that has no extent.
+
+        ``numbers`` are those of the vertex.
+        """
+        u = VertexSamples.draw(numbers).light
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
         scatters = _scatters(trace, si, k, active)
         light, Le = draw_emitter(trace.scene, si, u, scatters, visible=False)
@@ -71,6 +76,27 @@ class ShadowTest:
         for spot in trace.traits.spots:
             gap = dr.select(light.emitter == mi.EmitterPtr(spot), _inside_cone(spot, light), gap)
         return dr.select(active & self.outside, gap, shadow)
+
+
+@dataclass
+class HardShadow:
+    """The border of a hard shadow, which is between two places of what a ray meets."""
+
+    trace: TraceConfig
+    there: mi.Bool
+    in_a: mi.Bool  # whether the first of the places is in the shadow
+    shade: ShadowTest  # of the place in the shadow
+    n: mi.Vector3f
+
+    @staticmethod
+    def between(trace: TraceConfig, a: ShadowTest, b: ShadowTest, active: mi.Bool) -> HardShadow:
+        """That between two places, of which one is in the shadow and the other is not. Detached."""
+        there, shade = active & (a.dark != b.dark), dr.select(a.dark, a, b)
+        return HardShadow(trace, there, a.dark, shade, shade.normal(there))
+
+    def gap(self, met: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+        """B: see `ShadowTest.gap`."""
+        return self.shade.gap(self.trace, self.n, met, ray, active & self.there)
 
 
 def _ends_at_once(spot: mi.Emitter) -> mi.Bool:

@@ -1,23 +1,30 @@
-"""The vertex that sees an edge: a point of a surface or, in a medium, a particle, where it is and how it scatters."""
+"""The vertex that sees an edge: which one of a path, where it is and how it scatters.
+
+It is a point of a surface or, in a medium, a particle.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.boundary.through_media import going_on
+from pathreplay.adjoint.record import Layout, record
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport import arrive, scatter
 from pathreplay.transport.facts.traits import is_null
 from pathreplay.transport.meet import meet
+from pathreplay.transport.motion import may_move
+from pathreplay.transport.path import PathState
 from pathreplay.transport.signature import place_met, shape_met
+from pathreplay.transport.start import CameraStart, behind_emitters
 from pathreplay.transport.surface import met
 from pathreplay.transport.vertex import Arrival, Flight, SampledStep, TraceConfig, is_smooth
 from pathreplay.transport.volume.media import carried, span
-from pathreplay.transport.volume.passage import skip_null, transmittance_past_edge, transmittance_up_to
+from pathreplay.transport.volume.passage import further, skip_null, transmittance_past_edge, transmittance_up_to
 
 NEAR = 10.0
 """So many times as far as rays begin beside a surface is what they see well: directions are off by a tenth at most."""
@@ -37,11 +44,75 @@ def surface_sees(trace: TraceConfig, at: Arrival) -> mi.Bool:
     return valid & is_smooth(shape_met(trace, at.hit, at.ray, valid).bsdf())
 
 
+@dataclass
+class SelectedVertex:
+    """The vertex of a camera path that looks for edges."""
+
+    at: Arrival
+    k: mi.UInt32  # records before
+    depth: mi.UInt32  # vertices before: as many, but null boundaries are none
+    β: mi.Spectrum  # throughput before, over the probability of the choice
+    mass: mi.Float  # by which it was chosen
+    moves: mi.Bool  # it, or a vertex before, may move
+    active: mi.Bool
+    flight: Flight | None = None  # before it, with media
+
+
+@dr.syntax
+def choose_vertex(
+    trace: TraceConfig, numbers: CounterSampler, ray: mi.Ray3f, flows: mi.Bool, layout: Layout, records: Any
+) -> tuple[Any, SelectedVertex]:
+    """Walk along a camera path, and choose one of the vertices that scatter smoothly, by what they count.
+
+    ``flows``: all vertices may move under the place where the path begins. Vertices up to the chosen one are recorded,
+    if there are ``records``. The last vertex that ``trace`` allows scatters nothing: the walk ends before.
+    """
+    trace = replace(trace, max_depth=max(trace.max_depth - 1, 0))
+    path = PathState.begin(trace, CameraStart(ray, numbers, mi.Bool(True)))
+    if dr.hint(trace.max_depth == 1 and trace.media is None and records is None, mode="scalar"):
+        return None, _first_vertex(trace, path, flows)
+    none, no = mi.UInt32(0), mi.Bool(False)
+    flight = None if trace.media is None else Flight.none(trace.media)
+    chosen = SelectedVertex(path.at, none, mi.UInt32(0), mi.Spectrum(0), mi.Float(0), no, mi.Bool(False), flight)
+    mass = mi.Float(0)
+    count = mi.UInt32(0)
+    moves = mi.Bool(flows)
+    while dr.hint(path.active, exclude=[trace, layout], label="pathreplay: choose a vertex"):
+        choice = numbers.next_1d()
+        u, step = path.choose(trace, numbers)
+        here, w = may_see(trace, path.at, step)
+        m = dr.select(path.active & here, dr.mean(dr.abs(path.β * w)), 0)
+        mass += m
+        moves |= may_move(trace, path.at.hit)
+        take = (m > 0) & (choice * mass < m)
+        flight = None if trace.media is None else step.kept.media.flight
+        chosen = dr.select(
+            take, SelectedVertex(path.at, count, path.depth, path.β * w, m, moves, mi.Bool(True), flight), chosen
+        )
+        onward, v = path.advance(trace, u, step)
+        if dr.hint(records is not None, mode="scalar"):
+            records[count] = record(layout, v)
+        path = onward
+        count += 1
+    chosen.β *= mass / dr.maximum(chosen.mass, dr.smallest(mi.Float))
+    return records, chosen
+
+
+def _first_vertex(trace: TraceConfig, path: PathState, flows: mi.Bool) -> SelectedVertex:
+    """The first vertex, which is the only candidate; nothing is traced beyond it."""
+    at, none = path.at, mi.UInt32(0)
+    active = path.active & surface_sees(trace, at)
+    return SelectedVertex(
+        at, none, none, dr.select(active, path.β, 0), mi.Float(1), flows | may_move(trace, at.hit), active
+    )
+
+
 class ObserverVertex:
     """A vertex, detached; ``moved`` is where it is while things move."""
 
-    def __init__(self, trace: TraceConfig, at: Arrival, flight: Flight | None, active: mi.Bool) -> None:
-        self.trace, self.at, self.flight, self.active = trace, at, flight, active
+    def __init__(self, trace: TraceConfig, vertex: SelectedVertex) -> None:
+        self.trace, self.selected = trace, vertex
+        self.at, self.flight, self.active = at, flight, active = vertex.at, vertex.flight, vertex.active
         self.origin: mi.Interaction3f
         self.si: mi.SurfaceInteraction3f
         if trace.media is None:
@@ -175,3 +246,12 @@ class ObserverVertex:
         T, medium = transmittance_up_to(self.trace, arrivals[0].ray, t, arrivals[0].medium, others, active)
         T = dr.select(active, T, 1)
         return T, [dr.select(active, going_on(self.trace, at, t, medium, active), at) for at in arrivals]
+
+
+def going_on(trace: TraceConfig, at: Arrival, t: mi.Float, medium: mi.MediumPtr, active: mi.Bool) -> Arrival:
+    """The same arrival, as it is seen from distance ``t`` on its ray, where there is ``medium``."""
+    ray = further(at.ray, t)
+    hit = meet(trace, ray, active)
+    if trace.hide_emitters:
+        hit = behind_emitters(trace, ray, hit, active & at.camera)
+    return Arrival(ray, hit, at.pdf, at.delta, at.camera, medium, t)

@@ -12,9 +12,9 @@ import mitsuba as mi
 from pathreplay.adjoint.autodiff import NonFiniteCounter
 from pathreplay.adjoint.baseline import Baseline
 from pathreplay.boundary.edges import Edges, edges_backward, edges_forward
-from pathreplay.boundary.primary import primary_edges
-from pathreplay.boundary.secondary import secondary_edges
-from pathreplay.boundary.volumetric import volumetric_edges
+from pathreplay.boundary.primary import PrimarySearch
+from pathreplay.boundary.secondary import SecondarySearch
+from pathreplay.boundary.volumetric import VolumetricSearch
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
@@ -57,7 +57,7 @@ class Boundary:
         image = None
         for edges in self._searches(view, trace, places):
             δL = edges_forward(trace, places, edges)
-            part = places.image(edges.s, δL, edges.ray.wavelengths)
+            part = places.image(edges.path.s, δL, edges.path.ray.wavelengths)
             image = part if image is None else image + part
         return TermResult(image)
 
@@ -70,9 +70,9 @@ class Boundary:
 
         lost, paths = NonFiniteCounter(), 0
         for edges in self._searches(view, trace, places):
-            W = places.importance(wanted, edges.s, edges.ray.wavelengths)
+            W = places.importance(wanted, edges.path.s, edges.path.ray.wavelengths)
             edges_backward(trace, places, edges, W, lost)
-            paths += dr.width(edges.s)
+            paths += dr.width(edges.path.s)
         dr.eval()
         return TermResult(lost=lost.count, paths=paths, moves=True)
 
@@ -112,17 +112,17 @@ class Boundary:
         if why := self.obstacle(view):
             raise PathreplayError(f"{why}, or use boundary = 'none'")
         trace = self.informed(view, trace)
-        lines = lines_of(view, places, self.spp)
-        seed = Stream.BOUNDARY.of(view.opaque_seed)
+        n, seed = segments_of(view, places, self.spp), Stream.BOUNDARY.of(view.opaque_seed)
+        on_film, inner = max(n // FILM_CLOSER, 1), max(n // INNER_CLOSER, 1)
         if self.film:
-            yield primary_edges(trace, places, lines, max(lines // FILM_CLOSER, 1), seed, FILM_LENGTH)
+            yield PrimarySearch.of(trace, places, FILM_LENGTH).find(n, on_film, seed)
             if trace.media is not None and trace.traits.hard_lights:
-                yield volumetric_edges(trace, places, lines, max(lines // FILM_CLOSER, 1), seed, FILM_LENGTH)
+                yield VolumetricSearch.of(trace, places, FILM_LENGTH).find(n, on_film, seed)
         if self.inner:
-            yield secondary_edges(trace, places, lines, max(lines // INNER_CLOSER, 1), seed, INNER_LENGTHS)
+            yield SecondarySearch.of(trace, places, INNER_LENGTHS).find(n, inner, seed)
 
 
-def lines_of(view: Pass, places: FilmPlaces, spp: int) -> int:
+def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
     """How many lines look for edges: ``spp`` per pixel in the whole pass, or as many as samples (0)."""
     pixels = int(places.size.x) * int(places.size.y)
     lines = pixels * (math.ceil(spp * view.share) if spp else view.spp)
