@@ -20,7 +20,7 @@ from pathreplay.samplers.streams import Stream
 from pathreplay.transport.motion import may_move
 from pathreplay.transport.path import PathState
 from pathreplay.transport.signature import mixed, place_met, shape_met, turned_away
-from pathreplay.transport.start import CameraStart
+from pathreplay.transport.start import CameraStart, medium_around
 from pathreplay.transport.surface import steady
 from pathreplay.transport.vertex import Arrival, TraceConfig, VertexSamples
 from pathreplay.transport.volume.passage import SHORT_OF, transmittance_up_to
@@ -40,26 +40,21 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
     return chain if trace.media is None else replace(chain, media=None, clear=True)  # type: ignore[arg-type]
 
 
+@dr.syntax
 def probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool, flows: mi.Bool) -> VisibilityProbe:
     """What a path meets from the camera to the first vertex where it is scattered; until something moves, nothing.
 
     ``flows``: all that is met may move under the place where the path begins.
     """
-    if trace.traits.mirrors or trace.traits.hard_lights:
-        return _probe_chain(trace, ray, key, active, flows)
-    path = PathState.begin(trace, CameraStart(ray, CounterSampler.of(key), active))
-    moves = flows | may_move(trace, path.at.hit)
-    return dr.select(moves, _probe_vertex(trace, path, key, active & moves), VisibilityProbe.nothing())
-
-
-@dr.syntax
-def _probe_chain(trace: TraceConfig, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool, flows: mi.Bool) -> VisibilityProbe:
     numbers = CounterSampler.of(key)
     path = PathState.begin(trace, CameraStart(ray, numbers, active))
-    probe, moves = VisibilityProbe.nothing(), mi.Bool(flows)
+    if dr.hint(not (trace.traits.mirrors or trace.traits.hard_lights), mode="scalar"):
+        moved = flows | may_move(trace, path.at.hit)
+        return dr.select(moved, _probe_vertex(trace, path, key, active & moved), VisibilityProbe.of())
+    probe, moves = VisibilityProbe.of(), mi.Bool(flows)
     while dr.hint(path.active, exclude=[trace], label="pathreplay: chain"):
         moves |= may_move(trace, path.at.hit)
-        here = dr.select(moves, _probe_vertex(trace, path, key, path.active & moves), VisibilityProbe.nothing())
+        here = dr.select(moves, _probe_vertex(trace, path, key, path.active & moves), VisibilityProbe.of())
         if dr.hint(trace.traits.hard_lights, mode="scalar"):
             dark = _shadow_test(trace, path.at, key, path.depth, path.active).dark
             here.signature = mixed(here.signature, dr.select(dark, mi.UInt32(1), 0))
@@ -182,9 +177,7 @@ def transmittance_of_chain(
     numbers, others = CounterSampler.of(key), CounterSampler.stream(key, Stream.TRANSMITTANCE_OF_CHAIN)
     path = PathState.begin(chain, CameraStart(ray, numbers, active))
     T = mi.Spectrum(1)
-    around = trace.media.around
-    medium = dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)
-    count = mi.UInt32(0)
+    medium, count = medium_around(trace), mi.UInt32(0)
     while dr.hint(path.active & (count <= k), exclude=[trace, chain], label="pathreplay: transmittance of a chain"):
         last = count == k
         length = dr.select(last, reach, SHORT_OF * path.at.hit.t)

@@ -1,4 +1,4 @@
-"""Edges that are no outlines: lines where two surfaces meet, and where a smooth one turns dark.
+"""Edges that are no outlines: where two surfaces meet, where a smooth one turns dark, and where a hard shadow ends.
 
 A smooth mesh goes dark where its shading normal is at right angles to the ray, a little before its outline.
 """
@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.boundary.crofton import at_an_angle, hides_itself
+from pathreplay.boundary.hard_shadows import HardShadow
 from pathreplay.transport.meet import meet
 from pathreplay.transport.signature import place_met, shape_met, turned_away
 from pathreplay.transport.vertex import Arrival, TraceConfig
@@ -28,37 +29,42 @@ Side: TypeAlias = "tuple[mi.PreliminaryIntersection3f, mi.Ray3f]"
 
 
 @dataclass
-class CreaseOrContour:
-    """What two rays met, at the two sides of an edge."""
+class Crease:
+    """An edge that is no outline between what two rays met, if there is one."""
 
     a: mi.PreliminaryIntersection3f
     b: mi.PreliminaryIntersection3f
     meets: mi.Bool  # two surfaces meet there, at an angle
     turns: mi.Bool  # it is one sheet of one surface, the shading normal of which is at right angles to the ray
+    shadow: HardShadow | None  # where there are lights that cast them
 
     @staticmethod
-    def of(trace: TraceConfig, side_a: Side, side_b: Side, active: mi.Bool) -> CreaseOrContour:
+    def of(trace: TraceConfig, side_a: Side, side_b: Side, shadow: HardShadow | None, active: mi.Bool) -> Crease:
         """Detached."""
         (a, ray_a), (b, ray_b) = side_a, side_b
         both = active & a.is_valid() & b.is_valid()
+        if shadow is not None:
+            both &= ~shadow.there
         flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
         si_a, si_b = (hit.compute_surface_interaction(ray, flags, both) for hit, ray in (side_a, side_b))
         meets = both & at_an_angle(si_a.n, si_b.n) & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
         same = both & (place_met(trace, a, both, si_a.shape) == place_met(trace, b, both, si_b.shape))
         turns = same & (turned_away(si_a, ray_a.d) != turned_away(si_b, ray_b.d)) & ~hides_itself(si_a, si_b)
-        return CreaseOrContour(a, b, meets, turns)
+        return Crease(a, b, meets, turns, shadow)
 
     @property
     def there(self) -> mi.Bool:
-        """Whether it is one of the two."""
-        return self.meets | self.turns
+        """Whether there is one."""
+        there = self.meets | self.turns
+        return there if self.shadow is None else there | self.shadow.there
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
         """B: zero on the edge, and wherever there is none; differentiable in the ray and in the shapes."""
         meets, turns = active & self.meets, active & self.turns
         t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, meets).t for hit in (self.a, self.b)]
         si = self.a.compute_surface_interaction(ray, mi.RayFlags.All, turns)
-        return dr.select(meets, t[0] - t[1], dr.select(turns, dr.dot(si.sh_frame.n, ray.d), 0))
+        B = dr.select(meets, t[0] - t[1], dr.select(turns, dr.dot(si.sh_frame.n, ray.d), 0))
+        return B if self.shadow is None else dr.select(self.shadow.there, self.shadow.gap(ray, active), B)
 
 
 def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> list[Arrival]:

@@ -54,13 +54,9 @@ class VisibilityProbe:
     lobe: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # its plane may hide what is there
 
     @staticmethod
-    def of(signature: mi.UInt32) -> VisibilityProbe:
+    def of(signature: int | mi.UInt32 = 0) -> VisibilityProbe:
         """What nothing but its signature tells apart."""
-        return VisibilityProbe(signature, mi.Point3f(0), mi.Normal3f(0))
-
-    @staticmethod
-    def nothing() -> VisibilityProbe:
-        return VisibilityProbe.of(mi.UInt32(0))
+        return VisibilityProbe(mi.UInt32(signature), mi.Point3f(0), mi.Normal3f(0))
 
     def differs(self, other: VisibilityProbe) -> mi.Bool:
         """Whether it is another shape, or another sheet of the same: see `hides_itself`."""
@@ -137,11 +133,11 @@ class Crossed:
         return 0.5 * dr.pi * self.weight / (length * density)
 
 
-def passed(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f, active: mi.Bool) -> mi.Spectrum:
+def passed(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f) -> mi.Spectrum:
     """K: jump · sgn(w·∂B) / |∂B|, zero where that is not finite; ``slope`` is ∂B, ``jump`` the rest of K."""
     n = dr.norm(slope)
     K = jump * (dr.sign(dr.dot(w, slope)) / n)
-    return dr.select(active & (n > 0) & dr.all(dr.isfinite(K)), K, 0)
+    return dr.select((n > 0) & dr.all(dr.isfinite(K)), K, 0)
 
 
 @dataclass

@@ -23,80 +23,79 @@ class ShadowTest:
     """What keeps a light from a point: something between, or that it is outside of a projector's picture or a cone."""
 
     u: mi.Point2f  # which light
+    lit: mi.Bool  # there is such a light, which has no extent
+    Le: mi.Spectrum  # over the probability of the light
     ray: mi.Ray3f  # towards it
     hit: mi.PreliminaryIntersection3f
     outside: mi.Bool  # of the picture, or of the cone of a spot that ends at once
     uv: mi.Point2f  # place in it
+    met: mi.PreliminaryIntersection3f = None  # the point, if it is on the surface that a ray met
 
     @staticmethod
     def of(trace: TraceConfig, at: Arrival, numbers: CounterSampler, k: mi.UInt32, active: mi.Bool) -> ShadowTest:
-        """That of the light which is sampled where a path arrives as its k-th vertex, if that has no extent.
-
-        ``numbers`` are those of the vertex.
-        """
+        """That of the light which is sampled where a path arrives as its k-th vertex; ``numbers`` are the vertex's."""
         u = VertexSamples.draw(numbers).light
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
-        scatters = _scatters(trace, si, k, active)
-        light, Le = draw_emitter(trace.scene, si, u, scatters, visible=False)
-        lit = scatters & (light.pdf != 0)
-        ray = si.spawn_ray_to(light.p)
-        hit = meet(trace, ray, lit & light.delta)
-        if trace.clear:
+        test = ShadowTest.at(trace, si, u, _scatters(trace, si, k, active))
+        test.met = at.hit
+        return test
+
+    @staticmethod
+    def at(trace: TraceConfig, x: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> ShadowTest:
+        """That of the light which ``u`` samples from a point. In media no picture or cone has a border."""
+        light, Le = draw_emitter(trace.scene, x, u, active, visible=False)
+        found = active & (light.pdf != 0)
+        lit, ray = found & light.delta, x.spawn_ray_to(light.p)
+        hit = meet(trace, ray, lit)
+        if trace.clear or trace.media is not None:
             hit = skip_null(trace, ray, hit, lit)
         outside = mi.Bool(False)
-        for projector in trace.traits.projectors:
-            outside |= (light.pdf == 0) & (light.emitter == mi.EmitterPtr(projector))
-        for spot in trace.traits.spots:
-            outside |= (light.emitter == mi.EmitterPtr(spot)) & _ends_at_once(spot) & dr.all(Le == 0)
-        return ShadowTest(u, ray, hit, outside & scatters, light.uv)
+        if trace.media is None:
+            for projector in trace.traits.projectors:
+                outside |= (light.pdf == 0) & (light.emitter == mi.EmitterPtr(projector))
+            for spot in trace.traits.spots:
+                outside |= (light.emitter == mi.EmitterPtr(spot)) & _ends_at_once(spot) & dr.all(Le == 0)
+        return ShadowTest(u, lit, Le, ray, hit, outside & active, light.uv)
 
     @property
     def dark(self) -> mi.Bool:
         return self.outside | self.hit.is_valid()
 
-    def normal(self, active: mi.Bool) -> mi.Vector3f:
-        """That of the edge of what is between: see `edge_normal`."""
-        return edge_normal(self.hit, self.ray, active & ~self.outside)
-
-    def gap(
-        self, trace: TraceConfig, n: mi.Vector3f, met: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
-    ) -> mi.Float:
-        """B: zero where the shadow on the surface that was ``met`` ends; ``n`` is the `normal`.
-
-        Differentiable in the ray, which slides over that surface, in the surfaces and in the light.
-        """
-        si = met.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        light, _ = trace.scene.sample_emitter_direction(si, self.u, False, active)
-        shadow = outline_gap(n, si.p, light.d, self.hit, self.ray, active & ~self.outside)
-        if not trace.traits.projectors and not trace.traits.spots:
-            return shadow
-        beside = (self.uv.x < 0) | (self.uv.x > 1)
-        border = dr.select(dr.select(beside, self.uv.x, self.uv.y) > 0.5, mi.Float(1), 0)
-        gap = dr.select(beside, light.uv.x, light.uv.y) - border
-        for spot in trace.traits.spots:
-            gap = dr.select(light.emitter == mi.EmitterPtr(spot), _inside_cone(spot, light), gap)
-        return dr.select(active & self.outside, gap, shadow)
-
 
 @dataclass
 class HardShadow:
-    """The border of a hard shadow, which is between two places of what a ray meets."""
+    """The border of a hard shadow between two points of a surface, if one is in the shadow and the other is not."""
 
     trace: TraceConfig
     there: mi.Bool
-    in_a: mi.Bool  # whether the first of the places is in the shadow
-    shade: ShadowTest  # of the place in the shadow
-    n: mi.Vector3f
+    in_a: mi.Bool  # whether the first of the points is in the shadow
+    test: ShadowTest  # of the point in the shadow
+    n: mi.Vector3f  # normal to the edge of what is between: see `edge_normal`
 
     @staticmethod
     def between(trace: TraceConfig, a: ShadowTest, b: ShadowTest, active: mi.Bool) -> HardShadow:
-        """That between two places, of which one is in the shadow and the other is not. Detached."""
-        there, shade = active & (a.dark != b.dark), dr.select(a.dark, a, b)
-        return HardShadow(trace, there, a.dark, shade, shade.normal(there))
+        """Detached."""
+        there, test = active & (a.dark != b.dark), dr.select(a.dark, a, b)
+        return HardShadow(trace, there, a.dark, test, edge_normal(test.hit, test.ray, there & ~test.outside))
 
-    def gap(self, met: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        """B: see `ShadowTest.gap`."""
-        return self.shade.gap(self.trace, self.n, met, ray, active & self.there)
+    def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+        """B. Differentiable in the ray, which slides over the surface, in the surfaces and in the light."""
+        si = self.test.met.compute_surface_interaction(ray, mi.RayFlags.All, active & self.there)
+        return self.gap_at(si, active)
+
+    def gap_at(self, x: mi.Interaction3f, active: mi.Bool) -> mi.Float:
+        """B, as a function of the point. Differentiable in the point, in the surfaces and in the light."""
+        test, traits, active = self.test, self.trace.traits, active & self.there
+        light, _ = self.trace.scene.sample_emitter_direction(x, test.u, False, active)
+        shadow = outline_gap(self.n, x.p, light.d, test.hit, test.ray, active & ~test.outside)
+        if not traits.projectors and not traits.spots:
+            return shadow
+        beside = (test.uv.x < 0) | (test.uv.x > 1)
+        border = dr.select(dr.select(beside, test.uv.x, test.uv.y) > 0.5, mi.Float(1), 0)
+        gap = dr.select(beside, light.uv.x, light.uv.y) - border
+        for spot in traits.spots:
+            gap = dr.select(light.emitter == mi.EmitterPtr(spot), _inside_cone(spot, light), gap)
+        return dr.select(active & test.outside, gap, shadow)
 
 
 def _ends_at_once(spot: mi.Emitter) -> mi.Bool:

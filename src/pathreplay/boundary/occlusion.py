@@ -7,7 +7,6 @@ other, it bends, or a hard shadow ends on it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +14,7 @@ import mitsuba as mi
 from pathreplay.adjoint.autodiff import derivative_by_ray
 from pathreplay.adjoint.primal import walk_on
 from pathreplay.boundary.arcs import Arc, arc, density_of_samples
-from pathreplay.boundary.creases import CreaseOrContour, Side, off_contact
+from pathreplay.boundary.creases import Crease, off_contact
 from pathreplay.boundary.crofton import Crossed, Survey, VisibilityProbe, bisect, probed
 from pathreplay.boundary.edges import Crossing
 from pathreplay.boundary.hard_shadows import HardShadow, ShadowTest
@@ -81,7 +80,7 @@ class ArcSegment:
         bright = dr.select(seen.is_valid(), DIM, mi.Float(trace.scene.environment() is not None))
         probe = VisibilityProbe(mixed(place, turned), at.p, at.n, moves, near, bright)
         # As nothing, a sky would be.
-        dark = replace(VisibilityProbe.of(mi.UInt32(1)), moves=moves, near=near, bright=bright)
+        dark = replace(VisibilityProbe.of(1), moves=moves, near=near, bright=bright)
         return dr.select(counts, probe, dark)
 
     def _counts(self, seen: mi.PreliminaryIntersection3f) -> mi.Bool:
@@ -119,36 +118,29 @@ class ArcSegment:
         if self.hard:
             a, b = (self._probe(t, active, hard=False) for t in (crossed.a, crossed.b))
             tests = [self._shadow_test(ray, first, active) for ray, first in zip(rays, firsts, strict=True)]
-            shadow = HardShadow.between(trace, *tests, active & ~a.differs(b))
+            shadow = HardShadow.between(trace, tests[0], tests[1], active & ~a.differs(b))
             near_a = dr.select(shadow.there, shadow.in_a, near_a)
-        (near, far), (hit, beside) = _ordered(near_a, firsts), _ordered(near_a, edges)
-        ray_near, ray_far = _ordered(near_a, rays)
-        active = active & hit.is_valid() & observer.is_off(hit.t)
-        outlined = active if shadow is None else active & ~shadow.there
-        crease = CreaseOrContour.of(trace, (hit, ray_near), (beside, ray_far), outlined)
-        own = outlined & observer.parts(ray_near.d, ray_far.d)
-        edge = OcclusionEdge.of(Bend(hit, crease, shadow, own, active), observer, ray_near, ray_far)
-        sides = [(ray_near, near), (ray_far, far)]
-        K_near, K_far = self._weights(crossed, edge, sides, through)
-        return [
-            HeldEdge(K_far - K_near, edge),
-            MovedSide(K_near, edge, ray_near.d, near),
-            MovedSide(-K_far, edge, ray_far.d, far),
-        ]
+        sides = zip(rays, firsts, edges, strict=True)
+        near, far = (Side(*side) for side in sides)
+        near, far = dr.select(near_a, near, far), dr.select(near_a, far, near)
+        active = active & near.edge.is_valid() & observer.is_off(near.edge.t)
+        crease = Crease.of(trace, (near.edge, near.ray), (far.edge, far.ray), shadow, active)
+        edge = OcclusionEdge.of(observer, near, far, crease, active)
+        K_near, K_far = self._weights(crossed, edge, near, far, through)
+        return [HeldEdge(K_far - K_near, edge), MovedSide(K_near, edge, near), MovedSide(-K_far, edge, far)]
 
     def _weights(
-        self, crossed: Crossed, edge: OcclusionEdge, sides: list[Side], through: mi.Bool
+        self, crossed: Crossed, edge: OcclusionEdge, near: Side, far: Side, through: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Spectrum]:
         """π/2 f / (l p(c)) of the two sides: near the edge and far, both with the same random numbers."""
-        observer, trace, x = self.observer, self.observer.trace, self.observer.selected
-        d = sides[1][0].d
-        f, pdf = observer.towards(d, edge.active)
-        per_length = 0.5 * dr.pi * crossed.weight * self.arc.weight(observer, density_of_samples(pdf), edge.active)
+        observer, trace, x, active = self.observer, self.observer.trace, self.observer.selected, edge.active
+        f, pdf = observer.towards(far.ray.d, active)
+        per_length = 0.5 * dr.pi * crossed.weight * self.arc.weight(observer, density_of_samples(pdf), active)
         common = x.β * f * per_length
-        active = edge.active & dr.any(common != 0)
-        near, far = (observer.arrival(ray, hit, pdf) for ray, hit in sides)
-        arrivals = off_contact(trace, near, far, active)
-        T, arrivals = observer.onward(arrivals, SHORT_OF * edge.bend.hit.t, self.key, active & through)
+        active = active & dr.any(common != 0)
+        at_near, at_far = (observer.arrival(side.ray, side.hit, pdf) for side in (near, far))
+        arrivals = off_contact(trace, at_near, at_far, active)
+        T, arrivals = observer.onward(arrivals, SHORT_OF * near.edge.t, self.key, active & through)
         K, depth = [], x.depth + 1
         for arrival in arrivals:
             path = PathState(arrival, mi.Spectrum(1), None, mi.Float(1), depth, active & (depth < trace.max_depth))
@@ -157,85 +149,75 @@ class ArcSegment:
         return K[0], K[1]
 
 
-def _ordered(near_a: mi.Bool, pair: list[Any]) -> tuple[Any, Any]:
-    """What belongs to the near side, and what to the far one."""
-    a, b = pair
-    return dr.select(near_a, a, b), dr.select(near_a, b, a)
-
-
 @dataclass
-class Bend:
-    """What is at an edge where no surface hides another: a crease or contour, a hard shadow, or a plane."""
+class Side:
+    """What is seen at one side of an edge."""
 
-    hit: mi.PreliminaryIntersection3f
-    crease: CreaseOrContour
-    shadow: HardShadow | None
-    own: mi.Bool  # the plane of the observer's own triangle
-    active: mi.Bool
-
-    @property
-    def there(self) -> mi.Bool:
-        """Whether the edge is one of these."""
-        there = self.own | self.crease.there
-        return there if self.shadow is None else there | self.shadow.there
-
-    def gap(self, ray: mi.Ray3f, n: mi.Normal3f) -> mi.Float:
-        """B: zero on the edge; differentiable in the ray and the shapes. ``n`` is the normal of the own plane."""
-        B = dr.select(self.own, dr.dot(n, ray.d), self.crease.gap(ray, self.active & ~self.own))
-        if self.shadow is None:
-            return B
-        return dr.select(self.shadow.there, self.shadow.gap(self.hit, ray, self.active), B)
+    ray: mi.Ray3f
+    hit: mi.PreliminaryIntersection3f  # may be none
+    edge: mi.PreliminaryIntersection3f  # what has the edge: the same or, if that is a null boundary, what is behind
 
 
 @dataclass
 class OcclusionEdge:
     """An edge that a vertex sees between two directions, ``n`` normal to it and from the near one to the far one."""
 
-    bend: Bend
     observer: ObserverVertex
-    d: mi.Vector3f  # on its near side
+    near: Side
+    crease: Crease
+    own: mi.Bool  # it is the plane of the observer's own triangle
     n: mi.Vector3f
-    slope: mi.Float  # of the bend's B, along n
-    bent: mi.Bool
+    slope: mi.Float  # of B along n, where nothing hides anything
     active: mi.Bool
 
     @staticmethod
-    def of(bend: Bend, observer: ObserverVertex, near: mi.Ray3f, far: mi.Ray3f) -> OcclusionEdge:
-        """The edge between two rays. Detached."""
-        slope = derivative_by_ray(near, lambda ray: bend.gap(ray, observer.si.n)).d
-        slope -= dr.dot(slope, near.d) * near.d
-        bent = bend.there & (dr.squared_norm(slope) > 0)
-        active = bend.active if bend.shadow is None else bend.active & (bent | ~bend.shadow.there)
-        n = dr.select(bent, dr.normalize(slope), edge_normal(bend.hit, near, active))
-        n = dr.select(dr.dot(n, far.d - near.d) < 0, -n, n)
-        return OcclusionEdge(bend, observer, near.d, n, dr.select(bent, dr.dot(slope, n), 1), bend.there, active)
+    def of(observer: ObserverVertex, near: Side, far: Side, crease: Crease, active: mi.Bool) -> OcclusionEdge:
+        """Detached."""
+        own, d = observer.parts(near.ray.d, far.ray.d), near.ray.d
+        shadow = mi.Bool(False) if crease.shadow is None else crease.shadow.there
+        edge = OcclusionEdge(observer, near, crease, active & ~shadow & own, observer.si.n, mi.Float(1), active)
+        slope = derivative_by_ray(near.ray, lambda ray: edge.bend(ray, observer.si.n)).d
+        slope -= dr.dot(slope, d) * d
+        bent = edge.bends & (dr.squared_norm(slope) > 0)
+        n = dr.select(bent, dr.normalize(slope), edge_normal(near.edge, near.ray, active))
+        n = dr.select(dr.dot(n, far.ray.d - d) < 0, -n, n)
+        return replace(edge, n=n, slope=dr.select(bent, dr.dot(slope, n), 1), active=active & (bent | ~shadow))
+
+    @property
+    def bends(self) -> mi.Bool:
+        """Whether nothing hides anything."""
+        return self.own | self.crease.there
+
+    def bend(self, ray: mi.Ray3f, n: mi.Normal3f) -> mi.Float:
+        """B where nothing hides anything: zero on the edge. ``n`` is the normal of the observer's triangle."""
+        return dr.select(self.own, dr.dot(n, ray.d), self.crease.gap(ray, self.active & ~self.own))
 
 
 @dataclass
 class HeldEdge:
-    """The edge itself, where one surface hides another: it follows the point of the near one. See `Crossing`."""
+    """An edge where one surface hides another: it follows the point of the near one. See `Crossing`."""
 
     weight: mi.Spectrum
     edge: OcclusionEdge
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        """See `Crossing`: n·d, whose motion is n·V_edge."""
+        """B = n·d, whose motion is n·V_edge."""
         e = self.edge
-        return dr.select(e.active & ~e.bent, dr.dot(e.n, held_direction(at, e.d, e.bend.hit, e.active)), 0)
+        d = held_direction(at, e.near.ray.d, e.near.edge, e.active)
+        return dr.select(e.active & ~e.bends, dr.dot(e.n, d), 0)
 
 
 @dataclass
 class MovedSide:
-    """A side of the edge: its direction moves with the velocity that the interior gives it. See `Crossing`."""
+    """A side of the edge, whose direction moves with the velocity that the interior gives it. See `Crossing`."""
 
     weight: mi.Spectrum
     edge: OcclusionEdge
-    d: mi.Vector3f
-    hit: mi.PreliminaryIntersection3f  # along d; may be none
+    side: Side
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        """See `Crossing`: n·d, whose motion is n·V, or how far d is from a bend."""
-        e, lengths = self.edge, self.edge.observer.trace.traits.tables.blend_lengths
-        d, _ = moved_direction(lengths, at, self.d, self.hit, e.observer.holds(self.hit, e.active))
+        """B = n·d, whose motion is n·V; where nothing hides anything, B of the surface that bends."""
+        e, hit, lengths = self.edge, self.side.hit, self.edge.observer.trace.traits.tables.blend_lengths
+        d, _ = moved_direction(lengths, at, self.side.ray.d, hit, e.observer.holds(hit, e.active))
         ray = mi.Ray3f(at.spawn_ray(dr.detach(d)).o, d)
-        return dr.select(e.active, dr.select(e.bent, e.bend.gap(ray, at.n) / e.slope, dr.dot(e.n, d)), 0)
+        return dr.select(e.active, dr.select(e.bends, e.bend(ray, at.n) / e.slope, dr.dot(e.n, d)), 0)

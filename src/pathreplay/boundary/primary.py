@@ -23,7 +23,7 @@ ever.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -38,12 +38,12 @@ from pathreplay.boundary.chains import (
     split_chains,
     transmittance_of_chain,
 )
-from pathreplay.boundary.creases import CreaseOrContour, off_contact
-from pathreplay.boundary.crofton import PlaneSegment, VisibilityProbe, bisect, detect, heading, passed
-from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain, ray_to_camera
+from pathreplay.boundary.creases import Crease, off_contact
+from pathreplay.boundary.crofton import VisibilityProbe, heading
+from pathreplay.boundary.edges import Edges, ray_to_camera
 from pathreplay.boundary.hard_shadows import HardShadow
 from pathreplay.boundary.observer import going_on
-from pathreplay.boundary.search import EdgeSearch, SegmentDensity, looks_of
+from pathreplay.boundary.search import FilmSearch, FilmSegment, looks_of
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.path import PathState
@@ -53,44 +53,25 @@ from pathreplay.transport.volume.passage import SHORT_OF
 
 
 @dataclass
-class FilmSegment(PlaneSegment):
-    """A segment on the film."""
-
-    density: mi.Float  # of its centre, per pixel
-    key: mi.UInt32  # of the random numbers that its paths share
-
-
-@dataclass
 class FilmCrossing:
     """A crossing on the film: see `Crossing`."""
 
     weight: mi.Spectrum
     near: Arrival
     n: mi.Vector3f
-    crease: CreaseOrContour
-    shadow: HardShadow | None  # where there are lights that cast them
+    crease: Crease
     active: mi.Bool
 
-    def gap(self, ray: mi.Ray3f) -> mi.Float:
-        """See `Crossing`."""
-        B = outline_gap(self.n, ray.o, ray.d, self.near.hit, ray, self.active)
-        B = dr.select(self.crease.there, self.crease.gap(ray, self.active), B)
-        if self.shadow is None:
-            return B
-        return dr.select(self.shadow.there, self.shadow.gap(self.near.hit, ray, self.active), B)
+    def gap(self, at: mi.Ray3f) -> mi.Float:
+        outline = outline_gap(self.n, at.o, at.d, self.near.hit, at, self.active)
+        return dr.select(self.crease.there, self.crease.gap(at, self.active), outline)
 
 
 @dataclass(frozen=True)
-class PrimarySearch(EdgeSearch[FilmSegment]):
-    """A search by segments of a ``length`` in pixels."""
-
-    length: float
+class PrimarySearch(FilmSearch[FilmSegment]):
+    """The search on the film."""
 
     bisection = Stream.BISECT_PRIMARY
-
-    @staticmethod
-    def of(trace: TraceConfig, film: FilmDomain, length: float) -> PrimarySearch:
-        return PrimarySearch(trace, film, SegmentDensity.even(film.size, length), length)
 
     @cached_property
     def chain(self) -> TraceConfig:
@@ -103,38 +84,32 @@ class PrimarySearch(EdgeSearch[FilmSegment]):
         return replace(self, density=self.density.refined(first.c, wide.detect(first) * first.density))
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> FilmSegment:
-        """See `EdgeSearch`."""
         x, y, turn = quasi_random(i, n, seed, 3)
         c, density = self.density.draw(mi.Point2f(x, y))
-        return FilmSegment(c, heading(turn), mi.Float(self.length), density, key_of(i, Stream.PRIMARY_KEYS.of(seed)))
+        key = key_of(i, Stream.PRIMARY_KEYS.of(seed))
+        return FilmSegment(c, heading(turn), mi.Float(self.length), key, density, mi.Bool(True))
 
     def probe(self, segment: FilmSegment, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-        """What is seen at a place of a segment: see `Probe`."""
         s = segment.at(t)
         return probe_chain(self.chain, self.film.ray(s, segment.key)[0], segment.key, active, self.film.flows(s))
 
-    def detect(self, segments: FilmSegment) -> mi.Float:
-        """See `EdgeSearch`."""
-        return detect(partial(self.probe, segments), segments.length, mi.Bool(True)) / segments.density
+    def edge(self, segment: FilmSegment, a: mi.Float, b: mi.Float, active: mi.Bool) -> Edges:
+        ends, key = (segment.at(a), segment.at(b)), segment.key
+        (ray_a, weight), (ray_b, _) = (self.film.ray(s, key) for s in ends)
+        split = split_chains(self.chain, (ray_a, ray_b), key, active)
+        active = active & split.found
+        jump = weight * split.β * self._jump(split, ray_a, key, active)
 
-    def resolve(self, segments: FilmSegment, weight: mi.Float, generator: mi.PCG32) -> Edges:
-        """See `EdgeSearch`."""
-        key = segments.key
-        crossed = bisect(partial(self.probe, segments), segments.length, weight, generator)
-        ends = segments.at(crossed.a), segments.at(crossed.b)
-        (ray_a, ray_weight), (ray_b, _) = (self.film.ray(s, key) for s in ends)
-        split = split_chains(self.chain, (ray_a, ray_b), key, crossed.weight > 0)
-        active = (crossed.weight > 0) & split.found
-        jump = ray_weight * split.β * self._jump(split, ray_a, key, active)
-        jump *= crossed.per_length(segments.length, segments.density)
-        crossing, near_a = self._crossing(split, jump, active)
-
-        s = dr.select(near_a, *ends)
-        ray = self.film.ray(s, key)[0]
-        path, active = record_chain(self.chain, s, ray, key, split.k, crossing.near.ray, crossing.active)
-        crossing = replace(crossing, active=active)
-        K = passed(segments.w, jump, self._slope(path, crossing), active)
-        return Edges(path, [replace(crossing, weight=K)], None)
+        near_a, shadow = split.a.hit.t <= split.b.hit.t, None
+        if split.shadows is not None:
+            shadow = HardShadow.between(self.chain, split.shadows[0], split.shadows[1], active)
+            near_a = dr.select(shadow.there, shadow.in_a, near_a)
+        near, s = dr.select(near_a, split.a, split.b), dr.select(near_a, *ends)
+        active = active & near.hit.is_valid()
+        n = edge_normal(near.hit, near.ray, active)
+        crease = Crease.of(self.chain, (split.a.hit, split.a.ray), (split.b.hit, split.b.ray), shadow, active)
+        path, active = record_chain(self.chain, s, self.film.ray(s, key)[0], key, split.k, near.ray, active)
+        return Edges(path, [FilmCrossing(dr.select(active, jump, 0), near, n, crease, active)], None)
 
     def _jump(self, split: ChainSplit, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """f_a - f_b, with the same random numbers on both sides. ``ray`` is the camera's."""
@@ -153,23 +128,8 @@ class PrimarySearch(EdgeSearch[FilmSegment]):
             f.append(walk_on(onward, CounterSampler.at_vertex(key, split.k), path)[0])
         return T * (f[0] - f[1])
 
-    def _crossing(self, split: ChainSplit, jump: mi.Spectrum, active: mi.Bool) -> tuple[FilmCrossing, mi.Bool]:
-        """The crossing where two chains part, and whether its near side is a."""
-        a, b = split.a, split.b
-        near_a, shadow, outlined = a.hit.t <= b.hit.t, None, active
-        if split.shadows is not None:
-            shadow = HardShadow.between(self.chain, *split.shadows, active)
-            near_a, outlined = dr.select(shadow.there, shadow.in_a, near_a), active & ~shadow.there
-        near = dr.select(near_a, a, b)
-        active = active & near.hit.is_valid()
-        n = edge_normal(near.hit, near.ray, active)
-        if shadow is not None:
-            n = dr.select(shadow.there, shadow.n, n)
-        crease = CreaseOrContour.of(self.chain, (a.hit, a.ray), (b.hit, b.ray), outlined)
-        return FilmCrossing(jump, near, n, crease, shadow, active), near_a
-
-    def _slope(self, path: EdgePath, crossing: FilmCrossing) -> mi.Vector2f:
-        """∂B/∂s: how fast the edge is passed on the film. Reaches no parameter."""
+    def slope(self, segment: FilmSegment, edges: Edges) -> mi.Vector2f:
+        path, (crossing,) = edges.path, edges.crossings
         q = derivative_by_ray(path.ray, crossing.gap)
         q = ray_to_camera(self.chain, self.film, path, q, NonFiniteCounter(), rays_only=True)
 

@@ -8,13 +8,15 @@ segments decides where on the film the others are drawn.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import ClassVar, Generic, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.boundary.crofton import PlaneSegment, VisibilityProbe, bisect, detect, passed
 from pathreplay.boundary.edges import Edges, FilmDomain
 from pathreplay.samplers.counter_sampler import ROUNDS
 from pathreplay.samplers.streams import Stream
@@ -50,9 +52,9 @@ class EdgeSearch(ABC, Generic[Segments]):
         generator = mi.PCG32(closer, initstate=seed + int(self.bisection), initseq=dr.arange(mi.UInt32, closer))
         return search.resolve(search.draw(chosen.index, n, seed), share, generator)
 
-    @abstractmethod
     def guided(self, n: int, seed: mi.UInt32) -> EdgeSearch[Segments]:
-        """The search with what a first look tells of where segments are to be drawn."""
+        """The search with what a first look tells of where segments are to be drawn. Without one, the same."""
+        return self
 
     @abstractmethod
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> Segments:
@@ -68,6 +70,56 @@ class EdgeSearch(ABC, Generic[Segments]):
 
         Lanes of weight zero find nothing.
         """
+
+
+@dataclass
+class FilmSegment(PlaneSegment):
+    """A segment on the film."""
+
+    key: mi.UInt32  # of the random numbers that its paths share
+    density: mi.Float  # of its centre, per pixel, and of what else is drawn
+    active: mi.Bool
+
+
+OnFilm = TypeVar("OnFilm", bound=FilmSegment)
+
+
+@dataclass(frozen=True)
+class FilmSearch(EdgeSearch[OnFilm]):
+    """A search by segments on the film, of a ``length`` in pixels."""
+
+    length: float
+
+    @classmethod
+    def of(cls, trace: TraceConfig, film: FilmDomain, length: float) -> FilmSearch[OnFilm]:
+        return cls(trace, film, SegmentDensity.even(film.size, length), length)
+
+    @abstractmethod
+    def probe(self, segment: OnFilm, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
+        """What is seen at a place of a segment: see `Probe`."""
+
+    @abstractmethod
+    def edge(self, segment: OnFilm, a: mi.Float, b: mi.Float, active: mi.Bool) -> Edges:
+        """The edge between two places of a segment. Its crossing weighs the jump of the radiance, from ``a`` to ``b``.
+
+        Where there is none it weighs 0.
+        """
+
+    @abstractmethod
+    def slope(self, segment: OnFilm, edges: Edges) -> mi.Vector2f:
+        """∂B/∂s: how fast the edge is passed on the film. Reaches no parameter."""
+
+    def detect(self, segments: OnFilm) -> mi.Float:
+        return detect(partial(self.probe, segments), segments.length, segments.active) / segments.density
+
+    def resolve(self, segments: OnFilm, weight: mi.Float, generator: mi.PCG32) -> Edges:
+        weight = dr.select(segments.active, weight, 0)
+        crossed = bisect(partial(self.probe, segments), segments.length, weight, generator)
+        edges = self.edge(segments, crossed.a, crossed.b, crossed.weight > 0)
+        (crossing,) = edges.crossings
+        jump = crossing.weight * crossed.per_length(segments.length, segments.density)
+        K = passed(segments.w, jump, self.slope(segments, edges))
+        return replace(edges, crossings=[replace(crossing, weight=K)])  # type: ignore[type-var]
 
 
 @dataclass

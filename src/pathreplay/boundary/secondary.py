@@ -24,10 +24,10 @@ import mitsuba as mi
 from pathreplay.adjoint.record import Layout, deepest, record_type, room_for
 from pathreplay.boundary.cast_shadows import cast_shadows, casters
 from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
+from pathreplay.boundary.emitters import EmitterSegment
 from pathreplay.boundary.observer import ObserverVertex, SelectedVertex, choose_vertex
 from pathreplay.boundary.occlusion import ArcSegment
 from pathreplay.boundary.search import EdgeSearch, SegmentDensity, looks_of
-from pathreplay.boundary.shadows import EmitterSegment
 from pathreplay.boundary.worth import MOST, UNFORESEEN, Worth, radiance_of, weighed
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
@@ -96,7 +96,6 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         return worth + UNFORESEEN * found
 
     def resolve(self, segments: CameraPath, weight: mi.Float, generator: mi.PCG32) -> Edges:
-        """See `EdgeSearch`."""
         layout = Layout.of(self.trace, True)
         records = dr.alloc_local(record_type(layout), room_for(self.trace))
         records, x = self._vertex(segments, layout, records)

@@ -12,7 +12,6 @@ moves it, ∂B/∂s with τ held, since places and distances together are the do
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -20,17 +19,16 @@ import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import derivative_by_place
 from pathreplay.adjoint.record import Layout, deepest, record, record_type, room_for
-from pathreplay.boundary.crofton import PlaneSegment, VisibilityProbe, bisect, detect, heading, passed
+from pathreplay.boundary.crofton import VisibilityProbe, heading
 from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
+from pathreplay.boundary.hard_shadows import HardShadow, ShadowTest
 from pathreplay.boundary.observer import ObserverVertex, SelectedVertex
-from pathreplay.boundary.search import EdgeSearch, SegmentDensity
+from pathreplay.boundary.search import FilmSearch, FilmSegment
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
-from pathreplay.transport.emitters import draw_emitter
 from pathreplay.transport.meet import meet
 from pathreplay.transport.path import PathState
-from pathreplay.transport.signature import edge_normal, outline_gap
-from pathreplay.transport.start import CameraStart
+from pathreplay.transport.start import CameraStart, medium_around
 from pathreplay.transport.step import Visit, choose_step
 from pathreplay.transport.vertex import Flight, TraceConfig, VertexSamples
 from pathreplay.transport.volume.media import interaction
@@ -38,30 +36,14 @@ from pathreplay.transport.volume.passage import skip_null, transmittance_past_ed
 
 
 @dataclass
-class BeamSegment(PlaneSegment):
+class BeamSegment(FilmSegment):
     """A segment on the film, and of particles that are seen there at one distance."""
 
-    density: mi.Float  # of its centre, per pixel, and of the distance
-    key: mi.UInt32
     τ: mi.Float
-    active: mi.Bool  # there are particles
 
     @property
     def emitter_sample(self) -> mi.Point2f:
-        """The random numbers that say which light."""
         return CounterSampler.stream(self.key, Stream.BEAM_EMITTER).next_2d()
-
-
-@dataclass
-class Lighting:
-    """A particle, and what is between it and the light that is sampled there."""
-
-    there: mi.Bool  # nothing hides it from the camera
-    ray: mi.Ray3f  # towards the light, if that has no extent
-    hit: mi.PreliminaryIntersection3f
-    hidden: mi.Bool
-    Le: mi.Spectrum  # over the probability of the light
-    lit: mi.Bool  # there is such a light
 
 
 @dataclass
@@ -69,37 +51,24 @@ class BeamCrossing:
     """A crossing of the border of a beam: see `Crossing`."""
 
     weight: mi.Spectrum
-    scene: mi.Scene
-    emitter_sample: mi.Point2f
-    dark: Lighting
-    n: mi.Vector3f
+    shadow: HardShadow
     active: mi.Bool
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        """See `Crossing`."""
-        light, _ = self.scene.sample_emitter_direction(at, self.emitter_sample, False, self.active)
-        return outline_gap(self.n, at.p, light.d, self.dark.hit, self.dark.ray, self.active)
+        return self.shadow.gap_at(at, self.active)
 
 
 @dataclass(frozen=True)
-class VolumetricSearch(EdgeSearch[BeamSegment]):
-    """A search by segments of a ``length`` in pixels."""
-
-    length: float
+class VolumetricSearch(FilmSearch[BeamSegment]):
+    """The search on the film and along its rays. There is no first look: beams fill much of what they are seen in."""
 
     bisection = Stream.BISECT_VOLUMETRIC
 
-    @staticmethod
-    def of(trace: TraceConfig, film: FilmDomain, length: float) -> VolumetricSearch:
-        trace = replace(trace, max_depth=min(trace.max_depth, deepest(trace)))
-        return VolumetricSearch(trace, film, SegmentDensity.even(film.size, length), length)
-
-    def guided(self, n: int, seed: mi.UInt32) -> VolumetricSearch:
-        """See `EdgeSearch`. There is no first look: beams fill a large part of what they are seen in."""
-        return self
+    @classmethod
+    def of(cls, trace: TraceConfig, film: FilmDomain, length: float) -> FilmSearch[BeamSegment]:
+        return super().of(replace(trace, max_depth=min(trace.max_depth, deepest(trace))), film, length)
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> BeamSegment:
-        """See `EdgeSearch`."""
         key = key_of(i, Stream.VOLUMETRIC_KEYS.of(seed))
         numbers = CounterSampler.stream(key, Stream.BEAM)
         w = heading(numbers.next_1d())
@@ -108,51 +77,42 @@ class VolumetricSearch(EdgeSearch[BeamSegment]):
         τ = numbers.next_1d() * reach
         ok = dr.isfinite(reach) & (reach > 0)
         density = density * dr.select(ok, dr.rcp(reach), 1)
-        return BeamSegment(c, w, mi.Float(self.length), density, key, dr.select(ok, τ, 0), ok)
+        return BeamSegment(c, w, mi.Float(self.length), key, density, ok, dr.select(ok, τ, 0))
 
     def probe(self, segment: BeamSegment, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-        """What is seen at a place of a segment: see `Probe`."""
-        x = self._lighting(segment, t, active)
-        return VisibilityProbe.of(dr.select(x.there, mi.UInt32(1), 0) | dr.select(x.hidden, mi.UInt32(2), 0))
+        there, test = self._light(segment, t, active)
+        return VisibilityProbe.of(dr.select(there, mi.UInt32(1), 0) | dr.select(test.dark, mi.UInt32(2), 0))
 
-    def detect(self, segments: BeamSegment) -> mi.Float:
-        """See `EdgeSearch`."""
-        return detect(partial(self.probe, segments), segments.length, segments.active) / segments.density
+    def _light(self, segment: BeamSegment, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, ShadowTest]:
+        """Whether nothing hides the particle at a place from the camera, and what hides the light from it."""
+        ray = dr.detach(self.film.ray(segment.at(t), segment.key)[0])
+        before = self._hit(ray, active)
+        there = active & ~(before.is_valid() & (before.t < segment.τ))
+        return there, ShadowTest.at(self.trace, _place_on(ray, segment.τ), segment.emitter_sample, there)
 
-    def resolve(self, segments: BeamSegment, weight: mi.Float, generator: mi.PCG32) -> Edges:
-        """See `EdgeSearch`."""
-        weight = dr.select(segments.active, weight, 0)
-        crossed = bisect(partial(self.probe, segments), segments.length, weight, generator)
-        active = crossed.weight > 0
-        a, b = (self._lighting(segments, t, active) for t in (crossed.a, crossed.b))
-        active &= a.there & b.there & (a.hidden != b.hidden)
-        s = segments.at(dr.select(a.hidden, crossed.a, crossed.b))
-        dark, bright = dr.select(a.hidden, a, b), dr.select(a.hidden, b, a)
-        active &= bright.lit
-        ray, ray_weight = dr.detach(self.film.ray(s, segments.key))
-        path, observer = self._particle(s, ray, segments, active)
-        active &= observer.active
-        crossing = BeamCrossing(
-            mi.Spectrum(0), self.trace.scene, segments.emitter_sample, dark, edge_normal(dark.hit, dark.ray, active),
-            active,
-        )  # fmt: skip
-        jump = ray_weight * self._radiance(ray, segments, observer, dark, bright)
-        jump *= crossed.per_length(segments.length, segments.density)
-        jump *= dr.select(a.hidden, -1, 1)  # from begin to end of the segment
-        slope = derivative_by_place(s, lambda s: crossing.gap(_place_on(self.film.ray(s, segments.key)[0], segments.τ)))
-        return Edges(path, [replace(crossing, weight=passed(segments.w, jump, slope, active))], observer)
+    def edge(self, segment: BeamSegment, a: mi.Float, b: mi.Float, active: mi.Bool) -> Edges:
+        (there_a, test_a), (there_b, test_b) = (self._light(segment, t, active) for t in (a, b))
+        shadow = HardShadow.between(self.trace, test_a, test_b, active & there_a & there_b)
+        bright = dr.select(shadow.in_a, test_b, test_a)
+        s = segment.at(dr.select(shadow.in_a, a, b))
+        ray, weight = dr.detach(self.film.ray(s, segment.key))
+        path, observer = self._particle(s, ray, segment, shadow.there & bright.lit)
+        jump = weight * dr.select(shadow.in_a, -1, 1) * self._radiance(ray, segment, observer, shadow, bright)
+        return Edges(path, [BeamCrossing(dr.select(observer.active, jump, 0), shadow, observer.active)], observer)
+
+    def slope(self, segment: BeamSegment, edges: Edges) -> mi.Vector2f:
+        (crossing,), path = edges.crossings, edges.path
+        return derivative_by_place(path.s, lambda s: crossing.gap(_place_on(self.film.ray(s, path.key)[0], segment.τ)))
 
     def _radiance(
-        self, ray: mi.Ray3f, segment: BeamSegment, observer: ObserverVertex, dark: Lighting, bright: Lighting
+        self, ray: mi.Ray3f, segment: BeamSegment, observer: ObserverVertex, shadow: HardShadow, bright: ShadowTest
     ) -> mi.Spectrum:
         """f: what the particle sends to the camera, where it is lit."""
         trace, active = self.trace, observer.active
         numbers = CounterSampler.stream(segment.key, Stream.TRANSMITTANCE_OF_BEAM)
-        around = trace.media.around
-        medium = dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)
-        T = transmittance_up_to(trace, ray, segment.τ, medium, numbers, active)[0]
-        T *= transmittance_past_edge(trace, bright.ray, dark.hit.t, observer.at.medium, numbers, active)
-        return T * observer.flight.σ_s * observer.towards(bright.ray.d, active)[0] * bright.Le
+        T = transmittance_up_to(trace, ray, segment.τ, medium_around(trace), numbers, active)[0]
+        T *= transmittance_past_edge(trace, bright.ray, shadow.test.hit.t, observer.at.medium, numbers, active)
+        return T * observer.selected.β * observer.towards(bright.ray.d, active)[0] * bright.Le
 
     def _hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
         """What a ray meets behind null boundaries."""
@@ -163,17 +123,6 @@ class VolumetricSearch(EdgeSearch[BeamSegment]):
         hit, box = self._hit(ray, mi.Bool(True)), self.trace.scene.bbox()
         far = dr.norm(ray.o - box.center()) + 0.5 * dr.norm(box.extents())
         return dr.select(hit.is_valid(), hit.t, far)
-
-    def _lighting(self, segment: BeamSegment, t: mi.Float, active: mi.Bool) -> Lighting:
-        ray = dr.detach(self.film.ray(segment.at(t), segment.key)[0])
-        before = self._hit(ray, active)
-        there = active & ~(before.is_valid() & (before.t < segment.τ))
-        x = _place_on(ray, segment.τ)
-        light, Le = draw_emitter(self.trace.scene, x, segment.emitter_sample, there, visible=False)
-        lit = there & light.delta & (light.pdf != 0)
-        towards = x.spawn_ray_to(light.p)
-        hit = self._hit(towards, lit)
-        return Lighting(there, towards, hit, lit & hit.is_valid(), Le, lit)
 
     @dr.syntax
     def _particle(
@@ -205,7 +154,7 @@ class VolumetricSearch(EdgeSearch[BeamSegment]):
         active = active & flight.event
         σ_s, _, _ = at.medium.get_scattering_coefficients(interaction(at.medium, at.ray, flight.t), active)
         flight.σ_s = dr.detach(σ_s)
-        x = SelectedVertex(at, k, k, mi.Spectrum(1), mi.Float(1), mi.Bool(True), active, flight)
+        x = SelectedVertex(at, k, k, flight.σ_s, mi.Float(1), mi.Bool(True), active, flight)
         edge_path = EdgePath(s, segment.key, dr.select(active, k, 0), at.ray, layout, records)
         return edge_path, ObserverVertex(trace, x)
 

@@ -30,8 +30,7 @@ class CameraStart:
             hit = behind_emitters(trace, ray, hit, active)
         at = Arrival(ray=ray, hit=hit, pdf=mi.Float(1), delta=mi.Bool(True), camera=mi.Bool(True))
         if trace.media is not None:
-            around = trace.media.around
-            at.medium = dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)
+            at.medium = medium_around(trace)
             at.behind = mi.Float(0)
         return at
 
@@ -51,3 +50,9 @@ def behind_emitters(
     behind.t += dr.norm(onward.o - ray.o)
     hit[passed] = behind
     return hit
+
+
+def medium_around(trace: TraceConfig) -> mi.MediumPtr:
+    """The medium in which the camera stands."""
+    around = trace.media.around
+    return dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)
