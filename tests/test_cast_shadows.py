@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -9,8 +11,7 @@ import pytest
 
 from edge_ordinary import T, film, sensor
 from pathreplay.boundary.cast_shadows import cast_shadows, casters
-from pathreplay.boundary.emitters import Lamp
-from pathreplay.boundary.secondary import BORDER, SquareLine
+from pathreplay.boundary.emitters import BORDER, EmitterSegment, Lamp
 from pathreplay.integrators.boundary_term import Boundary
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
@@ -88,12 +89,13 @@ def test_lines_are_reflected_at_the_border_of_the_square() -> None:
     turn = mi.Float(rng.uniform(0, 2 * np.pi, n))
     c, w = mi.Point2f(rng.uniform(0, 1, (2, n))), mi.Vector2f(dr.cos(turn), dr.sin(turn))
     none = Lamp(dr.zeros(mi.EmitterPtr, n), mi.Point3f(0), mi.Float(0), mi.Bool(False))
-    line = SquareLine(c, w, mi.Float(-0.5 * l), mi.Float(0.5 * l), none, mi.Float(1))
+    nobody: Any = None
+    segment = EmitterSegment(c, w, mi.Float(l), nobody, mi.UInt32(0), none, mi.Float(1))
     t, step = mi.Float(rng.uniform(-0.5 * l, 0.5 * l, n)), 1e-3
-    at, ahead = np.array(line.at(t)), np.array(line.at(t + step))
+    at, ahead = np.array(segment.at(t)), np.array(segment.at(t + step))
     assert (at >= BORDER).all() and (at <= 1 - BORDER).all()
-    folded = np.array(line.way(t)) != np.array(line.way(t + step))
-    assert np.abs((ahead - at) / step - np.array(line.way(t)))[~folded].max() < 1e-3
+    folded = np.array(segment.direction(t)) != np.array(segment.direction(t + step))
+    assert np.abs((ahead - at) / step - np.array(segment.direction(t)))[~folded].max() < 1e-3
     assert 0 < folded.mean() < 0.01
     # Places of lines whose middle is anywhere fill the square evenly.
     counts = np.histogram2d(*at, bins=4, range=[[0, 1], [0, 1]])[0]

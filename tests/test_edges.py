@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import combinations
 from types import SimpleNamespace
 from typing import Any
@@ -13,11 +14,10 @@ import numpy as np
 import pytest
 
 import edge_scenes as scenes
-from pathreplay.boundary.crofton import BEYOND, BISECTIONS, PlaneLine, Resampled, VisibilityProbe, bisect, detect
-from pathreplay.boundary.emitters import sample_at
+from pathreplay.boundary.crofton import BEYOND, BISECTIONS, PlaneSegment, VisibilityProbe, bisect, detect, heading
+from pathreplay.boundary.emitters import BORDER, sample_at
 from pathreplay.boundary.observer import ObserverVertex
-from pathreplay.boundary.secondary import BORDER
-from pathreplay.boundary.segment_density import SegmentDensity
+from pathreplay.boundary.search import Resampled, SegmentDensity
 from pathreplay.integrators.boundary_term import INNER_LENGTHS
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
@@ -90,11 +90,12 @@ def test_nothing_comes_from_outside_of_the_film() -> None:
 def test_centres_are_drawn_with_their_density() -> None:
     even = SegmentDensity.even(mi.ScalarVector2f(5, 3), 0.5)
     rng = np.random.default_rng(1)
-    seen = mi.Point2f(2.5, 1.5) + 0 * mi.Float(rng.random(50))
+    seen = mi.Point2f(2.0, 1.0) + 0 * mi.Float(rng.random(50))
     centres = even.refined(seen, mi.Float(1))
     n = 200000
     c, density = centres.draw(mi.Point2f(rng.random((2, n), np.float32)))
-    pixel = np.array(mi.UInt32(c.y) * centres.width + mi.UInt32(c.x))
+    corner = c + centres.margin
+    pixel = np.array(mi.UInt32(corner.y) * centres.width + mi.UInt32(corner.x))
     counts = np.bincount(pixel, minlength=centres.width * centres.height) / n
     told = np.zeros_like(counts)
     told[pixel] = np.array(density)
@@ -114,7 +115,7 @@ def test_a_shape_that_hides_itself_is_seen() -> None:
     assert not here.differs(sight(7, [1, 0.3, 0.01], [0, 0.1, 1]))[0]  # on, around a slight bend
     assert here.differs(sight(7, [0.1, 0, -3], [0, 0, 1]))[0]  # behind
     assert here.differs(sight(8, [0.1, 0, 0], [0, 0, 1]))[0]
-    assert not VisibilityProbe.nothing().differs(VisibilityProbe.nothing())[0]
+    assert not VisibilityProbe.of().differs(VisibilityProbe.of())[0]
 
 
 def test_a_mesh_falls_into_pieces_where_vertices_are_written_twice() -> None:
@@ -164,22 +165,22 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle(width: float, halve
     def count(n: int, l: float, seed: int) -> mi.Float:
         number = dr.opaque(mi.UInt32, seed)
 
-        def line(i: mi.UInt32) -> PlaneLine:
+        def segment(i: mi.UInt32) -> PlaneSegment:
             c = mi.Point2f(quasi_random(i, n, number)) * (1 + 2 * l) - l
-            turn = dr.two_pi * mi.sample_tea_float32(i, number)
-            return PlaneLine(c, mi.Vector2f(dr.cos(turn), dr.sin(turn)), mi.Float(-l / 2), mi.Float(l / 2))
+            return PlaneSegment(c, heading(mi.sample_tea_float32(i, number)), mi.Float(l))
 
-        def probe(line: PlaneLine, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-            p = line.at(t)
+        def probe(segment: PlaneSegment, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
+            p = segment.at(t)
             half = dr.select((p.x - 0.3) * 0.3 > (p.y - 0.4) * width, mi.UInt32(halves), 1)
-            return VisibilityProbe(dr.select(inside(p), half, 0), mi.Point3f(0), mi.Normal3f(0))
+            return VisibilityProbe.of(dr.select(inside(p), half, 0))
 
-        mass = detect(probe, line(dr.arange(mi.UInt32, n)), mi.Bool(True))
-        picked = Resampled.of(mass, n // 4, number)
-        chosen = line(picked.index)
-        found = bisect(probe, chosen, picked.weight, mi.PCG32(n // 4, initstate=number))
+        drawn = segment(dr.arange(mi.UInt32, n))
+        picked = Resampled.of(detect(partial(probe, drawn), drawn.length, mi.Bool(True)), n // 4, number)
+        chosen, generator = segment(picked.index), mi.PCG32(n // 4, initstate=number)
+        found = bisect(partial(probe, chosen), chosen.length, picked.weight, generator)
         side = inside(chosen.at(found.a)) != inside(chosen.at(found.b))
-        return 0.5 * dr.pi * dr.sum(dr.select(side, found.weight, 0)) * (1 + 2 * l) ** 2 / (l * n)
+        per_length = found.per_length(l, mi.Float(n / (1 + 2 * l) ** 2))
+        return dr.sum(dr.select(side, per_length, 0))
 
     lengths = [count(1 << 18, 0.1, seed)[0] for seed in range(1, 9)]
     error = np.std(lengths, ddof=1) / len(lengths) ** 0.5
@@ -190,15 +191,14 @@ def test_lines_count_crossings_with_the_sides_of_a_rectangle(width: float, halve
 @pytest.mark.parametrize("at", [-0.5, 0.0, 0.5], ids=["begin", "middle", "end"])
 def test_cracks_are_no_edges(at: float) -> None:
     """Between triangles rays slip through, on a line's begin, middle or end: an edge as close to it is one, though."""
-    line = PlaneLine(mi.Point2f(0), mi.Vector2f(1, 0), mi.Float(-0.5), mi.Float(0.5))
 
     def halved(differs: Callable[[mi.Float], mi.Bool]) -> float:
-        def probe(line: PlaneLine, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-            return VisibilityProbe(mi.UInt32(differs(t)), mi.Point3f(0), mi.Normal3f(0))
+        def probe(t: mi.Float, active: mi.Bool) -> VisibilityProbe:
+            return VisibilityProbe.of(differs(t))
 
-        found = detect(probe, line, mi.Bool(True))
+        found = detect(probe, mi.Float(1), mi.Bool(True))
         assert found[0] > 0
-        return bisect(probe, line, found, mi.PCG32(1)).weight[0]
+        return bisect(probe, mi.Float(1), found, mi.PCG32(1)).weight[0]
 
     assert halved(lambda t: dr.abs(t - at) < 1e-6) == 0
     assert BEYOND * INNER_LENGTHS[0] < BORDER * 2**BISECTIONS  # among samples of an emitter one looks at samples

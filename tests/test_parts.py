@@ -11,7 +11,7 @@ import pytest
 
 from pathreplay import PathreplayError
 from pathreplay.integrators import parts as module
-from pathreplay.integrators.boundary_term import lines_of
+from pathreplay.integrators.boundary_term import segments_of
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
 from pathreplay.integrators.parts import parts
@@ -121,8 +121,8 @@ def test_tangents_are_of_all_parts(small: None) -> None:
 def test_edges_are_looked_for_by_as_many_lines_in_all(small: None) -> None:
     view = Pass.of(mi.load_dict(room(moves=True)), 0, SEED, SPP)
     found, places = parts(view), FilmPlaces.of(view)
-    assert sum(lines_of(part, places, 0) for part in found) == 16 * SPP
-    assert 16 * 64 <= sum(lines_of(part, places, 64) for part in found) <= 16 * (64 + len(found))
+    assert sum(segments_of(part, places, 0) for part in found) == 16 * SPP
+    assert 16 * 64 <= sum(segments_of(part, places, 64) for part in found) <= 16 * (64 + len(found))
 
 
 def test_gradients_that_were_there_stay(small: None) -> None:

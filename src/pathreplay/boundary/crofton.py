@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -98,7 +99,7 @@ def hides_itself(a: VisibilityProbe | mi.SurfaceInteraction3f, b: VisibilityProb
     return off > OFF_PLANE * dr.norm(across) + rounding
 
 
-Probe = Callable[[mi.Float, mi.Bool], VisibilityProbe]
+Probe: TypeAlias = "Callable[[mi.Float, mi.Bool], VisibilityProbe]"
 """(place, active) -> what is seen there. Places of a segment of length l are from -l / 2 to l / 2."""
 
 

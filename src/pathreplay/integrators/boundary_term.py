@@ -28,7 +28,7 @@ from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
 
 FILM_CLOSER, INNER_CLOSER = 5, 16
-"""For so many lines one is looked at closer, of those with an edge."""
+"""For so many segments one is resolved, of those with an edge."""
 GRID = "SDFGrid"
 """By class: its surface is neither met nor held where its outline would have to be."""
 BATCH = "BatchSensor"
@@ -47,7 +47,7 @@ class Boundary:
 
     film: bool = True  # edges that the camera sees
     inner: bool = True  # those that surfaces see
-    spp: int = 0  # lines per pixel, of each kind; 0: samples of the pass
+    spp: int = 0  # segments per pixel, of each kind; 0: samples of the pass
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         """Tangent of the image: see `Term`."""
@@ -123,15 +123,15 @@ class Boundary:
 
 
 def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
-    """How many lines look for edges: ``spp`` per pixel in the whole pass, or as many as samples (0)."""
+    """How many segments look for edges: ``spp`` per pixel in the whole pass, or as many as samples (0)."""
     pixels = int(places.size.x) * int(places.size.y)
-    lines = pixels * (math.ceil(spp * view.share) if spp else view.spp)
-    if lines > MOST_SAMPLES:
+    n = pixels * (math.ceil(spp * view.share) if spp else view.spp)
+    if n > MOST_SAMPLES:
         raise PathreplayError(
-            f"boundary_spp = {spp} with a film of {pixels} pixels are {lines} segments, beyond the {MOST_SAMPLES} that "
+            f"boundary_spp = {spp} with a film of {pixels} pixels are {n} segments, beyond the {MOST_SAMPLES} that "
             f"Dr.Jit takes at once; take boundary_spp up to {MOST_SAMPLES // pixels}, or 0"
         )
-    return max(lines, 1)
+    return max(n, 1)
 
 
 def _still_cameras(view: Pass) -> list[mi.Sensor]:
