@@ -19,7 +19,7 @@ import edge_media_scenes as media
 import edge_ordinary
 import edge_scenes as scenes
 from edge_truth import ours
-from pathreplay.boundary.arcs import arc, density_of_samples
+from pathreplay.boundary.arcs import Arc
 from pathreplay.testing.objective import Objective
 from pathreplay.transport.signature import turned_away
 from truth import Bench, add, translate
@@ -130,12 +130,12 @@ class Lobe:
 def crossings(κ: float, narrow: bool, n: int = 1 << 18) -> np.ndarray:
     """What each of n arcs says of ∫ f dl along a great circle through the middle of the lobe f."""
     observer: Any = Lobe(κ)
-    line, _ = arc(observer, 0.1, narrow, dr.arange(mi.UInt32, n) ^ mi.UInt32(0x51ED270B), mi.Bool(True))
+    line = Arc.draw(observer, 0.1, narrow, dr.arange(mi.UInt32, n) ^ mi.UInt32(0x51ED270B), mi.Bool(True))
     ends = -0.5 * line.length, 0.5 * line.length
     a, b = (dr.dot(mi.Vector3f(0, 1, 0), line.at(t)) for t in ends)
     t = dr.lerp(*ends, a / (a - b))  # the arc is all but straight
     f = observer.pdf(line.at(t))
-    weight = 0.5 * dr.pi * f * line.weight(observer, density_of_samples(f), mi.Bool(True))
+    weight = 0.5 * dr.pi * f * line.weight(f, mi.Bool(True))
     return np.array(dr.select(a * b < 0, weight, 0), np.float64)
 
 

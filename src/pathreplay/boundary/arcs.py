@@ -15,6 +15,7 @@ the right mean. Great circles carry the measure of arcs along, so that it does n
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -34,34 +35,63 @@ ANY = 0.1
 PLACES = 8
 """Places of an arc where the sample may lie, if a lobe may be narrow."""
 
+A = TypeVar("A", bound="Arc")
+
 
 @dataclass
 class Arc:
-    """A piece of a great circle of directions."""
+    """A piece of a great circle of directions, through one in which a vertex scatters."""
 
+    observer: ObserverVertex
+    key: mi.UInt32
     c: mi.Vector3f
     w: mi.Vector3f  # the direction in which it leaves its centre
     length: mi.Float
+    longest: float  # that of arcs where no lobe is narrow
     p: mi.Float  # density of the sample
     f: mi.Spectrum  # what is scattered from there
+    active: mi.Bool  # there is one
     j: mi.UInt32 | None  # of its length; None: there is one only, and the sample is the centre
+
+    @classmethod
+    def draw(cls: type[A], observer: ObserverVertex, l: float, narrow: bool, key: mi.UInt32, active: mi.Bool) -> A:
+        """An arc of at most ``l`` radians; as long as that where no lobe may be ``narrow``."""
+        numbers = CounterSampler.stream(key, Stream.ARC)
+        (lobe, way), turn = numbers.next_2d(), dr.two_pi * numbers.next_1d()
+        d, smooth = observer.sample(lobe, numbers.next_2d())
+        evenly = way < EVENLY
+        d = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), d)
+        ok = active & (evenly | smooth)
+        f, pdf = observer.towards(d, ok)
+        p = dr.select(ok, density_of_samples(pdf), 1)
+        d = dr.select(ok, d, mi.Vector3f(0, 0, 1))
+        sin, cos = dr.sincos(turn)
+        w = mi.Frame3f(d).to_world(mi.Vector3f(cos, sin, 0))
+        if not narrow:
+            return cls(observer, key, d, w, mi.Float(l), l, p, f, ok, None)
+        j = length_drawn(p, numbers)
+        full = l * _length(j)
+        back = -full * _place(dr.minimum(mi.UInt32(PLACES * numbers.next_1d()), PLACES - 1))
+        c, s = dr.cos(back), dr.sin(back)
+        return cls(observer, key, c * d + s * w, c * w - s * d, full, l, p, f, ok, j)
 
     def at(self, t: mi.Float) -> mi.Vector3f:
         return self.c * dr.cos(t) + self.w * dr.sin(t)
 
-    def weight(self, observer: ObserverVertex, p: mi.Float, active: mi.Bool) -> mi.Float:
-        """What a crossing counts at a direction with so much of the samples' density."""
+    def weight(self, pdf: mi.Float, active: mi.Bool) -> mi.Float:
+        """What a crossing counts at a direction that the BSDF samples with density ``pdf``."""
         if self.j is None:
             return dr.rcp(self.length * self.p)
+        p = density_of_samples(pdf)
         share = _length(self.j) * probability(p, self.j) * _suits(p, self.j) / _sum(p)
-        return share / (self.length * self._density(observer, active))
+        return share / (self.length * self._density(active))
 
     @dr.syntax
-    def _density(self, observer: ObserverVertex, active: mi.Bool) -> mi.Float:
+    def _density(self, active: mi.Bool) -> mi.Float:
         """The mean of p P_j over all places where the sample might lie."""
         arc, i, total = self, mi.UInt32(0), mi.Float(0)
-        while dr.hint(i < PLACES, exclude=[arc, observer, active], label="pathreplay: density of an arc"):
-            p = density_of_samples(observer.towards(arc.at(_place(i) * arc.length), active)[1])
+        while dr.hint(i < PLACES, exclude=[arc, active], label="pathreplay: density of an arc"):
+            p = density_of_samples(arc.observer.towards(arc.at(_place(i) * arc.length), active)[1])
             total += p * probability(p, arc.j) / PLACES
             i += 1
         return total
@@ -69,31 +99,6 @@ class Arc:
     def importance(self) -> mi.Float:
         """What a crossing is likely to count, relative to what it would if all arcs were long."""
         return mi.Float(1) if self.j is None else _suits(self.p, self.j) / _sum(self.p)
-
-
-def arc(observer: ObserverVertex, l: float, narrow: bool, key: mi.UInt32, active: mi.Bool) -> tuple[Arc, mi.Bool]:
-    """An arc through a direction in which a vertex scatters, and whether there is one.
-
-    The longest ones are ``l`` radians long; all are where no lobe may be ``narrow``.
-    """
-    numbers = CounterSampler.stream(key, Stream.ARC)
-    (lobe, way), turn = numbers.next_2d(), dr.two_pi * numbers.next_1d()
-    d, smooth = observer.sample(lobe, numbers.next_2d())
-    evenly = way < EVENLY
-    d = dr.select(evenly, mi.warp.square_to_uniform_sphere(numbers.next_2d()), d)
-    ok = active & (evenly | smooth)
-    f, pdf = observer.towards(d, ok)
-    p = dr.select(ok, density_of_samples(pdf), 1)
-    d = dr.select(ok, d, mi.Vector3f(0, 0, 1))
-    sin, cos = dr.sincos(turn)
-    w = mi.Frame3f(d).to_world(mi.Vector3f(cos, sin, 0))
-    if not narrow:
-        return Arc(d, w, mi.Float(l), p, f, None), ok
-    j = length_drawn(p, numbers)
-    full = l * _length(j)
-    back = -full * _place(dr.minimum(mi.UInt32(PLACES * numbers.next_1d()), PLACES - 1))
-    c, s = dr.cos(back), dr.sin(back)
-    return Arc(c * d + s * w, c * w - s * d, full, p, f, j), ok
 
 
 def density_of_samples(pdf: mi.Float) -> mi.Float:

@@ -62,6 +62,15 @@ class Lamp:
         ball = dr.gather(mi.Vector4f, trace.traits.tables.lamp_balls, index, active)
         return Lamp(emitter, mi.Point3f(ball.x, ball.y, ball.z), ball.w, around)
 
+    def may_move(self, trace: TraceConfig) -> mi.Bool:
+        """Whether it is known not to stand still."""
+        moving = trace.traits.moving
+        moves = mi.Bool(moving is None)
+        for shape in moving or ():
+            if shape.is_emitter():
+                moves |= self.emitter == mi.EmitterPtr(shape.emitter())
+        return moves
+
 
 @dataclass
 class Glimpse:
@@ -73,33 +82,6 @@ class Glimpse:
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f  # what it meets: of a mesh that is seen, that
     hidden: mi.Bool
-
-
-def glimpse(trace: TraceConfig, observer: ObserverVertex, lamp: Lamp, u: mi.Point2f, active: mi.Bool) -> Glimpse:
-    """Look at a place of a lamp's square. Detached."""
-    in_cone = active & (lamp.radius > 0)
-    light, Le = lamp.emitter.sample_direction(observer.origin, sample_at(trace, lamp, u), active & ~in_cone)
-    ray = observer.origin.spawn_ray_to(light.p)
-    looks = active & (light.pdf != 0)
-    if not trace.traits.mesh_lights:
-        hit = observer.behind(ray, observer.hit(ray, looks), looks)
-        return Glimpse(light, Le, light.pdf, ray, hit, _hides(hit, light.emitter, looks))
-    d, Ω = direction(lamp, observer.origin.p, u)
-    ray = dr.select(in_cone, observer.origin.spawn_ray(d), ray)
-    looks |= in_cone
-    first = observer.hit(ray, looks)
-    at_lamp = in_cone & first.is_valid() & (first.shape.emitter() == lamp.emitter)  # also if light goes through it
-    hit = dr.select(at_lamp, first, observer.behind(ray, first, looks & ~at_lamp))
-    seen = in_cone & hit.is_valid() & (hit.shape.emitter() == lamp.emitter)
-    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, seen)
-    there = mi.DirectionSample3f(trace.scene, si=si, ref=observer.origin)
-    there.d = d
-    light, density = dr.select(in_cone, there, light), dr.select(in_cone, 0, light.pdf)
-    Le = dr.select(in_cone, dr.select(seen, lamp.emitter.eval(si, seen) * Ω, 0), Le)
-    density = dr.select(seen, lamp.emitter.pdf_direction(observer.origin, there, seen), density)
-    # What is behind the ball does not hide it.
-    near = ~in_cone | (hit.t < dr.norm(lamp.centre - observer.origin.p) + lamp.radius)
-    return Glimpse(light, Le, density, ray, hit, _hides(hit, lamp.emitter, looks) & near)
 
 
 def _hides(hit: mi.PreliminaryIntersection3f, emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Bool:
@@ -130,23 +112,6 @@ def direction(lamp: Lamp, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi
     across = dr.safe_sqrt(s * (2 - s * n))
     frame = mi.Frame3f(dr.select(dist2 > 0, to * dr.rsqrt(dist2), mi.Vector3f(0, 0, 1)))
     return frame.to_world(mi.Vector3f(across * p.x, across * p.y, 1 - s * n)), dr.two_pi * s
-
-
-def followed(
-    trace: TraceConfig, lamp: Lamp, origin: mi.Interaction3f, u: mi.Point2f, glue: Glimpse, active: mi.Bool
-) -> mi.Vector3f:
-    """The direction to a place of a lamp, differentiable in it, and in the origin and the lamp.
-
-    On a mesh the point that follows it is that which ``glue`` sees.
-    """
-    in_cone = active & (lamp.radius > 0)
-    light, _ = lamp.emitter.sample_direction(origin, sample_at(trace, lamp, u), active & ~in_cone)
-    if not trace.traits.mesh_lights:
-        return light.d
-    d, _ = direction(lamp, origin.p, u)
-    y = held_point(glue.hit, dr.detach(glue.ray), in_cone & glue.hit.is_valid()).p
-    to_y = dr.normalize(dr.select(in_cone, y - origin.p, mi.Vector3f(0, 0, 1)))
-    return dr.select(in_cone, d + (to_y - dr.detach(to_y)), light.d)
 
 
 @dataclass
@@ -181,17 +146,55 @@ class EmitterSegment(PlaneSegment):
         return BORDER + INSIDE * dr.select(back, 2 - x, x), dr.select(back, -self.w, self.w)
 
     def glimpse(self, t: mi.Float, active: mi.Bool) -> Glimpse:
-        """The light at a place, or what hides it."""
-        return glimpse(self.observer.trace, self.observer, self.lamp, self.at(t), active)
+        """The light at a place, or what hides it. Detached."""
+        observer, trace, lamp, u = self.observer, self.observer.trace, self.lamp, self.at(t)
+        in_cone = active & (lamp.radius > 0)
+        light, Le = lamp.emitter.sample_direction(observer.origin, sample_at(trace, lamp, u), active & ~in_cone)
+        ray = observer.origin.spawn_ray_to(light.p)
+        looks = active & (light.pdf != 0)
+        if not trace.traits.mesh_lights:
+            hit = observer.behind(ray, observer.hit(ray, looks), looks)
+            return Glimpse(light, Le, light.pdf, ray, hit, _hides(hit, light.emitter, looks))
+        d, Ω = direction(lamp, observer.origin.p, u)
+        ray = dr.select(in_cone, observer.origin.spawn_ray(d), ray)
+        looks |= in_cone
+        first = observer.hit(ray, looks)
+        at_lamp = in_cone & first.is_valid() & (first.shape.emitter() == lamp.emitter)  # also if light goes through it
+        hit = dr.select(at_lamp, first, observer.behind(ray, first, looks & ~at_lamp))
+        seen = in_cone & hit.is_valid() & (hit.shape.emitter() == lamp.emitter)
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, seen)
+        there = mi.DirectionSample3f(trace.scene, si=si, ref=observer.origin)
+        there.d = d
+        light, density = dr.select(in_cone, there, light), dr.select(in_cone, 0, light.pdf)
+        Le = dr.select(in_cone, dr.select(seen, lamp.emitter.eval(si, seen) * Ω, 0), Le)
+        density = dr.select(seen, lamp.emitter.pdf_direction(observer.origin, there, seen), density)
+        # What is behind the ball does not hide it.
+        near = ~in_cone | (hit.t < dr.norm(lamp.centre - observer.origin.p) + lamp.radius)
+        return Glimpse(light, Le, density, ray, hit, _hides(hit, lamp.emitter, looks) & near)
+
+    def followed(self, origin: mi.Interaction3f, u: mi.Point2f, glue: Glimpse, active: mi.Bool) -> mi.Vector3f:
+        """The direction to a place of the emitter, differentiable in it, and in the origin and the emitter.
+
+        On a mesh the point that follows it is that which ``glue`` sees.
+        """
+        trace, lamp = self.observer.trace, self.lamp
+        in_cone = active & (lamp.radius > 0)
+        light, _ = lamp.emitter.sample_direction(origin, sample_at(trace, lamp, u), active & ~in_cone)
+        if not trace.traits.mesh_lights:
+            return light.d
+        d, _ = direction(lamp, origin.p, u)
+        y = held_point(glue.hit, dr.detach(glue.ray), in_cone & glue.hit.is_valid()).p
+        to_y = dr.normalize(dr.select(in_cone, y - origin.p, mi.Vector3f(0, 0, 1)))
+        return dr.select(in_cone, d + (to_y - dr.detach(to_y)), light.d)
 
     def probe(self, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
         """What is seen at a place: see `Probe`."""
         return self._probe(self.glimpse(t, active))
 
     def _probe(self, seen: Glimpse) -> VisibilityProbe:
-        x = self.observer.selected
-        moves = x.moves | _moves(self.observer, self.lamp.emitter) | may_move(self.observer.trace, seen.hit)
-        return VisibilityProbe.of(seen.hidden & moves)
+        trace, moves = self.observer.trace, self.observer.selected.moves
+        moving = moves | self.lamp.may_move(trace) | may_move(trace, seen.hit)
+        return VisibilityProbe.of(seen.hidden & moving)
 
     def detect(self) -> Worth:
         """What an edge on the segment may be worth. Where no lobe is narrow, the middle tells what is scattered."""
@@ -233,18 +236,8 @@ class EmitterSegment(PlaneSegment):
         u, u_lit = (self.at(dr.select(a.hidden, *t)) for t in ((crossed.a, crossed.b), (crossed.b, crossed.a)))
         own = active & observer.parts(lit.light.d, dark.light.d)  # not that of the ray, which begins a little beside
         n = edge_normal(dark.hit, dark.ray, active)
-        crossing = ShadowCrossing(jump, observer, self.lamp, u, lit, dark.hit, dark.ray, n, own, active)
+        crossing = ShadowCrossing(jump, self, u, lit, dark, n, own, active)
         return crossing.weighted(self.direction(crossed.a), u_lit)
-
-
-def _moves(observer: ObserverVertex, emitter: mi.EmitterPtr) -> mi.Bool:
-    """Whether an emitter may move."""
-    moving = observer.trace.traits.moving
-    moves = mi.Bool(moving is None)
-    for shape in moving or ():
-        if shape.is_emitter():
-            moves |= emitter == mi.EmitterPtr(shape.emitter())
-    return moves
 
 
 @dataclass
@@ -252,30 +245,28 @@ class ShadowCrossing:
     """A crossing in the square of an emitter, where the lit side ends: see `Crossing`."""
 
     weight: mi.Spectrum
-    observer: ObserverVertex
-    lamp: Lamp
+    segment: EmitterSegment
     u: mi.Point2f  # at the side in the shadow
-    lit: Glimpse  # at the other
-    hit: mi.PreliminaryIntersection3f  # of what casts it
-    ray: mi.Ray3f
+    lit: Glimpse
+    dark: Glimpse  # at u: it hits what casts the shadow
     n: mi.Vector3f
     own: mi.Bool  # what hides the emitter is the plane of the observer's own triangle
     active: mi.Bool
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        """See `Crossing`."""
         return self._gap(at, self.u)
 
     def _gap(self, at: mi.Interaction3f, u: mi.Point2f) -> mi.Float:
         """B of another emitter sample: distance of the line to it from the edge."""
-        d = followed(self.observer.trace, self.lamp, at, u, self.lit, self.active)
-        return dr.select(self.own, dr.dot(at.n, d), outline_gap(self.n, at.p, d, self.hit, self.ray, self.active))
+        d, dark = self.segment.followed(at, u, self.lit, self.active), self.dark
+        return dr.select(self.own, dr.dot(at.n, d), outline_gap(self.n, at.p, d, dark.hit, dark.ray, self.active))
 
     def weighted(self, w: mi.Vector2f, u_lit: mi.Point2f) -> ShadowCrossing:
         """The crossing with K: its weight so far is the jump along ``w``; ``u_lit`` is the sample at the lit side."""
-        at = self.observer.moved(self.observer.at.ray)
+        observer, dark = self.segment.observer, self.dark
+        at = observer.moved(observer.at.ray)
         slope = derivative_by_place(self.u, lambda u: self._gap(at, u))
         # Where a sample of the emitter jumps there is no edge: its other side is far off.
         off = dr.abs(self._gap(at, u_lit) - self._gap(at, self.u))
-        jumps = off > JUMP * dr.norm(slope) * dr.norm(u_lit - self.u) + ROUNDING * (dr.norm(self.ray.o) + self.hit.t)
+        jumps = off > JUMP * dr.norm(slope) * dr.norm(u_lit - self.u) + ROUNDING * (dr.norm(dark.ray.o) + dark.hit.t)
         return replace(self, weight=dr.select(self.active & ~jumps, passed(w, self.weight, slope), 0))

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import derivative_by_ray
 from pathreplay.adjoint.primal import walk_on
-from pathreplay.boundary.arcs import Arc, arc, density_of_samples
+from pathreplay.boundary.arcs import Arc
 from pathreplay.boundary.creases import Crease, off_contact
 from pathreplay.boundary.crofton import Crossed, Survey, VisibilityProbe, bisect, probed
 from pathreplay.boundary.edges import Crossing
@@ -29,22 +29,13 @@ from pathreplay.transport.velocity import held_direction, jumps_at_facets, moved
 from pathreplay.transport.volume.passage import SHORT_OF
 
 
-@dataclass
-class ArcSegment:
-    """An arc of directions from a vertex, and what is seen along it."""
+class ArcSegment(Arc):
+    """An arc, and what is seen along it."""
 
-    observer: ObserverVertex
-    key: mi.UInt32
-    arc: Arc
-    active: mi.Bool
-    longest: float  # length of arcs for broad lobes, in radians
-    hard: bool  # whether hard shadows are seen
-
-    @staticmethod
-    def draw(observer: ObserverVertex, l: float, key: mi.UInt32) -> ArcSegment:
-        traits, media = observer.trace.traits, observer.trace.media
-        drawn, ok = arc(observer, l, traits.narrow or media is not None, key, observer.active)
-        return ArcSegment(observer, key, drawn, ok, l, traits.hard_lights and media is None)
+    @property
+    def hard(self) -> bool:
+        """Whether hard shadows are seen."""
+        return self.observer.trace.traits.hard_lights and self.observer.trace.media is None
 
     def probe(self, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
         """What is seen at a place: see `Probe`."""
@@ -52,7 +43,7 @@ class ArcSegment:
 
     def _probe(self, t: mi.Float, active: mi.Bool, hard: bool) -> VisibilityProbe:
         observer, trace, x = self.observer, self.observer.trace, self.observer.selected
-        ray = observer.origin.spawn_ray(self.arc.at(t))
+        ray = observer.origin.spawn_ray(self.at(t))
         first = observer.hit(ray, active & observer.may_scatter(ray.d))
         seen = observer.behind(ray, first, active)
         counts, moves = self._counts(seen), x.moves | may_move(trace, seen)
@@ -99,19 +90,18 @@ class ArcSegment:
 
     def detect(self) -> Worth:
         """What an edge on the arc may be worth."""
-        arc, ok = self.arc, self.active
-        light = dr.select(ok, dr.mean(dr.abs(self.observer.selected.β * arc.f)) / arc.p, 0)
-        ends = (arc.at(t) for t in probed(arc.length)[:2])
-        survey = Survey.of([self.probe(t, ok) for t in probed(arc.length)], ok)
-        survey.found *= arc.importance()
-        return Worth.of(survey, light, light * own_plane(self.observer, *ends) / self.longest)
+        light = dr.select(self.active, dr.mean(dr.abs(self.observer.selected.β * self.f)) / self.p, 0)
+        a, b, c = probed(self.length)
+        survey = Survey.of([self.probe(t, self.active) for t in (a, b, c)], self.active)
+        survey.found *= self.importance()
+        return Worth.of(survey, light, light * own_plane(self.observer, self.at(a), self.at(b)) / self.longest)
 
     def resolve(self, weight: mi.Float, generator: mi.PCG32) -> list[Crossing]:
         """Bisect the arc, and weigh both sides of the edge: see `EdgeSearch.resolve`."""
         observer, trace = self.observer, self.observer.trace
-        crossed = bisect(self.probe, self.arc.length, dr.select(self.active, weight, 0), generator)
+        crossed = bisect(self.probe, self.length, dr.select(self.active, weight, 0), generator)
         active = crossed.weight > 0
-        rays = [observer.origin.spawn_ray(self.arc.at(t)) for t in (crossed.a, crossed.b)]
+        rays = [observer.origin.spawn_ray(self.at(t)) for t in (crossed.a, crossed.b)]
         firsts = [observer.hit(ray, active) for ray in rays]
         edges, through = observer.edges(rays, firsts, active)
         near_a, shadow = edges[0].t <= edges[1].t, None
@@ -135,7 +125,7 @@ class ArcSegment:
         """π/2 f / (l p(c)) of the two sides: near the edge and far, both with the same random numbers."""
         observer, trace, x, active = self.observer, self.observer.trace, self.observer.selected, edge.active
         f, pdf = observer.towards(far.ray.d, active)
-        per_length = 0.5 * dr.pi * crossed.weight * self.arc.weight(observer, density_of_samples(pdf), active)
+        per_length = 0.5 * dr.pi * crossed.weight * self.weight(pdf, active)
         common = x.β * f * per_length
         active = active & dr.any(common != 0)
         at_near, at_far = (observer.arrival(side.ray, side.hit, pdf) for side in (near, far))

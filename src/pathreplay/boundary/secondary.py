@@ -116,10 +116,11 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         return records, x
 
     def _segments(self, observer: ObserverVertex, key: mi.UInt32) -> tuple[EmitterSegment, ArcSegment]:
-        square, arc = self.lengths
+        (square, arc), active = self.lengths, observer.active
+        narrow = self.trace.traits.narrow or self.trace.media is not None
         return (
             EmitterSegment.draw(observer, square, Stream.EMITTER_SEGMENTS.of(key)),
-            ArcSegment.draw(observer, arc, Stream.ARCS.of(key)),
+            ArcSegment.draw(observer, arc, narrow, Stream.ARCS.of(key), active),
         )
 
     def _worths(self, path: CameraPath) -> list[Worth]:
