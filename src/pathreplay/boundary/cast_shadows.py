@@ -1,6 +1,6 @@
 """Where shadows of what moves fall on the film: they decide where a first look is taken, and nothing else.
 
-The shadow of something small covers few pixels, which few lines would find. Light tells where it falls: a point of a
+The shadow of something small covers few pixels, which few segments would find. Light tells where it falls: a point of a
 shape that moves, and a direction from which light arrives there, give a ray that goes on to what the shape may shade.
 Whether the camera sees that is not asked.
 """

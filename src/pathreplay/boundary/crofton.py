@@ -1,4 +1,4 @@
-"""Crofton's formula: edges are found by what differs between the ends of short segments, so that nobody lists them.
+"""Crofton's formula: edges are found by what differs between the ends of short segments, and not listed.
 
 Segments of length l are thrown at random on a surface, such as the film or the sphere of directions. With p(c) the
 density of their centres and directions that are uniform, the expected sum of g / p(c) over all crossings with edges is
@@ -46,7 +46,7 @@ class VisibilityProbe:
     p: mi.Point3f  # where the view ends; zero where it does not
     n: mi.Normal3f
     moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # between two that do not, an edge does nothing
-    # What whoever looks knows of how much an edge beside it counts:
+    # Importance of an edge beside it, as far as a probe can tell:
     near: mi.Float = field(default_factory=lambda: mi.Float(1))  # how close it is
     bright: mi.Float = field(default_factory=lambda: mi.Float(1))  # how much light comes from it
     # Of a mesh that is shaded smoothly and is not smooth:

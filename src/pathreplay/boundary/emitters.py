@@ -74,7 +74,7 @@ class Lamp:
 
 @dataclass
 class Glimpse:
-    """Of a lamp, at a place of its square."""
+    """What is seen of an emitter at a place of its square."""
 
     light: mi.DirectionSample3f
     Le: mi.Spectrum  # over the density of the place
@@ -85,7 +85,7 @@ class Glimpse:
 
 
 def _hides(hit: mi.PreliminaryIntersection3f, emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Bool:
-    # A lamp's own limb hides it by rounding only.
+    # An emitter's own limb hides it by rounding only.
     return active & hit.is_valid() & (hit.shape.emitter() != emitter)
 
 
@@ -257,7 +257,7 @@ class ShadowCrossing:
         return self._gap(at, self.u)
 
     def _gap(self, at: mi.Interaction3f, u: mi.Point2f) -> mi.Float:
-        """B of another emitter sample: distance of the line to it from the edge."""
+        """B for the emitter sample ``u``: distance of the line to it from the edge."""
         d, dark = self.segment.followed(at, u, self.lit, self.active), self.dark
         return dr.select(self.own, dr.dot(at.n, d), outline_gap(self.n, at.p, d, dark.hit, dark.ray, self.active))
 

@@ -1,6 +1,6 @@
 """Hard shadows: what keeps a light without extent from a point, and how far a point is from where that ends.
 
-The border of such a shadow is an edge for whoever sees the surface it falls on: the camera, or a point that scatters.
+The border of such a shadow is an edge as seen from the camera or from a vertex that sees the surface on which it falls.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from pathreplay.transport.volume.passage import skip_null
 
 @dataclass
 class ShadowTest:
-    """What keeps a light from a point: something between, or that it is outside of a projector's picture or a cone."""
+    """What keeps a light from a point: an occluder, or the border of a projector's image or of a spot's cone."""
 
     u: mi.Point2f  # which light
     lit: mi.Bool  # there is such a light, which has no extent
     Le: mi.Spectrum  # over the probability of the light
     ray: mi.Ray3f  # towards it
     hit: mi.PreliminaryIntersection3f
-    outside: mi.Bool  # of the picture, or of the cone of a spot that ends at once
+    outside: mi.Bool  # of the image, or of a cone without falloff
     uv: mi.Point2f  # place in it
     met: mi.PreliminaryIntersection3f = None  # the point, if it is on the surface that a ray met
 
@@ -42,7 +42,7 @@ class ShadowTest:
 
     @staticmethod
     def at(trace: TraceConfig, x: mi.Interaction3f, u: mi.Point2f, active: mi.Bool) -> ShadowTest:
-        """That of the light which ``u`` samples from a point. In media no picture or cone has a border."""
+        """That of the light which ``u`` samples from a point. In media, borders of images and cones are left out."""
         light, Le = draw_emitter(trace.scene, x, u, active, visible=False)
         found = active & (light.pdf != 0)
         lit, ray = found & light.delta, x.spawn_ray_to(light.p)

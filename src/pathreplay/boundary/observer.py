@@ -162,7 +162,7 @@ class ObserverVertex:
         """Whether the plane of its own surface lies between two directions.
 
         Where shading normals are interpolated, a vertex scatters light from below that plane, where its own shape
-        hides all lamps.
+        hides all emitters.
         """
         n = self.si.n
         between = dr.dot(n, a) * dr.dot(n, b) < 0

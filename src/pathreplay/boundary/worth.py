@@ -1,7 +1,7 @@
-"""What edges on a line may be worth, as far as a glance tells: it decides where one looks closer, and nothing else.
+"""Importance of edges on a segment, estimated from its probes: it decides which segments are resolved, nothing else.
 
-An edge at a distance r turns by 1 / r as things move, and the integrand jumps there by some of what is scattered. How
-much light comes from what is seen nobody knows before a path goes there: the sky counts fully, all else by `DIM`.
+An edge at a distance r turns by 1 / r as things move, and the integrand jumps there by a part of what is scattered. The
+radiance of what is seen is unknown before a path is traced: the sky counts fully, everything else by `DIM`.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ WITHIN = 2.0
 DIM, OWN = 0.3, 0.1
 """How much an edge counts where no sky is seen, and where the plane of the seer's own triangle may be all there is."""
 UNFORESEEN = 0.1
-"""Share of the lines looked at closer that are chosen by presence alone: a glance does not foresee all that counts."""
+"""Fraction of the importance that goes by the presence of an edge alone: probes do not foresee all that counts."""
 MOST = 4.0
-"""So many times what is usual is the most that a line counts in a first look, which knows few."""
+"""Largest importance of a segment in the first look, over the mean: the first look has few segments."""
 STEEP = 0.03
-"""Radians that a lamp turns by across its square, for a small one: it is not to count without bounds."""
+"""Least angle that an emitter subtends across its square, in radians: bounds the importance of small emitters."""
 
 
 @dataclass
 class Worth:
-    """What a glance at a line tells."""
+    """Importance of a segment."""
 
     found: mi.Float  # see `Survey`
     edges: mi.Float  # what they may be worth
-    light: mi.Float  # what is scattered there, of lamps or of light from all around
+    light: mi.Float  # what is scattered there, of emitters or of light from all around
 
     @staticmethod
     def of(seen: Survey, light: mi.Float, scale: mi.Float) -> Worth:
-        """Of a line with this survey; ``scale`` is the rest of its worth. What is not finite counts as zero."""
+        """Of a segment with this survey; ``scale`` is the rest of its importance. What is not finite counts as zero."""
         edges = seen.found * seen.near * seen.bright * scale
         return Worth(_finite(seen.found), _finite(edges), _finite(light))
 
@@ -59,13 +59,13 @@ def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Fl
 
 
 def radiance_of(worths: list[Worth]) -> mi.Float:
-    """How bright is what arcs see, as one number: as far as one knows, as what lamps light."""
+    """Radiance of what arcs see, relative to emitters, as one number: taken to be that of what emitters light."""
     lit, all_of_it = (dr.sum(worth.light) for worth in worths)
     return dr.select((lit > 0) & (all_of_it > 0), lit / all_of_it, 1)
 
 
 def weighed(worths: list[Worth], radiance: mi.Float) -> list[mi.Float]:
-    """Of each line of both kinds, in a row, how much it finds and what that is worth, as shares of all."""
+    """Presence and importance of edges on the segments of both kinds, one after the other, normalised to sum to 1."""
     in_squares, on_arcs = worths
     found = dr.concat([in_squares.found, on_arcs.found])
     worth = dr.concat([in_squares.edges, radiance * on_arcs.edges])
