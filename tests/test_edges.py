@@ -13,7 +13,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import edge_media_scenes as media
 import edge_scenes as scenes
+from pathreplay.boundary.chains import transmittance_of_chain
 from pathreplay.boundary.crofton import BEYOND, BISECTIONS, PlaneSegment, VisibilityProbe, bisect, detect, heading
 from pathreplay.boundary.emitters import BORDER, sample_at
 from pathreplay.boundary.observer import ObserverVertex
@@ -325,6 +327,22 @@ def test_samples_of_a_ball_are_asked_for_on_a_disk() -> None:
     there = [dr.sqrt(p.x) * mi.Point2f(dr.cos(dr.two_pi * p.y), dr.sin(dr.two_pi * p.y)) for p in close]
     assert dr.all(dr.norm(there[1] - there[0]) < 1e-2)
     assert dr.all(sample_at(trace, SimpleNamespace(around=mi.Bool(False)), close[0]).x == close[0].x)
+
+
+def test_chains_in_fog_are_not_ended_by_roulette() -> None:
+    """Between two mirrors: of a chain that ends early, transmittance would be that of a part of its way."""
+    behind = scenes.T().translate([0, 0, 5]).rotate([0, 1, 0], 180).scale([6, 6, 1])
+    mirrors = [scenes.shape(place, {"type": "conductor"}) for place in (scenes.BACK, behind)]
+    scene = mi.load_dict(media.in_fog(media.thin(), 5, front=mirrors[0], back=mirrors[1]))
+    view, key = Pass.of(scene, 0, 0, 1), dr.arange(mi.UInt32, 2000)
+    places = FilmPlaces.of(view)
+    trace = mi.load_dict({"type": "pathreplay", "max_depth": 8, "rr_depth": 1})._walk(scene, view.sensor)
+    with dr.suspend_grad():
+        s = mi.Point2f(quasi_random(key, 2000, mi.UInt32(1))) * places.size
+        ray, reach = places.ray(s, key)[0], 0.5
+        T, _ = transmittance_of_chain(trace, ray, key, mi.UInt32(4), mi.Float(reach), mi.Bool(True))
+    length = (5 + 3 * 6) / dr.abs(ray.d.z) + reach
+    assert np.array(T) == pytest.approx(np.exp(-0.25 * np.array(length)) * np.ones((3, 1)), rel=0.02)
 
 
 def test_a_single_line_has_a_place() -> None:
