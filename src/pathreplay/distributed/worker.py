@@ -16,8 +16,8 @@ import mitsuba as mi
 
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.dataset.targets import Targets
-from pathreplay.inverse.objective.evaluate import Evaluate, Evaluation, Evaluator, Shard
-from pathreplay.inverse.objective.stages import Staged
+from pathreplay.inverse.objective.evaluate import Evaluate, Evaluation, Shard
+from pathreplay.inverse.objective.stages import evaluator_of
 from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.inverse.problem.problem import Problem, build_problem
 from pathreplay.platform import backend
@@ -102,12 +102,7 @@ class RayActor:
             plugin, integrator = config.integrator, problem.integrator
             if baseline and config.baseline is not None and problem.baseline is not None:
                 plugin, integrator = config.baseline, problem.baseline
-            record = not config.deterministic
-            self.evaluators[baseline] = (
-                Evaluator(problem, integrator, record)
-                if config.stages is None
-                else Staged(problem, config, integrator, plugin, record)
-            )
+            self.evaluators[baseline] = evaluator_of(problem, config, integrator, plugin)
         return self.evaluators[baseline]
 
 

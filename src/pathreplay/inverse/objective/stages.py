@@ -14,7 +14,7 @@ from pathreplay.inverse.config.schema import Config, Plugin
 from pathreplay.inverse.config.stage_options import Stage, place
 from pathreplay.inverse.dataset.views import View
 from pathreplay.inverse.images.io import Image
-from pathreplay.inverse.objective.evaluate import Evaluation, Evaluator, Shard
+from pathreplay.inverse.objective.evaluate import Evaluate, Evaluation, Evaluator, Shard
 from pathreplay.inverse.objective.pixel_batches import obstacle, refused
 from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.inverse.problem.problem import Problem
@@ -194,3 +194,14 @@ class Staged:
             stateful(integrator).silence(stateful(self.integrator).warned)  # what has been said need not be said again
         views = tuple(scaled(view, stage.downscale) if not view.is_test else view for view in part.problem.views)
         return Evaluator(replace(part.problem, views=views), integrator, self.record, part.moving)
+
+
+def evaluator_of(problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin) -> Evaluate:
+    """What evaluates the shards of a job in this process, stage by stage where it has stages.
+
+    ``plugin`` is what the integrator is made of. Passes are recorded unless the job is deterministic.
+    """
+    record = not config.deterministic
+    if config.stages is None:
+        return Evaluator(problem, integrator, record)
+    return Staged(problem, config, integrator, plugin, record)
