@@ -13,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -111,6 +112,25 @@ def _sketched(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
     if not request.node.get_closest_marker("drawn"):
         images = {"svg": b"<svg/>", "png": png_bytes(np.zeros((1, 1, 3), np.float32))}
         monkeypatch.setattr(report, "drawn", lambda figure, kind: images[kind])
+
+
+@pytest.fixture
+def outputs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What the kernel of a notebook would send to the browser, one after the other."""
+    sent: list[str] = []
+
+    def display(html: str, display_id: bool) -> SimpleNamespace:
+        assert display_id is True
+        sent.append(html)
+        return SimpleNamespace(update=sent.append)
+
+    ipython, shown = ModuleType("IPython"), ModuleType("IPython.display")
+    ipython.version_info = 9, 0  # which matplotlib asks for
+    ipython.get_ipython = lambda: SimpleNamespace(kernel=object())
+    shown.HTML, shown.display = str, display
+    monkeypatch.setitem(sys.modules, "IPython", ipython)
+    monkeypatch.setitem(sys.modules, "IPython.display", shown)
+    return sent
 
 
 @pytest.fixture

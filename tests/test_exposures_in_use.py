@@ -44,7 +44,7 @@ def test_what_was_left_goes_on_bit_for_bit(kind: str) -> None:
     assert whole.iterations >= 8
     for stop in (1, 4, whole.iterations - 2):
         for state in iterate(job(kind, f"cut{stop}")):
-            if state.iteration == stop:
+            if state.number == stop:
                 break
         cut = optimize(resume=f"cut{stop}", progress=False)
         assert saved(f"cut{stop}") == saved("whole")

@@ -210,7 +210,7 @@ def test_automatic_samples_double_and_go_on_from_a_checkpoint() -> None:
     from pathreplay.jobs import iterate as states
 
     for state in states(make_config({**JOB, **changes, "output": "cut"})):
-        if state.iteration == WINDOW + 2:
+        if state.number == WINDOW + 2:
             break
     cut = optimize(resume="cut", progress=False)
     assert cut.parameters[KEY].tobytes() == whole.parameters[KEY].tobytes()

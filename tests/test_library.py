@@ -15,6 +15,7 @@ import pytest
 from safetensors.numpy import load_file
 
 import pathreplay
+from library_scenes import BODY, GREY, SIDE, TEXTURE, WALL, Descent, photos_of_room, room, views
 from ordinary_scenes import SCENES, Write
 from pathreplay import Parameter, PathreplayError, Problem, View
 from pathreplay.inverse.images.io import exr_bytes
@@ -22,8 +23,6 @@ from pathreplay.jobs import make_config, optimize
 from pathreplay.scenes.loading import load_scene
 from variant import VARIANT
 
-WALL, TEXTURE, BODY = "wall.bsdf.reflectance.value", "floor.bsdf.reflectance.data", "body.vertex_positions"
-SIDE = 16
 README = Path(__file__).parents[1] / "README.md"
 PAGE = Path(__file__).parents[1] / "docs" / "library.md"
 
@@ -34,48 +33,9 @@ def _variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def room() -> dict[str, Any]:
-    """A lit floor with a texture, a wall, and a body, seen by two cameras."""
-    T = mi.ScalarTransform4f
-    texels = np.random.default_rng(2).uniform(0.2, 0.8, (4, 4, 3)).astype(np.float32)
-
-    def sensor(x: float) -> dict[str, Any]:
-        film = {"type": "hdrfilm", "width": SIDE, "height": SIDE, "rfilter": {"type": "box"}}
-        place = T().look_at([x, 2, 4], [0, 0, 0], [0, 1, 0])
-        return {"type": "perspective", "fov": 45, "to_world": place, "film": film}
-
-    return {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 3},
-        "left": sensor(-1.0),
-        "right": sensor(1.0),
-        "sky": {"type": "constant"},
-        "floor": {
-            "type": "rectangle",
-            "to_world": T().rotate([1, 0, 0], -90).scale(2),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "raw": True, "data": mi.TensorXf(texels)}},
-        },
-        "wall": {
-            "type": "rectangle",
-            "to_world": T().translate([0, 1, -1]).scale(1.5),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.3, 0.2]}},
-        },
-        "body": {"type": "cube", "to_world": T().translate([0, 0.3, 0.3]).scale(0.3)},
-    }
-
-
 @pytest.fixture(scope="module")
 def photos() -> list[np.ndarray]:
-    mi.set_variant(VARIANT)
-    scene = mi.load_dict(room())
-    return [np.array(mi.render(scene, sensor=n, spp=256), np.float32) for n in (0, 1)]
-
-
-def views(photos: list[np.ndarray]) -> list[View]:
-    return [View("left", photos[0]), View("right", photos[1])]
-
-
-GREY = Parameter(initial=0.5, bounds=(0, 1))
+    return photos_of_room()
 
 
 def test_the_script_of_the_readme_recovers_a_texture_and_a_colour() -> None:
@@ -192,13 +152,6 @@ def test_scenes_are_objects_dictionaries_files_and_names(photos: list[np.ndarray
         np.testing.assert_allclose(problem.initial[key], [0.7, 0.3, 0.2], rtol=1e-5)
     by_name = Problem("cornell-box", ["red.reflectance.value"], View(0, np.zeros((256, 256, 3))))
     assert by_name.render(spp=1).shape == (256, 256, 3)
-
-
-class Descent:
-    """An optimiser of the user's own."""
-
-    def step(self, values: Any, gradients: Any, learning_rates: Any, loss: float) -> dict[str, np.ndarray]:
-        return {key: value - 20 * learning_rates[key] * gradients[key] for key, value in values.items()}
 
 
 @pytest.mark.parametrize(

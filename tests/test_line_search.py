@@ -178,7 +178,7 @@ def test_a_job_that_was_left_goes_on_bit_for_bit(room: Path) -> None:
     whole = optimize(make_config({**SEARCHED, "output": "whole"}), progress=False)
     for stop in range(whole.iterations - 1):
         for state in iterate(make_config({**SEARCHED, "output": f"cut{stop}"})):
-            if state.iteration == stop:
+            if state.number == stop:
                 break
         cut = optimize(resume=f"cut{stop}", progress=False)
         assert saved(f"cut{stop}") == saved("whole") and cut.iterations == whole.iterations

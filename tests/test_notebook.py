@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import pytest
 
@@ -16,25 +16,6 @@ from pathreplay.report.pages.panel import MOST_POINTS, Panel
 from test_steps import JOB, SCENE
 
 HOSTILE = "<script>alert('\"')</script>"
-
-
-@pytest.fixture
-def outputs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What a kernel would send to the browser, one after the other."""
-    sent: list[str] = []
-
-    def display(html: str, display_id: bool) -> SimpleNamespace:
-        assert display_id is True
-        sent.append(html)
-        return SimpleNamespace(update=sent.append)
-
-    ipython, shown = ModuleType("IPython"), ModuleType("IPython.display")
-    ipython.version_info = 9, 0  # which matplotlib asks for
-    ipython.get_ipython = lambda: SimpleNamespace(kernel=object())
-    shown.HTML, shown.display = str, display
-    monkeypatch.setitem(sys.modules, "IPython", ipython)
-    monkeypatch.setitem(sys.modules, "IPython.display", shown)
-    return sent
 
 
 def test_only_a_kernel_is_a_notebook(outputs: list[str], monkeypatch: pytest.MonkeyPatch) -> None:

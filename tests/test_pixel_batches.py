@@ -222,7 +222,7 @@ def test_a_job_takes_batches_of_pixels(tmp_path: Path, monkeypatch: pytest.Monke
     losses = [entry.loss for entry in whole.history]
     assert len(set(losses)) == 3 and losses[-1] < losses[0]
     for state in iterate(make_config({**job, "output": "cut"})):
-        if state.iteration == 1:
+        if state.number == 1:
             break
     cut = optimize(resume="cut", progress=False)
     assert [entry.loss for entry in cut.history] == losses

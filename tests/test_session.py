@@ -1,4 +1,4 @@
-"""Runs as loops over states: what a state shows, and what is left whoever ends the loop."""
+"""Runs as loops over iterations: what one shows, and what is left whoever ends the loop."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 import pathreplay
 from pathreplay.errors import PathreplayError
-from pathreplay.jobs import RunResult, State, iterate, make_config, optimize
+from pathreplay.jobs import RunResult, iterate, make_config, optimize
 from small_job import checkpoint_bits
 from test_deterministic import CLOUD
 from test_steps import JOB, SCENE
@@ -39,14 +39,14 @@ def saved(folder: str = "run") -> dict[str, bytes]:
 @pytest.mark.parametrize("changes", [{}, pytest.param(MEDIUM, marks=pytest.mark.slow)], ids=["surface", "medium"])
 def test_a_loop_that_looks_comes_where_optimize_comes(changes: dict[str, Any]) -> None:
     whole = optimize(job(**changes), progress=False)
-    seen: list[State] = []
+    seen: list[pathreplay.Iteration] = []
     session = pathreplay.iterate(job(**changes))
     for state in session:
         picture = state.render()
         assert picture.shape == state.render(state.views[0]).shape and np.isfinite(picture).all()
         seen.append(state)
     assert isinstance(session.result, RunResult) and session.result.folder.name == "run-2"
-    assert [state.iteration for state in seen] == [entry.iteration for entry in whole.history]
+    assert [state.number for state in seen] == [entry.iteration for entry in whole.history]
     assert [state.loss for state in seen] == [entry.loss for entry in whole.history]
     for key, value in seen[-1].values.items():
         assert value.tobytes() == whole.parameters[key].tobytes()
@@ -62,7 +62,7 @@ def test_who_leaves_the_loop_leaves_a_checkpoint_that_goes_on() -> None:
     whole = optimize(job(output="whole"), progress=False)
     threads, handler = dr.thread_count(), signal.getsignal(signal.SIGINT)
     for state in iterate(job()):
-        if state.iteration == 1:
+        if state.number == 1:
             break
     assert (dr.thread_count(), signal.getsignal(signal.SIGINT)) == (threads, handler)
     assert not Path("run/report.html").exists()
@@ -76,7 +76,7 @@ def test_a_loop_can_be_resumed_and_finished_early() -> None:
         next(session)
     with iterate(resume="run") as session:
         state = next(session)
-        assert state.iteration == 1
+        assert state.number == 1
         result = session.stop()
     assert result.stopped and result.stopped_by == "stop()" and result.iterations == 2
     assert result.report.is_file() and session.stop() is result
@@ -86,10 +86,10 @@ def test_a_loop_can_be_resumed_and_finished_early() -> None:
 def test_an_error_in_the_loop_leaves_a_checkpoint() -> None:
     with pytest.raises(ZeroDivisionError), iterate(job()) as session:
         for state in session:
-            if state.iteration == 2:
+            if state.number == 2:
                 1 / 0  # noqa: B018
     with iterate(resume="run") as session:  # the lock is free
-        assert next(session).iteration == 3
+        assert next(session).number == 3
 
 
 def test_nothing_is_done_before_the_first_state() -> None:

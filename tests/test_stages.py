@@ -128,7 +128,7 @@ def test_stopped_within_and_between_stages_is_undisturbed_to_the_bit(case: str) 
     whole = optimize(job, progress=False)
     for stop in range(1, job.iterations):
         for state in iterate(make_config({**CASES[case], "output": f"cut{stop}"})):
-            if state.iteration == stop - 1:
+            if state.number == stop - 1:
                 break
         cut = optimize(resume=f"cut{stop}", progress=False)
         assert cut.iterations == job.iterations

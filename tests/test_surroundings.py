@@ -79,7 +79,7 @@ def test_a_run_stays_in_its_folder_wherever_the_user_goes(room: Path) -> None:
     os.chdir(room / "elsewhere")
     for state in session:
         assert state.folder == room / "runs/mine"
-        os.chdir(room / f"elsewhere{'/..' * (state.iteration % 2)}")
+        os.chdir(room / f"elsewhere{'/..' * (state.number % 2)}")
     assert session.result is not None and session.result.folder.resolve() == room / "runs/mine"
     assert session.result.report.is_file() and not list((room / "elsewhere").iterdir())
     os.chdir(room)

@@ -82,7 +82,7 @@ def test_a_later_stage_moves_one_of_the_cameras_and_is_gone_on_with() -> None:
     assert (whole[0] == whole[1]).all() and (whole[-1] != whole[1]).any()
     session = iterate(make_config({**STAGED, "view_batch_size": 1, "deterministic": True, "output": "again"}))
     for state in session:
-        if state.iteration == 2:
+        if state.number == 2:
             session.close()
     after = [state.values["left.to_world:translation"] for state in iterate(resume="again")]
     assert np.array_equal(after[-1], whole[-1])

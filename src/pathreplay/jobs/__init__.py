@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from pathreplay.inverse.config.schema import Config, load_config, make_config
 from pathreplay.jobs.job import RunResult, iterate, optimize
-from pathreplay.jobs.session import Optimization, State
+from pathreplay.jobs.session import Optimization
 
-__all__ = ["Config", "Optimization", "RunResult", "State", "iterate", "load_config", "make_config", "optimize"]
+__all__ = ["Config", "Optimization", "RunResult", "iterate", "load_config", "make_config", "optimize"]

@@ -68,10 +68,10 @@ def iterate(
     define: Sequence[str] = (),
     executor: str | None = None,
 ) -> Optimization:
-    """Run a job iteration by iteration: iterating over the result yields a `State` after each.
+    """Run a job iteration by iteration: iterating over the result yields an `Iteration` after each.
 
     Arguments, signals and errors are those of `optimize`. The config is checked immediately, everything else when the
-    first state is requested. See `Optimization` for how it ends.
+    first one is requested. See `Optimization` for how it ends.
     """
     if executor is not None and executor not in get_args(ExecutorName):
         raise PathreplayError(f"executor is {shown(executor)}; use one of {', '.join(get_args(ExecutorName))}")

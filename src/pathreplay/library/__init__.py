@@ -1,7 +1,19 @@
 """The library: inverse problems of objects and arrays in memory, their gradients, and their minimisation."""
 
+from pathreplay.library.descriptions import Derived, Parameter, View
 from pathreplay.library.gradients import value_and_grad
-from pathreplay.library.minimize import Iteration, Result, minimize
-from pathreplay.library.problem import Derived, Parameter, Problem, View
+from pathreplay.library.iterations import Iteration
+from pathreplay.library.minimize import Result, minimize
+from pathreplay.library.problem import Problem, load_job
 
-__all__ = ["Derived", "Iteration", "Parameter", "Problem", "Result", "View", "minimize", "value_and_grad"]
+__all__ = [
+    "Derived",
+    "Iteration",
+    "Parameter",
+    "Problem",
+    "Result",
+    "View",
+    "load_job",
+    "minimize",
+    "value_and_grad",
+]

@@ -15,7 +15,10 @@ from pathreplay.inverse.parameters.values import Array, Arrays
 
 
 class Stepper(Protocol):
-    """An optimiser of the user's own."""
+    """An optimiser of the user's own.
+
+    One that has ``state_dict()``, arrays by name, and ``load_state_dict(arrays)`` can go on from a checkpoint.
+    """
 
     def step(
         self, values: Arrays, gradients: Arrays, learning_rates: Mapping[str, float], loss: float
@@ -23,31 +26,15 @@ class Stepper(Protocol):
         """The values after a step; arrays by name, in the shapes of ``values``."""
 
 
-class _Foreign:
-    """What both kinds share: they end with the loop, and what they remember is theirs."""
+class OfMitsuba:
+    """An optimiser of `mitsuba.ad` or `drjit.opt`; learning rates of ``own`` variables are the problem's."""
 
     finished = ""
-
-    def answer(self) -> dict[str, Array]:
-        """See `Optimiser`: the values after the last step."""
-        return {}
-
-    def state(self) -> State:
-        """See `Optimiser`: not known."""
-        raise PathreplayError("An optimizer object keeps its own state; save it yourself")
-
-    def restore(self, state: State, values: Arrays) -> None:
-        """See `Optimiser`: not known."""
-        self.state()
-
-
-class OfMitsuba(_Foreign):
-    """An optimiser of `mitsuba.ad` or `drjit.opt`; learning rates of ``own`` variables are the problem's."""
 
     def __init__(self, optimizer: Any, values: Arrays, own: Collection[str]) -> None:
         if any(True for _ in optimizer.keys()):
             raise PathreplayError("optimizer: it holds variables already; give one that was made without any")
-        self._optimizer, self._own = optimizer, own
+        self._optimizer, self._own, self._steps = optimizer, own, dict.fromkeys(values, 0)
         for key, value in values.items():
             optimizer[key] = mi.TensorXf(value)
 
@@ -59,17 +46,62 @@ class OfMitsuba(_Foreign):
         if rates := {key: rates[key] for key in values if key in self._own}:
             optimizer.set_learning_rate(rates)
         for key, value in values.items():
+            anew = optimizer[key].shape != value.shape
+            self._steps[key] = 1 if anew else self._steps[key] + 1
             optimizer[key] = mi.TensorXf(value)
             dr.set_grad(optimizer[key], mi.TensorXf(gradients[key]))
         optimizer.step()
         return {key: np.array(dr.detach(optimizer[key])).reshape(value.shape) for key, value in values.items()}
 
+    def answer(self) -> dict[str, Array]:
+        """See `Optimiser`: the values after the last step."""
+        return {}
 
-class OfUser(_Foreign):
+    def state(self) -> State:
+        """See `Optimiser`: what Dr.Jit keeps beside values and learning rates, numbered for each variable."""
+        kept = {key: _leaves(self._optimizer.state[key][3:]) for key in self._steps}
+        arrays = {f"{n}:{key}": np.array(leaf) for key, leaves in kept.items() for n, leaf in enumerate(leaves)}
+        return State(dict(self._steps), arrays)
+
+    def restore(self, state: State, values: Arrays) -> None:
+        """See `Optimiser`."""
+        arrays = dict(state.arrays)
+        for key, value in values.items():
+            self._optimizer[key] = mi.TensorXf(value)
+            about = self._optimizer.state[key]
+            like = _leaves(about[3:])
+            found = [arrays.pop(f"{n}:{key}") for n in range(len(like))]
+            if any(np.array(leaf).shape != array.shape for leaf, array in zip(like, found, strict=True)):
+                raise ValueError(f"what the optimizer keeps of '{key}' has another shape")
+            kept = _with_leaves(about[3:], iter([type(leaf)(a) for leaf, a in zip(like, found, strict=True)]))
+            self._optimizer.state[key] = (*about[:3], *kept)
+        if arrays:
+            raise ValueError(f"'{min(arrays)}' is nothing that this optimizer keeps")
+        self._steps = dict(state.steps)
+
+
+def _leaves(tree: Any) -> list[Any]:
+    """The arrays of nested tuples, in order."""
+    if isinstance(tree, tuple):
+        return [leaf for branch in tree for leaf in _leaves(branch)]
+    return [tree] if dr.is_array_v(tree) else []
+
+
+def _with_leaves(tree: Any, leaves: Any) -> Any:
+    """Nested tuples with other arrays."""
+    if isinstance(tree, tuple):
+        return tuple(_with_leaves(branch, leaves) for branch in tree)
+    return next(leaves) if dr.is_array_v(tree) else tree
+
+
+class OfUser:
     """An object with a ``step``: see `Stepper`."""
 
-    def __init__(self, stepper: Stepper) -> None:
-        self._stepper = stepper
+    finished = ""
+
+    def __init__(self, stepper: Stepper, values: Arrays) -> None:
+        self._stepper: Any = stepper
+        self._steps = dict.fromkeys(values, 0)
 
     def step(
         self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
@@ -85,11 +117,52 @@ class OfUser(_Foreign):
                 raise PathreplayError(
                     f"optimizer: step() gave '{key}' the shape {stepped[key].shape}, it has {value.shape}; keep it"
                 )
+            self._steps[key] += 1
         return stepped
+
+    def answer(self) -> dict[str, Array]:
+        """See `Optimiser`: the values after the last step."""
+        return {}
+
+    def state(self) -> State:
+        """See `Optimiser`. Raises PathreplayError for an object that does not tell its state."""
+        self._require_state()
+        kept = {f"own:{name}": np.array(array) for name, array in self._stepper.state_dict().items()}
+        return State(dict(self._steps), kept)
+
+    def restore(self, state: State, values: Arrays) -> None:
+        """See `Optimiser`. Raises PathreplayError for an object that takes no state."""
+        self._require_state()
+        self._stepper.load_state_dict({name.removeprefix("own:"): array for name, array in state.arrays.items()})
+        self._steps = dict(state.steps)
+
+    def _require_state(self) -> None:
+        if not all(hasattr(self._stepper, name) for name in ("state_dict", "load_state_dict")):
+            raise PathreplayError(
+                f"optimizer: {type(self._stepper).__name__} has no state_dict() and load_state_dict(), so that nothing "
+                "could go on from its state; add them, or take one of ours or of mitsuba.ad"
+            )
 
 
 def adapted(optimizer: Any, values: Arrays, own: Collection[str]) -> OfMitsuba | OfUser:
     """The optimiser that our loop steps with an object of somebody else's."""
     if hasattr(optimizer, "set_learning_rate") and hasattr(optimizer, "keys"):
         return OfMitsuba(optimizer, values, own)
-    return OfUser(optimizer)
+    return OfUser(optimizer, values)
+
+
+def options_of(optimizer: Any) -> tuple[dict[str, Any] | None, Any]:
+    """The options of an optimizer of ours, or another's object; neither where there is none to say.
+
+    Raises PathreplayError for what is no optimizer at all.
+    """
+    if optimizer is None or isinstance(optimizer, str):
+        return None if optimizer is None else {"type": optimizer}, None
+    if isinstance(optimizer, Mapping) and "type" in optimizer:
+        return dict(optimizer), None
+    if not hasattr(optimizer, "step"):
+        raise PathreplayError(
+            f"optimizer: {type(optimizer).__name__} has no step(); give a name such as 'adam', an optimizer of "
+            "mitsuba.ad, or an object with step(values, gradients, learning_rates, loss)"
+        )
+    return None, optimizer

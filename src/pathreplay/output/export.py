@@ -28,7 +28,7 @@ from pathreplay.platform import backend
 from pathreplay.platform.atomic_files import whole_folder
 from pathreplay.platform.files import file_names
 from pathreplay.platform.traversal import traversed
-from pathreplay.runs.run_folder import Job, read_job, require_writable_name
+from pathreplay.runs.run_folder import IN_MEMORY, Job, read_job, require_writable_name
 from pathreplay.scenes.builtin import BUILTINS
 from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.loading import as_xml_has_them, builtin_dict, coarse_pictures
@@ -114,6 +114,11 @@ def _source(job: Job, values: Arrays) -> Source:
     shots = {} if config.capture is None else read_capture(config.capture, job.base, picture_size, film)
     cameras = {name: shot.camera for name, shot in shots.items()}
     plugins = {"dielectric": "dielectric_ad"} if any(key.endswith(".eta") for key in values) else {}
+    if job.in_python and config.scene == IN_MEMORY:
+        raise PathreplayError(
+            "The run was begun in Python with a scene that no file holds; give one its values there: "
+            "result.apply(scene)"
+        )
     if config.scene in BUILTINS:
         return Source(builtin_dict(config.scene, config.scene_parameters), {}, plugins, cameras)
     path = job.base / config.scene

@@ -8,31 +8,25 @@ never ends a run.
 from __future__ import annotations
 
 import contextlib
-import io
 import re
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 
-import numpy as np
-import PIL.Image
 from pydantic import TypeAdapter
 
-from pathreplay.errors import PathreplayError, plain_line
+from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.dataset.views import View
-from pathreplay.inverse.images.io import Image, displayed, exposure_for
-from pathreplay.inverse.images.metrics import Likeness
+from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.loop.checkpoint import Run
 from pathreplay.inverse.loop.events import Event, Notes, Started, Stepped, Stopped
-from pathreplay.inverse.loop.loop import best_values, picture_of
-from pathreplay.inverse.parameters import grids
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.platform.interrupts import Stop
-from pathreplay.report.outcome import DIFFERENCE_GAIN, Recovered, ViewPictures, number_of, resume_command
+from pathreplay.report.live_pictures import CAPTIONS, LivePictures, encoded_picture
+from pathreplay.report.outcome import Recovered, number_of
 from pathreplay.report.page_parts import (
     about,
-    common_exposure,
     dropped_notice,
     facts,
     integrator_row,
@@ -60,12 +54,6 @@ PAUSE_S, PAUSE = 1.0, 100
 LARGEST, FRAME_SIDE = 1024, 384
 # Size limit of all frames in a report: enough for a film per image, and small for a page.
 MOST_FILM_BYTES = 2_000_000
-# Pixels along the longer side of the thumbnails in a notebook.
-SMALL_SIDE = 192
-# Minimum samples per pixel of a preview, unless `eval_spp` is lower: noisier images are hard to judge.
-LEAST_SPP = 16
-
-CAPTIONS = {"target": "target", "result": "now", "difference": f"difference ×{DIFFERENCE_GAIN:g}"}
 
 PAGES = TypeAdapter(Page)
 
@@ -77,18 +65,11 @@ class Previews:
         self, folder: RunFolder, config: Config, problem: Problem, run: Run, before: Mapping[str, Image], stop: Stop
     ) -> None:
         self.folder, self.config, self.problem, self.run, self.stop = folder, config, problem, run, stop
-        self._share = config.preview.share
+        self.pictures = LivePictures(problem, run, stop, before)
         self._began = self._written = time.perf_counter()
-        self._exposure = common_exposure([view.target for view in problem.views])
-        self._views = _chosen(problem, config.preview.views) if self._share else []
-        self._before = {view.name: before[view.name] for view in self._views}
-        self._now = {v.name: _pictures_of(v, self._before[v.name], self._before[v.name]) for v in self._views}
         self._pause = PAUSE_S
-        self._spent = self._cost = 0.0
         self._resumed, self._stride = 0, 1.0
         self._kept = [0]
-        self._likenesses = self._measure_likeness()
-        self._shown_at = 0
         self._stale = (folder.path / STOP).exists()  # a stop request for an earlier part of the run
         self._log: list[str] = list(problem.notes)
         self._notes = Notes()
@@ -101,7 +82,8 @@ class Previews:
             self._log.append(f"iterations {event.done} to {event.wanted}")
             self._resumed = event.done
             if event.done == 0:
-                self._write(self._begun() | (self._frames(0, self._before) if self._share else {}))
+                shown = self.pictures
+                self._write(self._begun() | (self._frames(0, shown.before) if shown.share else {}))
         elif isinstance(event, Stepped):
             if event.entry.iteration == self._resumed:
                 self._continued()
@@ -112,43 +94,27 @@ class Previews:
             self._remove_stop_file()
             by, took = f" by {self.stop.by}" if self.stop.by else "", time.perf_counter() - self._began
             self._log.append(f"ended after {event.done} iterations{by}")
-            self._log.append(f"previews took {self._spent:.1f} of {took:.1f} s")
+            self._log.append(f"previews took {self.pictures.spent:.1f} of {took:.1f} s")
             self._write({})
-
-    @property
-    def shown_at(self) -> int:
-        """Number of completed iterations at the last preview."""
-        return self._shown_at
-
-    def small_pictures(self) -> tuple[pages.View, ...]:
-        """Thumbnails of target, current image and difference of each view, as data URIs."""
-        views = []
-        for view in self._views:
-            images, stored = self._now[view.name].pictures(), self._stored(view)
-            small = {kind: _encoded(images[kind], stored, SMALL_SIDE, "webp") for kind in CAPTIONS}
-            pictures = tuple(Picture(kind, CAPTIONS[kind], uri("image/webp", data)) for kind, data in small.items())
-            views.append(pages.View(view.name, pictures))
-        return tuple(views)
 
     def _remove_stop_file(self) -> None:
         self.folder.discard([STOP])
 
     def finished(self, after: Mapping[str, Image]) -> dict[str, tuple[Still, ...]]:
         """Films for the report by view-NAME, texture-NAME and volume-NAME; the last frames show the results."""
-        if self._share:
+        if self.pictures.share:
             with contextlib.suppress(PathreplayError):
-                self.folder.write(self._frames(len(self.run.history), {name: after[name] for name in self._before}))
+                shown = {name: after[name] for name in self.pictures.before}
+                self.folder.write(self._frames(len(self.run.history), shown))
         return films(self.folder.path, MOST_FILM_BYTES)
 
     def _stepped(self, done: int, seconds: float) -> None:
         now = time.perf_counter()
-        # Until the first preview, assume that one costs as much as an iteration, which also differentiates.
-        if self._share and self._spent + (self._cost or seconds) <= self._share * (now - self._began):
+        if self.pictures.is_due(seconds):
             files = self._render_previews(done)
             dropped = self._dropped_frames(done)
             self._write(files, dropped)
-            self._cost = time.perf_counter() - now
-            self._spent += self._cost
+            self.pictures.paid(time.perf_counter() - now)
         elif now - self._written >= self._pause:
             self._write({})
 
@@ -169,52 +135,40 @@ class Previews:
 
     def _render_previews(self, done: int) -> dict[str, bytes]:
         """Render the views with the current values; returns preview files by name."""
-        try:
-            spp = max(self.config.most_spp, min(LEAST_SPP, self.config.eval_spp))
-            values = best_values(self.problem, self.run)
-            images = {v.name: picture_of(self.problem, self.config, values, v, spp) for v in self._views}
-        except RuntimeError as error:
-            if self.stop.aborted:
-                raise
-            self._share = 0.0
-            self._log.append(f"no more previews: {plain_line(str(error))}")
+        images = self.pictures.look(done)
+        if self.pictures.why_none:
+            self._log.append(f"no more previews: {self.pictures.why_none}")
             return {}
-        self._now = {v.name: _pictures_of(v, self._before[v.name], images[v.name]) for v in self._views}
-        self._likenesses, self._shown_at = self._measure_likeness(), done
-        files = self._frames(done, images)
-        for view in self._views:
-            for kind in ("result", "difference"):
-                image = self._now[view.name].pictures()[kind]
-                files[f"{FOLDER}/{kind}-{view.name}.png"] = _encoded(image, self._stored(view), LARGEST, "png")
+        return self._frames(done, images) | self._of_views("result", "difference")
+
+    def _of_views(self, *kinds: str) -> dict[str, bytes]:
+        """Files of the images of these kinds; default: all kinds."""
+        files, shown = {}, self.pictures
+        for view in shown.views:
+            for kind, image in shown.now[view.name].pictures().items():
+                if not kinds or kind in kinds:
+                    name = f"{FOLDER}/{kind}-{view.name}.png"
+                    files[name] = encoded_picture(image, shown.stored(view), LARGEST, "png")
         return files
-
-    def _measure_likeness(self) -> dict[str, Likeness]:
-        return {name: Likeness.of(it.result, it.target, it.exposure, it.weight) for name, it in self._now.items()}
-
-    def _stored(self, view: View) -> float:
-        return min(self._exposure, exposure_for(view.target))
 
     def _begun(self) -> dict[str, bytes]:
         """Files of the images that never change, and of the initial values as the first previews."""
-        files = {}
-        for view in self._views:
-            for kind, image in self._now[view.name].pictures().items():
-                files[f"{FOLDER}/{kind}-{view.name}.png"] = _encoded(image, self._stored(view), LARGEST, "png")
+        files = self._of_views()
         for item in recovered_of(self.problem, self.run):
             for kind, image in _grids(item).items():
-                files[_address(kind, item)] = _encoded(image, 1.0, LARGEST, "png")
+                files[_address(kind, item)] = encoded_picture(image, 1.0, LARGEST, "png")
         return files
 
     def _frames(self, done: int, images: Mapping[str, Image]) -> dict[str, bytes]:
         shown = {}
-        for view in self._views:
-            shown[f"view-{view.name}"] = (images[view.name], self._stored(view))
+        for view in self.pictures.views:
+            shown[f"view-{view.name}"] = (images[view.name], self.pictures.stored(view))
         for item in recovered_of(self.problem, self.run):
             for what, images_by_kind in (("texture", item.textures()), ("volume", item.volumes())):
                 if images_by_kind:
                     shown[f"{what}-{item.file_name}"] = (images_by_kind["result"], 1.0)
         return {
-            f"{FOLDER}/{done:06d}-{name}.webp": _encoded(image, exposure, FRAME_SIDE, "webp")
+            f"{FOLDER}/{done:06d}-{name}.webp": encoded_picture(image, exposure, FRAME_SIDE, "webp")
             for name, (image, exposure) in shown.items()
         }
 
@@ -254,26 +208,26 @@ class Previews:
             lead=lead(config, self._count(), learned, len(self.problem.views) - learned),
             notices=stopping + dropped_notice(history),
             facts=((f"{done} of {wanted}", first), *others),
-            views=tuple(self._view(view, shown) for view in self._views),
-            views_note=f"{len(self._views)} of {len(self.problem.views)} views, last rendered after {self._shown_at} "
-            "iterations. Difference: red where brighter than the target, blue where darker.",
-            exposure=self._exposure,
+            views=tuple(self._view(view, shown) for view in self.pictures.views),
+            views_note=f"{len(self.pictures.views)} of {len(self.problem.views)} views, last rendered after "
+            f"{self.pictures.shown_at} iterations. Difference: red where brighter than the target, blue where darker.",
+            exposure=self.pictures.exposure,
             plots=plots(history),
             plots_note=plots_note(history),
             parameters=self._parameters(shown),
-            command=resume_command(self.folder.name),
+            command=self.folder.resume_command(),
             how=(integrator_row(config), target_row(config)),
             log=tuple(self._log),
             titles={"plots": "Curves", "parameters": "Parameters", "how": "How to resume"},
         )
 
     def _view(self, view: View, shown: Mapping[str, tuple[Still, ...]]) -> pages.View:
-        it, stored = self._now[view.name], self._stored(view)
+        it, stored = self.pictures.now[view.name], self.pictures.stored(view)
         pictures = tuple(
-            Picture(kind, CAPTIONS.get(kind, kind), f"{FOLDER}/{kind}-{view.name}.png?{self._shown_at}")
+            Picture(kind, CAPTIONS.get(kind, kind), f"{FOLDER}/{kind}-{view.name}.png?{self.pictures.shown_at}")
             for kind in it.pictures()
         )
-        likeness = self._likenesses[view.name]
+        likeness = self.pictures.likenesses[view.name]
         note = (
             f"RMS difference from the target {it.error(it.result):.4g}, PSNR {likeness.psnr:.2f} dB, "
             f"SSIM {likeness.ssim:.4f}, including render noise."
@@ -302,19 +256,6 @@ class Previews:
         return tuple(parameters)
 
 
-def _chosen(problem: Problem, count: int) -> list[View]:
-    """Choose ``count`` evenly spaced views; up to half of them are test views."""
-    test = [view for view in problem.views if view.is_test]
-    trained = [view for view in problem.views if not view.is_test]
-    test_count = min(len(test), count // 2)
-    chosen = {view.name for view in (*_evenly(trained, max(1, count - test_count)), *_evenly(test, test_count))}
-    return [view for view in problem.views if view.name in chosen]
-
-
-def _evenly(views: list[View], count: int) -> list[View]:
-    return views if len(views) <= count else [views[i * len(views) // count] for i in range(count)]
-
-
 def _grids(item: Recovered) -> dict[str, Image]:
     """Initial value and truth of a texture or a volume, if known."""
     return {kind: image for kind, image in (item.textures() or item.volumes()).items() if kind in ("start", "truth")}
@@ -322,24 +263,6 @@ def _grids(item: Recovered) -> dict[str, Image]:
 
 def _address(kind: str, item: Recovered) -> str:
     return f"{FOLDER}/{kind}-of-{item.file_name}.png"
-
-
-def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
-    exposure = exposure_for(view.target)
-    return ViewPictures(view.name, view.target, before, now, exposure, None, view.weight, view.is_test)
-
-
-def _encoded(image: Image, exposure: float, side: int, kind: str) -> bytes:
-    """Encode a tone-mapped image of at most ``side`` x ``side`` pixels, as PNG or lossy WebP."""
-    # Downscale first: a large texture in double precision would need more memory than everything else about it.
-    pixels = np.round(255 * displayed(grids.shown(image, 2 * side), exposure)).astype(np.uint8)
-    picture = PIL.Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
-    if max(picture.size) > side:
-        factor = side / max(picture.size)
-        picture = picture.resize([max(1, round(n * factor)) for n in picture.size], PIL.Image.Resampling.BOX)
-    buffer = io.BytesIO()
-    picture.save(buffer, kind, **({"quality": 88, "method": 2} if kind == "webp" else {}))
-    return buffer.getvalue()
 
 
 def frames(run: Path) -> Iterator[tuple[int, str, Path]]:

@@ -9,9 +9,10 @@ from typing import Any
 
 from pathreplay.errors import plain_line
 from pathreplay.inverse.loop.events import Event, Notes, Started, Stepped
-from pathreplay.report.live_page import Previews
+from pathreplay.report.live_pictures import LivePictures
 from pathreplay.report.pages.page import View
 from pathreplay.report.pages.panel import Panel
+from pathreplay.report.progress import Progress
 
 # Between two states of the output: each is sent to the browser as a whole.
 PAUSE_S = 1.0
@@ -34,7 +35,7 @@ class NotebookPanel:
         self._wanted = self._before = 0
         self._lines: list[str] = []
         self._notes = Notes()
-        self._previews: Previews | None = None
+        self._pictures: LivePictures | None = None
         self._views: tuple[int, tuple[View, ...]] = -1, ()
         self._begin = self._told = time.monotonic()
         self._handle: Any = display(self._html(self._panel().html()), display_id=True)
@@ -46,9 +47,9 @@ class NotebookPanel:
         self._status = "ended" if kind is None else f"ended by {kind.__name__}"
         self._draw()
 
-    def follow(self, previews: Previews) -> None:
+    def follow(self, pictures: LivePictures, title: str) -> None:
         """Show the pictures and losses of a run from now on."""
-        self._previews, self._title = previews, str(previews.folder.name)
+        self._pictures, self._title = pictures, title
 
     def say(self, text: str) -> None:
         """Name what is going on now."""
@@ -85,16 +86,16 @@ class NotebookPanel:
         self._told = time.monotonic()
 
     def _panel(self) -> Panel:
-        if self._previews is not None and self._previews.shown_at != self._views[0]:
-            self._views = self._previews.shown_at, self._previews.small_pictures()
-        history = self._previews.run.history if self._previews else []
+        if self._pictures is not None and self._pictures.shown_at != self._views[0]:
+            self._views = self._pictures.shown_at, self._pictures.small()
+        losses = self._pictures.losses() if self._pictures else ()
         return Panel(
             self._title,
             self._status,
-            len(history),
+            len(losses),
             self._wanted,
-            self._left(len(history)),
-            tuple(entry.loss for entry in history),
+            self._left(len(losses)),
+            losses,
             self._views[1],
             tuple(self._lines),
         )
@@ -104,3 +105,8 @@ class NotebookPanel:
         if not 0 < steps or done == self._wanted:
             return ""
         return f"about {(time.monotonic() - self._begin) / steps * (self._wanted - done):.0f} s left"
+
+
+def progress_of(shown: bool) -> Progress | NotebookPanel:
+    """What tells the user how a run goes, where they are; silence unless it is ``shown``."""
+    return NotebookPanel() if shown and in_notebook() else Progress(shown)

@@ -20,15 +20,11 @@ from pathreplay.inverse.loop.verdict import Verdict
 from pathreplay.inverse.parameters.grids import matched, rmse, shown, slices
 from pathreplay.inverse.parameters.pose import Pose, PoseError, error_names
 from pathreplay.inverse.parameters.values import Array
+from pathreplay.runs.run_folder import resume_command
 
 # Gain of difference images, which would be black after convergence otherwise.
 DIFFERENCE_GAIN = 4.0
 _KINDS = "target", "start", "result", "difference"
-
-
-def resume_command(folder: Path) -> str:
-    """The command line that resumes a run."""
-    return f"pathreplay optimize --resume {shlex.quote(str(folder))}"
 
 
 @dataclass(frozen=True)
@@ -233,6 +229,8 @@ class Outcome:
     """Decoded values of the variables, and the transforms or vertices of poses, by key."""
     notes: tuple[str, ...]
     verdict: Verdict
+    in_python: bool = False
+    """See `Job`."""
 
     @property
     def complete(self) -> bool:
@@ -248,9 +246,11 @@ class Outcome:
         return any(view.likenesses["result"].flip is not None for view in self.views)
 
     def command(self) -> str:
-        """The command line that repeats this run, or resumes it if it was stopped."""
+        """Return the command line, or the call in Python, that repeats this run, or resumes it if it was stopped."""
         if not self.complete:
-            return resume_command(self.folder)
+            return resume_command(self.folder, self.in_python)
+        if self.in_python:
+            return f"pathreplay.minimize(problem, output={str(self.folder)!r})"
         job = self.folder / "config.json" if self.source is None else self.source
         changes = "".join(f" --set {shlex.quote(change)}" for change in self.changes)
         return f"pathreplay optimize {shlex.quote(str(job))}{changes if self.source else ''}"

@@ -20,10 +20,10 @@ from pathreplay.inverse.parameters.values import Array
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.platform.atomic_files import Content, made
 from pathreplay.platform.tensor_files import safetensors_chunks
-from pathreplay.report.outcome import Outcome, ViewPictures, resume_command
+from pathreplay.report.outcome import Outcome, ViewPictures
 from pathreplay.report.recovered import poses_of, recovered_of, with_faces, with_scene
 from pathreplay.report.report import Film, report_files
-from pathreplay.runs.run_folder import Job
+from pathreplay.runs.run_folder import Job, resume_command
 from pathreplay.scenes.volume_files import vol_bytes
 
 
@@ -114,8 +114,9 @@ def outcome_of(
     recovered, poses = with_faces(problem, recovered_of(problem, run)), poses_of(problem, run)
     values = with_scene(problem, run.values)
     return Outcome(
-        job.config, job.source, job.changes, folder, views, recovered, poses, run, values, problem.notes, verdict
-    )
+        job.config, job.source, job.changes, folder, views, recovered, poses, run, values, problem.notes, verdict,
+        job.in_python,
+    )  # fmt: skip
 
 
 def result_files(outcome: Outcome, films: Mapping[str, Film]) -> dict[str, Content]:

@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import secrets
+import shlex
 import shutil
 import stat
 from collections.abc import Iterable, Iterator, Mapping
@@ -29,6 +30,8 @@ _CONFIGS = "config.toml", "config.yaml", "config.json"
 _FOLDERS = "images", "volumes", "baseline", "previews"
 CHECKPOINT = "checkpoint.safetensors"
 BASELINE_CHECKPOINT = "baseline/checkpoint.safetensors"
+IN_MEMORY = "memory"
+"""What the config calls a scene that is an object in Python."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,15 @@ class Job:
     source: Path | None
     base: Path
     changes: tuple[str, ...] = ()
+    in_python: bool = False
+    """Some of it are objects that only the program has which began it: the config does not tell all."""
+
+
+def resume_command(folder: Path, in_python: bool = False) -> str:
+    """What goes on with a run: a command line, or a call in the program that has its objects."""
+    if in_python:
+        return f"pathreplay.minimize(problem, output={str(folder)!r}, resume=True)"
+    return f"pathreplay optimize --resume {shlex.quote(str(folder))}"
 
 
 class RunFolder:
@@ -53,8 +65,9 @@ class RunFolder:
             has no effect.
     """
 
-    def __init__(self, given: Path, home: Path | None = None) -> None:
+    def __init__(self, given: Path, home: Path | None = None, in_python: bool = False) -> None:
         self.given, self.home = given, Path.cwd() if home is None else home
+        self.in_python = in_python
         self.path = self.home / given
         self.lock = FolderLock(self.path)
         self.identity = _identity(self.path)
@@ -68,6 +81,10 @@ class RunFolder:
             if Path.cwd() == self.home:
                 return self.given
         return self.path
+
+    def resume_command(self, name: Path | None = None) -> str:
+        """What goes on with its run, under another ``name`` if it has one."""
+        return resume_command(self.name if name is None else name, self.in_python)
 
     def remove(self) -> None:
         """Remove the folder with its contents and created parents, unless another folder has taken its path."""
@@ -90,7 +107,7 @@ class RunFolder:
         if _identity(self.path if descriptor is None else descriptor) != self.identity:
             raise PathreplayError(
                 f"Run folder {self.name} was removed or renamed during the run, so the run ends: {lost} lost; if it "
-                "was renamed, resume with: pathreplay optimize --resume NEW_NAME, otherwise start the job again"
+                f"was renamed, resume with: {self.resume_command(Path('NEW_NAME'))}, otherwise start the job again"
             )
 
     def write(self, files: Mapping[str, Content]) -> None:
@@ -161,7 +178,7 @@ class RunFolder:
 
     def _failure(self, error: OSError) -> str:
         if (self.path / CHECKPOINT).exists():
-            remedy = f"then resume with: pathreplay optimize --resume {self.name}"
+            remedy = f"then resume with: {self.resume_command()}"
         else:
             remedy = "or choose another --output, then start again (this folder was removed)"
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -193,13 +210,15 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
     }
     if job.changes:
         origin["changes"] = list(job.changes)
+    if job.in_python:
+        origin["in_python"] = True
     home = Path.cwd() if home is None else home
     missing = [folder for folder in (home / output).parents if not folder.exists()]
     with undisturbed(), contextlib.ExitStack() as undo:
         undo.callback(_remove_empty, missing)
         part = _make_part(output, home)
         undo.callback(shutil.rmtree, part, ignore_errors=True)
-        run = RunFolder(part)
+        run = RunFolder(part, in_python=job.in_python)
         run.given, run.home, run.created_parents = _free(output, home), home, missing
         undo.callback(run.lock.close)
         run.write({**copy, "run.json": json.dumps(origin, indent=2).encode(), **files})
@@ -210,26 +229,32 @@ def create_run_folder(output: Path, job: Job, files: Mapping[str, Content], home
 
 
 class _Origin(BaseModel):
-    """Content of run.json: base of the config's relative paths, path of the config file, and `Job.changes`."""
+    """Content of run.json: base of the config's relative paths, path of the config file, and fields of `Job`."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
     base: str
     config: str | None
     changes: list[str] = []
+    in_python: bool = False
 
 
-def open_run_folder(path: Path) -> tuple[Job, RunFolder]:
+def open_run_folder(path: Path, in_python: bool = False) -> tuple[Job, RunFolder]:
     """Open and lock an existing run folder; returns its job and the folder.
 
     Temporary files of a killed run are removed. Raises PathreplayError if ``path`` is not a run folder, has no
-    checkpoint, is damaged, or is in use.
+    checkpoint, is damaged, or is in use; or if it was started from objects in Python and is not resumed there
+    (``in_python``), or the other way round.
     """
     require_writable_name(path, "--resume")
     copy = _config_in(path)
     if not (path / CHECKPOINT).is_file():
         raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start the job from its config")
-    job, run = _job(path, copy), RunFolder(path)
+    job = _job(path, copy)
+    if job.in_python != in_python:
+        what = "was begun in Python, with objects that no file holds" if job.in_python else "is of a job in a file"
+        raise PathreplayError(f"Run {path} {what}; go on with: {resume_command(path, job.in_python)}")
+    run = RunFolder(path, in_python=in_python)
     _remove_parts(path)
     return job, run
 
@@ -269,7 +294,7 @@ def _job(path: Path, copy: Path) -> Job:
         what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
         raise PathreplayError(f"{path / 'run.json'} cannot be used ({what}); start the job from its config") from None
     source = None if origin.config is None else Path(origin.config)
-    return Job(load_config(copy), source, Path(origin.base), tuple(origin.changes))
+    return Job(load_config(copy), source, Path(origin.base), tuple(origin.changes), origin.in_python)
 
 
 def new_output(output: str | Path | None, source: Path | None) -> Path:

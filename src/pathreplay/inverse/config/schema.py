@@ -316,6 +316,14 @@ def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
         PathreplayError: the file cannot be read, a key is unknown (the message suggests the nearest one), or a value is
             invalid.
     """
+    return _checked(str(path), read_table(path, changes))
+
+
+def read_table(path: Path, changes: Sequence[str] = ()) -> Any:
+    """What a job's file says, with ``changes`` (see `defined`), before it is checked.
+
+    Raises PathreplayError for an unreadable file.
+    """
     problem = file_problem(path, most_bytes(path))
     if problem == MISSING:
         siblings = path.parent.glob("*") if path.parent.is_dir() else []
@@ -329,7 +337,7 @@ def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise PathreplayError(f"Config {path} cannot be read ({error}); give a UTF-8 text file") from None
-    return _checked(str(path), defined(parsed(path, text), changes))
+    return defined(parsed(path, text), changes)
 
 
 def make_config(values: dict[str, Any], name: str = "config") -> Config:

@@ -343,6 +343,14 @@ def _plain(problem: Problem, config: Config, view: View, spp: int) -> Image:
     return _picture(problem, view, problem.integrator, spp, config.seeds(PICTURE, view.sensor)[0])
 
 
+def ended(problem: Problem, config: Config, run: Run) -> Run:
+    """The run with the values that it has come to, exposures of held-out views among them; its baseline, too."""
+    run = replace(run, values=best_values(problem, run))
+    for each in filter(None, (run, run.baseline)):
+        each.values = dict(with_exposures(problem, config, each.values))
+    return run
+
+
 def with_exposures(problem: Problem, config: Config, values: Arrays) -> Arrays:
     """Return the values with the exposures of test views, which the run does not optimise, fitted to their targets."""
     if EXPOSURE not in values or not any(view.is_test for view in problem.views):

@@ -12,9 +12,21 @@ from pathreplay.integrators.film.image import picture_shape
 from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.config.stage_options import begins
-from pathreplay.inverse.objective.stages import Part, part_at
+from pathreplay.inverse.objective.evaluate import computing
+from pathreplay.inverse.objective.stages import Part, part_at, require_single_pixels, require_stages
 from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.problem.problem import Problem, scene_values, variables_of
+
+
+def require_possible(problem: Problem) -> None:
+    """Raise PathreplayError unless all stages of a problem can be done, pixel by pixel where it wants that.
+
+    And where all that moves in one of them reaches no view.
+    """
+    require_stages(problem, problem.config)
+    require_single_pixels(problem, problem.config)
+    with computing(problem.config):
+        require_reached(problem, problem.config)
 
 
 def require_reached(problem: Problem, config: Config) -> None:

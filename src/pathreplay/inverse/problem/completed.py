@@ -17,7 +17,7 @@ SHOWN = {"max_depth": "the length of paths", "hide_emitters": "whether emitters 
 """Options that change the expected image, and what each determines."""
 
 
-def completed(config: Config, scene: mi.Scene) -> tuple[Config, tuple[str, ...]]:
+def completed(config: Config, scene: mi.Scene, own: mi.Integrator | None = None) -> tuple[Config, tuple[str, ...]]:
     """Fill in the integrators that a job leaves out.
 
     The default integrator of a job is `pathreplay` with the options of the scene's integrator. The default integrator
@@ -26,6 +26,7 @@ def completed(config: Config, scene: mi.Scene) -> tuple[Config, tuple[str, ...]]
     Args:
         config: the job.
         scene: its scene.
+        own: an integrator object that takes the place of the job's.
 
     Returns:
         The completed job, and a note if targets are rendered with other limits than the job's.
@@ -37,7 +38,7 @@ def completed(config: Config, scene: mi.Scene) -> tuple[Config, tuple[str, ...]]
         config = config.model_copy(update={"integrator": Plugin(type="pathreplay", **options)})
     if config.brings_pictures:
         return config, ()
-    limits = read_limits(load_integrator(config.integrator.model_dump()))
+    limits = read_limits(load_integrator(config.integrator.model_dump()) if own is None else own)
     asked = config.target.integrator
     if asked is not None:
         return config, _differences(limits, read_limits(load_integrator(asked.model_dump())), config)

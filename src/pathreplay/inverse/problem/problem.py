@@ -219,7 +219,7 @@ def build_problem(
     loss = find_loss(config.loss, modules)
     film = "rgba" if config.target.alpha == "compare" else "rgb"
     shots = {} if config.capture is None else read_capture(config.capture, base, picture_size, film)
-    scene, config, notes = _loaded(config, base, shots, given.scene)
+    scene, config, notes = _loaded(config, base, shots, given)
     params = traversed(scene)
     parameters.require_finite(params)
     integrator = given.integrator
@@ -277,17 +277,17 @@ def build_problem(
 
 
 def _loaded(
-    config: Config, base: Path, shots: Mapping[str, Shot], scene: mi.Scene | None
+    config: Config, base: Path, shots: Mapping[str, Shot], given: InMemory
 ) -> tuple[mi.Scene, Config, tuple[str, ...]]:
     """Load the scene and fill in the default integrators of the job; returns both, and notes for the user."""
-    if scene is not None:
-        config, differences = completed(config, scene)
-        return scene, config, differences
+    if given.scene is not None:
+        config, differences = completed(config, given.scene, given.integrator)
+        return given.scene, config, differences
     wanted = [entry.key for entry in config.parameters if entry.shape is None]
     wanted += [entry.key for entry in config.derived]
     cameras = {name: shot.camera for name, shot in shots.items()}
     scene, notes = load_scene_for(config.scene, wanted, base, cameras, **config.scene_parameters)
-    config, differences = completed(config, scene)
+    config, differences = completed(config, scene, given.integrator)
     return scene, config, notes + differences
 
 

@@ -1,0 +1,137 @@
+"""A run in a folder: checkpoints and a page while it is under way, and the report at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.images.io import Image
+from pathreplay.inverse.loop.checkpoint import Run
+from pathreplay.inverse.loop.events import Event
+from pathreplay.inverse.loop.loop import ended, render_views
+from pathreplay.inverse.loop.verdict import verdict_of
+from pathreplay.inverse.objective.evaluate import computing
+from pathreplay.inverse.problem.feasibility import require_finite_loss
+from pathreplay.inverse.problem.problem import Problem
+from pathreplay.platform.interrupts import Stop
+from pathreplay.report.live_page import Previews
+from pathreplay.report.result import RunResult, outcome_of, result_files, result_of
+from pathreplay.runs.run_folder import Job, RunFolder, create_run_folder
+from pathreplay.runs.saving import Saving, first_files, go_on, saved_targets
+
+
+class FolderRun:
+    """What a run writes; ``observe`` wants all of its events.
+
+    Args:
+        job: its config is that of the problem.
+        problem: what is solved.
+        run: where it begins; brought to the last checkpoint of a folder that is ``resumed``.
+        stop: what the page's button asks.
+        output: the new folder; a number is appended where there is one.
+        home: the folder in which a relative ``output`` begins.
+        resumed: the folder that is gone on with.
+
+    Raises:
+        PathreplayError: the folder cannot be made or is damaged, the run has ended, or its loss is no finite number.
+    """
+
+    def __init__(
+        self, job: Job, problem: Problem, run: Run, stop: Stop, output: Path, home: Path, resumed: RunFolder | None
+    ) -> None:
+        self._job, self._problem, self._run, self._stop, self._is_new = job, problem, run, stop, resumed is None
+        if resumed is None:
+            self.folder, self._before = _begun(output, home, job, problem, run)
+        else:
+            self.folder, self._before = resumed, _went_on(resumed, problem, run)
+        self._saving = Saving(self.folder, run, problem.config.checkpoint_every)
+        self.previews = Previews(self.folder, problem.config, problem, run, self._before, stop)
+
+    @property
+    def way_out(self) -> str:
+        """What is said where the run is aborted."""
+        return f"aborted; go on from the last checkpoint with: {self.folder.resume_command()}"
+
+    def observe(self, event: Event) -> None:
+        """Write what is due. Raises PathreplayError where the folder is gone, or cannot be written."""
+        self._saving.observe(event)
+        with computing(self._problem.config):
+            self.previews.observe(event)
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """Around the iterations: what was done is saved, where they end before their time by an error or a break.
+
+        A new folder goes again where not even the first iteration can be done; one that is resumed never does.
+        """
+        try:
+            yield
+        except GeneratorExit:
+            self._saving.close()
+            raise
+        except PathreplayError as error:
+            if self._is_new and not self._run.history and not self._stop.aborted:
+                self.folder.remove()
+            elif self._saving.rescued() and not self._stop.aborted:
+                way_out = f"what was done is saved, go on with: {self.folder.resume_command()}"
+                raise PathreplayError(f"{error}; {way_out}") from error
+            raise
+
+    def finish(self) -> RunResult:
+        """Write the end of the run: values, pictures and the report. Raises as `observe` does."""
+        problem, config = self._problem, self._problem.config
+        with computing(config):
+            run = ended(problem, config, self._run)
+            verdict = verdict_of(problem, run, self._stop.by is not None)
+            after = render_views(problem, config, run.values)
+            theirs = render_views(problem, config, run.baseline.values) if run.baseline else {}
+        outcome = outcome_of(self._job, self.folder.name, problem, run, self._before, after, theirs, verdict)
+        files = result_files(outcome, self.previews.finished(after))
+        problem.album.rest()
+        self.folder.write(files)
+        return result_of(outcome, self._stop.by)
+
+
+def require_targets(folder: Path, problem: Problem) -> None:
+    """Raise PathreplayError unless a problem has the targets and the weights that a run in the folder began with."""
+    saved = saved_targets(folder)
+    for view in problem.views:
+        pairs = (saved.images.get(view.name), view.target), (saved.weights.get(view.name), view.weight)
+        if not all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs):
+            raise PathreplayError(
+                f"Run {folder} has another target or weight of view '{view.name}' than the problem; give it what it "
+                "began with, or begin another run"
+            )
+
+
+def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tuple[RunFolder, dict[str, Image]]:
+    """A new folder for a run, and the pictures of its start."""
+    with computing(problem.config):
+        before = render_views(problem, problem.config, run.values)
+    for view in problem.views:
+        require_finite_loss(problem.loss, view.name, view.target, view.weight, before[view.name])
+    return create_run_folder(
+        output, replace(job, config=problem.config), first_files(problem, before, run), home
+    ), before
+
+
+def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:
+    config = problem.config
+    held = {v.key for v in problem.variables} if config.stages else set()  # some of them, in some stages
+    before = go_on(folder.path, problem, run, held)
+    # All iterations but no report: the disk was full at the end. Then only the end is done again.
+    if not (folder.path / "report.html").exists():
+        return before
+    name = f"Run {folder.name}"
+    if run.optimiser.finished:
+        way_out = "lower the optimizer's 'tolerance'" + ("" if folder.in_python else " in its config")
+        raise PathreplayError(f"{name} has ended by itself ({run.optimiser.finished}); {way_out}")
+    if len(run.history) >= config.iterations:
+        way_out = "raise 'steps'" if folder.in_python else "raise 'iterations' in its config"
+        raise PathreplayError(f"{name} has all its {len(run.history)} iterations; {way_out}")
+    return before

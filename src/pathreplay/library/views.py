@@ -1,0 +1,71 @@
+"""Views as a problem has them: sensors by name, targets and weights as arrays, checked against the films."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from pathreplay.errors import PathreplayError
+from pathreplay.integrators.film.image import picture_shape
+from pathreplay.inverse.dataset.targets import Targets, as_weight
+from pathreplay.inverse.dataset.views import sensors_of
+from pathreplay.inverse.images.io import Image, find_image, read_image
+from pathreplay.inverse.parameters.values import adapted_image
+from pathreplay.library.descriptions import View
+
+
+def by_name(scene: mi.Scene, views: Sequence[View]) -> dict[str, View]:
+    """The views by the names of their sensors. Raises PathreplayError for two of one sensor, and for none."""
+    found: dict[str, View] = {}
+    for view in views:
+        name = next(iter(sensors_of(scene, [view.sensor])))
+        if name in found:
+            raise PathreplayError(f"views: sensor {view.sensor!r} is named twice; give each view a sensor of its own")
+        found[name] = view
+    if not found:
+        raise PathreplayError("views: there is none; give a View")
+    return found
+
+
+def targets_of(scene: mi.Scene, views: Mapping[str, View]) -> Targets:
+    """The arrays of all views, checked against their films."""
+    images, weights = {}, {}
+    sensors = sensors_of(scene, list(views))
+    for name, view in views.items():
+        height, width, channels = picture_shape(scene.sensors()[sensors[name]])
+        what = f"Target of sensor '{name}'"
+        image = _pixels(what, view.target)
+        if image.shape[:2] != (height, width):
+            raise PathreplayError(
+                f"{what} is {image.shape[1]} x {image.shape[0]}, and its film {width} x {height}; resize the image or "
+                "the film"
+            )
+        images[name] = adapted_image(what, image, "the film has", channels)
+        if view.weight is not None:
+            mask = _pixels(f"Weight of sensor '{name}'", view.weight)
+            if mask.shape != (height, width, 1):
+                raise PathreplayError(f"Weight of sensor '{name}' has the shape {mask.shape}; give ({height}, {width})")
+            weights[name] = as_weight("the weight", mask, name)
+    return Targets(images, weights)
+
+
+def _pixels(what: str, value: Any) -> Image:
+    """An image as linear pixels (height, width, channels)."""
+    if isinstance(value, (str, Path)):
+        return read_image(find_image(str(value), Path()))
+    if isinstance(value, mi.Bitmap):
+        value = value.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
+    if value is None:
+        raise PathreplayError(f"{what} is missing; give an array, a mi.Bitmap or a file")
+    try:
+        image = np.array(value, np.float32)
+    except (TypeError, ValueError) as error:
+        raise PathreplayError(f"{what} is no image ({error}); give an array, a mi.Bitmap or a file") from None
+    image = image[:, :, None] if image.ndim == 2 else image
+    if image.ndim != 3:
+        raise PathreplayError(f"{what} has the shape {image.shape}; give (height, width, channels)")
+    return image

@@ -1,0 +1,146 @@
+"""Pictures of some views of a run while it is under way, rendered now and then for a share of its time."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Mapping
+
+import numpy as np
+import PIL.Image
+
+from pathreplay.errors import plain_line
+from pathreplay.inverse.dataset.views import View
+from pathreplay.inverse.images.io import Image, displayed, exposure_for
+from pathreplay.inverse.images.metrics import Likeness
+from pathreplay.inverse.loop.checkpoint import Run
+from pathreplay.inverse.loop.events import Event, Stepped
+from pathreplay.inverse.loop.loop import best_values, picture_of
+from pathreplay.inverse.objective.evaluate import computing
+from pathreplay.inverse.parameters import grids
+from pathreplay.inverse.problem.problem import Problem
+from pathreplay.platform.interrupts import Stop
+from pathreplay.report.outcome import DIFFERENCE_GAIN, ViewPictures
+from pathreplay.report.page_parts import common_exposure, uri
+from pathreplay.report.pages import page as pages
+from pathreplay.report.pages.page import Picture
+
+# Pixels along the longer side of the small pictures that a notebook shows.
+SMALL_SIDE = 192
+# Samples per pixel of a picture at least, where the run's own pictures have as many: fewer are hard to look at.
+LEAST_SPP = 16
+
+CAPTIONS = {"target": "target", "result": "now", "difference": f"difference ×{DIFFERENCE_GAIN:g}"}
+
+
+class LivePictures:
+    """The last pictures of the views that are looked at; ``before`` are those of the start (default: rendered now)."""
+
+    def __init__(self, problem: Problem, run: Run, stop: Stop, before: Mapping[str, Image] | None = None) -> None:
+        self._problem, self._run, self._stop = problem, run, stop
+        preview = problem.config.preview
+        self.share = preview.share
+        self.exposure = common_exposure([view.target for view in problem.views])
+        self.views = _chosen(problem, preview.views) if self.share else []
+        start = self._rendered() if before is None else before
+        self.before = {view.name: start[view.name] for view in self.views}
+        self._set(0, self.before)
+        self._began = time.perf_counter()
+        self.spent = self._cost = 0.0
+        self.why_none = ""
+        """Why there are no more of them."""
+
+    def _set(self, done: int, images: Mapping[str, Image]) -> None:
+        self.now = {view.name: _pictures_of(view, self.before[view.name], images[view.name]) for view in self.views}
+        self.likenesses = {
+            name: Likeness.of(it.result, it.target, it.exposure, it.weight) for name, it in self.now.items()
+        }
+        self.shown_at = done
+        """After how many iterations there were pictures the last time."""
+
+    def observe(self, event: Event) -> None:
+        """Look at the views where it is time: of a run that has no page."""
+        if isinstance(event, Stepped) and self.is_due(event.entry.seconds):
+            begin = time.perf_counter()
+            with computing(self._problem.config):
+                self.look(event.entry.iteration + 1)
+            self.paid(time.perf_counter() - begin)
+
+    def is_due(self, seconds: float) -> bool:
+        """Whether there is time for pictures, after an iteration of so many seconds."""
+        # An iteration renders its views, and differentiates them: pictures of a few take less.
+        allowed = self.share * (time.perf_counter() - self._began)
+        return self.share > 0 and self.spent + (self._cost or seconds) <= allowed
+
+    def paid(self, seconds: float) -> None:
+        """What the last pictures have cost."""
+        self._cost = seconds
+        self.spent += seconds
+
+    def look(self, done: int) -> dict[str, Image]:
+        """Pictures of the views as they are after so many iterations; none, and none later, where that fails."""
+        try:
+            images = self._rendered()
+        except RuntimeError as error:
+            if self._stop.aborted:
+                raise
+            self.share = 0.0
+            self.why_none = plain_line(str(error))
+            return {}
+        self._set(done, images)
+        return images
+
+    def _rendered(self) -> dict[str, Image]:
+        config = self._problem.config
+        spp = max(config.most_spp, min(LEAST_SPP, config.eval_spp))
+        values = best_values(self._problem, self._run)
+        return {view.name: picture_of(self._problem, config, values, view, spp) for view in self.views}
+
+    def small(self) -> tuple[pages.View, ...]:
+        """Target, now and difference of the views, small, each within its address."""
+        found = []
+        for view in self.views:
+            shown, stored = self.now[view.name].pictures(), self.stored(view)
+            small = {kind: encoded_picture(shown[kind], stored, SMALL_SIDE, "webp") for kind in CAPTIONS}
+            pictures = tuple(Picture(kind, CAPTIONS[kind], uri("image/webp", data)) for kind, data in small.items())
+            found.append(pages.View(view.name, pictures))
+        return tuple(found)
+
+    def losses(self) -> tuple[float, ...]:
+        """Of all iterations."""
+        return tuple(entry.loss for entry in self._run.history)
+
+    def stored(self, view: View) -> float:
+        """The exposure at which pictures of the view are encoded."""
+        return min(self.exposure, exposure_for(view.target))
+
+
+def _chosen(problem: Problem, count: int) -> list[View]:
+    """So many views, evenly among those that are learned from and those that are not; both, where there are both."""
+    out = [view for view in problem.views if view.is_test]
+    learned = [view for view in problem.views if not view.is_test]
+    some = min(len(out), count // 2)
+    chosen = {view.name for view in (*_evenly(learned, max(1, count - some)), *_evenly(out, some))}
+    return [view for view in problem.views if view.name in chosen]
+
+
+def _evenly(views: list[View], count: int) -> list[View]:
+    return views if len(views) <= count else [views[i * len(views) // count] for i in range(count)]
+
+
+def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
+    exposure = exposure_for(view.target)
+    return ViewPictures(view.name, view.target, before, now, exposure, None, view.weight, view.is_test)
+
+
+def encoded_picture(image: Image, exposure: float, side: int, kind: str) -> bytes:
+    """The picture as a display shows it, no longer than ``side`` pixels: PNG, or WebP, which loses what few see."""
+    # In double precision a large texture would take more than all else that is known of it.
+    pixels = np.round(255 * displayed(grids.shown(image, 2 * side), exposure)).astype(np.uint8)
+    picture = PIL.Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
+    if max(picture.size) > side:
+        factor = side / max(picture.size)
+        picture = picture.resize([max(1, round(n * factor)) for n in picture.size], PIL.Image.Resampling.BOX)
+    buffer = io.BytesIO()
+    picture.save(buffer, kind, **({"quality": 88, "method": 2} if kind == "webp" else {}))
+    return buffer.getvalue()
