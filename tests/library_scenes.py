@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
@@ -63,3 +64,31 @@ class Descent:
 
     def step(self, values: Any, gradients: Any, learning_rates: Any, loss: float) -> dict[str, np.ndarray]:
         return {key: value - 20 * learning_rates[key] * gradients[key] for key, value in values.items()}
+
+
+class Heavy(Descent):
+    """An optimiser of the user's own that remembers something, and tells it."""
+
+    def __init__(self) -> None:
+        self.velocity: dict[str, np.ndarray] = {}
+
+    def step(self, values: Any, gradients: Any, learning_rates: Any, loss: float) -> dict[str, np.ndarray]:
+        for key, gradient in gradients.items():
+            before = self.velocity.get(key)
+            same = before is not None and before.shape == gradient.shape
+            self.velocity[key] = gradient + 0.5 * before if same else gradient
+        return super().step(values, self.velocity, learning_rates, loss)
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        return dict(self.velocity)
+
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
+        self.velocity = dict(state)
+
+
+OPTIMIZERS: dict[str, Callable[[], Any]] = {
+    "adam": lambda: "adam",
+    "mitsuba": lambda: mi.ad.Adam(lr=0.03),
+    "sgd of mitsuba": lambda: mi.ad.SGD(lr=0.5, momentum=0.8),
+    "own": Heavy,
+}

@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 import pathreplay
-from library_scenes import GREY, SIDE, TEXTURE, WALL, Descent, photos_of_room, room, views
+from library_scenes import GREY, OPTIMIZERS, SIDE, TEXTURE, WALL, Descent, Heavy, photos_of_room, room, views
 from pathreplay import Parameter, PathreplayError, Problem, View
 from pathreplay.cli import app
 from pathreplay.jobs import optimize
@@ -46,26 +46,6 @@ def problem_of(photos: list[np.ndarray], **settings: Any) -> Problem:
     return Problem(room(), wanted, views(photos), spp=4, **{"deterministic": True, "learning_rate": 0.03, **settings})
 
 
-class Heavy(Descent):
-    """An optimiser of the user's own that remembers something, and tells it."""
-
-    def __init__(self) -> None:
-        self.velocity: dict[str, np.ndarray] = {}
-
-    def step(self, values: Any, gradients: Any, learning_rates: Any, loss: float) -> dict[str, np.ndarray]:
-        for key, gradient in gradients.items():
-            before = self.velocity.get(key)
-            same = before is not None and before.shape == gradient.shape
-            self.velocity[key] = gradient + 0.5 * before if same else gradient
-        return super().step(values, self.velocity, learning_rates, loss)
-
-    def state_dict(self) -> dict[str, np.ndarray]:
-        return dict(self.velocity)
-
-    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
-        self.velocity = dict(state)
-
-
 def run(problem: Problem, optimizer: Any = None, steps: int = 6, **more: Any) -> pathreplay.Result:
     return pathreplay.minimize(problem, optimizer, steps, progress=False, **more)
 
@@ -85,14 +65,6 @@ def test_a_folder_is_that_of_a_job(photos: list[np.ndarray]) -> None:
     assert run(problem, output="run", steps=4).folder == Path("run-2").absolute()
     told = CliRunner().invoke(app, ["compare", "run", "run-2"])
     assert told.exit_code == 0, told.output
-
-
-OPTIMIZERS: dict[str, Callable[[], Any]] = {
-    "adam": lambda: "adam",
-    "mitsuba": lambda: mi.ad.Adam(lr=0.03),
-    "sgd of mitsuba": lambda: mi.ad.SGD(lr=0.5, momentum=0.8),
-    "own": Heavy,
-}
 
 
 @pytest.mark.parametrize("make", OPTIMIZERS.values(), ids=OPTIMIZERS)

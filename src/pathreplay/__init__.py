@@ -20,16 +20,20 @@ __all__ = [
     "PathreplayError",
     "Problem",
     "Result",
+    "State",
     "View",
     "__version__",
     "baselines",
     "check_gradient",
     "exclusive",
+    "init",
     "iterate",
     "load_job",
     "losses",
     "minimize",
     "optimize",
+    "regularizers",
+    "step",
     "value_and_grad",
 ]
 
@@ -40,17 +44,24 @@ _LAZY = {
     "Parameter": "pathreplay.library",
     "Problem": "pathreplay.library",
     "Result": "pathreplay.library",
+    "State": "pathreplay.library",
     "View": "pathreplay.library",
     "check_gradient": "pathreplay.testing",
     "exclusive": "pathreplay.integrators.lifetimes",
+    "init": "pathreplay.library",
     "iterate": "pathreplay.jobs",
     "load_job": "pathreplay.library",
     "minimize": "pathreplay.library",
     "optimize": "pathreplay.jobs",
+    "step": "pathreplay.library",
     "value_and_grad": "pathreplay.library",
 }
 #: Modules that are called otherwise here.
-_MODULES = {"baselines": "pathreplay.baselines", "losses": "pathreplay.inverse.losses.pixelwise"}
+_MODULES = {
+    "baselines": "pathreplay.baselines",
+    "losses": "pathreplay.inverse.losses.pixelwise",
+    "regularizers": "pathreplay.inverse.parameters.regularizers",
+}
 
 
 def _set_up() -> None:

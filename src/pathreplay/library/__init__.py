@@ -5,6 +5,7 @@ from pathreplay.library.gradients import value_and_grad
 from pathreplay.library.iterations import Iteration
 from pathreplay.library.minimize import Result, minimize
 from pathreplay.library.problem import Problem, load_job
+from pathreplay.library.steps import State, init, step
 
 __all__ = [
     "Derived",
@@ -12,8 +13,11 @@ __all__ = [
     "Parameter",
     "Problem",
     "Result",
+    "State",
     "View",
+    "init",
     "load_job",
     "minimize",
+    "step",
     "value_and_grad",
 ]

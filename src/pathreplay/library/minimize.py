@@ -181,8 +181,7 @@ def _run(problem: Problem, built: inner.Problem, own: Any, stack: ExitStack, bar
     pool = stack.enter_context(crew_of(config, problem.base, built, bar.remark, bar.status))
     run = run_of(built, pool)
     if own is not None:
-        rates = {entry.key: entry.learning_rate for entry in config.parameters}
-        run.optimiser = adapted(own, run.values, {key for key, rate in rates.items() if rate is not None})
+        run.optimiser = adapted(own, run.values, config.parameters)
     return run
 
 

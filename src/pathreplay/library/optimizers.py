@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any, Protocol
 
 import drjit as dr
@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config.schema import Parameter
 from pathreplay.inverse.optim.adaptive import State
 from pathreplay.inverse.parameters.values import Array, Arrays
 
@@ -144,8 +145,9 @@ class OfUser:
             )
 
 
-def adapted(optimizer: Any, values: Arrays, own: Collection[str]) -> OfMitsuba | OfUser:
-    """The optimiser that our loop steps with an object of somebody else's."""
+def adapted(optimizer: Any, values: Arrays, entries: Iterable[Parameter]) -> OfMitsuba | OfUser:
+    """The optimiser that our loop steps with an object of somebody else's; ``entries`` are a job's parameters."""
+    own = {entry.key for entry in entries if entry.learning_rate is not None}
     if hasattr(optimizer, "set_learning_rate") and hasattr(optimizer, "keys"):
         return OfMitsuba(optimizer, values, own)
     return OfUser(optimizer, values)

@@ -85,12 +85,13 @@ def new_run(
     }
     return Run(
         executor or Local(Evaluator(problem, integrator, record) if evaluate is None else evaluate),
-        _optimiser(problem, values, optimizer or Optimizer()),
+        optimiser_of(problem, values, optimizer or Optimizer()),
         values,
     )
 
 
-def _optimiser(problem: Problem, values: Arrays, options: Optimizer) -> Optimiser:
+def optimiser_of(problem: Problem, values: Arrays, options: Optimizer) -> Optimiser:
+    """An optimiser of the problem's variables that begins at these values."""
     if options.searches:
         free = -np.inf, np.inf  # coordinates enforce the bounds themselves
         bounds = {v.key: free if v.coordinates else v.bounds for v in problem.variables}
@@ -150,7 +151,7 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
                 faint.add(key)
                 yield LowSNR(key, ratio, i, run.history[-1].spp)
         yield Stepped(run.history[-1])
-        _require_gradients(config, run)
+        require_gradients(config, run)
         if stop.by is not None:
             break
     yield Stopped(len(run.history))
@@ -167,7 +168,7 @@ def computed(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator
         yield event
 
 
-def _require_gradients(config: Config, run: Run) -> None:
+def require_gradients(config: Config, run: Run) -> None:
     """Raise PathreplayError after `max_consecutive_nonfinite` iterations in which half of a gradient is not finite."""
     last = run.history[-config.max_consecutive_nonfinite :]
     if len(last) < config.max_consecutive_nonfinite:
