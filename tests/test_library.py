@@ -120,6 +120,34 @@ def test_regularizers_are_in_loss_and_gradient(photos: list[np.ndarray]) -> None
     np.testing.assert_allclose(slopes[WALL] - grads[WALL], 3 * 2 * 0.25 / 3, rtol=1e-4)
 
 
+@pytest.mark.parametrize("kind", ["total_variation", "l2_to_initial", "laplacian_weight"])
+def test_regularizers_by_name_are_those_of_the_module(kind: str, photos: list[np.ndarray]) -> None:
+    """Of a texture or of a body that were shaken; a function of one's own may be made of them."""
+    rng, of = np.random.default_rng(5), pathreplay.regularizers
+    key = BODY if kind == "laplacian_weight" else TEXTURE
+    params = mi.traverse(mi.load_dict(room()))
+    own_value = np.array(params[key])
+    start = own_value + rng.normal(0, 0.1, own_value.shape)
+    function = {
+        "total_variation": of.total_variation,
+        "l2_to_initial": of.l2_to(start),
+        "laplacian_weight": of.laplacian(own_value, np.array(params["body.faces"])) if key == BODY else None,
+    }[kind]
+    values = {key: start + 0.1 * rng.normal(0, 0.1, start.shape)}
+    evaluated = [
+        pathreplay.value_and_grad(Problem(room(), {key: entry}, views(photos), spp=1, deterministic=True))(values)
+        for entry in (
+            Parameter(initial=start),
+            Parameter(initial=start, **{kind: 0.3}),
+            Parameter(initial=start, regularizer=lambda v: 0.3 * function(v)),
+        )
+    ]
+    (plain, none), (by_name, slopes), (own, others) = evaluated
+    assert by_name > plain * (1 + 1e-6) and own == pytest.approx(by_name, rel=1e-6)
+    np.testing.assert_allclose(others[key] - none[key], slopes[key] - none[key], rtol=1e-3, atol=1e-7)
+    assert np.abs(slopes[key] - none[key]).max() > 1e-5
+
+
 def test_arrays_tensors_bitmaps_and_files_are_targets(photos: list[np.ndarray], tmp_path: Path) -> None:
     (tmp_path / "photo.exr").write_bytes(exr_bytes(photos[0]))
     kinds = [photos[0], mi.TensorXf(photos[0]), mi.Bitmap(photos[0]), tmp_path / "photo.exr"]

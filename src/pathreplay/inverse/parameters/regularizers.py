@@ -1,19 +1,23 @@
 """Regularizers: terms of the loss that depend on the values of a parameter alone.
 
-Each maps decoded values v to a number and its gradient by v.
+Each `Term` maps decoded values v to a number and its gradient by v. `total_variation`, `l2_to` and `laplacian` are the
+same terms as functions of Dr.Jit tensors, from which a ``regularizer`` of a parameter can be composed:
+
+    Parameter(regularizer=lambda v: 0.1 * total_variation(v) + dr.mean(dr.square(v - 0.5), axis=None))
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.user_functions import Imported
@@ -134,6 +138,51 @@ class Own:
                 "(e.g. the derivative of a length is infinite at 0), or bound the parameter"
             )
         return penalty, gradient
+
+
+def total_variation(values: mi.TensorXf) -> mi.TensorXf:
+    """Compute the total variation of a grid: the sum over its axes of mean √(Δv² + r²) - r, with r = `ROUND`.
+
+    Args:
+        values: a texture (height, width, channels) or a volume (depth, height, width, channels).
+
+    Returns:
+        The total variation, differentiable by the values.
+    """
+    return _differentiable(TotalVariation(1.0), values)
+
+
+def l2_to(reference: ArrayLike) -> Callable[[mi.TensorXf], mi.TensorXf]:
+    """Create the function that computes the mean squared difference from an array.
+
+    Args:
+        reference: array in the shape of the values; a grid is resampled to their resolution.
+
+    Returns:
+        A function of the values that returns one number, differentiable by the values.
+    """
+    return partial(_differentiable, Prior(1.0, np.array(reference, np.float32)))
+
+
+def laplacian(positions: ArrayLike, faces: ArrayLike) -> Callable[[mi.TensorXf], mi.TensorXf]:
+    """Create the function that computes the mean squared distance of vertices from the mean of their neighbours.
+
+    Args:
+        positions: vertex positions, (n, 3) or flat; vertices at the same position count as one.
+        faces: vertex indices of the triangles, (m, 3) or flat.
+
+    Returns:
+        A function of vertex positions that returns one number, in squared scene units, differentiable by them.
+    """
+    vertices, triangles = np.array(positions, np.float32).ravel(), np.array(faces).ravel()
+    return partial(_differentiable, Laplacian(1.0, vertices, triangles))
+
+
+def _differentiable(term: Term, values: mi.TensorXf) -> mi.TensorXf:
+    """Evaluate a term as a tensor with its first derivative."""
+    value, slope = term(np.array(dr.detach(values)))
+    linear = dr.sum((values - dr.detach(values)) * mi.TensorXf(slope.astype(np.float32)), axis=None)
+    return linear + value
 
 
 def _flat(value: Any) -> Any:
