@@ -276,6 +276,25 @@ def test_a_problem_is_left_as_it_was(photos: list[np.ndarray]) -> None:
     assert after[0] == before[0] and np.array_equal(after[1][WALL], before[1][WALL])
 
 
+def test_what_one_minimisation_learns_of_media_is_not_known_to_others() -> None:
+    """Nor to gradients that a callback asks for on the way, nor to the minimisation what these have learned."""
+    scene, density = load_scene("cloud", resolution=12, grid=6, views=1), "*.sigma_t.data"
+    view = View(0, np.full((12, 12, 3), 0.4))
+    limits = {"type": "pathreplay", "max_depth": 4}
+    problem = Problem(
+        scene, {density: Parameter(initial=1.0)}, view, integrator=limits, spp=2, deterministic=True, seed=3
+    )
+    f = pathreplay.value_and_grad(problem)
+    before = f(seed=5)[0]
+
+    def losses(*callbacks: Any) -> list[float]:
+        result = pathreplay.minimize(problem, steps=4, progress=False, callbacks=callbacks)
+        return [entry.loss for entry in result.history]
+
+    found = losses(), losses(), losses(lambda it: f(it.values, seed=it.number))
+    assert found[0] == found[1] == found[2] and f(seed=5)[0] == before
+
+
 def test_an_iteration_that_is_kept_stays_as_it_was(photos: list[np.ndarray]) -> None:
     kept: list[pathreplay.Iteration] = []
     problem = Problem(room(), {WALL: GREY}, views(photos))

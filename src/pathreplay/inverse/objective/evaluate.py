@@ -200,7 +200,8 @@ class Evaluator:
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
         # Of each view and number of samples that was seen, whole or a batch of it: whether pixels can be swept.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
-        self._learned: Arrays = {}  # what the integrator knows
+        self._learned: Arrays = {}  # what the integrator knew after the last evaluation
+        self._at: Any = None  # what it held then: others may have used it since
         self._begun = False
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
@@ -219,10 +220,11 @@ class Evaluator:
 
     def _know(self, learned: Arrays) -> None:
         """Go on with what an evaluation has learned. Raises PathreplayError if it is none of this integrator's."""
-        if learned is self._learned or not (learned or self._learned):
+        held = getattr(self.integrator, "baseline", None)
+        if (learned is self._learned and held is self._at) or (held is None and not learned):
             return
         self.integrator.load_state_dict(self.problem.scene, learned)
-        self._learned = learned
+        self._learned, self._at = learned, getattr(self.integrator, "baseline", None)
 
     def _view(self, values: Arrays, view: int, seed: int, spp: int, pixels: int | None) -> Evaluation:
         about = self.problem.views[view]
@@ -251,7 +253,7 @@ class Evaluator:
         dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
         for key in broken:
             gradients[key] = np.where(np.isfinite(gradients[key]), gradients[key], 0)
-        self._learned = self.integrator.state_dict()
+        self._learned, self._at = self.integrator.state_dict(), getattr(self.integrator, "baseline", None)
         return Evaluation(loss, gradients, dropped, self._learned)
 
     def _differentiated(
