@@ -111,8 +111,11 @@ class Problem:
             job["integrator"] = dict(integrator)
         elif integrator is not None:
             own_integrator, job["integrator"] = integrator, {"type": type(integrator).__name__}
-        if scene is not None or views is not None:
+        if isinstance(scene, (str, Path)):
+            job["scene"], scene = str(scene), None
+        if scene is not None or looked_at is not None:
             own_scene, self.notes = _loaded(job.get("scene") if scene is None else scene, job, base)
+            job["target"] = {"scene": job.get("scene"), **job.get("target", {})}  # where that is rendered
             job["scene"] = IN_MEMORY
         if looked_at is not None:
             targets = _seen(job, own_scene, looked_at)
