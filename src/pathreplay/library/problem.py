@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
@@ -199,7 +200,7 @@ class Problem:
 
 def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
     """A value of a parameter; textures and grids may have other sizes."""
-    array = np.array(value, np.float32)
+    array = np.array(dr.detach(value) if dr.is_array_v(value) else value, np.float32)
     resized = len(wanted) >= 3 and array.ndim == len(wanted) and array.shape[-1] == wanted[-1]
     if array.shape != wanted and not resized and not (len(wanted) == 1 and array.size == wanted[0]):
         raise PathreplayError(f"Value of '{key}' has the shape {array.shape}, the parameter {wanted}; reshape it")
