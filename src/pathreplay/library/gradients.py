@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from numpy.typing import ArrayLike
 
 from pathreplay.inverse.config.schema import ITERATION
-from pathreplay.inverse.objective.evaluate import Evaluator, Shard, computing, total
+from pathreplay.inverse.objective.evaluate import Shard, computing, total
+from pathreplay.inverse.objective.stages import evaluator_of
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.library.problem import Problem
 
@@ -27,8 +28,9 @@ def value_and_grad(problem: Problem) -> ValueAndGrad:
         regularizers) and the gradients, arrays in the shapes of the values. Unbiased for ``l2`` and ``relative-l2``;
         the loss itself carries the variance of the images on top. Entries that are NaN or infinite count as zero.
     """
-    built, config = problem.built, problem.built.config
-    evaluator = Evaluator(built, built.integrator, record=not config.deterministic)
+    built = problem.built
+    config = built.config.model_copy(update={"stages": None})
+    evaluator = evaluator_of(built, config, built.integrator, config.integrator)
 
     def evaluated(
         values: Mapping[str, ArrayLike] | None = None, seed: int = 0, spp: int | None = None

@@ -19,6 +19,7 @@ from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.losses.pixelwise import LOSSES
 from pathreplay.inverse.objective.reached import require_possible
 from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.problem import joint as inner_joint
 from pathreplay.inverse.problem import problem as inner
 from pathreplay.library.descriptions import Derived, Objects, Parameter, View, by_key, require_kinds
 from pathreplay.library.iterations import rendered
@@ -130,6 +131,40 @@ class Problem:
         self.built = inner.build_problem(config, base, targets, memory if self.in_memory else None)
         require_possible(self.built)
 
+    @staticmethod
+    def joint(problems: Sequence[Problem]) -> Problem:
+        """Make one problem of several, each of a scene of its own: min of the mean of their losses.
+
+        Args:
+            problems: what they have in common are parameters of one name, which are one parameter; initial value,
+                bounds, learning rate and regularizers are those of the first problem that has it. Settings (``spp``,
+                ``seed``, ``deterministic``, ...) are those of the first problem.
+
+        Returns:
+            The problem, whose views are those of all, named ``0-left``, ``1-left``, ... It uses their scenes.
+
+        Raises:
+            PathreplayError: parameters of one name in several shapes, problems of one scene, and those with exposures
+                or baselines.
+        """
+        if not problems:
+            raise PathreplayError("problems: there is none; give two or more")
+        joint: Problem = Problem.__new__(Problem)
+        first = problems[0]
+        joint.base, joint.in_memory = first.base, True
+        joint.notes = tuple(dict.fromkeys(note for problem in problems for note in problem.notes))
+        tables = {kind: [each for p in problems for each in p.job.get(kind, [])] for kind in ("parameters", "derived")}
+        known = {kind: list({table["key"]: table for table in all_[::-1]}.values()) for kind, all_ in tables.items()}
+        seen = {f"{n}-{view.name}": view for n, problem in enumerate(problems) for view in problem.built.views}
+        joint.job = {
+            **first.job, **known, "scene": IN_MEMORY, "sensors": list(seen), "target": {"images": list(seen)},
+            "test_views": [name for name, view in seen.items() if view.is_test],
+            "view_weights": {name: view.share for name, view in seen.items() if view.share != 1},
+        }  # fmt: skip
+        config = first.built.config.model_copy(update={"parameters": make_config(joint.job).parameters})
+        joint.built = inner_joint.joined([problem.built for problem in problems], config)
+        return joint
+
     def __repr__(self) -> str:
         """Short: for notebooks."""
         return f"<Problem: {', '.join(self.initial)}; {len(self.built.views)} views, loss {self.job['loss']}>"
@@ -189,12 +224,15 @@ class Problem:
 
     def assign(self, values: Arrays, scene: mi.Scene) -> None:
         """Give a scene with the same parameters these values."""
-        params = traversed(scene)
-        stored = inner.scene_values(self.built, inner.variables_of(self.built, values))
-        for key, value in stored.items():
-            if key not in params:
-                raise PathreplayError(f"The scene has no parameter '{key}'; give one that is built alike")
-            params[key] = value
+        params, known = traversed(scene), self.built.scenes()
+        found = [inner.scene_values(each, inner.variables_of(each, values)) for each in known]
+        fitting = [each for each in found if each.keys() <= set(params.keys())]
+        if not fitting:
+            missing = next(key for key in found[0] if key not in params)
+            raise PathreplayError(f"The scene has no parameter '{missing}'; give one that is built alike")
+        for each in fitting:
+            for key, value in each.items():
+                params[key] = value
         params.update()
 
 

@@ -99,7 +99,8 @@ def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) 
     keep, sums = problem.album.keep, Sums(folder)
     before = {view.name: keep(_read(folder / _picture("start", view.name), sums)) for view in problem.views}
     for view in problem.views:
-        wanted = picture_shape(problem.scene.sensors()[view.sensor])
+        home, there = problem.home(view)
+        wanted = picture_shape(home.scene.sensors()[there.sensor])
         for kind, image in (("target", view.target), ("start", before[view.name])):
             path = folder / _picture(kind, view.name)
             if image.shape != wanted:

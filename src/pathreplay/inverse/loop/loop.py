@@ -334,14 +334,15 @@ def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, 
 
 def picture_of(problem: Problem, config: Config, values: Arrays, view: View, spp: int | None = None) -> Image:
     """Render one view as `render_views` does, with ``spp`` samples per pixel (default: ``eval_spp``)."""
-    put_values(problem, values)
+    put_values(problem.home(view)[0], values)
     index = next(n for n, other in enumerate(problem.views) if other.name == view.name)
     return exposed(values, index, _plain(problem, config, view, config.eval_spp if spp is None else spp))
 
 
 def _plain(problem: Problem, config: Config, view: View, spp: int) -> Image:
     """Render a view at exposure 1 with the current values of the scene."""
-    return _picture(problem, view, problem.integrator, spp, config.seeds(PICTURE, view.sensor)[0])
+    home, there = problem.home(view)
+    return _picture(home, there, home.integrator, spp, config.seeds(PICTURE, view.sensor)[0])
 
 
 def ended(problem: Problem, config: Config, run: Run) -> Run:

@@ -23,10 +23,12 @@ def require_possible(problem: Problem) -> None:
 
     And where all that moves in one of them reaches no view.
     """
-    require_stages(problem, problem.config)
-    require_single_pixels(problem, problem.config)
-    with computing(problem.config):
-        require_reached(problem, problem.config)
+    config = problem.config
+    for each in problem.scenes():
+        require_stages(each, config)
+        require_single_pixels(each, config)
+        with computing(config):
+            require_reached(each, config)
 
 
 def require_reached(problem: Problem, config: Config) -> None:

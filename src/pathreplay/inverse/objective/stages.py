@@ -15,8 +15,10 @@ from pathreplay.inverse.config.stage_options import Stage, place
 from pathreplay.inverse.dataset.views import View
 from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.objective.evaluate import Evaluate, Evaluation, Evaluator, Shard
+from pathreplay.inverse.objective.joint import JointEvaluator
 from pathreplay.inverse.objective.pixel_batches import obstacle, refused
 from pathreplay.inverse.parameters.values import Arrays
+from pathreplay.inverse.problem.joint import JointProblem
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.scenes import parameters
 from pathreplay.scenes.descriptions import load_integrator
@@ -199,9 +201,14 @@ class Staged:
 def evaluator_of(problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin) -> Evaluate:
     """What evaluates the shards of a job in this process, stage by stage where it has stages.
 
-    ``plugin`` is what the integrator is made of. Passes are recorded unless the job is deterministic.
+    ``plugin`` is what the integrator is made of; several scenes have their own. Passes are recorded unless the job is
+    deterministic. Raises PathreplayError for several scenes in stages.
     """
     record = not config.deterministic
+    if isinstance(problem, JointProblem):
+        if config.stages is not None:
+            raise PathreplayError("stages: a problem of several scenes has none; leave them out")
+        return JointEvaluator(problem, [Evaluator(part, part.integrator, record) for part in problem.parts])
     if config.stages is None:
         return Evaluator(problem, integrator, record)
     return Staged(problem, config, integrator, plugin, record)

@@ -116,6 +116,14 @@ class Problem:
         flags = reached_sensors(self.scene, sensors, self.params, self.moves(moving))
         return {n for n, reached in enumerate(flags) if reached}
 
+    def scenes(self) -> tuple[Problem, ...]:
+        """The problem itself, or those of its scenes where it has several."""
+        return (self,)
+
+    def home(self, view: View) -> tuple[Problem, View]:
+        """The problem whose scene has the sensor of a view, and the view as it is there."""
+        return self, view
+
     def made(self) -> tuple[Pose | Derived, ...]:
         """Return the scene parameters that are computed from variables: poses and derived parameters."""
         return *self.poses, *self.derived
@@ -157,8 +165,9 @@ def sensor_of(problem: Problem, view: View) -> mi.Sensor:
 
 
 def put_values(problem: Problem, values: Arrays) -> None:
-    """Set the scene parameters to the values of the variables, without gradients."""
-    problem.params.update(scene_values(problem, problem.held.variables(problem, values)))
+    """Set the parameters of the scene, or of all scenes, to the values of the variables, without gradients."""
+    for each in problem.scenes():
+        each.params.update(scene_values(each, each.held.variables(each, values)))
 
 
 def errors_of(problem: Problem, values: Arrays) -> dict[str, float]:

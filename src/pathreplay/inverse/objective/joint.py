@@ -1,0 +1,43 @@
+"""Evaluation of a problem of several scenes: each shard by the scene that its view belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pathreplay.inverse.objective.evaluate import Evaluate, Evaluation, Shard
+from pathreplay.inverse.parameters.values import Arrays
+from pathreplay.inverse.problem.joint import JointProblem
+
+
+class JointEvaluator:
+    """An `Evaluate` of a joint problem, by those of its ``parts``. A shard holds a view, or several of one scene.
+
+    What a scene's integrator has learned has the number of the scene before its name.
+    """
+
+    def __init__(self, problem: JointProblem, parts: Sequence[Evaluate]) -> None:
+        self._problem, self._parts = problem, parts
+        self._fresh: dict[str, np.ndarray] = {}
+        for n, part in enumerate(problem.parts):
+            if hasattr(part.integrator, "load_state_dict"):
+                part.integrator.load_state_dict(part.scene, {})
+                self._fresh |= {f"{n}:{name}": array for name, array in part.integrator.state_dict().items()}
+
+    def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
+        """See `Evaluate`. The loss is a mean, of which each scene has an equal share."""
+        places = [self._problem.place(view) for view in shard.views]
+        ((n, part),) = {number: self._problem.parts[number] for number, _ in places}.items()
+        known = learned or self._fresh
+        found = self._parts[n](
+            {v.key: values[v.key] for v in part.variables},
+            replace(shard, views=tuple(view for _, view in places)),
+            {name.removeprefix(f"{n}:"): array for name, array in known.items() if name.startswith(f"{n}:")},
+        )
+        share = np.float32(1 / len(self._parts))
+        gradients = {key: np.zeros_like(value) for key, value in values.items() if key not in found.gradients}
+        gradients |= {key: share * gradient for key, gradient in found.gradients.items()}
+        after = {**known, **{f"{n}:{name}": array for name, array in found.learned.items()}}
+        return Evaluation(found.loss / len(self._parts), gradients, found.dropped, after)

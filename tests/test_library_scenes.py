@@ -1,0 +1,138 @@
+"""Problems of several scenes that share parameters: loss and gradient are means, and each scene keeps its own rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import pathreplay
+from library_scenes import GREY, SIDE, TEXTURE, WALL, photos_of_room, room, views
+from pathreplay import Parameter, PathreplayError, Problem, View
+from pathreplay.scenes.loading import load_scene
+from small_job import checkpoint_bits
+from variant import VARIANT
+
+SKY = "sky.radiance.value"
+
+
+@pytest.fixture(autouse=True)
+def _variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mi.set_variant(VARIANT)
+    monkeypatch.chdir(tmp_path)
+
+
+def lit(light: float) -> dict[str, Any]:
+    return {**room(), "sky": {"type": "constant", "radiance": {"type": "rgb", "value": light}}}
+
+
+def problem_in(light: float, *keys: str, sensors: tuple[str, ...] = ("left",), **settings: Any) -> Problem:
+    scene = mi.load_dict(lit(light))
+    photos = [np.array(mi.render(scene, sensor=("left", "right").index(name), spp=256)) for name in sensors]
+    wanted = {key: Parameter(initial=0.5) if key == SKY else GREY for key in (WALL, *keys)}
+    seen = [View(name, photo) for name, photo in zip(sensors, photos, strict=True)]
+    return Problem(lit(0.8 if SKY in keys else light), wanted, seen, **{"spp": 16, "learning_rate": 0.03, **settings})
+
+
+def test_loss_and_gradient_are_means_over_scenes() -> None:
+    """Of scenes with another number of views; what only one has, has half of its gradient."""
+    pair = [problem_in(0.5, SKY, spp=256), problem_in(2.0, TEXTURE, sensors=("left", "right"), spp=256)]
+    alone = [pathreplay.value_and_grad(problem)(seed=1) for problem in pair]
+    loss, gradients = pathreplay.value_and_grad(Problem.joint(pair))(seed=2)
+    assert set(gradients) == {WALL, SKY, TEXTURE}
+    assert loss == pytest.approx((alone[0][0] + alone[1][0]) / 2, rel=0.02)
+    expected = {
+        WALL: (alone[0][1][WALL] + alone[1][1][WALL]) / 2,
+        SKY: alone[0][1][SKY] / 2,
+        TEXTURE: alone[1][1][TEXTURE] / 2,
+    }
+    for key, gradient in expected.items():
+        np.testing.assert_allclose(gradients[key], gradient, atol=0.05 * np.abs(gradient).max())
+
+
+def test_scenes_with_one_wall_recover_it_and_each_its_light() -> None:
+    """The light of one of them is not known, nor is the texture of the other."""
+    problem = Problem.joint([problem_in(0.5, SKY), problem_in(2.0, TEXTURE)])
+    result = pathreplay.minimize(problem, steps=80, progress=False)
+    np.testing.assert_allclose(result.values[WALL], [0.7, 0.3, 0.2], atol=0.03)
+    np.testing.assert_allclose(result.values[SKY], 0.5, atol=0.05)
+    assert result.render(view="1-left", spp=4).shape == result.render(view=0, spp=4).shape == (SIDE, SIDE, 3)
+    assert np.abs(result.render(view="0-left") - result.render(view="1-left")).mean() > 0.1
+    other = mi.load_dict(lit(3.0))
+    result.apply(other)
+    np.testing.assert_allclose(np.array(mi.traverse(other)[SKY]).ravel(), result.values[SKY].ravel(), rtol=1e-5)
+
+
+def test_two_scenes_alike_are_one_with_twice_the_samples(tmp_path: Path) -> None:
+    """Their noise is independent: the variance of the gradient is half of that of one."""
+    photos = photos_of_room()
+
+    def one() -> Problem:
+        return Problem(room(), {WALL: GREY}, views(photos), spp=2)
+
+    single, double = pathreplay.value_and_grad(one()), pathreplay.value_and_grad(Problem.joint([one(), one()]))
+    spread = [np.var([f(seed=seed)[1][WALL] for seed in range(60)], axis=0).sum() for f in (single, double)]
+    assert 0.3 < spread[1] / spread[0] < 0.75
+
+
+def test_it_goes_on_bit_for_bit_steps_and_has_a_folder() -> None:
+    def joint() -> Problem:
+        return Problem.joint([problem_in(light, deterministic=True, spp=2) for light in (0.5, 2.0)])
+
+    def stop(it: pathreplay.Iteration) -> None:
+        if it.number == 1:
+            raise ZeroDivisionError
+
+    settings: dict[str, Any] = {"steps": 4, "progress": False, "view_batch_size": 1}
+    whole = pathreplay.minimize(joint(), output="whole", **settings)
+    with pytest.raises(ZeroDivisionError):
+        pathreplay.minimize(joint(), output="run", callbacks=[stop], **settings)
+    pathreplay.minimize(joint(), output="run", resume=True, **settings)
+    assert checkpoint_bits(Path("run")) == checkpoint_bits(Path("whole"))
+    assert {path.name for path in Path("run/images").glob("result-*.exr")} == {
+        "result-0-left.exr", "result-1-left.exr",
+    }  # fmt: skip
+    problem = joint()
+    state = pathreplay.init(problem, steps=4, view_batch_size=1)
+    for _ in range(4):
+        state = pathreplay.step(problem, state)
+    np.testing.assert_array_equal(state.values[WALL], whole.values[WALL])
+
+
+def test_media_of_several_scenes_learn_each_for_itself() -> None:
+    limits = {"type": "pathreplay", "max_depth": 4}
+
+    def cloud(level: float) -> Problem:
+        scene = load_scene("cloud", resolution=12, grid=6, views=1)
+        view = View(0, np.full((12, 12, 3), level))
+        return Problem(scene, {"*.sigma_t.data": Parameter(initial=1.0)}, view, integrator=limits, spp=2)
+
+    problem = Problem.joint([cloud(0.3), cloud(0.5)])
+    state = pathreplay.init(problem)
+    for _ in range(3):
+        state = pathreplay.step(problem, state)
+    names = {name.partition(":")[0] for name in state._learned}
+    assert names == {"0", "1"} and len({state._learned[f"{n}:sums"].sum() for n in (0, 1)}) == 2
+
+
+def test_what_scenes_cannot_share_is_told() -> None:
+    photos = photos_of_room()
+    scene = mi.load_dict(room(), optimize=False)
+    one, two = (Problem(scene, {WALL: GREY}, View(name, photos[0])) for name in ("left", "right"))
+    coarse = Problem(room(), {TEXTURE: Parameter(initial=0.5, resolutions=[2, 4], refine_at=[3])}, views(photos))
+    fine = Problem(room(), {TEXTURE: GREY}, views(photos))
+    exposed = Problem(room(), {WALL: GREY}, views(photos), exposure={})
+    for problems, words in (
+        ([one, two], "of one scene"),
+        ([coarse, fine], "shape"),
+        ([one, exposed], "neither 'exposure' nor"),
+        ([], "problems: there is none"),
+    ):
+        with pytest.raises(PathreplayError, match=words) as told:
+            Problem.joint(problems)
+        assert "\n" not in str(told.value)
+    with pytest.raises(PathreplayError, match="stages: a problem of several scenes has none"):
+        pathreplay.minimize(Problem.joint([one, fine]), stages=[{"iterations": 2}], progress=False)
