@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
+import scipy.optimize
 
 from pathreplay import Parameter, View
 from variant import VARIANT
@@ -91,4 +93,9 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "mitsuba": lambda: mi.ad.Adam(lr=0.03),
     "sgd of mitsuba": lambda: mi.ad.SGD(lr=0.5, momentum=0.8),
     "own": Heavy,
+}
+SEARCHES: dict[str, Callable[[], Any]] = {
+    "l-bfgs-b": lambda: "l-bfgs-b",
+    "slsqp of scipy": lambda: partial(scipy.optimize.minimize, method="SLSQP"),
+    "tnc of scipy": lambda: partial(scipy.optimize.minimize, method="TNC"),
 }

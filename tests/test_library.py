@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import scipy.optimize
 from safetensors.numpy import load_file
 
 import pathreplay
@@ -190,12 +192,13 @@ def test_scenes_are_objects_dictionaries_files_and_names(photos: list[np.ndarray
         (lambda: mi.ad.Adam(lr=0.03), 0.5),
         (Descent, 0.03),
         ("l-bfgs-b", 0.03),
+        (partial(scipy.optimize.minimize, method="SLSQP"), 0.03),
     ],
-    ids=["name", "table", "mitsuba", "own", "scipy"],
+    ids=["name", "table", "mitsuba", "own", "scipy", "any of scipy"],
 )
 def test_any_optimizer_lowers_the_loss(optimizer: Any, rate: float, photos: list[np.ndarray]) -> None:
     problem = Problem(room(), {WALL: GREY}, views(photos), learning_rate=rate, spp=8)
-    made = optimizer() if callable(optimizer) else optimizer
+    made = optimizer() if callable(optimizer) and not isinstance(optimizer, partial) else optimizer
     result = pathreplay.minimize(problem, made, steps=12, progress=False)
     assert result.history[-1].loss < 0.8 * result.history[0].loss
 
@@ -359,7 +362,14 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
     problem = Problem(room(), {WALL: GREY}, views(photos))
     held = mi.ad.Adam(lr=0.1)
     held["x"] = mi.Float(1)
-    for optimizer, words in ((object(), "has no step"), (held, "holds variables already"), ("adem", "adem")):
+    unbounded = partial(scipy.optimize.minimize, method="BFGS")
+    for optimizer, words in (
+        (object(), "has no step"),
+        (mi.ad.Adam, "is a class; make an object"),
+        (unbounded, "BFGS cannot handle.*leave the bounds out"),
+        (held, "holds variables already"),
+        ("adem", "adem"),
+    ):
         with pytest.raises(PathreplayError, match=words):
             pathreplay.minimize(problem, optimizer, progress=False)
     with pytest.raises(PathreplayError, match="No parameter 'x'"):

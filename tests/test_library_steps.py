@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pathreplay
-from library_scenes import GREY, OPTIMIZERS, TEXTURE, WALL, Descent, photos_of_room, room, views
+from library_scenes import GREY, OPTIMIZERS, SEARCHES, TEXTURE, WALL, Descent, photos_of_room, room, views
 from pathreplay import Parameter, PathreplayError, Problem, State, View
 from variant import VARIANT
 
@@ -38,13 +38,13 @@ def frozen(state: State) -> dict[str, bytes]:
     return {key: value.tobytes() for key, value in state.values.items()}
 
 
-MAKERS: dict[str, Callable[[], Any]] = {**OPTIMIZERS, "l-bfgs-b": lambda: "l-bfgs-b"}
+MAKERS: dict[str, Callable[[], Any]] = {**OPTIMIZERS, **SEARCHES}
 
 
 @pytest.mark.parametrize("name", MAKERS)
 def test_steps_are_those_of_minimize_and_change_no_state(name: str, photos: list[np.ndarray]) -> None:
     """Forwards; then again from a state in the middle, and from the first, of the same states."""
-    make, problem = MAKERS[name], (wall_of if name == "l-bfgs-b" else problem_of)(photos)
+    make, problem = MAKERS[name], (wall_of if name in SEARCHES else problem_of)(photos)
     wanted = pathreplay.minimize(problem, make(), steps=5, progress=False)
     states = [pathreplay.init(problem, make(), steps=5)]
     for _ in range(5):

@@ -129,7 +129,7 @@ def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:
         return before
     name = f"Run {folder.name}"
     if run.optimiser.finished:
-        way_out = "lower the optimizer's 'tolerance'" + ("" if folder.in_python else " in its config")
+        way_out = "lower the optimizer's tolerance" if folder.in_python else "lower 'tolerance' in its config"
         raise PathreplayError(f"{name} has ended by itself ({run.optimiser.finished}); {way_out}")
     if len(run.history) >= config.iterations:
         way_out = "raise 'steps'" if folder.in_python else "raise 'iterations' in its config"

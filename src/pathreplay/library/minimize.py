@@ -89,8 +89,9 @@ def minimize(  # noqa: PLR0913 (of which most are keywords)
         problem: what is minimised. Its scene holds the result afterwards.
         optimizer: ``"adam"`` (the default), ``"adamw"``, ``"sgd"``, ``"rmsprop"`` or ``"l-bfgs-b"``; a mapping with its
             ``type`` and options; an optimizer of `mitsuba.ad` that holds nothing yet, with learning rates of its own
-            where a `Parameter` has none; or any object with ``step(values, gradients, learning_rates, loss) ->
-            values``, arrays by name.
+            where a `Parameter` has none; any object with ``step(values, gradients, learning_rates, loss) ->
+            values``, arrays by name; or a function that is called as `scipy.optimize.minimize`, such as
+            ``functools.partial(scipy.optimize.minimize, method="SLSQP")``, for up to 1000 numbers.
         steps: iterations; None: those of the job that the problem comes from, or 200.
         callbacks: each is called after every step with an `Iteration`; one that returns True ends the minimisation.
         progress: show a bar on a terminal, curve and images in a notebook, and lines elsewhere.
@@ -181,7 +182,7 @@ def _run(problem: Problem, built: inner.Problem, own: Any, stack: ExitStack, bar
     pool = stack.enter_context(crew_of(config, problem.base, built, bar.remark, bar.status))
     run = run_of(built, pool)
     if own is not None:
-        run.optimiser = adapted(own, run.values, config.parameters)
+        run.optimiser = adapted(own, built, run.values)
     return run
 
 

@@ -1,8 +1,8 @@
-"""Optimisers of others in our loop: those of `mitsuba.ad`, and objects with a step of their own."""
+"""Optimisers of others in our loop: those of `mitsuba.ad`, objects with a step of their own, and SciPy's."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Protocol
 
 import drjit as dr
@@ -10,9 +10,10 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.schema import Parameter
-from pathreplay.inverse.optim.adaptive import State
+from pathreplay.inverse.loop.loop import optimiser_of
+from pathreplay.inverse.optim.adaptive import Optimiser, State
 from pathreplay.inverse.parameters.values import Array, Arrays
+from pathreplay.inverse.problem.problem import Problem
 
 
 class Stepper(Protocol):
@@ -145,16 +146,19 @@ class OfUser:
             )
 
 
-def adapted(optimizer: Any, values: Arrays, entries: Iterable[Parameter]) -> OfMitsuba | OfUser:
-    """The optimiser that our loop steps with an object of somebody else's; ``entries`` are a job's parameters."""
-    own = {entry.key for entry in entries if entry.learning_rate is not None}
+def adapted(optimizer: Any, problem: Problem, values: Arrays) -> Optimiser:
+    """The optimiser that our loop steps with an object, or a function, of somebody else's."""
+    config = problem.config
+    if not hasattr(optimizer, "step"):
+        return optimiser_of(problem, values, config.optimizer, optimizer)
     if hasattr(optimizer, "set_learning_rate") and hasattr(optimizer, "keys"):
+        own = {entry.key for entry in config.parameters if entry.learning_rate is not None}
         return OfMitsuba(optimizer, values, own)
     return OfUser(optimizer, values)
 
 
 def options_of(optimizer: Any) -> tuple[dict[str, Any] | None, Any]:
-    """The options of an optimizer of ours, or another's object; neither where there is none to say.
+    """The options of an optimizer of ours, and an object or a function of another's; neither where nothing is said.
 
     Raises PathreplayError for what is no optimizer at all.
     """
@@ -162,9 +166,14 @@ def options_of(optimizer: Any) -> tuple[dict[str, Any] | None, Any]:
         return None if optimizer is None else {"type": optimizer}, None
     if isinstance(optimizer, Mapping) and "type" in optimizer:
         return dict(optimizer), None
-    if not hasattr(optimizer, "step"):
-        raise PathreplayError(
-            f"optimizer: {type(optimizer).__name__} has no step(); give a name such as 'adam', an optimizer of "
-            "mitsuba.ad, or an object with step(values, gradients, learning_rates, loss)"
-        )
-    return None, optimizer
+    if isinstance(optimizer, type):
+        raise PathreplayError(f"optimizer: {optimizer.__name__} is a class; make an object of it")
+    if hasattr(optimizer, "step"):
+        return None, optimizer
+    if callable(optimizer):
+        return {"type": "l-bfgs-b"}, optimizer  # which is what a job calls a search along lines
+    raise PathreplayError(
+        f"optimizer: {type(optimizer).__name__} has no step(); give a name such as 'adam', an optimizer of "
+        "mitsuba.ad, an object with step(values, gradients, learning_rates, loss), or a function like "
+        "scipy.optimize.minimize"
+    )

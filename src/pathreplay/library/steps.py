@@ -105,7 +105,7 @@ def init(
     built, executor = task.of(problem, "init")
     run = new_run(built, built.integrator, optimizer=built.config.optimizer, executor=executor)
     if own is not None:
-        run.optimiser = task.own = adapted(own, run.values, built.config.parameters)
+        run.optimiser = task.own = adapted(own, built, run.values)
     return State(run.values, (), "", run.values, {}, _copied(run.optimiser.state()), task)
 
 

@@ -46,7 +46,7 @@ from pathreplay.inverse.objective.evaluate import (
 )
 from pathreplay.inverse.objective.stages import Part, part_at
 from pathreplay.inverse.optim.adaptive import DrJitOptimiser, Optimiser
-from pathreplay.inverse.optim.lbfgs import LineSearch
+from pathreplay.inverse.optim.lbfgs import LineSearch, Search
 from pathreplay.inverse.parameters.exposures import EXPOSURE, exposed, with_held_out
 from pathreplay.inverse.parameters.grids import resampled
 from pathreplay.inverse.parameters.values import Array, Arrays
@@ -90,12 +90,12 @@ def new_run(
     )
 
 
-def optimiser_of(problem: Problem, values: Arrays, options: Optimizer) -> Optimiser:
-    """An optimiser of the problem's variables that begins at these values."""
+def optimiser_of(problem: Problem, values: Arrays, options: Optimizer, search: Search | None = None) -> Optimiser:
+    """An optimiser of the problem's variables that begins at these values; for ``search`` see `LineSearch`."""
     if options.searches:
         free = -np.inf, np.inf  # coordinates enforce the bounds themselves
         bounds = {v.key: free if v.coordinates else v.bounds for v in problem.variables}
-        return LineSearch(values, options, bounds)
+        return LineSearch(values, options, bounds, search)
     uniform = [v.key for v in problem.variables if v.coordinates and v.coordinates.uniform]
     return DrJitOptimiser(values, options, uniform)
 

@@ -1,4 +1,4 @@
-"""SciPy's L-BFGS-B as an `Optimiser` that gets one loss and gradient at a time, for few parameters.
+"""Search methods of SciPy, L-BFGS-B and others, as an `Optimiser` that gets one loss and gradient at a time.
 
 Each iteration of a job is one function evaluation, which may be a trial step of the line search with a larger loss than
 before. The result is the best evaluation. SciPy does not expose its state, but it is deterministic: at each iteration
@@ -8,7 +8,9 @@ time compared with rendering, and makes resuming from a checkpoint exact to the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,8 @@ MOST = 1000
 ENDLESS = 10**9
 
 Vector = NDArray[np.float64]
+Search = Callable[..., Any]
+"""search(function, start, jac=True, bounds=...) -> anything; see `LineSearch`."""
 _START, _SCALE, _LOSSES, _GRADIENTS, _NEXT = (f"search:{n}" for n in ("start", "scale", "losses", "gradients", "next"))
 
 
@@ -34,7 +38,7 @@ class _Asked(Exception):
 
 
 class LineSearch:
-    """L-BFGS-B with bounds.
+    """A search method with bounds.
 
     Variables are scaled by their initial learning rates, losses by the initial loss.
 
@@ -42,20 +46,27 @@ class LineSearch:
         values: initial values by key.
         options: options of the optimiser.
         bounds: lower and upper bound of each variable, by key.
+        search: a deterministic function with the interface of `scipy.optimize.minimize`, called with a function that
+            returns loss and gradient, the start, ``jac=True`` and ``bounds``. Default: L-BFGS-B with ``options``.
 
     Raises:
         PathreplayError: there are more than `MOST` entries.
     """
 
-    def __init__(self, values: Arrays, options: Optimizer, bounds: Mapping[str, tuple[float, float]]) -> None:
+    def __init__(
+        self,
+        values: Arrays,
+        options: Optimizer,
+        bounds: Mapping[str, tuple[float, float]],
+        search: Search | None = None,
+    ) -> None:
         self._shapes = {key: value.shape for key, value in values.items()}
         n = sum(value.size for value in values.values())
         if n > MOST:
             raise PathreplayError(
                 f"The parameters have {n} entries, but optimizer type = '{options.type}' takes up to {MOST}; use 'adam'"
             )
-        given = options.options()
-        self._memory, self._tolerance = given["history_size"], given["tolerance"]
+        self._search = partial(_of_scipy, **options.options()) if search is None else search
         ends = [np.broadcast_to(np.array(bounds[key], float), (value.size, 2)) for key, value in values.items()]
         self._bounds = np.concatenate(ends)
         self._start, self._scale, self._next = np.zeros(0), np.zeros(0), np.zeros(0)
@@ -89,26 +100,23 @@ class LineSearch:
                 raise _Asked
             return self._losses[k] / unit, self._gradients[k] / unit
 
+        low, high = (self._bounds / self._scale[:, None]).T
+        free = np.isinf(self._bounds).all()
         try:
-            result = scipy.optimize.minimize(
-                recorded,
-                self._start,
-                jac=True,
-                method="L-BFGS-B",
-                bounds=scipy.optimize.Bounds(*(self._bounds / self._scale[:, None]).T),
-                options={
-                    "maxcor": self._memory,
-                    "ftol": self._tolerance,
-                    "gtol": 0.0,
-                    "maxfun": ENDLESS,
-                    "maxiter": ENDLESS,
-                },
-            )
+            with warnings.catch_warnings():
+                warnings.filterwarnings("error", ".* cannot handle .*bounds", RuntimeWarning)
+                bounds = None if free else scipy.optimize.Bounds(low, high)
+                result = self._search(recorded, self._start, jac=True, bounds=bounds)
+        except RuntimeWarning as error:
+            raise PathreplayError(
+                f"optimizer: {error}; remove the bounds, use a parameterization that enforces them, or another method"
+            ) from None
         except _Asked:
             self._next = self._points.pop()
             return
-        reason = "the loss has converged" if result.success else "no step lowers the loss, possibly because of noise"
-        self.finished = f"{reason} ({' '.join(str(result.message).split())})"
+        success, message = getattr(result, "success", True), str(getattr(result, "message", "it returned"))
+        reason = "the loss has converged" if success else "no step lowers the loss, possibly because of noise"
+        self.finished = f"{reason} ({' '.join(message.split())})"
 
     def _split(self, x: Vector) -> dict[str, Array]:
         parts, at = {}, 0
@@ -145,6 +153,7 @@ class LineSearch:
             raise ValueError("the shapes of its parameters differ")
         if rest := set(state.arrays) - {_START, _SCALE, _LOSSES, _GRADIENTS, _NEXT}:
             raise ValueError(f"'{min(rest)}' is not a state array of this optimizer")
+        self.finished, self._points, self._losses, self._gradients = "", [], [], []
         if not count:
             return
         shapes = {_START: (n,), _SCALE: (n,), _LOSSES: (count,), _GRADIENTS: (count, n), _NEXT: (n,)}
@@ -160,6 +169,14 @@ class LineSearch:
         expected = state.arrays.get(_NEXT)
         if len(self._points) != count or (expected is not None and not np.array_equal(self._next, expected)):
             raise ValueError("SciPy requests other points than recorded; its version may have changed")
+
+
+def _of_scipy(
+    function: Callable[[Vector], tuple[float, Vector]], start: Vector, history_size: int, tolerance: float, **more: Any
+) -> Any:
+    """Run SciPy's L-BFGS-B."""
+    options = {"maxcor": history_size, "ftol": tolerance, "gtol": 0.0, "maxfun": ENDLESS, "maxiter": ENDLESS}
+    return scipy.optimize.minimize(function, start, method="L-BFGS-B", options=options, **more)
 
 
 def _flat(arrays: Arrays) -> Vector:
