@@ -211,6 +211,17 @@ def test_mitsubas_adam_takes_the_steps_of_ours(photos: list[np.ndarray]) -> None
     np.testing.assert_allclose(theirs.values[WALL], ours.values[WALL], rtol=1e-4)
 
 
+@pytest.mark.parametrize("key", [WALL, "wall.*reflectance*", BODY])
+def test_learning_rates_of_parameters_are_those_of_mitsubas_optimizer(key: str, photos: list[np.ndarray]) -> None:
+    """The first step of Adam has the length of the rate: of a key, of a glob, and of a pose."""
+    entry = Parameter(pose="translation", learning_rate=0.01) if key == BODY else Parameter(learning_rate=0.01)
+    problem = Problem(room(), {key: entry, TEXTURE: None}, views(photos), spp=4)
+    result = pathreplay.minimize(problem, mi.ad.Adam(lr=0.1), steps=1, progress=False)
+    name = f"{BODY}:translation" if key == BODY else WALL
+    for each, rate in ((name, 0.01), (TEXTURE, 0.1)):
+        assert np.abs(result.values[each] - problem.initial[each]).max() == pytest.approx(rate, rel=1e-2)
+
+
 def test_losses_of_ones_own_and_by_name(photos: list[np.ndarray]) -> None:
     def own(image: Any, target: Any) -> Any:
         return dr.abs(image - target)

@@ -112,8 +112,9 @@ def test_targets_of_files_and_masks_go_along(place: Path) -> None:
     (place / "mask.exr").write_bytes(exr_bytes(mask))
     path = written(place, {**JOB, "target": {"images": ["photo.exr"], "masks": ["mask.exr"]}})
     job = optimize(path, output="job", progress=False)
-    result = pathreplay.minimize(load_job(path), output="run", progress=False)
-    np.testing.assert_array_equal(result.values[KEY], job.parameters[KEY])
+    for scene in (None, mi.load_file(str(place / "room.xml"))):
+        result = pathreplay.minimize(load_job(path, scene=scene), output="run", progress=False)
+        np.testing.assert_array_equal(result.values[KEY], job.parameters[KEY])
 
 
 @pytest.mark.parametrize(

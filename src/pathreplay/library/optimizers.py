@@ -12,8 +12,10 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.loop.loop import optimiser_of
 from pathreplay.inverse.optim.adaptive import Optimiser, State
+from pathreplay.inverse.parameters.pose import PART_NAMES
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem
+from pathreplay.scenes.parameters import resolve_keys
 
 
 class Stepper(Protocol):
@@ -148,13 +150,19 @@ class OfUser:
 
 def adapted(optimizer: Any, problem: Problem, values: Arrays) -> Optimiser:
     """The optimiser that our loop steps with an object, or a function, of somebody else's."""
-    config = problem.config
     if not hasattr(optimizer, "step"):
-        return optimiser_of(problem, values, config.optimizer, optimizer)
+        return optimiser_of(problem, values, problem.config.optimizer, optimizer)
     if hasattr(optimizer, "set_learning_rate") and hasattr(optimizer, "keys"):
-        own = {entry.key for entry in config.parameters if entry.learning_rate is not None}
-        return OfMitsuba(optimizer, values, own)
+        return OfMitsuba(optimizer, values, _rated(problem))
     return OfUser(optimizer, values)
+
+
+def _rated(problem: Problem) -> set[str]:
+    """The variables whose parameters, named by key or glob, have learning rates of their own."""
+    owners = {v.key: v.key.rpartition(":")[0] if v.key.endswith(PART_NAMES) else v.key for v in problem.variables}
+    entries = [e for e in problem.config.parameters if e.learning_rate or e.rotation_learning_rate]
+    rated = resolve_keys(dict.fromkeys(owners.values()), [entry.key for entry in entries])
+    return {key for key, owner in owners.items() if owner in rated}
 
 
 def options_of(optimizer: Any) -> tuple[dict[str, Any] | None, Any]:

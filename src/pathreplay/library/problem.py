@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -85,7 +85,7 @@ class Problem:
 
     def _build(
         self,
-        settings: dict[str, Any],
+        job: dict[str, Any],
         base: Path,
         scene: Any = None,
         parameters: Any = None,
@@ -95,11 +95,10 @@ class Problem:
         derived: Any = None,
     ) -> None:
         """Put objects, those that are given, in the place of what a job says, and build all of it."""
-        self.base, self.job = base, settings
+        self.base, self.job, objects = base, job, Objects()
         self.notes: tuple[str, ...] = ()
-        if mi.variant() is None or "variant" in settings:
-            backend.set_variant(settings.get("variant"))
-        job, objects, targets, own_scene, own_integrator = settings, Objects(), None, None, None
+        if mi.variant() is None or "variant" in job:
+            backend.set_variant(job.get("variant"))
         wanted = None if parameters is None else by_key(parameters)
         looked_at = None if views is None else [views] if isinstance(views, View) else list(views)
         require_kinds(wanted or {}, looked_at or (), derived or {})
@@ -109,23 +108,20 @@ class Problem:
             job["derived"] = objects.made(derived)
         if loss is not None:
             job["loss"] = next((name for name, each in LOSSES.items() if each is loss), None) or objects.named(loss)
-        if isinstance(integrator, Mapping):
-            job["integrator"] = dict(integrator)
-        elif integrator is not None:
-            own_integrator, job["integrator"] = integrator, {"type": type(integrator).__name__}
+        own_integrator = None if isinstance(integrator, Mapping) else integrator
+        if integrator is not None:
+            job["integrator"] = {"type": type(integrator).__name__} if own_integrator else dict(integrator)
         if isinstance(scene, (str, Path)):
             job["scene"], scene = str(scene), None
+        own_scene, targets = None, None
         if scene is not None or looked_at is not None:
             own_scene, self.notes = _loaded(job.get("scene") if scene is None else scene, job, base)
-            job["target"] = {"scene": job.get("scene"), **job.get("target", {})}  # where that is rendered
-            job["scene"] = IN_MEMORY
-        if looked_at is not None:
-            targets = _seen(job, own_scene, looked_at)
+            targets = _moved(job, own_scene, looked_at)
         if job.get("deterministic"):
             require_order(mi.variant())
-        self.in_memory = bool(objects.functions or objects.starts) or (own_scene, own_integrator) != (None, None)
-        """Whether it holds objects that no job could name."""
         memory = inner.InMemory(own_scene, own_integrator, objects.functions, objects.starts)
+        self.in_memory = memory != inner.InMemory()
+        """Whether it holds objects that no job could name."""
         known = {"iterations", "stages"} & set(job)
         config = make_config(job if known else {"iterations": MOST_ITERATIONS, **job}, "problem")
         self.built = inner.build_problem(config, base, targets, memory if self.in_memory else None)
@@ -260,9 +256,14 @@ def _loaded(scene: Any, job: Mapping[str, Any], base: Path) -> tuple[mi.Scene, t
     return load_scene_for(dict(scene) if isinstance(scene, Mapping) else scene, wanted, base, **given)
 
 
-def _seen(job: dict[str, Any], scene: mi.Scene, views: Iterable[View]) -> Targets:
-    """The images of the views, which the job names from now on in place of what it named."""
-    named = by_name(scene, list(views))
+def _moved(job: dict[str, Any], scene: mi.Scene, views: Sequence[View] | None) -> Targets | None:
+    """Tell a job that its scene is in memory, and so are its images, if there are ``views``, which are returned."""
+    said, job["scene"] = job.get("scene"), IN_MEMORY
+    if views is None:
+        if "images" not in job.get("target", {}) and "capture" not in job:
+            job["target"] = {"scene": said, **job.get("target", {})}  # where they are rendered
+        return None
+    named = by_name(scene, views)
     job.pop("capture", None)
     job["sensors"] = list(named)
     job["test_views"] = [name for name, view in named.items() if view.test]
