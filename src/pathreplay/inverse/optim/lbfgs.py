@@ -109,7 +109,7 @@ class LineSearch:
                 result = self._search(recorded, self._start, jac=True, bounds=bounds)
         except RuntimeWarning as error:
             raise PathreplayError(
-                f"optimizer: {error}; remove the bounds, use a parameterization that enforces them, or another method"
+                f"optimizer: {str(error).rstrip('.')}; remove the bounds, use a parameterization that enforces them, or another method"
             ) from None
         except _Asked:
             self._next = self._points.pop()
