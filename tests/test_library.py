@@ -376,7 +376,7 @@ def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None
     unbounded = partial(scipy.optimize.minimize, method="BFGS")
     for optimizer, words in (
         (object(), "has no step"),
-        (mi.ad.Adam, "is a class; make an object"),
+        (mi.ad.Adam, "is a class; create an object"),
         (unbounded, "BFGS cannot handle bounds; remove the bounds"),
         (held, "holds variables already"),
         ("adem", "adem"),

@@ -101,7 +101,7 @@ def test_what_a_file_says_can_be_changed(place: Path) -> None:
     result = pathreplay.minimize(own_objects, "adam", 3, output="run", progress=False)
     job = optimize(path, output="job", progress=False, define=["iterations=3"])
     np.testing.assert_array_equal(result.values[KEY], job.parameters[KEY])
-    with pytest.raises(PathreplayError, match="begun in Python"):
+    with pytest.raises(PathreplayError, match="started in Python"):
         optimize(resume="run", progress=False)
 
 

@@ -139,12 +139,12 @@ def test_what_cannot_go_on_is_told_in_one_line(photos: list[np.ndarray]) -> None
     told("another target or weight of view 'right'", problem_of([photos[0], photos[0]]))
     told("has the parameters", Problem(room(), {WALL: GREY}, views(photos), spp=4))
     told("is not a state array of this optimizer", optimizer="sgd")
-    told("'loss' belongs to the problem", loss="l1")
+    told("'loss' belongs to the problem; give it to Problem", loss="l1")
     told("unknown key 'checkpoint_evry'; did you mean 'checkpoint_every'", checkpoint_evry=3)
-    told("executor = 'ray': other processes cannot be sent", executor="ray", output=None, resume=False)
+    told("executor = 'ray': objects in memory cannot be sent", executor="ray", output=None, resume=False)
     Path("file").write_text("")
     told("there is a file of that name|no run folder", output="file")
-    with pytest.raises(PathreplayError, match=r"begun in Python.*minimize\(problem, output='run', resume=True\)"):
+    with pytest.raises(PathreplayError, match=r"started in Python.*minimize\(problem, output='run', resume=True\)"):
         optimize(resume="run", progress=False)
     exported = CliRunner().invoke(app, ["export", "run"])
     assert "result.apply(scene)" in str(exported.exception)
@@ -156,7 +156,7 @@ def test_a_folder_of_a_run_that_cannot_begin_goes_again(photos: list[np.ndarray]
         def step(self, *_: Any) -> Any:
             return {}
 
-    with pytest.raises(PathreplayError, match="gave no value"):
+    with pytest.raises(PathreplayError, match="returned no value"):
         run(problem_of(photos), Broken(), output="deep/run")
     assert not Path("deep").exists()
 

@@ -126,13 +126,13 @@ def test_what_scenes_cannot_share_is_told() -> None:
     fine = Problem(room(), {TEXTURE: GREY}, views(photos))
     exposed = Problem(room(), {WALL: GREY}, views(photos), exposure={})
     for problems, words in (
-        ([one, two], "of one scene"),
+        ([one, two], "have the same scene"),
         ([coarse, fine], "shape"),
-        ([one, exposed], "neither 'exposure' nor"),
-        ([], "problems: there is none"),
+        ([one, exposed], "neither 'exposure' nor 'baseline'"),
+        ([], "problems: there are none"),
     ):
         with pytest.raises(PathreplayError, match=words) as told:
             Problem.joint(problems)
         assert "\n" not in str(told.value)
-    with pytest.raises(PathreplayError, match="stages: a problem of several scenes has none"):
+    with pytest.raises(PathreplayError, match="stages: joint problems support none"):
         pathreplay.minimize(Problem.joint([one, fine]), stages=[{"iterations": 2}], progress=False)

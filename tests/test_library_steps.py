@@ -107,7 +107,7 @@ def test_what_cannot_be_stepped_is_told(photos: list[np.ndarray]) -> None:
     problem = wall_of(photos)
     state = pathreplay.init(problem)
     assert np.isnan(state.loss)
-    with pytest.raises(PathreplayError, match=r"The state has the parameters .*; begin anew with init"):
+    with pytest.raises(PathreplayError, match=r"The state has the parameters .*; start again with init"):
         pathreplay.step(problem_of(photos), state)
     with pytest.raises(PathreplayError, match="has no state_dict"):
         pathreplay.init(problem, Descent())

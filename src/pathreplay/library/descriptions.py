@@ -1,4 +1,4 @@
-"""What a problem is described with: its parameters, what is derived from them, and its views."""
+"""Descriptions of parameters, derived parameters and views, and their translation to the tables of a job."""
 
 from __future__ import annotations
 
@@ -15,24 +15,29 @@ from pathreplay.inverse.parameters.values import Array
 
 @dataclass(frozen=True)
 class Parameter:
-    """What is sought of one scene parameter, or of several by a glob; every field has a key of that name in jobs.
+    """Options of one scene parameter, or of several by a glob; fields have the names of the keys of jobs.
 
-    Values are decoded ones: reflectances and radiances as arrays of numbers, in the shape that `mi.traverse` shows.
+    Values are decoded reflectances and radiances, in the shape that `mi.traverse` shows.
 
     Args:
         initial: a number, a colour, an array in the parameter's shape, or an image or volume file; for a pose a
-            displacement ``{"translation": [x, y, z], "rotation": [rx, ry, rz]}`` (scene units, degrees). None: the
+            displacement ``{"translation": [x, y, z], "rotation": [rx, ry, rz]}`` (scene units, degrees). Default: the
             value in the scene.
-        bounds: lowest and highest value, held by projection after each step; None: none.
-        learning_rate: about the length of a step of Adam. None: that of the problem.
-        parameterization: ``"log"``, ``"softplus"`` or ``"logit"``: steps are taken in that function of the value.
-        resolutions, refine_at: sizes of a grid, coarse to fine, and the iterations at which it is refined.
-        pose: ``"translation"``, ``"rotation"`` or ``"rigid"``, of a ``to_world`` or of ``vertex_positions``; with
-            ``pivot``, ``rotation_learning_rate`` (degrees) and ``error_scale``.
+        bounds: lower and upper bound, enforced by projection after each step.
+        learning_rate: approximate length of a step of Adam. Default: that of the problem.
+        parameterization: ``"log"``, ``"softplus"`` or ``"logit"``: steps are taken in this function of the value.
+        resolutions: sizes of a grid, coarse to fine.
+        refine_at: iterations at which the grid is refined.
+        pose: ``"translation"``, ``"rotation"`` or ``"rigid"`` motion of a ``to_world`` or of ``vertex_positions``.
+        pivot: centre of the rotation of a pose.
+        rotation_learning_rate: learning rate of the rotation of a pose, in degrees.
+        error_scale: length with which position errors of a pose are compared.
         large_steps_lambda: λ of Large Steps (Nicolet et al. 2021), for ``vertex_positions``.
-        total_variation, l2_to_initial, laplacian_weight: weights of regularizers.
-        regularizer: a function of the values (a tensor) that gives one number, which is added to the loss.
-        shape: of numbers that are no part of the scene, from which others are `Derived`.
+        total_variation: weight of the total variation.
+        l2_to_initial: weight of the mean squared difference from the initial value.
+        laplacian_weight: weight of the mean squared Laplacian of vertices.
+        regularizer: function of the values (a tensor) that returns one number, which is added to the loss.
+        shape: shape of a parameter that is not part of the scene, from which others are `Derived`.
     """
 
     initial: Any = None
@@ -55,7 +60,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Derived:
-    """A scene parameter that a function makes of others: ``function(value in the scene, *values of those in of)``."""
+    """A scene parameter computed from parameters: ``function(value in the scene, *values of the parameters in of)``."""
 
     function: Callable[..., Any] | str
     of: Sequence[str]
@@ -63,14 +68,14 @@ class Derived:
 
 @dataclass(frozen=True)
 class View:
-    """A sensor and the image that it should see.
+    """A sensor and its target image.
 
     Args:
-        sensor: its place in the scene, or its id.
+        sensor: index or id of the sensor.
         target: linear pixels (height, width, channels): a NumPy or Dr.Jit array, a `mi.Bitmap`, or an image file.
-        weight: how much pixels count (height, width), none negative; scaled to the mean 1. None: all the same.
-        share: how much the view counts beside the others.
-        test: never learned from.
+        weight: nonnegative pixel weights (height, width), normalised to mean 1. Default: equal weights.
+        share: weight of the view relative to the others.
+        test: whether the view is held out.
     """
 
     sensor: int | str = 0
@@ -81,7 +86,7 @@ class View:
 
 
 def require_kinds(wanted: Mapping[str, Parameter | None], views: Sequence[View], made: Mapping[str, Derived]) -> None:
-    """Raise PathreplayError for a number in the place of a Parameter, and the like."""
+    """Raise PathreplayError if an entry has the wrong type."""
     for what, kind, things in (
         ("parameters", Parameter, [each for each in wanted.values() if each is not None]),
         ("views", View, list(views)),
@@ -92,21 +97,21 @@ def require_kinds(wanted: Mapping[str, Parameter | None], views: Sequence[View],
 
 
 def by_key(parameters: Mapping[str, Parameter | None] | Sequence[str] | str) -> dict[str, Parameter | None]:
-    """By key or glob; a name stands for a parameter as it is."""
+    """Return parameters by key or glob; names alone stand for parameters without options."""
     if isinstance(parameters, Mapping):
         return dict(parameters)
     return dict.fromkeys([parameters] if isinstance(parameters, str) else parameters)
 
 
 class Objects:
-    """What of a problem a job could not name: functions and arrays, by the names that stand for them in its tables."""
+    """Functions and arrays of a problem, by the names that represent them in the tables of a job."""
 
     def __init__(self) -> None:
         self.functions: dict[str, Callable[..., Any]] = {}
         self.starts: dict[str, Array] = {}
 
     def named(self, function: Callable[..., Any] | str) -> str:
-        """The name of a function; a text is one already."""
+        """Return the name that represents a function; strings are returned unchanged."""
         if isinstance(function, str):
             return function
         plain = getattr(function, "__name__", type(function).__name__).strip("<>")
@@ -118,7 +123,7 @@ class Objects:
         return name
 
     def tables(self, wanted: Mapping[str, Parameter | None]) -> list[dict[str, Any]]:
-        """Parameters as a job has them. Raises PathreplayError for the start of a pose that is no displacement."""
+        """Translate parameters to tables. Raises PathreplayError if the initial value of a pose is an array."""
         return [self._table(key, entry or Parameter()) for key, entry in wanted.items()]
 
     def _table(self, key: str, entry: Parameter) -> dict[str, Any]:
@@ -138,14 +143,14 @@ class Objects:
         return {name: _plain(value) for name, value in table.items() if value is not None}
 
     def made(self, derived: Mapping[str, Derived]) -> list[dict[str, Any]]:
-        """Derived parameters as a job has them."""
+        """Translate derived parameters to tables."""
         return [
             {"key": key, "function": self.named(each.function), "of": list(each.of)} for key, each in derived.items()
         ]
 
 
 def _plain(value: Any) -> Any:
-    """Numbers and lists as a job has them."""
+    """Convert arrays and NumPy scalars to lists and numbers."""
     if isinstance(value, (str, Mapping)):
         return value
     if isinstance(value, Iterable):

@@ -1,4 +1,4 @@
-"""A run in a folder: checkpoints and a page while it is under way, and the report at its end."""
+"""A run with a folder: checkpoints and live page during the run, report at the end."""
 
 from __future__ import annotations
 
@@ -26,19 +26,20 @@ from pathreplay.runs.saving import Saving, first_files, go_on, saved_targets
 
 
 class FolderRun:
-    """What a run writes; ``observe`` wants all of its events.
+    """Writer of a run folder; ``observe`` receives all events of the run.
 
     Args:
-        job: its config is that of the problem.
-        problem: what is solved.
-        run: where it begins; brought to the last checkpoint of a folder that is ``resumed``.
-        stop: what the page's button asks.
-        output: the new folder; a number is appended where there is one.
-        home: the folder in which a relative ``output`` begins.
-        resumed: the folder that is gone on with.
+        job: the job; its config is replaced by that of the problem.
+        problem: the problem.
+        run: the run at its start. If a folder is resumed, it is restored from the checkpoint.
+        stop: set by the stop button of the live page.
+        output: the new folder; a number is appended if it exists.
+        home: folder to which a relative ``output`` refers.
+        resumed: the folder to resume; default: create a new one.
 
     Raises:
-        PathreplayError: the folder cannot be made or is damaged, the run has ended, or its loss is no finite number.
+        PathreplayError: the folder cannot be created or is damaged, the run has ended, or the initial loss is not
+            finite.
     """
 
     def __init__(
@@ -54,20 +55,20 @@ class FolderRun:
 
     @property
     def way_out(self) -> str:
-        """What is said where the run is aborted."""
+        """Return the message for an aborted run."""
         return f"aborted; go on from the last checkpoint with: {self.folder.resume_command()}"
 
     def observe(self, event: Event) -> None:
-        """Write what is due. Raises PathreplayError where the folder is gone, or cannot be written."""
+        """Write what is due. Raises PathreplayError if the folder has disappeared or cannot be written."""
         self._saving.observe(event)
         with computing(self._problem.config):
             self.previews.observe(event)
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Around the iterations: what was done is saved, where they end before their time by an error or a break.
+        """Save a checkpoint if the iterations in this block end early, by an error or by closing the generator.
 
-        A new folder goes again where not even the first iteration can be done; one that is resumed never does.
+        A new folder is removed if the first iteration fails. A resumed one is never removed.
         """
         try:
             yield
@@ -83,7 +84,7 @@ class FolderRun:
             raise
 
     def finish(self) -> RunResult:
-        """Write the end of the run: values, pictures and the report. Raises as `observe` does."""
+        """Write values, images and report at the end of the run. Raises as `observe` does."""
         problem, config = self._problem, self._problem.config
         with computing(config):
             run = ended(problem, config, self._run)
@@ -98,19 +99,19 @@ class FolderRun:
 
 
 def require_targets(folder: Path, problem: Problem) -> None:
-    """Raise PathreplayError unless a problem has the targets and the weights that a run in the folder began with."""
+    """Raise PathreplayError if targets or weights of a problem differ from those of the run in a folder."""
     saved = saved_targets(folder)
     for view in problem.views:
         pairs = (saved.images.get(view.name), view.target), (saved.weights.get(view.name), view.weight)
         if not all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs):
             raise PathreplayError(
-                f"Run {folder} has another target or weight of view '{view.name}' than the problem; give it what it "
-                "began with, or begin another run"
+                f"Run {folder} has another target or weight of view '{view.name}' than the problem; use the original "
+                "targets, or start a new run"
             )
 
 
 def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tuple[RunFolder, dict[str, Image]]:
-    """A new folder for a run, and the pictures of its start."""
+    """Create the folder of a run; returns it and the images at the initial values."""
     with computing(problem.config):
         before = render_views(problem, problem.config, run.values)
     for view in problem.views:
@@ -122,9 +123,9 @@ def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tu
 
 def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:
     config = problem.config
-    held = {v.key for v in problem.variables} if config.stages else set()  # some of them, in some stages
+    held = {v.key for v in problem.variables} if config.stages else set()  # stages may freeze some of them
     before = go_on(folder.path, problem, run, held)
-    # All iterations but no report: the disk was full at the end. Then only the end is done again.
+    # All iterations are done but there is no report: the disk was full. Only the end is repeated.
     if not (folder.path / "report.html").exists():
         return before
     name = f"Run {folder.name}"

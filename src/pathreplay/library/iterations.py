@@ -1,4 +1,4 @@
-"""The iterations of a run, one after the other, as jobs and `minimize` loop over them."""
+"""The optimisation loop that jobs and `minimize` share: iterations of a run, and its observers."""
 
 from __future__ import annotations
 
@@ -27,63 +27,63 @@ from pathreplay.platform.interrupts import Stop
 
 @dataclass(frozen=True)
 class Iteration:
-    """A run after one of its iterations. Nothing in it changes when the run goes on."""
+    """Snapshot of a run after an iteration. It does not change when the run continues."""
 
     entry: Entry
-    """What the history says of it."""
+    """Entry of the history."""
     values: Mapping[str, Array]
-    """After the step, by name, decoded; of poses ``KEY:translation`` and ``KEY:rotation``."""
+    """Decoded values after the step, by name; a pose has ``KEY:translation`` and ``KEY:rotation``."""
     views: tuple[str, ...]
     """Names of the views."""
     folder: Path | None
-    """Of the run; None where it has none."""
+    """Run folder, if there is one."""
     _problem: Problem = field(repr=False)
 
     @property
     def number(self) -> int:
-        """From 0."""
+        """Return the index of the iteration, from 0."""
         return self.entry.iteration
 
     @property
     def loss(self) -> float:
-        """Before the step, without regularizers."""
+        """Return the loss before the step, without regularizers."""
         return self.entry.loss
 
     @property
     def gradient_norms(self) -> Mapping[str, float]:
-        """L2 norms of the gradients that were stepped by, by name."""
+        """Return the L2 norms of the gradients, by name."""
         return self.entry.gradient_norms
 
     @property
     def errors(self) -> Mapping[str, float]:
-        """Root mean square errors after the step, by name, where the truth is known."""
+        """Return the root mean square errors after the step, by name, of parameters whose true value is known."""
         return self.entry.errors
 
     def render(self, view: int | str = 0, spp: int | None = None) -> Image:
-        """Render a view with these values, without changing what comes after.
+        """Render a view with these values. The run is not affected.
 
         Args:
-            view: its place or its name.
-            spp: samples per pixel; None: ``eval_spp``.
+            view: index or name of the view.
+            spp: samples per pixel; default: ``eval_spp``.
 
         Returns:
             Linear pixels (height, width, channels).
 
         Raises:
-            PathreplayError: there is no such view.
+            PathreplayError: the view does not exist.
         """
         return rendered(self._problem, self.values, view, spp)
 
 
 def rendered(problem: Problem, values: Arrays, view: int | str, spp: int | None) -> Image:
-    """The image of a view, by its place or its name, with these values. Raises PathreplayError for another view."""
+    """Render a view, given by index or name, with these values. Raises PathreplayError if it does not exist."""
     about = view_of(problem, view)
     with computing(problem.config):
         return picture_of(problem, problem.config, values, about, spp)
 
 
 def view_of(problem: Problem, view: int | str) -> views.View:
-    """The view of that place or name. Raises PathreplayError if there is none."""
+    """Return a view by index or name. Raises PathreplayError if it does not exist."""
     for n, each in enumerate(problem.views):
         if view in (n, n - len(problem.views), each.name):
             return each
@@ -91,7 +91,15 @@ def view_of(problem: Problem, view: int | str) -> views.View:
 
 
 def run_of(problem: Problem, pool: WorkerPool | None = None) -> Run:
-    """The run of a problem, and that of its baseline, at their start; in this process, if there is no ``pool``."""
+    """Create the run of a problem, and of its baseline, at the initial values.
+
+    Args:
+        problem: the problem.
+        pool: actors that evaluate it; default: this process.
+
+    Returns:
+        The run before its first iteration.
+    """
     config = problem.config
     run = _run(problem, problem.integrator, config.integrator, pool)
     if problem.baseline is not None and config.baseline is not None:
@@ -117,10 +125,20 @@ def iterations(
     observers: Sequence[Callable[[Event], None]],
     kept: FolderRun | None = None,
 ) -> Generator[Iteration, None, None]:
-    """Take all steps of a run; observers are told of everything before what they hear of is yielded.
+    """Run the loop.
 
-    ``kept`` is its folder, an observer among these, which saves what was done when the generator is closed.
-    Raises as `inverse.loop.loop.iterate` and the observers do.
+    Args:
+        problem: the problem.
+        run: its run, which is modified.
+        stop: requests to stop after the current iteration.
+        observers: receive every event, before the iteration is yielded.
+        kept: the run in its folder, one of the observers, which saves a checkpoint when the generator is closed.
+
+    Yields:
+        Each iteration.
+
+    Raises:
+        PathreplayError: see `inverse.loop.loop.iterate`, and the observers.
     """
     names = tuple(view.name for view in problem.views)
     folder = None if kept is None else kept.folder.path

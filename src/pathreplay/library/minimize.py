@@ -1,4 +1,4 @@
-"""Minimisation of a problem: steps, callbacks, a folder where one is asked for, and the result."""
+"""`minimize`: the optimisation loop with callbacks, progress display, an optional run folder, and the result."""
 
 from __future__ import annotations
 
@@ -35,34 +35,34 @@ from pathreplay.runs.run_folder import Job, new_output, open_run_folder
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """What a minimisation came to."""
+    """Result of `minimize`."""
 
     values: dict[str, Array]
-    """By name; poses and derived parameters by their keys, too."""
+    """Values by name, including poses and derived parameters by key."""
     history: list[Entry]
-    """One entry for each iteration: loss, seconds, norms of gradients, ..."""
+    """One entry per iteration: loss, seconds, gradient norms and more."""
     stopped: str | None
-    """Who ended it early: a callback, 'Ctrl-C', or the optimiser, and why."""
+    """Why it ended early: 'a callback', 'Ctrl-C', 'the stop button', or the reason of the optimiser."""
     problem: Problem
     folder: Path | None = None
-    """What was written: the report, ``report.html``, is in it."""
+    """Run folder, which contains ``report.html``; None if there is none."""
 
     def __repr__(self) -> str:
-        """Short: a notebook prints it."""
+        """Return a short description for notebooks."""
         stopped = "" if self.stopped is None else f", ended by {self.stopped}"
         return f"<Result: {len(self.history)} iterations, loss {self.loss:.4g}{stopped}; {', '.join(self.values)}>"
 
     @property
     def loss(self) -> float:
-        """Of the last iteration, before its step."""
+        """Return the loss of the last iteration, before its step."""
         return self.history[-1].loss if self.history else float("nan")
 
     def apply(self, scene: mi.Scene) -> None:
-        """Give a scene with these parameters the values that were found; that of the problem has them."""
+        """Set the parameters of a scene to the result. The scene of the problem already has these values."""
         self.problem.assign(self.values, scene)
 
     def render(self, view: int | str = 0, spp: int | None = None) -> Image:
-        """The image of a view (height, width, channels; linear) with these values: see `Problem.render`."""
+        """Render a view with the resulting values; see `Problem.render`."""
         return self.problem.render({v.key: self.values[v.key] for v in self.problem.built.variables}, view, spp)
 
 
@@ -86,33 +86,33 @@ def minimize(  # noqa: PLR0913 (of which most are keywords)
     """Minimise a problem from its initial values.
 
     Args:
-        problem: what is minimised. Its scene holds the result afterwards.
-        optimizer: ``"adam"`` (the default), ``"adamw"``, ``"sgd"``, ``"rmsprop"`` or ``"l-bfgs-b"``; a mapping with its
-            ``type`` and options; an optimizer of `mitsuba.ad` that holds nothing yet, with learning rates of its own
-            where a `Parameter` has none; any object with ``step(values, gradients, learning_rates, loss) ->
-            values``, arrays by name; or a function that is called as `scipy.optimize.minimize`, such as
-            ``functools.partial(scipy.optimize.minimize, method="SLSQP")``, for up to 1000 numbers.
-        steps: iterations; None: those of the job that the problem comes from, or 200.
-        callbacks: each is called after every step with an `Iteration`; one that returns True ends the minimisation.
-        progress: show a bar on a terminal, curve and images in a notebook, and lines elsewhere.
-        output: a folder for checkpoints, the page of ``pathreplay watch`` and the report, as jobs have it. Where it
-            exists, a number is appended. None: nothing is written.
-        resume: go on with the run in ``output`` from its last checkpoint, if there is one.
-        stages: tables of settings that differ for some iterations, as ``[[stages]]`` of jobs; their ``iterations`` take
-            the place of ``steps``.
+        problem: the problem. Its scene holds the result afterwards.
+        optimizer: ``"adam"`` (the default), ``"adamw"``, ``"sgd"``, ``"rmsprop"`` or ``"l-bfgs-b"``; a mapping with
+            ``type`` and options; an empty optimizer of `mitsuba.ad`, whose learning rate applies to parameters without
+            their own; an object with ``step(values, gradients, learning_rates, loss) -> values``, arrays by name; or a
+            function with the interface of `scipy.optimize.minimize`, such as
+            ``functools.partial(scipy.optimize.minimize, method="SLSQP")``, for up to 1000 entries.
+        steps: number of iterations. Default: that of the problem's job, or 200.
+        callbacks: functions that are called with an `Iteration` after each step; one that returns True stops the loop.
+        progress: show a bar on a terminal, loss curve and images in a notebook, and lines elsewhere.
+        output: run folder for checkpoints, the page of ``pathreplay watch`` and the report, as of jobs. If it exists, a
+            number is appended. Default: no files are written.
+        resume: resume the run in ``output`` from its last checkpoint, if the folder exists.
+        stages: tables of settings for parts of the run, as ``[[stages]]`` of jobs; their ``iterations`` replace
+            ``steps``.
         learning_rate_schedule: ``"constant"`` (the default), ``"exponential"``, ``"linear"`` or ``"cosine"``.
-        final_learning_rate_ratio: learning rate at the end over that at the start.
-        warmup_steps: iterations in which the learning rate grows from nearly zero.
-        view_batch_size: views in an iteration; all by default.
-        pixel_batch_size: pixels of each view in an iteration; all by default.
-        **settings: other keys of a job that are not the problem's, such as ``checkpoint_every``, ``preview``, ``spp``.
+        final_learning_rate_ratio: final learning rate divided by the initial one.
+        warmup_steps: iterations in which the learning rate increases linearly from nearly zero.
+        view_batch_size: views per iteration. Default: all.
+        pixel_batch_size: pixels of each view per iteration. Default: all.
+        **settings: further keys of a job, such as ``checkpoint_every``, ``preview`` or ``spp`` (docs/job-reference.md).
 
     Returns:
-        Values, history, and who ended it. A first Ctrl-C ends it after the iteration that is under way.
+        Values, history, and the reason if it ended early. A first Ctrl-C ends it after the current iteration.
 
     Raises:
-        PathreplayError: for settings that cannot work, where loss or values are no longer finite, and for a folder that
-            is in use, damaged, or of another problem.
+        PathreplayError: settings are invalid, loss or values are not finite, or the folder is in use, damaged, or
+            belongs to another problem.
     """
     options, own = options_of(optimizer)
     given = {
@@ -139,12 +139,12 @@ def _minimized(
     output: Path | None,
     resume: bool,
 ) -> Result:
-    """See `minimize`; ``built`` has its settings, and ``own`` is an optimizer of the user's, if there is one."""
+    """Run `minimize` for a problem with settings (``built``) and the user's optimizer, if any (``own``)."""
     stop = Stop()
     if built.config.executor != "local" and problem.in_memory:
         raise PathreplayError(
-            f"executor = '{built.config.executor}': other processes cannot be sent what this problem holds in memory; "
-            "make it with load_job, of a file"
+            f"executor = '{built.config.executor}': objects in memory cannot be sent to other processes; create the "
+            "problem with load_job"
         )
     with ExitStack() as stack:
         stack.enter_context(memory.within(built.config.budget))
@@ -159,7 +159,7 @@ def _minimized(
             job = Job(built.config, None, problem.base, in_python=problem.in_memory or own is not None)
             kept = _folder_run(job, built, run, stop, output, resume, stack)
         elif resume:
-            raise PathreplayError("resume = True goes on with a run in a folder; give 'output'")
+            raise PathreplayError("resume = True needs a folder; give 'output'")
         stack.enter_context(stopping(bar.say, "aborted" if kept is None else kept.way_out, stop))
         observers = [bar.observe, *_observers(bar, built, run, stop, kept)]
         for about in stack.enter_context(closing(iterations(built, run, stop, observers, kept))):
@@ -177,7 +177,7 @@ def _minimized(
 
 
 def _run(problem: Problem, built: inner.Problem, own: Any, stack: ExitStack, bar: Progress | NotebookPanel) -> Run:
-    """A run at the start, stepped by an optimizer of the user's ``own`` if there is one."""
+    """Create the run, with the user's optimizer if there is one."""
     config = built.config
     pool = stack.enter_context(crew_of(config, problem.base, built, bar.remark, bar.status))
     run = run_of(built, pool)
@@ -189,8 +189,8 @@ def _run(problem: Problem, built: inner.Problem, own: Any, stack: ExitStack, bar
 def _folder_run(
     job: Job, built: inner.Problem, run: Run, stop: Stop, output: Path, resume: bool, stack: ExitStack
 ) -> FolderRun:
-    """The run in a folder: a new one, or the one that is there."""
-    run.optimiser.state()  # an optimizer of the user's may have none that can be saved
+    """Create or resume the run folder."""
+    run.optimiser.state()  # raises if the user's optimizer cannot be saved
     resumed = None
     if resume and output.exists():
         _, resumed = open_run_folder(output, job.in_python)
@@ -204,7 +204,7 @@ def _folder_run(
 def _observers(
     bar: Progress | NotebookPanel, built: inner.Problem, run: Run, stop: Stop, kept: FolderRun | None
 ) -> list[Callable[[Event], None]]:
-    """Who else is told of a run: its folder, or where there is none, but a notebook, the images in that."""
+    """Return the observers besides the progress display: the run folder, or images for a notebook without one."""
     if kept is not None:
         if isinstance(bar, NotebookPanel):
             bar.follow(kept.previews.pictures, str(kept.folder.name))

@@ -1,4 +1,4 @@
-"""Optimisers of others in our loop: those of `mitsuba.ad`, objects with a step of their own, and SciPy's."""
+"""Adapters for foreign optimisers: those of `mitsuba.ad`, objects with a step method, and functions like SciPy's."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from pathreplay.scenes.parameters import resolve_keys
 
 
 class Stepper(Protocol):
-    """An optimiser of the user's own.
+    """An optimiser of the user.
 
-    One that has ``state_dict()``, arrays by name, and ``load_state_dict(arrays)`` can go on from a checkpoint.
+    With ``state_dict()``, which returns arrays by name, and ``load_state_dict(arrays)`` it can be resumed.
     """
 
     def step(
         self, values: Arrays, gradients: Arrays, learning_rates: Mapping[str, float], loss: float
     ) -> Mapping[str, Array]:
-        """The values after a step; arrays by name, in the shapes of ``values``."""
+        """Return the values after a step: arrays by name, in the shapes of ``values``."""
 
 
 class OfMitsuba:
-    """An optimiser of `mitsuba.ad` or `drjit.opt`; learning rates of ``own`` variables are the problem's."""
+    """An optimiser of `mitsuba.ad` or `drjit.opt`; variables in ``own`` have the learning rates of the problem."""
 
     finished = ""
 
     def __init__(self, optimizer: Any, values: Arrays, own: Collection[str]) -> None:
         if any(True for _ in optimizer.keys()):
-            raise PathreplayError("optimizer: it holds variables already; give one that was made without any")
+            raise PathreplayError("optimizer: it holds variables already; give an empty one")
         self._optimizer, self._own, self._steps = optimizer, own, dict.fromkeys(values, 0)
         for key, value in values.items():
             optimizer[key] = mi.TensorXf(value)
@@ -58,11 +58,11 @@ class OfMitsuba:
         return {key: np.array(dr.detach(optimizer[key])).reshape(value.shape) for key, value in values.items()}
 
     def answer(self) -> dict[str, Array]:
-        """See `Optimiser`: the values after the last step."""
+        """See `Optimiser`."""
         return {}
 
     def state(self) -> State:
-        """See `Optimiser`: what Dr.Jit keeps beside values and learning rates, numbered for each variable."""
+        """See `Optimiser`: the arrays that Dr.Jit keeps besides values and learning rates, numbered per variable."""
         kept = {key: _leaves(self._optimizer.state[key][3:]) for key in self._steps}
         arrays = {f"{n}:{key}": np.array(leaf) for key, leaves in kept.items() for n, leaf in enumerate(leaves)}
         return State(dict(self._steps), arrays)
@@ -76,30 +76,30 @@ class OfMitsuba:
             like = _leaves(about[3:])
             found = [arrays.pop(f"{n}:{key}") for n in range(len(like))]
             if any(np.array(leaf).shape != array.shape for leaf, array in zip(like, found, strict=True)):
-                raise ValueError(f"what the optimizer keeps of '{key}' has another shape")
+                raise ValueError(f"the state of '{key}' has the wrong shape")
             kept = _with_leaves(about[3:], iter([type(leaf)(a) for leaf, a in zip(like, found, strict=True)]))
             self._optimizer.state[key] = (*about[:3], *kept)
         if arrays:
-            raise ValueError(f"'{min(arrays)}' is nothing that this optimizer keeps")
+            raise ValueError(f"'{min(arrays)}' is not a state array of this optimizer")
         self._steps = dict(state.steps)
 
 
 def _leaves(tree: Any) -> list[Any]:
-    """The arrays of nested tuples, in order."""
+    """Return the arrays of nested tuples, in order."""
     if isinstance(tree, tuple):
         return [leaf for branch in tree for leaf in _leaves(branch)]
     return [tree] if dr.is_array_v(tree) else []
 
 
 def _with_leaves(tree: Any, leaves: Any) -> Any:
-    """Nested tuples with other arrays."""
+    """Replace the arrays of nested tuples."""
     if isinstance(tree, tuple):
         return tuple(_with_leaves(branch, leaves) for branch in tree)
     return next(leaves) if dr.is_array_v(tree) else tree
 
 
 class OfUser:
-    """An object with a ``step``: see `Stepper`."""
+    """An object with a step method: see `Stepper`."""
 
     finished = ""
 
@@ -110,32 +110,33 @@ class OfUser:
     def step(
         self, values: Arrays, gradients: Arrays, rates: Mapping[str, float], loss: float = 0.0
     ) -> dict[str, Array]:
-        """See `Optimiser`. Raises PathreplayError for values that are missing, or of another shape."""
+        """See `Optimiser`. Raises PathreplayError if a value is missing or has the wrong shape."""
         found = self._stepper.step(values, gradients, rates, loss)
         stepped = {}
         for key, value in values.items():
             if not isinstance(found, Mapping) or key not in found:
-                raise PathreplayError(f"optimizer: step() gave no value of '{key}'; return arrays by name")
+                raise PathreplayError(f"optimizer: step() returned no value of '{key}'; return arrays by name")
             stepped[key] = np.array(found[key], np.float32)
             if stepped[key].shape != value.shape:
                 raise PathreplayError(
-                    f"optimizer: step() gave '{key}' the shape {stepped[key].shape}, it has {value.shape}; keep it"
+                    f"optimizer: step() returned '{key}' with the shape {stepped[key].shape}, not {value.shape}; keep "
+                    "the shape"
                 )
             self._steps[key] += 1
         return stepped
 
     def answer(self) -> dict[str, Array]:
-        """See `Optimiser`: the values after the last step."""
+        """See `Optimiser`."""
         return {}
 
     def state(self) -> State:
-        """See `Optimiser`. Raises PathreplayError for an object that does not tell its state."""
+        """See `Optimiser`. Raises PathreplayError if the object has no ``state_dict``."""
         self._require_state()
         kept = {f"own:{name}": np.array(array) for name, array in self._stepper.state_dict().items()}
         return State(dict(self._steps), kept)
 
     def restore(self, state: State, values: Arrays) -> None:
-        """See `Optimiser`. Raises PathreplayError for an object that takes no state."""
+        """See `Optimiser`. Raises PathreplayError if the object has no ``load_state_dict``."""
         self._require_state()
         self._stepper.load_state_dict({name.removeprefix("own:"): array for name, array in state.arrays.items()})
         self._steps = dict(state.steps)
@@ -143,13 +144,13 @@ class OfUser:
     def _require_state(self) -> None:
         if not all(hasattr(self._stepper, name) for name in ("state_dict", "load_state_dict")):
             raise PathreplayError(
-                f"optimizer: {type(self._stepper).__name__} has no state_dict() and load_state_dict(), so that nothing "
-                "could go on from its state; add them, or take one of ours or of mitsuba.ad"
+                f"optimizer: {type(self._stepper).__name__} has no state_dict() and load_state_dict(), which "
+                "checkpoints and steps need; add them, or use another optimizer"
             )
 
 
 def adapted(optimizer: Any, problem: Problem, values: Arrays) -> Optimiser:
-    """The optimiser that our loop steps with an object, or a function, of somebody else's."""
+    """Adapt an optimizer object or a search function."""
     if not hasattr(optimizer, "step"):
         return optimiser_of(problem, values, problem.config.optimizer, optimizer)
     if hasattr(optimizer, "set_learning_rate") and hasattr(optimizer, "keys"):
@@ -158,7 +159,7 @@ def adapted(optimizer: Any, problem: Problem, values: Arrays) -> Optimiser:
 
 
 def _rated(problem: Problem) -> set[str]:
-    """The variables whose parameters, named by key or glob, have learning rates of their own."""
+    """Return the variables whose parameters have their own learning rates."""
     owners = {v.key: v.key.rpartition(":")[0] if v.key.endswith(PART_NAMES) else v.key for v in problem.variables}
     entries = [e for e in problem.config.parameters if e.learning_rate or e.rotation_learning_rate]
     rated = resolve_keys(dict.fromkeys(owners.values()), [entry.key for entry in entries])
@@ -166,20 +167,20 @@ def _rated(problem: Problem) -> set[str]:
 
 
 def options_of(optimizer: Any) -> tuple[dict[str, Any] | None, Any]:
-    """The options of an optimizer of ours, and an object or a function of another's; neither where nothing is said.
+    """Return the options of a built-in optimizer, and a foreign optimizer object or search function.
 
-    Raises PathreplayError for what is no optimizer at all.
+    Raises PathreplayError if it is neither.
     """
     if optimizer is None or isinstance(optimizer, str):
         return None if optimizer is None else {"type": optimizer}, None
     if isinstance(optimizer, Mapping) and "type" in optimizer:
         return dict(optimizer), None
     if isinstance(optimizer, type):
-        raise PathreplayError(f"optimizer: {optimizer.__name__} is a class; make an object of it")
+        raise PathreplayError(f"optimizer: {optimizer.__name__} is a class; create an object of it")
     if hasattr(optimizer, "step"):
         return None, optimizer
     if callable(optimizer):
-        return {"type": "l-bfgs-b"}, optimizer  # which is what a job calls a search along lines
+        return {"type": "l-bfgs-b"}, optimizer  # the type of search methods in jobs
     raise PathreplayError(
         f"optimizer: {type(optimizer).__name__} has no step(); give a name such as 'adam', an optimizer of "
         "mitsuba.ad, an object with step(values, gradients, learning_rates, loss), or a function like "

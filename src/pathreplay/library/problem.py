@@ -1,4 +1,4 @@
-"""An inverse problem in memory: a scene, what of it is sought, the images to match, and a loss."""
+"""Inverse problems: a scene, its unknown parameters, target images and a loss, from objects or from a job."""
 
 from __future__ import annotations
 
@@ -31,38 +31,38 @@ from pathreplay.runs.run_folder import IN_MEMORY
 from pathreplay.scenes.loading import load_scene_for
 
 MOST_ITERATIONS = 10**6
-"""Iterations of a problem that nobody minimises: above all at which a grid is refined."""
+"""Iterations of a problem that is not part of a run: larger than any iteration at which a grid is refined."""
 OF_A_PROBLEM = frozenset(
     "scene scene_parameters sensors test_views variant integrator baseline parameters derived capture exposure "
     "view_weights target loss learning_rate deterministic memory_limit".split()
 )
-"""Keys of a job that decide what is built, and do not change afterwards."""
+"""Keys of a job that are fixed when the problem is created."""
 
 
 class Problem:
-    """min over the parameters of the mean over views of loss(render(scene, view), target of the view).
+    """Minimise over the parameters the mean over views of loss(render(scene, view), target of the view).
 
-    The scene is used, not copied: it holds the values of the last evaluation. Occlusion is differentiated by the
-    integrator's boundary terms; the choice of paths, roulette and targets are not differentiated.
+    The scene is not copied: it holds the values of the last evaluation. The integrator's boundary terms differentiate
+    visibility. Sampling decisions, Russian roulette and targets are not differentiated.
 
     Args:
-        scene: a scene, a dictionary for `mi.load_dict`, an XML file, or the name of a built-in scene. Of the last three
-            a ``dielectric`` whose index is sought, and 8-bit textures that are sought, are exchanged for plugins that
-            can be differentiated.
-        parameters: by key of ``mi.traverse(scene)`` or by glob; keys alone take each as it is.
-        views: what should be seen.
-        loss: a name (``"l2"``, ``"relative-l2"``, ...; see `pathreplay.losses`) or ``loss(image, target)`` on tensors
-            of shape (height, width, channels) that gives such a tensor, or one number.
-        integrator: a dictionary of Mitsuba's, or an integrator. None: `pathreplay`, with the depth of the scene's own.
-        derived: scene parameters by key, or glob, that functions make of ``parameters``.
-        spp: samples per pixel, of the image and of its derivative.
-        learning_rate: of parameters that have none of their own.
-        seed: decides all random numbers.
-        deterministic: the same bits every time, on one thread of an LLVM variant.
+        scene: a scene, a dictionary for `mi.load_dict`, an XML file, or the name of a built-in scene. In the last three
+            cases a ``dielectric`` with an unknown index, and unknown 8-bit textures, are replaced by differentiable
+            plugins.
+        parameters: options by key of ``mi.traverse(scene)`` or glob; or keys alone.
+        views: sensors and their targets.
+        loss: a name (see `pathreplay.losses`), or ``loss(image, target)`` on tensors of shape (height, width, channels)
+            that returns such a tensor or one number.
+        integrator: an integrator or its dictionary. Default: `pathreplay` with the depth of the scene's integrator.
+        derived: scene parameters, by key or glob, computed from ``parameters``.
+        spp: samples per pixel of the image and of its derivative.
+        learning_rate: learning rate of parameters without their own.
+        seed: seed of all random numbers.
+        deterministic: reproduce results to the bit, on one thread of an LLVM variant.
         **settings: further keys of a job, such as ``eval_spp``, ``exposure``, ``memory_limit`` (docs/job-reference.md).
 
     Raises:
-        PathreplayError: for whatever cannot work, before anything is rendered.
+        PathreplayError: the problem is invalid. This is checked before anything is rendered.
     """
 
     def __init__(  # noqa: PLR0913 (of which most are keywords)
@@ -94,7 +94,7 @@ class Problem:
         integrator: Any = None,
         derived: Any = None,
     ) -> None:
-        """Put objects, those that are given, in the place of what a job says, and build all of it."""
+        """Replace parts of a job by the given objects, and build the problem."""
         self.base, self.job, objects = base, job, Objects()
         self.notes: tuple[str, ...] = ()
         if mi.variant() is None or "variant" in job:
@@ -121,7 +121,7 @@ class Problem:
             require_order(mi.variant())
         memory = inner.InMemory(own_scene, own_integrator, objects.functions, objects.starts)
         self.in_memory = memory != inner.InMemory()
-        """Whether it holds objects that no job could name."""
+        """Whether it holds objects that the file of a job cannot name."""
         known = {"iterations", "stages"} & set(job)
         config = make_config(job if known else {"iterations": MOST_ITERATIONS, **job}, "problem")
         self.built = inner.build_problem(config, base, targets, memory if self.in_memory else None)
@@ -129,22 +129,22 @@ class Problem:
 
     @staticmethod
     def joint(problems: Sequence[Problem]) -> Problem:
-        """Make one problem of several, each of a scene of its own: min of the mean of their losses.
+        """Combine problems with different scenes into one, whose loss is the mean of their losses.
 
         Args:
-            problems: what they have in common are parameters of one name, which are one parameter; initial value,
-                bounds, learning rate and regularizers are those of the first problem that has it. Settings (``spp``,
-                ``seed``, ``deterministic``, ...) are those of the first problem.
+            problems: the problems. Parameters with the same name are shared: initial value, bounds, learning rate and
+                regularizers are those of the first problem that has it. Settings such as ``spp``, ``seed`` and
+                ``deterministic`` are those of the first problem.
 
         Returns:
-            The problem, whose views are those of all, named ``0-left``, ``1-left``, ... It uses their scenes.
+            The combined problem. It uses the scenes of the problems; its views are called ``0-left``, ``1-left`` etc.
 
         Raises:
-            PathreplayError: parameters of one name in several shapes, problems of one scene, and those with exposures
-                or baselines.
+            PathreplayError: shared parameters have different shapes, two problems have the same scene, or a problem has
+                exposures or a baseline.
         """
         if not problems:
-            raise PathreplayError("problems: there is none; give two or more")
+            raise PathreplayError("problems: there are none; give two or more")
         joint: Problem = Problem.__new__(Problem)
         first = problems[0]
         joint.base, joint.in_memory = first.base, True
@@ -162,17 +162,17 @@ class Problem:
         return joint
 
     def __repr__(self) -> str:
-        """Short: for notebooks."""
+        """Return a short description for notebooks."""
         return f"<Problem: {', '.join(self.initial)}; {len(self.built.views)} views, loss {self.job['loss']}>"
 
     @property
     def scene(self) -> mi.Scene:
-        """The scene, with the values of the last evaluation."""
+        """Return the scene, with the values of the last evaluation."""
         return self.built.scene
 
     @property
     def initial(self) -> dict[str, Array]:
-        """The values at which the parameters start, by name; a pose has names ``KEY:translation``, ``KEY:rotation``."""
+        """Return the initial values by name; a pose has the names ``KEY:translation`` and ``KEY:rotation``."""
         return {v.key: np.array(v.start, np.float32) for v in self.built.variables}
 
     def render(
@@ -181,20 +181,20 @@ class Problem:
         """Render a view.
 
         Args:
-            values: arrays by name; initial ones where left out.
-            view: its place or its name.
-            spp: samples per pixel; None: ``eval_spp``.
+            values: arrays by name; default: initial values.
+            view: index or name of the view.
+            spp: samples per pixel; default: ``eval_spp``.
 
         Returns:
             Linear pixels (height, width, channels).
 
         Raises:
-            PathreplayError: values that do not fit, or no such view.
+            PathreplayError: a value has the wrong name or shape, or the view does not exist.
         """
         return rendered(self.built, self.complete(values), view, spp)
 
     def complete(self, values: Mapping[str, ArrayLike] | None) -> dict[str, Array]:
-        """Values of all parameters: those given, else initial ones. Raises PathreplayError for what does not fit."""
+        """Complete values by initial values. Raises PathreplayError if a value has the wrong name or shape."""
         given, starts = values or {}, {v.key: v.start for v in self.built.variables}
         if unknown := set(given) - set(starts):
             raise PathreplayError(f"No parameter '{min(unknown)}' in the problem; it has {', '.join(starts)}")
@@ -204,13 +204,22 @@ class Problem:
         }
 
     def configured(self, changes: Mapping[str, Any], name: str) -> inner.Problem:
-        """The problem with other settings, checked as those of a job; ``name`` is who asks.
+        """Return the problem with changed settings.
 
-        Raises PathreplayError for what cannot be, and for what a problem cannot change.
+        Args:
+            changes: keys of a job and their values.
+            name: start of error messages.
+
+        Returns:
+            The problem with the complete settings.
+
+        Raises:
+            PathreplayError: a setting is invalid, or fixed when the problem is created.
         """
         if fixed := sorted(OF_A_PROBLEM & set(changes)):
-            raise PathreplayError(f"{name}: '{fixed[0]}' belongs to the problem; give it where that is made")
-        checked = make_config({**self.job, **changes}, name)
+            raise PathreplayError(f"{name}: '{fixed[0]}' belongs to the problem; give it to Problem")
+        job = {key: value for key, value in self.job.items() if key != "iterations" or "stages" not in changes}
+        checked = make_config({**job, **changes}, name)
         config = self.built.config.model_copy(update={key: getattr(checked, key) for key in {*changes, "iterations"}})
         config.model_fields_set.update(changes)
         config.__dict__["learning_rate_schedule"] = checked.learning_rate_schedule
@@ -219,7 +228,7 @@ class Problem:
         return built
 
     def assign(self, values: Arrays, scene: mi.Scene) -> None:
-        """Give a scene with the same parameters these values."""
+        """Set the parameters of a scene to these values. Raises PathreplayError if the scene does not have them."""
         params, known = traversed(scene), self.built.scenes()
         found = [inner.scene_values(each, inner.variables_of(each, values)) for each in known]
         fitting = [each for each in found if each.keys() <= set(params.keys())]
@@ -233,7 +242,7 @@ class Problem:
 
 
 def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
-    """A value of a parameter; textures and grids may have other sizes."""
+    """Convert a value of a parameter; textures and grids may have another resolution."""
     array = np.array(dr.detach(value) if dr.is_array_v(value) else value, np.float32)
     resized = len(wanted) >= 3 and array.ndim == len(wanted) and array.shape[-1] == wanted[-1]
     if array.shape != wanted and not resized and not (len(wanted) == 1 and array.size == wanted[0]):
@@ -242,7 +251,7 @@ def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
 
 
 def _loaded(scene: Any, job: Mapping[str, Any], base: Path) -> tuple[mi.Scene, tuple[str, ...]]:
-    """The scene, in which what is sought carries derivatives as far as exchanging plugins brings it, and notes."""
+    """Load a scene, with differentiable plugins for the unknown parameters (see `load_scene_for`), and notes."""
     if isinstance(scene, mi.Scene):
         return scene, ()
     if not isinstance(scene, (Mapping, str, Path)):
@@ -257,11 +266,11 @@ def _loaded(scene: Any, job: Mapping[str, Any], base: Path) -> tuple[mi.Scene, t
 
 
 def _moved(job: dict[str, Any], scene: mi.Scene, views: Sequence[View] | None) -> Targets | None:
-    """Tell a job that its scene is in memory, and so are its images, if there are ``views``, which are returned."""
+    """Change a job for a scene in memory, and for targets in memory if there are ``views``; returns these targets."""
     said, job["scene"] = job.get("scene"), IN_MEMORY
     if views is None:
         if "images" not in job.get("target", {}) and "capture" not in job:
-            job["target"] = {"scene": said, **job.get("target", {})}  # where they are rendered
+            job["target"] = {"scene": said, **job.get("target", {})}  # from which targets are rendered
         return None
     named = by_name(scene, views)
     job.pop("capture", None)
@@ -284,30 +293,30 @@ def load_job(
     define: Sequence[str] = (),
     **settings: Any,
 ) -> Problem:
-    """Make a problem of what a job's file says, and of what shall be otherwise.
+    """Create a problem from the file of a job, with changes.
 
-    `minimize` takes optimizer, iterations and schedule from the file, too, where it is given no others; it writes a
-    folder only where it is asked to, and takes no notice of ``output``.
+    Optimizer, iterations and schedule of the file are the defaults of `minimize`. Its ``output`` is ignored: only
+    `minimize` with ``output`` writes a folder.
 
     Args:
-        path: a TOML, YAML or JSON file; its relative paths start at its folder.
-        scene: as in `Problem`; this and the next five take the place of the file's.
-        parameters: as in `Problem`.
-        views: as in `Problem`.
-        loss: as in `Problem`.
-        integrator: as in `Problem`.
-        derived: as in `Problem`.
-        define: changes as the command line has them, each ``KEY=VALUE``.
-        **settings: keys of a job with their values, such as ``spp=8`` or ``stages=[...]``; None: as if left out.
+        path: a TOML, YAML or JSON file; relative paths in it refer to its folder.
+        scene: replaces the scene of the file; see `Problem`.
+        parameters: replaces the parameters of the file; see `Problem`.
+        views: replaces sensors and targets of the file; see `Problem`.
+        loss: replaces the loss of the file; see `Problem`.
+        integrator: replaces the integrator of the file; see `Problem`.
+        derived: replaces the derived parameters of the file; see `Problem`.
+        define: overrides ``KEY=VALUE``, as on the command line.
+        **settings: keys of a job and their values, such as ``spp=8`` or ``stages=[...]``; None removes a key.
 
     Returns:
-        The problem, with the targets that the file names or renders. It sets the file's ``variant``.
+        The problem. Targets are read or rendered, and the ``variant`` of the file is set.
 
     Raises:
-        PathreplayError: what a file cannot say, and for whatever cannot work, before the first iteration.
+        PathreplayError: the file cannot be read, or the problem is invalid.
     """
     table = read_table(Path(path), define)
-    make_config(table, str(path))  # which says what is wrong with the file
+    make_config(table, str(path))  # for its error messages
     table = {key: value for key, value in {**table, **settings}.items() if value is not None}
     problem = Problem.__new__(Problem)
     problem._build(table, Path(path).parent.absolute(), scene, parameters, views, loss, integrator, derived)

@@ -1,4 +1,4 @@
-"""One step of a minimisation as a pure function of a problem and a state, for loops of a user's own."""
+"""One optimisation step as a pure function of problem and state, for custom loops."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from pathreplay.library.problem import Problem
 
 
 class _Task:
-    """What the states of one minimisation share: settings, kernels, and an optimiser that is at one of them."""
+    """Settings and kernels shared by the states of one optimisation, and an optimiser synchronised with one of them."""
 
     def __init__(self, changes: Mapping[str, Any]) -> None:
         self._changes = changes
         self.own: adaptive.Optimiser | None = None
-        """Of the user's, where it is none of ours."""
+        """Optimiser object of the user, if any."""
         self._known: WeakKeyDictionary[Problem, tuple[inner.Problem, Executor]] = WeakKeyDictionary()
         self.at: State | None = None
         self.optimiser: adaptive.Optimiser | None = None
 
     def of(self, problem: Problem, name: str = "step") -> tuple[inner.Problem, Executor]:
-        """The problem with these settings, and who evaluates it; ``name`` is who asks."""
+        """Return the problem with these settings, and its executor. ``name`` starts error messages."""
         if problem not in self._known:
             built = problem.configured(self._changes, name)
             config = built.config
@@ -42,38 +42,37 @@ class _Task:
         return self._known[problem]
 
     def optimiser_at(self, state: State, built: inner.Problem) -> adaptive.Optimiser:
-        """An optimiser that goes on from the state."""
+        """Return an optimiser synchronised with the state."""
         if self.optimiser is None or self.at is not state:
-            # A new one: what a line search has found out since is not to be known.
             self.optimiser = self.own or optimiser_of(built, state._next, built.config.optimizer)
             self.optimiser.restore(state._kept, state._next)
-        self.at = None  # until the step is done
+        self.at = None  # not synchronised until the step has succeeded
         return self.optimiser
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class State:
-    """Where a minimisation is. Nothing changes it: `step` makes another."""
+    """State of an optimisation, immutable: `step` returns the next one."""
 
     values: Mapping[str, Array]
-    """By name; the best so far where the optimizer searches along lines."""
+    """Values by name; of search methods such as ``l-bfgs-b``, the best ones so far."""
     history: tuple[Entry, ...]
-    """One entry for each step: loss, seconds, norms of gradients, ..."""
+    """One entry per step: loss, seconds, gradient norms and more."""
     finished: str
-    """Why the optimizer takes no more steps; "" while it does."""
+    """Reason why the optimizer has terminated, or ""."""
     _next: Arrays = field(repr=False)
     _learned: Arrays = field(repr=False)
     _kept: adaptive.State = field(repr=False)
     _task: _Task = field(repr=False)
 
     def __repr__(self) -> str:
-        """Short: a notebook prints it."""
+        """Return a short description for notebooks."""
         loss = f", loss {self.loss:.4g}" if self.history else ""
         return f"<State: after {len(self.history)} steps{loss}; {', '.join(self.values)}>"
 
     @property
     def loss(self) -> float:
-        """Of the last step, before it; NaN before the first."""
+        """Return the loss before the last step; NaN before the first step."""
         return self.history[-1].loss if self.history else float("nan")
 
 
@@ -83,20 +82,20 @@ def init(
     steps: int | None = None,
     **settings: Any,
 ) -> State:
-    """Make the state at which a minimisation begins.
+    """Create the initial state of an optimisation.
 
     Args:
-        problem: what shall be minimised.
-        optimizer: as `minimize` takes it; an object of your own needs ``state_dict()`` and ``load_state_dict(arrays)``.
-            The states own an object that is given here.
-        steps: the length of the schedule, whose last learning rate stays after it; it ends nothing.
-        **settings: as `minimize` takes them: ``stages``, ``learning_rate_schedule``, ``view_batch_size``, ...
+        problem: the problem.
+        optimizer: see `minimize`. A custom object needs ``state_dict()`` and ``load_state_dict(arrays)``. The object is
+            modified by `step` and must not be used elsewhere.
+        steps: length of the learning rate schedule; the last rate is kept afterwards. Default: see `minimize`.
+        **settings: see `minimize`, such as ``stages``, ``learning_rate_schedule`` or ``view_batch_size``.
 
     Returns:
         The state before the first step.
 
     Raises:
-        PathreplayError: for settings that cannot work.
+        PathreplayError: the settings are invalid.
     """
     options, own = options_of(optimizer)
     given = {"iterations": steps, "optimizer": options, **settings}
@@ -110,21 +109,21 @@ def init(
 
 
 def step(problem: Problem, state: State) -> State:
-    """Take one step: evaluate the problem at the state, and step against its gradient.
+    """Take one optimisation step: evaluate loss and gradient, and update the values.
 
-    A pure function, but for rounding where threads add; with ``deterministic`` the same state gives the same bits. The
-    problem may be another one with the same parameters at each step, so that several scenes are learned from in turn.
-    Kernels are recorded by the second step of each problem, and used by all later ones.
+    The function is pure up to rounding in multithreaded sums; with ``deterministic`` it is pure to the bit. The problem
+    may change from step to step, if its parameters stay the same. The second step of each problem records kernels,
+    which later steps replay.
 
     Args:
-        problem: what is minimised.
-        state: of `init`, or of a step before.
+        problem: the problem.
+        state: state from `init` or from an earlier step.
 
     Returns:
-        The state after the step; ``state`` itself where the optimizer has finished.
+        The state after the step, or ``state`` itself if the optimizer has terminated.
 
     Raises:
-        PathreplayError: loss or values are no longer finite, or the problem has other parameters than the state.
+        PathreplayError: loss or values are not finite, or the problem and the state have different parameters.
     """
     if state.finished:
         return state
@@ -132,8 +131,8 @@ def step(problem: Problem, state: State) -> State:
     built, executor = task.of(problem)
     if (keys := {v.key for v in built.variables}) != set(state._next):
         raise PathreplayError(
-            f"The state has the parameters {', '.join(state._next)}, and the problem {', '.join(sorted(keys))}; begin "
-            "anew with init"
+            f"The state has the parameters {', '.join(state._next)}, but the problem has {', '.join(sorted(keys))}; "
+            "start again with init"
         )
     optimiser = task.optimiser_at(state, built)
     run = Run(executor, optimiser, dict(state._next), state._learned, list(state.history))
@@ -148,5 +147,5 @@ def step(problem: Problem, state: State) -> State:
 
 
 def _copied(state: adaptive.State) -> adaptive.State:
-    """What an optimiser remembers, in arrays that it does not change any more."""
+    """Copy the state of an optimiser."""
     return adaptive.State(dict(state.steps), {name: np.array(state.arrays[name]) for name in state.arrays})

@@ -1,4 +1,4 @@
-"""Views as a problem has them: sensors by name, targets and weights as arrays, checked against the films."""
+"""Conversion of views: sensors by name, targets and weights as arrays, checked against the films."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pathreplay.library.descriptions import View
 
 
 def by_name(scene: mi.Scene, views: Sequence[View]) -> dict[str, View]:
-    """The views by the names of their sensors. Raises PathreplayError for two of one sensor, and for none."""
+    """Return views by sensor name. Raises PathreplayError if two have the same sensor, or there is none."""
     found: dict[str, View] = {}
     for view in views:
         name = next(iter(sensors_of(scene, [view.sensor])))
@@ -32,7 +32,7 @@ def by_name(scene: mi.Scene, views: Sequence[View]) -> dict[str, View]:
 
 
 def targets_of(scene: mi.Scene, views: Mapping[str, View]) -> Targets:
-    """The arrays of all views, checked against their films."""
+    """Convert targets and weights to arrays. Raises PathreplayError if they do not fit the films."""
     images, weights = {}, {}
     sensors = sensors_of(scene, list(views))
     for name, view in views.items():
@@ -54,7 +54,7 @@ def targets_of(scene: mi.Scene, views: Mapping[str, View]) -> Targets:
 
 
 def _pixels(what: str, value: Any) -> Image:
-    """An image as linear pixels (height, width, channels)."""
+    """Convert an image to linear pixels (height, width, channels). Raises PathreplayError if this is impossible."""
     if isinstance(value, (str, Path)):
         return read_image(find_image(str(value), Path()))
     if isinstance(value, mi.Bitmap):

@@ -116,8 +116,7 @@ def _source(job: Job, values: Arrays) -> Source:
     plugins = {"dielectric": "dielectric_ad"} if any(key.endswith(".eta") for key in values) else {}
     if job.in_python and config.scene == IN_MEMORY:
         raise PathreplayError(
-            "The run was begun in Python with a scene that no file holds; give one its values there: "
-            "result.apply(scene)"
+            "The run was started in Python with a scene object; set the values of a scene with result.apply(scene)"
         )
     if config.scene in BUILTINS:
         return Source(builtin_dict(config.scene, config.scene_parameters), {}, plugins, cameras)

@@ -1,4 +1,4 @@
-"""Pictures of some views of a run while it is under way, rendered now and then for a share of its time."""
+"""Images of some views during a run, rendered from time to time within a fraction of its time."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from pathreplay.report.page_parts import common_exposure, uri
 from pathreplay.report.pages import page as pages
 from pathreplay.report.pages.page import Picture
 
-# Pixels along the longer side of the small pictures that a notebook shows.
+# Longer side of the images in a notebook, in pixels.
 SMALL_SIDE = 192
-# Samples per pixel of a picture at least, where the run's own pictures have as many: fewer are hard to look at.
+# Minimum of samples per pixel, if ``eval_spp`` is as large.
 LEAST_SPP = 16
 
 CAPTIONS = {"target": "target", "result": "now", "difference": f"difference ×{DIFFERENCE_GAIN:g}"}
 
 
 class LivePictures:
-    """The last pictures of the views that are looked at; ``before`` are those of the start (default: rendered now)."""
+    """Latest images of the selected views; ``before`` are those at the initial values (default: rendered now)."""
 
     def __init__(self, problem: Problem, run: Run, stop: Stop, before: Mapping[str, Image] | None = None) -> None:
         self._problem, self._run, self._stop = problem, run, stop
@@ -48,7 +48,7 @@ class LivePictures:
         self._began = time.perf_counter()
         self.spent = self._cost = 0.0
         self.why_none = ""
-        """Why there are no more of them."""
+        """Error that ended the rendering of images, or ""."""
 
     def _set(self, done: int, images: Mapping[str, Image]) -> None:
         self.now = {view.name: _pictures_of(view, self.before[view.name], images[view.name]) for view in self.views}
@@ -56,10 +56,10 @@ class LivePictures:
             name: Likeness.of(it.result, it.target, it.exposure, it.weight) for name, it in self.now.items()
         }
         self.shown_at = done
-        """After how many iterations there were pictures the last time."""
+        """Number of iterations at the latest images."""
 
     def observe(self, event: Event) -> None:
-        """Look at the views where it is time: of a run that has no page."""
+        """Render images when they are due. For runs without a live page."""
         if isinstance(event, Stepped) and self.is_due(event.entry.seconds):
             begin = time.perf_counter()
             with computing(self._problem.config):
@@ -67,18 +67,18 @@ class LivePictures:
             self.paid(time.perf_counter() - begin)
 
     def is_due(self, seconds: float) -> bool:
-        """Whether there is time for pictures, after an iteration of so many seconds."""
-        # An iteration renders its views, and differentiates them: pictures of a few take less.
+        """Return whether images are due, after an iteration that took so many seconds."""
+        # Before the first images, their cost is estimated by that of an iteration, which is larger.
         allowed = self.share * (time.perf_counter() - self._began)
         return self.share > 0 and self.spent + (self._cost or seconds) <= allowed
 
     def paid(self, seconds: float) -> None:
-        """What the last pictures have cost."""
+        """Account for the time of the latest images."""
         self._cost = seconds
         self.spent += seconds
 
     def look(self, done: int) -> dict[str, Image]:
-        """Pictures of the views as they are after so many iterations; none, and none later, where that fails."""
+        """Render images after so many iterations. If that fails, return none, and render no more."""
         try:
             images = self._rendered()
         except RuntimeError as error:
@@ -97,7 +97,7 @@ class LivePictures:
         return {view.name: picture_of(self._problem, config, values, view, spp) for view in self.views}
 
     def small(self) -> tuple[pages.View, ...]:
-        """Target, now and difference of the views, small, each within its address."""
+        """Return target, current image and difference of the views as thumbnails in data URIs."""
         found = []
         for view in self.views:
             shown, stored = self.now[view.name].pictures(), self.stored(view)
@@ -107,16 +107,16 @@ class LivePictures:
         return tuple(found)
 
     def losses(self) -> tuple[float, ...]:
-        """Of all iterations."""
+        """Return the losses of all iterations."""
         return tuple(entry.loss for entry in self._run.history)
 
     def stored(self, view: View) -> float:
-        """The exposure at which pictures of the view are encoded."""
+        """Return the exposure of encoded images of the view."""
         return min(self.exposure, exposure_for(view.target))
 
 
 def _chosen(problem: Problem, count: int) -> list[View]:
-    """So many views, evenly among those that are learned from and those that are not; both, where there are both."""
+    """Select views evenly from training views and test views."""
     out = [view for view in problem.views if view.is_test]
     learned = [view for view in problem.views if not view.is_test]
     some = min(len(out), count // 2)

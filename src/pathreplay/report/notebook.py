@@ -108,5 +108,5 @@ class NotebookPanel:
 
 
 def progress_of(shown: bool) -> Progress | NotebookPanel:
-    """What tells the user how a run goes, where they are; silence unless it is ``shown``."""
+    """Create the progress display: a panel in a notebook, a bar or lines elsewhere, nothing unless ``shown``."""
     return NotebookPanel() if shown and in_notebook() else Progress(shown)

@@ -31,7 +31,7 @@ _FOLDERS = "images", "volumes", "baseline", "previews"
 CHECKPOINT = "checkpoint.safetensors"
 BASELINE_CHECKPOINT = "baseline/checkpoint.safetensors"
 IN_MEMORY = "memory"
-"""What the config calls a scene that is an object in Python."""
+"""Name of a scene object in the config."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Job:
     base: Path
     changes: tuple[str, ...] = ()
     in_python: bool = False
-    """Some of it are objects that only the program has which began it: the config does not tell all."""
+    """Parts of it are Python objects, which the config cannot describe."""
 
 
 def resume_command(folder: Path, in_python: bool = False) -> str:
-    """What goes on with a run: a command line, or a call in the program that has its objects."""
+    """Return the command that resumes a run, or the call in Python if its job has objects."""
     if in_python:
         return f"pathreplay.minimize(problem, output={str(folder)!r}, resume=True)"
     return f"pathreplay optimize --resume {shlex.quote(str(folder))}"
@@ -83,7 +83,7 @@ class RunFolder:
         return self.path
 
     def resume_command(self, name: Path | None = None) -> str:
-        """What goes on with its run, under another ``name`` if it has one."""
+        """Return the command or call that resumes its run, for a folder ``name`` (default: its own)."""
         return resume_command(self.name if name is None else name, self.in_python)
 
     def remove(self) -> None:
@@ -252,8 +252,8 @@ def open_run_folder(path: Path, in_python: bool = False) -> tuple[Job, RunFolder
         raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start the job from its config")
     job = _job(path, copy)
     if job.in_python != in_python:
-        what = "was begun in Python, with objects that no file holds" if job.in_python else "is of a job in a file"
-        raise PathreplayError(f"Run {path} {what}; go on with: {resume_command(path, job.in_python)}")
+        what = "was started in Python, with objects" if job.in_python else "was started from the file of a job"
+        raise PathreplayError(f"Run {path} {what}; resume it with: {resume_command(path, job.in_python)}")
     run = RunFolder(path, in_python=in_python)
     _remove_parts(path)
     return job, run

@@ -320,10 +320,7 @@ def load_config(path: Path, changes: Sequence[str] = ()) -> Config:
 
 
 def read_table(path: Path, changes: Sequence[str] = ()) -> Any:
-    """What a job's file says, with ``changes`` (see `defined`), before it is checked.
-
-    Raises PathreplayError for an unreadable file.
-    """
+    """Read the file of a job without checking it; see `load_config`. Raises PathreplayError if it cannot be read."""
     problem = file_problem(path, most_bytes(path))
     if problem == MISSING:
         siblings = path.parent.glob("*") if path.parent.is_dir() else []

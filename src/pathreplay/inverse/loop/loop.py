@@ -91,7 +91,7 @@ def new_run(
 
 
 def optimiser_of(problem: Problem, values: Arrays, options: Optimizer, search: Search | None = None) -> Optimiser:
-    """An optimiser of the problem's variables that begins at these values; for ``search`` see `LineSearch`."""
+    """Create the optimiser of the problem's variables at these values. For ``search`` see `LineSearch`."""
     if options.searches:
         free = -np.inf, np.inf  # coordinates enforce the bounds themselves
         bounds = {v.key: free if v.coordinates else v.bounds for v in problem.variables}
@@ -346,7 +346,7 @@ def _plain(problem: Problem, config: Config, view: View, spp: int) -> Image:
 
 
 def ended(problem: Problem, config: Config, run: Run) -> Run:
-    """The run with the values that it has come to, exposures of held-out views among them; its baseline, too."""
+    """Return the run, and its baseline, with their resulting values, including exposures of held-out views."""
     run = replace(run, values=best_values(problem, run))
     for each in filter(None, (run, run.baseline)):
         each.values = dict(with_exposures(problem, config, each.values))

@@ -200,8 +200,8 @@ class Evaluator:
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
         # Of each view and number of samples that was seen, whole or a batch of it: whether pixels can be swept.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
-        self._learned: Arrays = {}  # what the integrator knew after the last evaluation
-        self._at: Any = None  # what it held then: others may have used it since
+        self._learned: Arrays = {}  # state of the integrator after the last evaluation
+        self._at: Any = None  # its state then, which another evaluator may have changed since
         self._begun = False
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:

@@ -1,4 +1,4 @@
-"""Evaluation of a problem of several scenes: each shard by the scene that its view belongs to."""
+"""Evaluation of a joint problem: each shard by the scene of its view."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pathreplay.inverse.problem.joint import JointProblem
 
 
 class JointEvaluator:
-    """An `Evaluate` of a joint problem, by those of its ``parts``. A shard holds a view, or several of one scene.
+    """Evaluate shards of a joint problem by the evaluators of its parts; the views of a shard belong to one scene.
 
-    What a scene's integrator has learned has the number of the scene before its name.
+    Learned state is prefixed by the index of the scene.
     """
 
     def __init__(self, problem: JointProblem, parts: Sequence[Evaluate]) -> None:
@@ -27,7 +27,7 @@ class JointEvaluator:
                 self._fresh |= {f"{n}:{name}": array for name, array in part.integrator.state_dict().items()}
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
-        """See `Evaluate`. The loss is a mean, of which each scene has an equal share."""
+        """See `Evaluate`. Loss and gradients are divided by the number of scenes."""
         places = [self._problem.place(view) for view in shard.views]
         ((n, part),) = {number: self._problem.parts[number] for number, _ in places}.items()
         known = learned or self._fresh

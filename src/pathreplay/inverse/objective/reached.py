@@ -19,9 +19,9 @@ from pathreplay.inverse.problem.problem import Problem, scene_values, variables_
 
 
 def require_possible(problem: Problem) -> None:
-    """Raise PathreplayError unless all stages of a problem can be done, pixel by pixel where it wants that.
+    """Raise PathreplayError unless all stages of a problem are possible.
 
-    And where all that moves in one of them reaches no view.
+    See `require_stages`, `require_single_pixels` and `require_reached`.
     """
     config = problem.config
     for each in problem.scenes():

@@ -199,15 +199,24 @@ class Staged:
 
 
 def evaluator_of(problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin) -> Evaluate:
-    """What evaluates the shards of a job in this process, stage by stage where it has stages.
+    """Create the evaluator of a job in this process. Passes are recorded unless the job is deterministic.
 
-    ``plugin`` is what the integrator is made of; several scenes have their own. Passes are recorded unless the job is
-    deterministic. Raises PathreplayError for several scenes in stages.
+    Args:
+        problem: the problem.
+        config: the job.
+        integrator: evaluates the problem; joint problems use the integrators of their parts.
+        plugin: description of the integrator, from which stages create others.
+
+    Returns:
+        The evaluator.
+
+    Raises:
+        PathreplayError: a joint problem has stages.
     """
     record = not config.deterministic
     if isinstance(problem, JointProblem):
         if config.stages is not None:
-            raise PathreplayError("stages: a problem of several scenes has none; leave them out")
+            raise PathreplayError("stages: joint problems support none; leave them out")
         return JointEvaluator(problem, [Evaluator(part, part.integrator, record) for part in problem.parts])
     if config.stages is None:
         return Evaluator(problem, integrator, record)

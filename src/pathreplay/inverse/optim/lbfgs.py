@@ -108,8 +108,9 @@ class LineSearch:
                 bounds = None if free else scipy.optimize.Bounds(low, high)
                 result = self._search(recorded, self._start, jac=True, bounds=bounds)
         except RuntimeWarning as error:
+            why = str(error).rstrip(".")
             raise PathreplayError(
-                f"optimizer: {str(error).rstrip('.')}; remove the bounds, use a parameterization that enforces them, or another method"
+                f"optimizer: {why}; remove the bounds, use a parameterization that enforces them, or another method"
             ) from None
         except _Asked:
             self._next = self._points.pop()

@@ -1,4 +1,4 @@
-"""Problems of several scenes that share variables, as one problem: the mean of their losses."""
+"""Joint problems: several scenes with shared variables, and the mean of their losses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathreplay.inverse.problem.problem import Problem
 
 @dataclass(frozen=True)
 class JointProblem(Problem):
-    """Its views are those of all parts, numbered throughout, so that each has random numbers of its own."""
+    """A problem of several scenes. Views are numbered across scenes, so that their random numbers are independent."""
 
     parts: tuple[Problem, ...] = ()
 
@@ -29,7 +29,7 @@ class JointProblem(Problem):
         return self.parts[part], self.parts[part].views[place]
 
     def place(self, view: int) -> tuple[int, int]:
-        """The part that a view belongs to, and its place there."""
+        """Return the index of the scene of a view, and the index of the view in this scene."""
         for n, part in enumerate(self.parts):
             if view < len(part.views):
                 return n, view
@@ -38,9 +38,18 @@ class JointProblem(Problem):
 
 
 def joined(parts: Sequence[Problem], config: Config) -> JointProblem:
-    """The problems as one, with the settings of the ``config``; of a shared variable, the first problem's counts.
+    """Combine problems.
 
-    Raises PathreplayError for what several scenes cannot have, and for variables of one name and several shapes.
+    Args:
+        parts: problems of different scenes; the first definition of a shared variable is used.
+        config: settings of the joint problem.
+
+    Returns:
+        The joint problem.
+
+    Raises:
+        PathreplayError: shared variables have different shapes, two problems have the same scene, or a problem has
+            exposures or a baseline.
     """
     variables: dict[str, Variable] = {}
     for part in parts:
@@ -52,9 +61,9 @@ def joined(parts: Sequence[Problem], config: Config) -> JointProblem:
                     "only parameters of one shape are shared"
                 )
     if EXPOSURE in variables or any(part.baseline is not None for part in parts):
-        raise PathreplayError("Several scenes have neither 'exposure' nor 'baseline'; leave them out")
+        raise PathreplayError("Joint problems support neither 'exposure' nor 'baseline'; leave them out")
     if len({id(part.scene) for part in parts}) < len(parts):
-        raise PathreplayError("Two of the problems are of one scene; give one problem several views")
+        raise PathreplayError("Two of the problems have the same scene; use one problem with several views")
     views = [replace(view, name=f"{n}-{view.name}") for n, part in enumerate(parts) for view in part.views]
     first = parts[0]
     return JointProblem(

@@ -117,11 +117,11 @@ class Problem:
         return {n for n, reached in enumerate(flags) if reached}
 
     def scenes(self) -> tuple[Problem, ...]:
-        """The problem itself, or those of its scenes where it has several."""
+        """Return the problem, or the problems of all scenes of a joint problem."""
         return (self,)
 
     def home(self, view: View) -> tuple[Problem, View]:
-        """The problem whose scene has the sensor of a view, and the view as it is there."""
+        """Return the problem with the scene of a view, and the view in that problem."""
         return self, view
 
     def made(self) -> tuple[Pose | Derived, ...]:
