@@ -94,6 +94,8 @@ def test_what_a_file_says_can_be_changed(place: Path) -> None:
     by_name, by_hand = (load_job(path, loss=loss) for loss in ("l1", own))
     a, b = (pathreplay.value_and_grad(problem)(seed=1) for problem in (by_name, by_hand))
     assert a[0] == b[0] and np.array_equal(a[1][KEY], b[1][KEY])
+    stages = [{"iterations": 2}, {"iterations": 1, "spp": 8}]  # instead of the iterations of the file
+    assert len(pathreplay.minimize(load_job(path), stages=stages, progress=False).history) == 3
     own_scene = mi.load_file(str(place / "room.xml"))
     prb = mi.load_dict({"type": "prb", "max_depth": 2})
     own_objects = load_job(path, scene=own_scene, integrator=prb)

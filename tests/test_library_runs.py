@@ -141,6 +141,7 @@ def test_what_cannot_go_on_is_told_in_one_line(photos: list[np.ndarray]) -> None
     told("is not a state array of this optimizer", optimizer="sgd")
     told("'loss' belongs to the problem; give it to Problem", loss="l1")
     told("unknown key 'checkpoint_evry'; did you mean 'checkpoint_every'", checkpoint_evry=3)
+    told("'iterations' is called 'steps' here", iterations=3)
     told("executor = 'ray': objects in memory cannot be sent", executor="ray", output=None, resume=False)
     Path("file").write_text("")
     told("there is a file of that name|no run folder", output="file")

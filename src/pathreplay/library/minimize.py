@@ -23,7 +23,7 @@ from pathreplay.inverse.problem.problem import put_values
 from pathreplay.library.folder_run import FolderRun, require_targets
 from pathreplay.library.iterations import Iteration, iterations, run_of
 from pathreplay.library.optimizers import Stepper, adapted, options_of
-from pathreplay.library.problem import Problem
+from pathreplay.library.problem import Problem, run_settings
 from pathreplay.platform import memory
 from pathreplay.platform.interrupts import Stop, stopping
 from pathreplay.report.live_pictures import LivePictures
@@ -115,18 +115,15 @@ def minimize(  # noqa: PLR0913 (of which most are keywords)
             belongs to another problem.
     """
     options, own = options_of(optimizer)
-    given = {
-        "iterations": steps,
+    settings |= {
         "stages": None if stages is None else [dict(stage) for stage in stages],
-        "optimizer": options,
         "learning_rate_schedule": learning_rate_schedule,
         "final_learning_rate_ratio": final_learning_rate_ratio,
         "warmup_steps": warmup_steps,
         "view_batch_size": view_batch_size,
         "pixel_batch_size": pixel_batch_size,
-        **settings,
     }
-    built = problem.configured({key: value for key, value in given.items() if value is not None}, "minimize")
+    built = problem.configured(run_settings("minimize", steps, options, settings), "minimize")
     return _minimized(problem, built, own, list(callbacks), progress, None if output is None else Path(output), resume)
 
 

@@ -241,6 +241,16 @@ class Problem:
         params.update()
 
 
+def run_settings(
+    name: str, steps: int | None, options: dict[str, Any] | None, settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Collect the settings of a run as keys of a job; None stands for the default. ``name`` starts error messages."""
+    if "iterations" in settings:
+        raise PathreplayError(f"{name}: 'iterations' is called 'steps' here")
+    given = {"iterations": steps, "optimizer": options, **settings}
+    return {key: value for key, value in given.items() if value is not None}
+
+
 def _fitted(key: str, value: ArrayLike, wanted: tuple[int, ...]) -> Array:
     """Convert a value of a parameter; textures and grids may have another resolution."""
     array = np.array(dr.detach(value) if dr.is_array_v(value) else value, np.float32)

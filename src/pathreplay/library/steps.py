@@ -18,7 +18,7 @@ from pathreplay.inverse.optim import adaptive
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem import problem as inner
 from pathreplay.library.optimizers import Stepper, adapted, options_of
-from pathreplay.library.problem import Problem
+from pathreplay.library.problem import Problem, run_settings
 
 
 class _Task:
@@ -98,9 +98,7 @@ def init(
         PathreplayError: the settings are invalid.
     """
     options, own = options_of(optimizer)
-    given = {"iterations": steps, "optimizer": options, **settings}
-    changes = {key: value for key, value in given.items() if value is not None}
-    task = _Task(changes)
+    task = _Task(run_settings("init", steps, options, settings))
     built, executor = task.of(problem, "init")
     run = new_run(built, built.integrator, optimizer=built.config.optimizer, executor=executor)
     if own is not None:
