@@ -163,7 +163,7 @@ class Problem:
 
     def __repr__(self) -> str:
         """Return a short description for notebooks."""
-        return f"<Problem: {', '.join(self.initial)}; {len(self.built.views)} views, loss {self.job['loss']}>"
+        return f"<Problem: {', '.join(self.initial)}; {len(self.built.views)} views, loss {self.built.config.loss}>"
 
     @property
     def scene(self) -> mi.Scene:
