@@ -1,4 +1,4 @@
-"""A run, iteration by iteration: what a loop over it gives, and how it ends, whoever ends it."""
+"""A running job as an iterator, and the ways in which it ends."""
 
 from __future__ import annotations
 
@@ -25,12 +25,11 @@ from pathreplay.runs.saving import saved_targets
 
 
 class Optimization:
-    """A run under way, to be looped over: each iteration gives its `Iteration`.
+    """A running job: iterating over it yields an `Iteration` after each step.
 
-    The scene is loaded when the first one is asked for, and all is written when the loop has come to its end, which
-    makes ``result``. Who leaves the loop before leaves a checkpoint to go on from; so does `close`, which is also the
-    end of a ``with``. `stop` ends the run here, with everything written. While it runs, signals ask it to end: see
-    `pathreplay.optimize`.
+    The scene is loaded when the first iteration is requested. At the end of the loop everything is written, and
+    ``result`` is set. Leaving the loop early, or `close`, which ends a ``with`` block, leaves a checkpoint to resume
+    from. `stop` ends the run with everything written. For signals see `pathreplay.optimize`.
     """
 
     def __init__(self, job: Job, output: Path, resumed: RunFolder | None, progress: bool) -> None:
@@ -43,7 +42,7 @@ class Optimization:
         return self
 
     def __next__(self) -> Iteration:
-        self._resumed = None  # the generator lets go of it
+        self._resumed = None  # the generator releases it from now on
         try:
             return next(self._iterations)
         except StopIteration as end:
@@ -57,15 +56,15 @@ class Optimization:
         self.close()
 
     def close(self) -> None:
-        """End it here with a checkpoint only."""
+        """End the run with a checkpoint only."""
         self._iterations.close()
-        if self._resumed is not None:  # which nobody has begun to go on with
+        if self._resumed is not None:  # the generator has not started
             self._resumed.lock.close()
 
     def stop(self) -> RunResult:
-        """End it here (after one iteration, if there was none) with everything written.
+        """End the run with everything written, after at least one iteration.
 
-        Raises PathreplayError as the loop does, and where the run was closed before.
+        Raises PathreplayError as the loop does, and if the run was closed before.
         """
         self._stop.by = self._stop.by or "stop()"
         for _ in self:
@@ -78,7 +77,7 @@ class Optimization:
 def _iterations(
     job: Job, output: Path, home: Path, resumed: RunFolder | None, progress: bool, stop: Stop
 ) -> Generator[Iteration, None, RunResult]:
-    """The iterations of a run; returns what it came to. A relative ``output`` starts at ``home``."""
+    """Run a job; yields its iterations and returns the result. A relative ``output`` refers to ``home``."""
     config = job.config
     with ExitStack() as stack:
         if resumed is not None:

@@ -116,11 +116,11 @@ class LivePictures:
 
 
 def _chosen(problem: Problem, count: int) -> list[View]:
-    """Select views evenly from training views and test views."""
-    out = [view for view in problem.views if view.is_test]
-    learned = [view for view in problem.views if not view.is_test]
-    some = min(len(out), count // 2)
-    chosen = {view.name for view in (*_evenly(learned, max(1, count - some)), *_evenly(out, some))}
+    """Choose ``count`` evenly spaced views; up to half of them are test views."""
+    test = [view for view in problem.views if view.is_test]
+    trained = [view for view in problem.views if not view.is_test]
+    test_count = min(len(test), count // 2)
+    chosen = {view.name for view in (*_evenly(trained, max(1, count - test_count)), *_evenly(test, test_count))}
     return [view for view in problem.views if view.name in chosen]
 
 
@@ -134,8 +134,8 @@ def _pictures_of(view: View, before: Image, now: Image) -> ViewPictures:
 
 
 def encoded_picture(image: Image, exposure: float, side: int, kind: str) -> bytes:
-    """The picture as a display shows it, no longer than ``side`` pixels: PNG, or WebP, which loses what few see."""
-    # In double precision a large texture would take more than all else that is known of it.
+    """Encode a tone-mapped image of at most ``side`` x ``side`` pixels, as PNG or lossy WebP."""
+    # Downscale first: a large texture in double precision would need more memory than everything else about it.
     pixels = np.round(255 * displayed(grids.shown(image, 2 * side), exposure)).astype(np.uint8)
     picture = PIL.Image.fromarray(pixels[..., 0] if pixels.shape[2] == 1 else pixels).convert("RGB")
     if max(picture.size) > side:
