@@ -15,6 +15,7 @@ from edge_ordinary import PAINT, Moving, T, film, grey, hold_quiet, loaded, meas
 from edge_truth import hold_agreement
 from pathreplay.integrators import integrator as integrators
 from pathreplay.integrators.camera_pass import Pass
+from pathreplay.testing.objective import Objective
 from pathreplay.testing.statistics import gap
 from pathreplay.testing.verdict import Z_LIMIT
 from pathreplay.transport.facts.nodes import nodes_of
@@ -110,6 +111,26 @@ def test_the_gradient_is_that_without_a_flow(name: str, tmp_path: Path, monkeypa
 
 def test_noise_is_below_that_of_a_difference(tmp_path: Path) -> None:
     hold_quiet(CELLS[QUICK](tmp_path), tmp_path)
+
+
+def test_noise_inside_one_colour_falls_with_the_size_of_the_film() -> None:
+    """A wall under a constant sky translates. Inside its outline the image stays, and the flow brings noise alone.
+
+    With a mean over a fixed number of pixels that noise grows with the film, as the velocity in pixels does.
+    """
+
+    def noise_of(size: int) -> float:
+        wall = {"type": "rectangle", "to_world": T().scale(0.8), "bsdf": PAINT}
+        camera = sensor(film=film(width=size, height=size))
+        scene = mi.load_dict({"type": "scene", "camera": camera, "wall": wall, "sky": SKY}, optimize=False)
+        objective = Objective(scene, mi.traverse(scene), "wall.to_world", translate(1, 0, 0))
+        integrator = mi.load_dict({"type": "pathreplay", "max_depth": 2})
+        inside = slice(3 * size // 8, 5 * size // 8)
+        images = [objective.forward(integrator, seed, 16)[inside, inside] for seed in range(4)]
+        return float(np.std(images))
+
+    small, large = noise_of(32), noise_of(128)
+    assert 0 < large < small
 
 
 FLOORS: dict[str, tuple[Callable[[], dict], bool]] = {

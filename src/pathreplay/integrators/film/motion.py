@@ -44,8 +44,10 @@ from pathreplay.transport.vertex import TraceConfig
 
 GROUP = 5
 """Paths with the same random numbers: to the right and to the left, above and below, and one for the divergence."""
-BLUR = 3
-"""Pixels to each side, over which what is wanted of pixels counts as smooth."""
+BLUR, MOST = 16, 16
+"""The adjoint of pixels is averaged over a BLUR-th of the film's shorter side to each side, and at most MOST pixels.
+
+The noise of the smooth part falls with the third power of that length, as long as the adjoint is smooth over it."""
 NUMBERS = 1
 """Number of the set of random numbers; the interior uses 0."""
 
@@ -181,12 +183,13 @@ def _seen(
 def blurred(pixels: mi.TensorXf) -> mi.TensorXf:
     """The mean of pixels over a square around each, with zero beyond the border: its own transpose."""
     height, width, channels = pixels.shape
+    reach = min(max(min(height, width) // BLUR, 1), MOST)
     index, values = dr.arange(mi.UInt32, height * width * channels), pixels.array
     for stride, most in ((channels, width), (channels * width, height)):
         place, total = mi.Int32(index // stride % most), mi.Float(0)
-        for k in range(-BLUR, BLUR + 1):
+        for k in range(-reach, reach + 1):
             inside = (place + k >= 0) & (place + k < most)
             total += dr.gather(mi.Float, values, mi.UInt32(mi.Int32(index) + k * stride), inside)
-        values = total / (2 * BLUR + 1)
+        values = total / (2 * reach + 1)
         dr.eval(values)  # before it is read at other places
     return mi.TensorXf(values, pixels.shape)
