@@ -63,7 +63,7 @@ def test_a_table_has_what_runs_came_to_and_where_they_differ(tmp_path: Path) -> 
     assert [head.text for head in table.heads] == ["", "a", "b"]
     assert rows["iterations"] == ("3 of 6", "2 of 6") and rows["seconds"] == ("1.5", "1.0")
     assert rows["loss"] == ("1 → 0.25 (l2)", "1 → 0.1 (l1)") and rows[f"error of {TEXTURE}"] == ("0.5", "0.2")
-    assert rows["PSNR, held-out views"] == ("20.25 dB", "20.1 dB")
+    assert rows["PSNR, test views"] == ("20.25 dB", "20.1 dB")
     assert rows["job: spp"] == ("4", "32") and rows["job: loss"] == ("'l2'", "'l1'") and len(rows) == 10
 
 

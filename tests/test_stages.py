@@ -164,7 +164,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "no view": ({"stages": [{"iterations": 1, "sensors": ["up"]}]}, "sensor 'up' is none of the job's views"),
     "held out": (
         {"test_views": ["right"], "stages": [{"iterations": 1, "sensors": ["right"]}]},
-        "sensor 'right' is held out; name some of left",
+        "sensor 'right' is a test view; name some of left",
     ),
     "no key": ({"stages": [{"iterations": 1, "parameters": ["flor.*"]}]}, "No parameter 'flor.*'"),
     "never": ({"stages": [{"iterations": 1, "parameters": [FLOOR]}]}, f"'{TEXTURE}' moves in none of them"),

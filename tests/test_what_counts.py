@@ -116,9 +116,9 @@ def test_views_that_are_held_out_are_looked_at_only(room: Path) -> None:
     assert result.history[0].loss == pytest.approx(alone.history[0].loss, rel=1e-4)
     assert result.test_views == ("other",)
     assert result.views["one"].psnr > 30 > result.views["other"].psnr
-    assert "held-out views (1): PSNR" in result.describe()
+    assert "test views (1): PSNR" in result.describe()
     html = result.report.read_text()
-    assert "recovered from 1 picture, 1 held out" in html and "other (held out)" in html
+    assert "recovered from 1 image, 1 test view" in html and "other (test view)" in html
 
 
 def test_a_job_may_bring_its_loss(room: Path) -> None:

@@ -75,7 +75,7 @@ class View:
         target: linear pixels (height, width, channels): a NumPy or Dr.Jit array, a `mi.Bitmap`, or an image file.
         weight: nonnegative pixel weights (height, width), normalised to mean 1. Default: equal weights.
         share: weight of the view relative to the others.
-        test: whether the view is held out.
+        test: whether the view is a test view.
     """
 
     sensor: int | str = 0

@@ -33,7 +33,7 @@ def common_exposure(targets: Sequence[Image]) -> float:
 
 def lead(config: Config, parameters: int, learned: int, test_views: int) -> tuple[str, str, str]:
     """The sentence at the top: parameters, name of the scene, and number of images."""
-    test = f", {test_views} held out" if test_views else ""
+    test = f", {test_views} test view{'s' if test_views != 1 else ''}" if test_views else ""
     images = f" recovered from {learned} image{'s' if learned != 1 else ''}{test}"
     return f"{parameters} parameter{'s' if parameters != 1 else ''} of ", config.scene, images
 

@@ -143,16 +143,16 @@ def _likeness(outcome: Outcome) -> Table:
             cells += ["" if likeness.flip is None else f"{likeness.flip:.4f}" for likeness in (before, after)]
         if exposed:
             cells.append("× " + ", ".join(f"{factor:.3f}" for factor in view.factors))
-        rows.append(Row(view.name + " (held out)" * view.is_test, tuple(cells)))
+        rows.append(Row(view.name + " (test view)" * view.is_test, tuple(cells)))
     return Table(tuple(Head(text) for text in heads), tuple(rows))
 
 
 def _likeness_note(outcome: Outcome) -> str:
     note = "Metrics of the displayed image of each view at its own exposure, including render noise."
     if outcome.test_views():
-        note += " Held-out views are excluded from the optimization"
+        note += " Test views are excluded from the optimization"
         note += "; their exposures are fitted to their targets at the end." if outcome.config.exposure else "."
-        note += "" if outcome.has_flip() else " FLIP of held-out views needs: pip install 'pathreplay[flip]'."
+        note += "" if outcome.has_flip() else " FLIP of test views needs: pip install 'pathreplay[flip]'."
     return note
 
 

@@ -74,7 +74,7 @@ class RunResult:
             psnr, ssim = (np.mean([getattr(self.views[v], kind) for v in self.test_views]) for kind in ("psnr", "ssim"))
             flips = [flip for v in self.test_views if (flip := self.views[v].flip) is not None]
             mean_flip = f", FLIP {np.mean(flips):.4f}" if flips else ""
-            lines.append(f"held-out views ({len(self.test_views)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}{mean_flip}")
+            lines.append(f"test views ({len(self.test_views)}): PSNR {psnr:.2f} dB, SSIM {ssim:.4f}{mean_flip}")
         lines.append(f"report: {self.report}")
         if self.stopped:
             lines.append(f"stopped early by {self.stopped_by}; resume with: {resume_command(self.folder)}")

@@ -346,7 +346,7 @@ def _plain(problem: Problem, config: Config, view: View, spp: int) -> Image:
 
 
 def ended(problem: Problem, config: Config, run: Run) -> Run:
-    """Return the run, and its baseline, with their resulting values, including exposures of held-out views."""
+    """Return the run, and its baseline, with their resulting values, including exposures of test views."""
     run = replace(run, values=best_values(problem, run))
     for each in filter(None, (run, run.baseline)):
         each.values = dict(with_exposures(problem, config, each.values))

@@ -65,7 +65,7 @@ def _views(problem: Problem, stage: Stage) -> set[str] | None:
     for item in stage.sensors:
         named = [v for v in problem.views if item in (v.name, ids[v.name]) or item == v.sensor]
         if not named or named[0].is_test:
-            why = "is held out" if named else "is none of the job's views"
+            why = "is a test view" if named else "is none of the job's views"
             names = ", ".join(v.name for v in problem.trained().values())
             raise PathreplayError(f"stages: sensor {shown(item)} {why}; name some of {names}")
         found.add(named[0].name)

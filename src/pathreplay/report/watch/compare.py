@@ -28,7 +28,7 @@ def table(runs: list[Past]) -> Table:
         Row("loss", tuple(_loss(run) for run in runs)),
     ]
     for kind, unit in (("psnr", " dB"), ("ssim", "")):
-        for name, views in (("training views", _learned), ("held-out views", Past.test_views)):
+        for name, views in (("training views", _learned), ("test views", Past.test_views)):
             cells = tuple(_mean([run.likeness(view, kind) for view in views(run)], unit) for run in runs)
             if any(cells):
                 rows.append(Row(f"{kind.upper()}, {name}", cells))
