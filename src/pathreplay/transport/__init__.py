@@ -1,1 +1,1 @@
-"""Light transport at one vertex: the differentiable step, next-event estimation, lobes and attachment."""
+"""The differentiable step of a path at one vertex: arrival, next-event estimation, scattering, and attachment."""

@@ -1,7 +1,7 @@
-"""Arrive: what there is at the end of a ray, what comes along the ray from there by itself, and the flight before it.
+"""Arrive: evaluate the end of a ray, the radiance emitted along the ray, and the flight before it.
 
-With media the ray may end at a particle, and the flight has a weight and emission of its own; without them it ends at
-a surface or leaves the scene.
+With media a ray may end at a scattering event inside a medium, and the flight has its own weight and emission. Without
+media a ray ends at a surface or leaves the scene.
 """
 
 from __future__ import annotations
@@ -21,35 +21,36 @@ from pathreplay.transport.volume.media import interaction
 
 @dataclass
 class Vertex:
-    """What a path arrived at. A surface scatters here, or a particle, or nothing does."""
+    """The vertex that a path arrived at: a scattering surface, a medium event, or a place where nothing scatters."""
 
     si: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
-    surface: mi.Bool  # a surface that scatters
-    origin: mi.Interaction3f  # where rays leave
-    glow: mi.Spectrum  # emission towards the ray's origin, MIS weighted
-    inside: InMedium = None  # type: ignore[assignment]  # not in scenes without media
+    surface: mi.Bool  # the vertex lies on a surface that scatters
+    origin: mi.Interaction3f  # origin of the rays that leave the vertex
+    glow: mi.Spectrum  # radiance emitted towards the ray's origin, MIS weighted
+    inside: InMedium = None  # type: ignore[assignment]  # None in scenes without media
 
 
 @dataclass
 class InMedium:
-    """What there is besides in a scene with media."""
+    """The additional state of a vertex in a scene with media."""
 
-    event: mi.Bool  # the flight ended at a particle
-    through: mi.Bool  # a surface that all light passes straight through, which is no vertex
+    event: mi.Bool  # the flight ended at a real collision in the medium
+    through: mi.Bool  # a null boundary, which all light crosses unscattered; it does not count as a vertex
     mei: mi.MediumInteraction3f
     phase: mi.PhaseFunctionPtr
     flight: Flight
-    w: mi.Spectrum  # weight of all that comes from the vertex: transmittance, at a particle times σ_s over its density
-    e: mi.Spectrum  # what the flight adds by itself
+    w: mi.Spectrum  # weight of all radiance from the vertex: transmittance, times σ_s / density at a medium event
+    e: mi.Spectrum  # radiance emitted by the medium along the flight
 
 
 def choose(
     trace: TraceConfig, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: mi.Bool, flight: Flight | None = None
 ) -> Vertex:
-    """Arrive in a first walk; with media, draw the flight from ``sampler``, unless it is given. Detached.
+    """Arrive in the sampling pass. Nothing is differentiated.
 
-    Real collisions are chosen by the throughput ``β``, see `fly`.
+    With media, sample the flight from ``sampler`` unless ``flight`` is given. The throughput ``β`` determines the
+    probability that a collision is real, see `fly`.
     """
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
     if trace.steady:
@@ -65,9 +66,10 @@ def choose(
 
 
 def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool) -> Vertex:
-    """Arrive once more, differentiably in emission and the coefficients of media.
+    """Arrive again, differentiably in emission and the coefficients of media.
 
-    If ``attached`` the hit point follows the ray and the shape, and the emission's MIS weight the ray's density.
+    If ``attached``, the hit point follows the ray and the shape, and the MIS weight of the emission follows the density
+    of the ray.
     """
     at, kept = again.at, again.kept
     with dr.suspend_grad(when=not attached):
@@ -94,7 +96,7 @@ def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
 
 
 def sees_lights(trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-    """Where what is emitted at the end of a ray counts: with ``hide_emitters`` no camera ray sees the environment."""
+    """Lanes that count the emission at the end of a ray: ``hide_emitters`` hides the environment from camera rays."""
     return active & (~at.camera | si.is_valid()) if trace.hide_emitters else active
 
 

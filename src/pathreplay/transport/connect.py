@@ -1,4 +1,4 @@
-"""Connect: the next-event estimate, light of an emitter sample that a vertex scatters along the path."""
+"""Connect: next-event estimation, the radiance of an emitter sample that a vertex scatters back along the path."""
 
 from __future__ import annotations
 
@@ -16,28 +16,31 @@ from pathreplay.transport.volume.shadow import shadow, shadow_again
 
 @dataclass
 class Connection:
-    """An emitter sample, seen from a vertex."""
+    """An emitter sample as seen from a vertex."""
 
     light: mi.DirectionSample3f
-    Le: mi.Spectrum  # its radiance over its density, with what is left of it on the way
-    lit: mi.Bool  # there is one, and nothing is in its way
-    shadow: Shadow = None  # type: ignore[assignment]  # not in scenes without media
+    Le: mi.Spectrum  # emitted radiance over density, times the transmittance in between
+    lit: mi.Bool  # the sample is valid and unoccluded
+    shadow: Shadow = None  # type: ignore[assignment]  # None in scenes without media
 
     def mis(self, pdf: mi.Float) -> mi.Float:
-        """Its weight; ``pdf`` is that of sampling its direction at the vertex."""
+        """MIS weight of the sample; ``pdf`` is the density of sampling its direction at the vertex."""
         return dr.select(self.light.delta, 1, mis_weight(self.light.pdf, pdf))
 
     def reaches(self, pdf: mi.Float, attached: bool) -> mi.Spectrum:
-        """What reaches the vertex (Spectrum), MIS weighted; ``pdf`` is that of sampling its direction there."""
+        """MIS-weighted radiance at the vertex (Spectrum); ``pdf`` is the density of sampling its direction there."""
         mis = self.mis(pdf)
-        # A path that is held fixed needs no derivative of its weights: they sum to one whatever the parameters do.
+        # The MIS weights of a detached path need no derivative: they sum to one for all values of the parameters.
         return self.Le * (mis if attached else dr.detach(mis))
 
 
 def choose(
     trace: TraceConfig, v: Vertex, medium: mi.MediumPtr, u: VertexSamples, sampler: mi.Sampler, go_on: mi.Bool
 ) -> Connection:
-    """Draw an emitter sample, and with media a shadow ray in ``medium``, where something can scatter it. Detached."""
+    """Sample an emitter where the vertex can scatter its light, and with media trace a shadow ray. Detached.
+
+    The shadow ray starts in ``medium``.
+    """
     if v.inside is None:
         lit = go_on & v.surface & is_smooth(v.bsdf)
         light, Le = draw_emitter(trace.scene, v.origin, u.light, lit)
@@ -52,14 +55,14 @@ def choose(
 
 
 def shadow_start(v: Vertex, light: mi.DirectionSample3f, medium: mi.MediumPtr) -> mi.MediumPtr:
-    """What a shadow ray starts in, where the path came through ``medium``."""
+    """The medium in which a shadow ray starts, if the path arrived through ``medium``."""
     return dr.select(v.surface & v.si.is_medium_transition(), v.si.target_medium(light.d), medium)
 
 
 def repeat(trace: TraceConfig, v: Vertex, again: VertexRecord, ctx: mi.BSDFContext, attached: bool) -> mi.Spectrum:
-    """The part of e that the kept emitter sample brings (Spectrum), differentiably.
+    """The contribution of the recorded emitter sample to e (Spectrum), differentiably.
 
-    If ``attached`` the point on the emitter follows the emitter. Visibility is not differentiated.
+    If ``attached``, the point on the emitter follows the emitter. Visibility is not differentiated.
     """
     kept = again.kept
     if kept.known is not None and not attached:

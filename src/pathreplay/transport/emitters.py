@@ -1,4 +1,4 @@
-"""The light that a vertex adds by itself: emission of what was hit, and samples of the emitters."""
+"""Radiance that a vertex adds by itself: emission at the hit point, and emitter samples."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from pathreplay.transport.volume.passage import skip_null
 
 
 def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool) -> mi.Spectrum:
-    """Radiance emitted towards the ray's origin by what the ray hit (the environment on a miss), MIS weighted.
+    """Radiance emitted towards the ray's origin by the surface that it hit (on a miss: the environment), MIS weighted.
 
-    Differentiable in the emitter's radiance and, if ``attached``, in the ray, the hit point and
-    the density ``at.pdf``. A path that is held fixed needs no derivative of its MIS weights: they sum to one whatever
-    the parameters do.
+    Differentiable in the emitter's radiance and, if ``attached``, in the ray, the hit point and the density ``at.pdf``.
+    The MIS weights of a detached path need no derivative: they sum to one for all values of the parameters.
     """
     with dr.suspend_grad(when=not attached):
         origin = dr.zeros(mi.Interaction3f)
@@ -32,14 +31,14 @@ def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached
 def vertex_glow(
     trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool
 ) -> mi.Spectrum:
-    """The `emission` at a vertex: none where what is around the scene is none, and no surface emits."""
+    """The `emission` at a vertex; zero where the background is added separately and no surface of the scene emits."""
     if trace.leaves and not trace.traits.area_lights:
         return mi.Spectrum(0)
     return emission(trace.scene, at, si, attached, active)
 
 
 def relight(trace: TraceConfig, at: Arrival, lighting: Lighting) -> mi.Spectrum:
-    """The e of a vertex once more (Spectrum), differentiable in what emitters emit alone: all else is as it was."""
+    """Evaluate e of a recorded vertex again (Spectrum), differentiable in emitted radiance only."""
     own = vertex_glow(trace, at, lighting.si, False, lighting.seen)
     return own + lighting.w * trace.scene.eval_emitter_direction(lighting.si, lighting.light, lighting.lit)
 
@@ -47,10 +46,10 @@ def relight(trace: TraceConfig, at: Arrival, lighting: Lighting) -> mi.Spectrum:
 def draw_emitter(
     scene: mi.Scene, origin: mi.Interaction3f, u: mi.Point2f, active: mi.Bool, visible: bool = True
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """Sample a direction towards an emitter, with Le/p.
+    """Sample a direction towards an emitter, and return it with Le/p.
 
-    If it must be ``visible``, an occluded sample comes back with density and weight zero; else nobody looks. Nothing is
-    differentiated.
+    If ``visible``, occlusion is tested and an occluded sample has density and weight zero; otherwise no ray is traced.
+    Nothing is differentiated.
     """
     with dr.suspend_grad():
         return scene.sample_emitter_direction(origin, u, visible, active)
@@ -64,11 +63,11 @@ def redraw_emitter(
     attached: bool,
     lit: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """The emitter sample of a first walk once more, with Le/p, differentiable.
+    """The emitter sample of the sampling pass again, with Le/p, differentiable.
 
-    ``light`` is the sample itself, if it is still at hand, else None. If ``attached``, the point on the emitter stays
-    the same in the emitter's own coordinates, so that it moves with the emitter, and everything follows; else it is
-    fixed in space and only the emitted radiance is differentiated. Visibility never is.
+    ``light`` is the sample itself if it is still available, else None. If ``attached``, the point keeps its coordinates
+    on the emitter and so moves with it, and direction, distance and density follow. Otherwise the point is fixed in
+    space and only the emitted radiance is differentiated. Visibility is never differentiated.
     """
     scene = trace.scene
     if attached:
@@ -91,9 +90,10 @@ def redraw_emitter(
 def _glued(
     trace: TraceConfig, origin: mi.Interaction3f, still: mi.DirectionSample3f, active: mi.Bool
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """A sample of a mesh with a texture, at a point that is glued to it, with Le/p; ``still`` is the same, detached.
+    """Sample a textured emissive mesh at a point with fixed barycentric coordinates, and return it with Le/p.
 
-    Mitsuba's own slides: it meets the mesh in space along a ray in the plane of texture coordinates.
+    ``still`` is the same sample, detached. Mitsuba's own sample slides over the mesh: Mitsuba intersects the mesh with
+    a ray in the plane of texture coordinates.
     """
     ray = dr.detach(origin.spawn_ray_to(still.p))
     ray.maxt = dr.largest(mi.Float)
@@ -105,7 +105,7 @@ def _glued(
     facing = dr.abs(dr.dot(y.A, towards))
     ok = active & hit.is_valid() & (hit.shape.emitter() == still.emitter) & (facing > 0)
     dist2 = dr.select(ok, dr.squared_norm(towards), 1)
-    log_J = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)  # of the solid angle of an area around the point
+    log_J = dr.log(dr.select(ok, facing, 1)) - 1.5 * dr.log(dist2)  # log solid angle of an area element at the point
     J = dr.replace_grad(mi.Float(1), log_J)
     light = dr.copy(still)
     light.p = dr.select(ok, dr.replace_grad(still.p, y.p), still.p)
@@ -117,9 +117,9 @@ def _glued(
 
 
 def _mesh_growth(scene: mi.Scene, origin: mi.Interaction3f, light: mi.DirectionSample3f, lit: mi.Bool) -> mi.Float:
-    """Area of the emitting triangle relative to its present one: 1, with the derivative of log area.
+    """Area of the sampled emissive triangle over its detached value: 1, with the derivative of log area.
 
-    Mitsuba samples a mesh with the areas that its triangles had, and does not differentiate them.
+    Mitsuba samples a mesh with the triangle areas at load time and does not differentiate them.
     """
     ray = dr.detach(origin.spawn_ray_to(light.p))
     ray.maxt = dr.largest(mi.Float)

@@ -1,9 +1,10 @@
-"""What a ray meets: every path, shadow ray and line looks for it here.
+"""Ray intersection for paths, shadow rays and boundary segments, with a workaround for the ends of B-spline curves.
 
-Mitsuba computes derivatives at a point of a B-spline curve from v, its place along the whole curve, and takes
-floor(n v) for the number of its segment, of n. Where v rounds to 1 there is no such segment, and whatever lies behind
-the table in memory is read (Mitsuba 3.9.1): garbage, or the process ends. The end of a curve is an edge, on which
-lines close in. So hits stay short of the end of their segment, by what rounding may add.
+At a point of a B-spline curve with n segments, Mitsuba 3.9.1 computes derivatives from the global curve parameter v and
+takes floor(n v) as the segment index. Where v rounds to 1 this index is out of range, and Mitsuba reads past the end of
+its table: the result is garbage, or the process crashes. Boundary sampling is likely to hit this case, because the end
+of a curve is an edge to which bisection converges. Hits are therefore kept short of the end of their segment, by a
+bound on the rounding error.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from pathreplay.transport.signature import shape_met
 from pathreplay.transport.vertex import TraceConfig
 
 ROUNDING = 2.0**-22
-"""Of v = (s + k) / n, for the k-th segment and its own s, in segments per segment before."""
+"""Rounding error of v = (s + k) / n for local parameter s of segment k, in segments, per preceding segment."""
 
 
 def meet(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.PreliminaryIntersection3f:
-    """What a ray meets. Detached."""
+    """Intersect a ray with the scene. Detached."""
     hit = trace.scene.ray_intersect_preliminary(ray, coherent=coherent, reorder=False, active=active)
     return short_of_end(trace, ray, hit, active)
 
@@ -27,7 +28,7 @@ def meet(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool, coherent: bool = Fa
 def short_of_end(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """The same hit; on a B-spline not at the end of a segment."""
+    """The hit, moved away from the end of its segment if it lies on a B-spline curve."""
     if trace.traits.splines:
         kind = shape_met(trace, hit, ray, active).shape_type()
         on_spline = active & hit.is_valid() & (kind == int(mi.ShapeType.BSplineCurve))

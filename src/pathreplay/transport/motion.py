@@ -1,4 +1,4 @@
-"""What of a path depends on parameters? Found out when a kernel is traced, so that it holds nothing it need not."""
+"""Find which parts of a path depend on differentiated parameters, at trace time, so that kernels omit the rest."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import Arrival, SampledContinuation, TraceConfig, VertexRecord, VertexSamples
 
 FEW = 8
-"""Of more moving shapes than these nobody asks which they are."""
+"""Largest number of moving shapes that are tracked individually; beyond it, every shape counts as moving."""
 COPIES = frozenset({"Instance", "ShapeGroup"})
 
 
 def moving_shapes(scene: mi.Scene, still: Collection[mi.Object]) -> tuple[mi.Shape, ...] | None:
-    """Those that have gradients, in whatever belongs to them; None where other things have gradients, or too many.
+    """Find the shapes with gradients in any of their objects.
 
-    Things that are known to be ``still`` do not count.
+    Returns None if other objects than shapes have gradients, if an instance moves, or for more than `FEW` shapes.
+    Objects in ``still`` are known not to move and do not count.
     """
     params = mi.traverse(scene)
     with dr.resume_grad():
@@ -36,7 +37,7 @@ def moving_shapes(scene: mi.Scene, still: Collection[mi.Object]) -> tuple[mi.Sha
 
 
 def may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
-    """Whether what was hit may be moved by a parameter; what a ray misses is not."""
+    """Whether a parameter may move the surface that was hit; False for rays that hit nothing."""
     moving = trace.traits.moving
     if moving is None:
         return mi.Bool(True)
@@ -49,18 +50,18 @@ def may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
 def path_moves(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
     """Whether hit points, sampled directions or emitter samples depend on parameters with gradients.
 
-    ``at`` is the first arrival. Looks at the four places where motion can enter: the start, the shapes, the BSDFs whose
-    directions are followed, and the emitters. Nothing is evaluated.
+    ``at`` is the first arrival. Motion can enter at four places, which are checked: the start of the path, the shapes,
+    the BSDFs whose sampled directions are differentiated, and the emitters. Nothing is evaluated.
     """
     return _depends(trace, start, at, painted=True)
 
 
 def edges_move(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
-    """Whether something that can hide light, or what is seen or lit from, depends on parameters with gradients.
+    """Whether an occluder, or a point that sees or lights the scene, depends on parameters with gradients.
 
-    As `path_moves`, but for texture coordinates and the tangents that follow them: what is painted on a surface hides
-    nothing. A projector or a spot that turns moves the border of what it lights, though its light comes from where it
-    came.
+    Like `path_moves`, without texture coordinates and the tangents that follow them: a texture occludes nothing. A
+    projector or spot light that rotates moves the boundary of the region that it lights, although the origin of its
+    light does not move.
     """
     lights = [*trace.traits.projectors, *trace.traits.spots]
     turns = trace.attach != "none" and any(with_gradients(light, "to_world", "cutoff_angle") for light in lights)
@@ -76,7 +77,7 @@ def _depends(trace: TraceConfig, start: CameraStart, at: Arrival, painted: bool)
         if painted:
             moving += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)
-        # Rough lobes are followed where nothing has an outline, and so there are no edges to move.
+        # Rough lobes are attached only in scenes without outlines, which have no edges that could move.
         for bsdf in trace.traits.mirrors + (trace.traits.attachables if trace.follows and painted else ()):
             sample, _ = bsdf.sample(mi.BSDFContext(), still, 0.5, mi.Point2f(0.5))
             moving.append(sample.wo)
@@ -86,11 +87,12 @@ def _depends(trace: TraceConfig, start: CameraStart, at: Arrival, painted: bool)
 
 
 def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
-    """Whether the weights of continuations on surfaces depend on parameters with gradients, where nothing moves.
+    """Whether weights of continuations on surfaces depend on parameters with gradients, in a scene where nothing moves.
 
-    ``at`` is the first arrival. The weight of any lobe is looked at, as later passes find it. Nothing is evaluated.
+    ``at`` is the first arrival. The weight of an arbitrary lobe is probed in the way that later passes evaluate it.
+    Nothing is evaluated.
     """
-    lobe, valid = at.hit.prim_index, at.hit.is_valid()  # numbers that are not known while a kernel is traced
+    lobe, valid = at.hit.prim_index, at.hit.is_valid()  # values unknown at trace time
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, valid)
     v = Vertex(si, si.bsdf(at.ray), valid, si, mi.Spectrum(0))
     kept = SampledContinuation(si.to_world(si.wi), mi.Float(1), lobe == 0, mi.Bool(False), lobe, valid)

@@ -1,4 +1,4 @@
-"""The one walk that all drivers share: where a path is, and how it goes on to its next vertex."""
+"""The path state that all drivers share, and its transition to the next vertex."""
 
 from __future__ import annotations
 
@@ -13,50 +13,54 @@ from pathreplay.transport.step import Visit, choose_step
 from pathreplay.transport.vertex import Arrival, SampledStep, TraceConfig, VertexRecord, VertexSamples, reciprocal
 from pathreplay.transport.volume.passage import skip_null
 
-# Russian roulette ends at least one path in twenty, so that a path between mirrors comes to an end.
+# Russian roulette terminates at least one path in twenty, so that paths between mirrors end.
 MAX_SURVIVAL = 0.95
 
 
 @dataclass
 class PathState:
-    """A path on its way (loop state): where it has arrived, and what its vertices so far made of it."""
+    """The state of a path as a loop variable: its arrival at the current vertex, and what it accumulated before."""
 
     at: Arrival
     β: mi.Spectrum  # throughput
-    # Throughput with one zero weight left out, what keeps a path going that is to be differentiated; else None.
+    # Throughput with one zero weight per channel left out, see `sustain`: keeps a path alive that still has
+    # derivatives. None if zero weights end the path.
     β_alive: mi.Spectrum | None
     η: mi.Float  # relative index of refraction since the camera
-    depth: mi.UInt32  # vertices before
+    depth: mi.UInt32  # number of vertices before this one
     active: mi.Bool
 
     @staticmethod
     def begin(trace: TraceConfig, start: CameraStart, sustained: bool = False) -> PathState:
-        """Paths at their first vertices; ``sustained`` says that weights of zero are to keep their derivatives."""
+        """Paths at their first vertices; with ``sustained``, zero weights do not end a path that has derivatives."""
         active = mi.Bool(start.active) & (trace.max_depth > 0)
         β_alive = mi.Spectrum(1) if sustained else None
         return PathState(start.choose(trace, active), mi.Spectrum(1), β_alive, mi.Float(1), mi.UInt32(0), active)
 
     def choose(self, trace: TraceConfig, sampler: mi.Sampler) -> tuple[VertexSamples, SampledStep]:
-        """The random numbers of this vertex, and the step that they choose."""
+        """Draw the random numbers of this vertex, and sample its step from them."""
         u = VertexSamples.draw(sampler)
         β = self.β if self.β_alive is None else self.β_alive
         return u, choose_step(trace, Visit(self.at, β, self.depth + 1 < trace.max_depth, self.active), u, sampler)
 
     def leave(self) -> tuple[PathState, mi.Bool]:
-        """The path, ended where the ray that arrives has hit nothing, and where that is so. ``at`` stays what it is."""
+        """Terminate paths whose ray leaves the scene.
+
+        Returns the new state, whose ``at`` is unchanged, and the mask of the terminated paths.
+        """
         left = self.active & ~self.at.hit.is_valid()
         return replace(self, active=self.active & ~left), left
 
     def passed(self, trace: TraceConfig, step: SampledStep) -> mi.UInt32:
-        """Vertices before the next: one more, but with media not so at null boundaries."""
+        """Number of vertices before the next one; with media a null boundary is not counted."""
         return self.depth + (1 if trace.media is None else dr.select(step.null, mi.UInt32(0), 1))
 
     def advance(
         self, trace: TraceConfig, u: VertexSamples, step: SampledStep, at: Arrival | None = None
     ) -> tuple[PathState, VertexRecord]:
-        """The path at its next vertex, and what later passes are to know of the one that it has left.
+        """Move to the next vertex; return the new state and the record of the previous vertex for later passes.
 
-        ``at`` is the next arrival, if somebody has followed the step already.
+        ``at`` is the next arrival if the caller has traced it already.
         """
         β = self.β * dr.detach(step.w)
         β_alive = None if self.β_alive is None else sustain(self.β_alive, self.β, step)
@@ -75,8 +79,8 @@ def survival(
 ) -> tuple[mi.Float, mi.Bool]:
     """Russian roulette: 1 / (survival probability), and whether the path survives. Detached.
 
-    The probability is min(max β · η², 0.95) from ``rr_depth`` on and one before; η² takes the compression of solid
-    angle out of the radiance throughput. Null boundaries between media let all paths pass.
+    The probability is min(max β · η², 0.95) from depth ``rr_depth`` on and one before. η² removes the compression of
+    solid angle from the radiance throughput. Null boundaries between media do not terminate paths.
     """
     probability = dr.minimum(dr.max(β) * dr.square(η), MAX_SURVIVAL)
     plays = depth >= trace.rr_depth
@@ -86,11 +90,12 @@ def survival(
 
 
 def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spectrum:
-    """Throughput that decides how long a path is worth differentiating: one zero weight per channel is left out.
+    """The throughput that decides how long to continue a differentiated path: one zero weight per channel is left out.
 
-    A weight that is zero now still has a derivative, times the light beyond it; so the path goes on as if that weight
-    were the largest among the channels (one, if all are zero). A second zero makes every derivative zero and ends it.
-    So does a null collision that was impossible in a channel: its weight is a choice of the walk.
+    A weight of zero still has a derivative, which multiplies the radiance beyond it. The path therefore continues as if
+    that weight were the largest among the channels (or one if all are zero). A second zero makes all derivatives zero
+    and ends the path. So does a null collision with zero probability in a channel: its weight is a choice of the
+    sampling, not of the scene.
     """
     w = dr.detach(step.w)
     w_max = dr.max(w)
@@ -101,9 +106,9 @@ def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spe
 
 
 def next_arrival(trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.Bool) -> Arrival:
-    """Follow the continuation of a step, which was taken from ``at``, to the next vertex.
+    """Trace the continuation of a step, taken from ``at``, to the next vertex.
 
-    With media a null boundary is no vertex for multiple importance sampling: what was sampled before it still counts.
+    With media a null boundary is transparent to multiple importance sampling: the density before it stays in effect.
     """
     kept, null, ray = step.kept, step.null, step.ray_next
     hit = meet(trace, ray, active)

@@ -1,9 +1,10 @@
-"""Scatter: the continuation of a path at a surface or a particle, its weight, and the derivatives of both.
+"""Scatter: sample the continuation of a path at a surface or in a medium, and differentiate its weight and direction.
 
-A first walk samples a lobe; later passes follow the choice. A smooth lobe is differentiated as f/p at a held place: the
-point where the continuation hit the next surface, which moves with that surface, or its direction (see `velocity`). A
-delta lobe is differentiated through its direction. With ``attach='all'`` so are the smooth lobes of BSDFs for which
-that is right, and where nothing has an outline the narrow ones in any case.
+The sampling pass chooses a lobe; later passes keep that choice. A smooth lobe is differentiated as f/p with frozen
+sampling: either the next hit point is fixed on its surface and moves with it, or the direction is fixed (see
+`velocity`). A delta lobe is differentiated through its direction. With ``attach='all'`` the smooth lobes of attachable
+BSDFs are differentiated through their directions as well; in scenes without outlines this applies to narrow lobes for
+every ``attach`` but ``none``.
 """
 
 from __future__ import annotations
@@ -25,25 +26,26 @@ from pathreplay.transport.vertex import (
     reciprocal,
 )
 
-# Share by which the weight of a lobe sampled alone may differ from the weight that was drawn (and squared distance of
-# their directions) and still belong to the same lobe: float32 rounding is far below it, BSDFs without support for
-# restricted sampling (`mask`) far above.
+# Tolerance for comparing a lobe sampled alone with the original sample: relative difference of the weights, squared
+# distance of the directions. Float32 rounding stays far below it; BSDFs that do not support restricted sampling
+# (`mask`) are far above it.
 SAME_LOBE = 1e-3
 
-# Density in its centre above which a lobe is narrow: that of a diffuse lobe. A held lobe has noise in proportion to the
-# slope of its logarithm, a followed one to that of the light; docs/gradients.md has the variances by roughness.
+# Density at the centre of a lobe above which it counts as narrow: that of a diffuse lobe. The noise of a detached lobe
+# is proportional to the slope of the log density, the noise of an attached lobe to the slope of the radiance.
+# docs/gradients.md lists the variances by roughness.
 NARROW = 1 / dr.pi
 
 
 @dataclass
 class Sampled:
-    """What a first walk sampled at a vertex, and what the vertex scatters from the direction of the emitter sample."""
+    """The continuation sampled at a vertex, and the vertex's response to the direction of the emitter sample."""
 
-    f: mi.Spectrum  # value for the direction of the emitter sample
+    f: mi.Spectrum  # BSDF or phase function, times cosine on surfaces, for the direction of the emitter sample
     pdf_light: mi.Float  # density of sampling that direction
     w: mi.Spectrum  # weight of the continuation
     kept: SampledContinuation
-    null: mi.Bool  # the continuation passes straight through
+    null: mi.Bool  # the continuation passes through without scattering
     eta: mi.Float
     active: mi.Bool  # there is a continuation
 
@@ -60,7 +62,7 @@ def choose(
 ) -> Sampled:
     """Sample the continuation, and evaluate the vertex for the direction ``d`` of the emitter sample. Detached.
 
-    ``ctx`` has the transport mode, and the lobe where it is to be a given one.
+    ``ctx`` holds the transport mode and may restrict sampling to one component.
     """
     at_surface = go_on & v.surface
     if v.inside is not None and trace.media.passes:
@@ -77,7 +79,7 @@ def choose(
 def _in_medium(
     v: Vertex, at: Arrival, u: VertexSamples, d: mi.Vector3f, lit: mi.Bool, go_on: mi.Bool, surface: Sampled
 ) -> Sampled:
-    """The same where the vertex may be a particle or a null boundary instead of a ``surface``."""
+    """Extend the sample of a ``surface`` to lanes whose vertex is a medium event or a null boundary."""
     event, through, phase, ctx = v.inside.event, v.inside.through, v.inside.phase, mi.PhaseFunctionContext(None)
     f, pdf_light = phase.eval_pdf(ctx, v.inside.mei, d, lit & event)
     wo, w, pdf = phase.sample(ctx, v.inside.mei, u.lobe, u.direction, go_on & event)
@@ -96,7 +98,7 @@ def _in_medium(
 
 
 def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
-    """What the vertex scatters from the world direction ``d`` (Spectrum), and the density of sampling it there."""
+    """Evaluate scattering of light from the world direction ``d`` (Spectrum), and the density of sampling ``d``."""
     surface = active if v.inside is None else active & v.surface
     f, pdf = v.bsdf.eval_pdf(ctx, v.si, v.si.to_local(d), surface)
     if v.inside is None:
@@ -109,7 +111,7 @@ def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> 
 def repeat(
     trace: TraceConfig, v: Vertex, again: VertexRecord, ctx: mi.BSDFContext, attached: bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
-    """Weight w, world direction and density of the kept continuation, differentiably.
+    """Weight w, world direction and density of the recorded continuation, differentiably.
 
     Not differentiated: the choice among lobes and, unless ``attached``, direction and density.
     """
@@ -148,8 +150,8 @@ def _at_surface(
     else:
         f, pdf = bsdf.eval(ctx, si, wo, smooth), kept.pdf
     w = f * J * dr.detach(reciprocal(kept.pdf))
-    # A sample that failed (`roughdielectric` may reflect to the far side) has weight zero whatever f is there; a black
-    # BSDF has weight zero because f is, and keeps its derivative.
+    # A failed sample (`roughdielectric` may reflect to the far side) has weight zero whatever f is there. A black BSDF
+    # has weight zero because f is zero, and keeps its derivative.
     w = dr.select(kept.black & dr.any(dr.detach(f) != 0), 0, w)
 
     if attached and trace.resamples:
@@ -161,10 +163,11 @@ def _at_surface(
 
 
 def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-    """Where smooth continuations keep their direction rather than the point that they hit: where lobes are narrow.
+    """Lanes in which smooth continuations keep their direction instead of their hit point: those with narrow lobes.
 
-    Those would turn the motion of what they hit into noise. Only where edges are looked for, which they slide over.
-    Decided by the vertex and the ray that arrives there, so that all its directions move alike.
+    A narrow lobe turns the motion of the surface that it hits into noise. Applies only if boundary terms are estimated,
+    because a fixed direction slides over edges. The decision depends on the vertex and the incident ray only, so that
+    all directions sampled at the vertex move alike.
     """
     if not (trace.edges and trace.traits.glossy):
         return mi.Bool(False)
@@ -173,10 +176,10 @@ def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.
 
 
 def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
-    """Where a hit lets a part of the light straight through. A continuation keeps its direction there.
+    """Lanes whose hit lets part of the light pass unscattered. There, a continuation keeps its direction.
 
-    If it held the point of a sheet that moves, it would slide over what is behind, and over the borders of that. Only
-    where edges are looked for, which see the outline of the sheet.
+    A continuation that followed a moving transparent sheet would slide over the surfaces behind it and over their
+    edges. Applies only if boundary terms are estimated, which include the outline of the sheet.
     """
     if not (trace.edges and trace.traits.veils):
         return mi.Bool(False)
@@ -184,7 +187,7 @@ def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi
 
 
 def _followed(trace: TraceConfig, v: Vertex, u: VertexSamples, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:
-    """Which smooth lobes are sampled attached: decided by what the lobe is, never by the direction drawn."""
+    """Lanes whose smooth lobe is sampled attached; decided by the lobe, never by the sampled direction."""
     if not trace.follows:
         return mi.Bool(False)
     index = dr.reinterpret_array(mi.UInt32, v.bsdf)
@@ -207,17 +210,18 @@ def _delta_weight(
 ) -> mi.Spectrum:
     """Weight of a sampled delta lobe, with the derivative of (weight of the lobe alone) / (probability of its choice).
 
-    A BSDF that picks among lobes returns weights in which the choice has cancelled, and with it, in some plugins,
-    the derivative of Fresnel's term (``thindielectric``, ``plastic``). So the lobe is sampled once more by itself,
-    through ``BSDFContext.component``, and divided by the probability with which it was picked. Where a plugin does
-    not support that (weights or directions disagree) its own derivative stays.
+    A BSDF that chooses among lobes returns weights in which the selection probability has cancelled. In some plugins
+    (``thindielectric``, ``plastic``) the derivative of the Fresnel term cancels with it. The lobe is therefore sampled
+    again alone, through ``BSDFContext.component``, and divided by the selection probability. Where a plugin does not
+    support restricted sampling (weights or directions disagree), its own derivative is used.
     """
     drawn = dr.detach(w)
     missing = mi.Bool(active)
     for k in range(trace.traits.lobes):
         alone = mi.BSDFContext(ctx.mode)
         alone.component = k
-        # The lobes of a surface's back are counted from zero, too, but asked for after those of the front.
+        # On the back of a two-sided BSDF, ``sampled_component`` starts at zero again, but ``component`` counts from the
+        # front.
         picked = missing if trace.traits.two_sides else missing & (kept.lobe == k)
         sample, w_k = v.bsdf.sample(alone, v.si, u.lobe, u.direction, picked)
         w_k *= dr.detach(reciprocal(kept.pdf))
@@ -231,10 +235,10 @@ def _delta_weight(
 def _at_particle(
     trace: TraceConfig, v: Vertex, again: VertexRecord, attached: bool, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
-    """Hold the direction of a particle towards the next surface point, as on surfaces.
+    """Let the direction from a medium event follow the next surface point, as on surfaces.
 
-    Only if that surface scatters or emits, and so may have seams and edges. Otherwise the direction is fixed in space,
-    which is less noisy.
+    This applies only if that surface scatters or emits and so may have texture seams and edges. Otherwise the direction
+    is fixed in space, which is less noisy.
     """
     kept, hit_next = again.kept, again.hit_next
     d, J = kept.d, mi.Float(1)

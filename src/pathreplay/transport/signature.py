@@ -1,4 +1,4 @@
-"""Signature: what tells paths apart that have an edge between them, and which way that edge lies."""
+"""Signature: identify the surface that a ray meets, so that two rays with an edge between them differ; edge normals."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from pathreplay.transport.surface import held_point
 from pathreplay.transport.vertex import TraceConfig
 
 TUBES = mi.ShapeType.Cylinder, mi.ShapeType.BSplineCurve, mi.ShapeType.LinearCurve
-"""Open at both ends: an edge is a limb or a rim."""
-# Cosine between ray and normal of a tube below which an edge is its limb rather than its rim.
+"""Open at both ends: their outline consists of silhouettes and rims."""
+# Cosine between ray and normal of a tube below which an edge is its silhouette, above which it is its rim.
 GRAZING = 0.05
 
 
 def place_met(
     trace: TraceConfig, hit: mi.PreliminaryIntersection3f, active: mi.Bool, shape: mi.ShapePtr, facets: bool = True
 ) -> mi.UInt32:
-    """What a ray met, as a number: 0 for nothing, else one for each shape, copy of a shape, and smoothing group.
+    """Hash of the surface that a ray met: 0 for none, else a value per shape, instance and smoothing group.
 
-    ``shape`` is what `shape_met` says. Triangles of a flat mesh are groups of their own.
-    Only if ``facets``.
+    ``shape`` is the result of `shape_met`. Smoothing groups are told apart only if ``facets``; each triangle of a
+    flat-shaded mesh is its own group.
     """
     met = active & hit.is_valid()
     shape = dr.reinterpret_array(mi.UInt32, shape)
@@ -39,35 +39,35 @@ def _group(tables: Tables, shape: mi.UInt32, triangle: mi.UInt32, met: mi.Bool) 
 
 
 def shape_met(trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.ShapePtr:
-    """The shape that a ray met; of a copy that which is copied, which a hit does not tell by itself."""
+    """The shape that a ray met; for an instance the instanced shape, which a preliminary intersection does not hold."""
     if not trace.traits.copies:
         return hit.shape
     return hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active & hit.is_valid()).shape
 
 
 def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:
-    """A number for a pair of numbers (Knuth's multiplicative hashing)."""
+    """Hash of two integers (Knuth's multiplicative hashing)."""
     h = (h ^ x) * mi.UInt32(0x9E3779B1)
     return h ^ (h >> 15)
 
 
 def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
-    """Whether a ray along ``d`` meets a mesh where its shading normal points along it, so that it is dark there.
+    """Whether the shading normal of a mesh faces away from a ray along ``d``, so that shading is black there.
 
-    Other shapes turn away on their limb only, and there by rounding: what lies there is an outline, and nothing else.
+    Other shapes face away only at their silhouette, by rounding. A discontinuity there is an outline and nothing else.
     """
     return si.shape.is_mesh() & (dr.dot(si.sh_frame.n, d) > 0)
 
 
 def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
-    """A unit vector normal to the ray and to the border of the shape that it just met, on which the hit all but lies.
+    """Unit vector perpendicular to the ray and to the edge of the shape next to the hit. Detached.
 
-    On meshes the nearest side of the triangle, on rectangles and disks the rim, elsewhere the limb (of tubes
-    the nearer of the two). Detached.
+    The edge is the nearest side of the triangle on meshes, the rim on rectangles and disks, the nearer of rim and
+    silhouette on tubes, and the silhouette on other shapes.
     """
     with dr.suspend_grad():
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        kind = si.shape.shape_type()  # not that of the hit, which has none where a copy was met
+        kind = si.shape.shape_type()  # the shape of a hit on an instance has no type
         on_mesh = active & si.shape.is_mesh()
         square, disk = kind == int(mi.ShapeType.Rectangle), kind == int(mi.ShapeType.Disk)
         limb = dr.abs(dr.dot(si.n, ray.d)) < GRAZING
@@ -84,7 +84,8 @@ def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Boo
         )
         straight = on_mesh | square | rim
         n = dr.normalize(dr.select(straight, dr.cross(side, ray.d), si.n - dr.dot(si.n, ray.d) * ray.d))
-        # Zero where there is none (a triangle without area, a ray along its normal): no edge, and no NaN behind a mask.
+        # Zero where no normal exists (a triangle without area, a ray along its normal), so that no NaN hides behind a
+        # mask.
         return dr.select(dr.all(dr.isfinite(n)), n, 0)
 
 
@@ -96,9 +97,9 @@ def outline_gap(
     ray: mi.Ray3f,
     active: mi.Bool,
 ) -> mi.Float:
-    """B = n·(o + t d - z): distance, along n, of a line from a point of an outline, z, that ``ray`` hit at t.
+    """B = n·(o + t d - z): signed distance along n between a line and an outline point z, which ``ray`` hit at t.
 
-    z is glued to its shape. Differentiable in o, d and the shape; zero where not ``active``.
+    z has fixed surface coordinates on its shape. Differentiable in o, d and the shape; zero where not ``active``.
     """
     z = held_point(hit, dr.detach(ray), active).p
     return dr.select(active, dr.dot(n, o + dr.select(active, hit.t, 0) * d - z), 0)
@@ -114,6 +115,6 @@ def _nearest_side(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
     a, b, c = corners
     sides = (c - b, c - a, b - a)  # facing a, b, c
     weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
-    heights = [dr.abs(w) * dr.rcp(dr.norm(side)) for w, side in zip(weights, sides, strict=True)]  # x 2 areas
+    heights = [dr.abs(w) * dr.rcp(dr.norm(side)) for w, side in zip(weights, sides, strict=True)]  # over 2 areas
     nearest = dr.select(heights[1] < heights[2], sides[1], sides[2])
     return dr.select(heights[0] < dr.minimum(heights[1], heights[2]), sides[0], nearest)

@@ -1,4 +1,4 @@
-"""Start: where a path begins, the camera ray, and its first arrival."""
+"""Start: the camera ray of a path, and its first arrival."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pathreplay.transport.volume.passage import skip_null
 class CameraStart:
     """Paths that begin with camera rays. The rays are the differentiable function whose adjoint is q_0."""
 
-    ray: mi.Ray3f  # attached to the camera, if that has gradients
-    sampler: mi.Sampler  # of the numbers that choose the paths
+    ray: mi.Ray3f  # attached to the camera's parameters, if these have gradients
+    sampler: mi.Sampler  # source of the random numbers of the paths
     active: mi.Bool
 
     def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
@@ -35,14 +35,14 @@ class CameraStart:
         return at
 
     def repeat(self) -> tuple[mi.Point3f, mi.Vector3f]:
-        """Origin and direction once more, differentiably."""
+        """Origin and direction of the rays, differentiably."""
         return self.ray.o, self.ray.d
 
 
 def behind_emitters(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """The hit, or what lies behind the area emitters that were hit; distances are told along ``ray``."""
+    """The hit, or the first hit behind area emitters if one was hit; distances are measured along ``ray``."""
     passed = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
     si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, passed)
     onward = si.spawn_ray(ray.d)
@@ -53,6 +53,6 @@ def behind_emitters(
 
 
 def medium_around(trace: TraceConfig) -> mi.MediumPtr:
-    """The medium in which the camera stands."""
+    """The medium that contains the camera."""
     around = trace.media.around
     return dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)

@@ -1,7 +1,7 @@
-"""The step: one vertex of a path, L_i = e_i + w_i L_{i+1}, made of arriving, connecting and scattering.
+"""The step: one vertex of a path, L_i = e_i + w_i L_{i+1}, composed of arrive, connect and scatter.
 
-`choose_step` draws, in a first walk; `repeat_step` is given what was chosen and is differentiable. Loops, images and
-their gradients are their callers' business.
+`choose_step` samples a vertex in the sampling pass. `repeat_step` evaluates the recorded choices again and is
+differentiable. Loops, images and gradient accumulation belong to the callers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from pathreplay.transport.vertex import (
 
 @dataclass
 class Visit:
-    """State of a path that arrives at a vertex."""
+    """The state of a path that arrives at a vertex."""
 
     at: Arrival
     β: mi.Spectrum  # throughput; real collisions are sampled in proportion to it
@@ -46,11 +46,11 @@ def choose_step(
     flight: Flight | None = None,
     ctx: mi.BSDFContext | None = None,
 ) -> SampledStep:
-    """The step of a first walk, which draws emitter sample and continuation from the numbers ``u``.
+    """Sample a step: emitter sample and continuation come from the random numbers ``u``.
 
-    With media also the flight, unless ``flight`` is given, and the shadow ray, both from ``sampler``; null boundaries
-    come back as ``null`` steps, which are not counted as vertices. ``ctx`` has the transport mode (radiance), and
-    Mitsuba's number of a lobe where surfaces are to scatter by that one alone.
+    With media, the flight (unless ``flight`` is given) and the shadow ray draw from ``sampler``; null boundaries are
+    returned as ``null`` steps, which do not count as vertices. ``ctx`` holds the transport mode (default: radiance) and
+    may restrict sampling on surfaces to one BSDF component.
     """
     ctx = mi.BSDFContext() if ctx is None else ctx
     at, go_on, active = visit.at, visit.go_on, visit.active
@@ -79,11 +79,11 @@ def choose_step(
 def repeat_step(
     trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.Bool, ctx: mi.BSDFContext | None = None
 ) -> Step:
-    """The same step once more, differentiable in emission, BSDFs, textures and media.
+    """Evaluate the same step again, differentiable in emission, BSDFs, textures and media.
 
-    If ``attached``, also in the ray that arrives, its density and everything that moves: the hit point follows ray and
-    shape, and the continuation follows as `scatter` says. Else vertices and directions are constants. Visibility and
-    Russian roulette are never differentiated. ``ctx`` is that of the first walk.
+    If ``attached``, the step is also differentiable in the incident ray, its density and all geometry: the hit point
+    follows ray and shape, and the continuation follows as described in `scatter`. Otherwise vertices and directions are
+    constants. Visibility and Russian roulette are never differentiated. ``ctx`` is the context that `choose_step` used.
     """
     ctx = mi.BSDFContext() if ctx is None else ctx
     v = arrive.repeat(trace, again, attached, active)

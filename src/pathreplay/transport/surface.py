@@ -1,4 +1,4 @@
-"""Points of surfaces while rays and shapes move: those that a ray slides to, and those that are held where they are."""
+"""Surface interactions under motion: hit points that follow the ray, and points with fixed surface coordinates."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-# Share by which a surface may differ from a sphere (derivatives of its normal) and still be taken for one.
+# Relative deviation of the normal's derivatives from those of a sphere up to which a surface is treated as a sphere.
 UMBILIC = 1e-4
-# Cosine between a ray and the limb of a sphere or cylinder below which nothing follows; as wide a band beside it counts
-# for both.
+# Cosine between ray and normal below which derivatives of hits on spheres and cylinders are dropped. The band from here
+# to twice this value counts double, in compensation.
 GRAZES = 0.01
 
 
 def met(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-    """What a ray met, differentiable in the ray and the shape.
+    """The surface interaction of a hit, differentiable in the ray and the shape.
 
-    Distances to spheres and cylinders are roots of which the derivative is 1 / cos of the angle to the normal. Its
-    square has no mean over rays, and where rounding has put a ray on the limb itself it is many millions. So where the
-    cosine is less than `GRAZES`, nothing follows, and what does where it is less than twice that counts twice. Rays
-    that are spread evenly meet cosines c with density c, which is what makes up for 1 / c: both bands hold as much of
-    the mean. What remains is of second order in `GRAZES`.
+    The distance to a sphere or cylinder is a root whose derivative is proportional to 1 / c, with c the cosine between
+    ray and normal. Its square has no finite mean over rays, and where rounding puts a ray onto the silhouette the
+    derivative reaches many millions. Derivatives are therefore zero for c < `GRAZES` and doubled for `GRAZES` <= c < 2
+    `GRAZES`. Uniformly distributed rays have cosines with density proportional to c, which cancels 1 / c: both bands
+    contribute equally to the mean. The remaining bias is of second order in `GRAZES`.
     """
     si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
     kind = si.shape.shape_type()
@@ -33,7 +33,7 @@ def met(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi
 
 
 def _scaled(si: mi.SurfaceInteraction3f, by: mi.Float) -> mi.SurfaceInteraction3f:
-    """The same, with so many times its derivatives: zero times those that are not finite is zero."""
+    """Scale the derivatives of the interaction by ``by``; a factor of zero also removes non-finite derivatives."""
     for name in ("t", "p", "n", "uv", "dp_du", "dp_dv", "dn_du", "dn_dv", "wi"):
         setattr(si, name, _times(getattr(si, name), by))
     frame = si.sh_frame
@@ -47,10 +47,10 @@ def _times(value: Any, by: mi.Float) -> Any:
 
 
 def steady(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-    """The same point of a mesh with a shading frame that its normal decides alone, which no crease makes jump.
+    """Replace the shading frame of mesh hits by one that depends only on the shading normal.
 
-    Mitsuba's has the tangent of the triangle. With equal random numbers lobes that are as wide in all directions then
-    have equal directions on both sides of a crease.
+    Mitsuba's frame uses the tangent of the triangle and is discontinuous across mesh edges. With this frame, isotropic
+    lobes sampled with equal random numbers have equal directions on both sides of an edge.
     """
     turned = mi.SurfaceInteraction3f(si)
     turned.sh_frame = mi.Frame3f(si.sh_frame.n)
@@ -60,19 +60,19 @@ def steady(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Su
 
 @dataclass
 class HeldPoint:
-    """A point that is glued to its surface."""
+    """A point with fixed surface coordinates, which moves with its surface."""
 
     p: mi.Point3f
-    A: mi.Vector3f  # area element, along the normal; only relative changes of its length mean something
-    n: mi.Normal3f  # the side from which κ is seen; detached
-    κ: mi.Float  # curvature of a sphere (> 0: convex), 0 of a plane, infinite of what is neither; detached
+    A: mi.Vector3f  # area element times the normal; only relative changes of its length are meaningful
+    n: mi.Normal3f  # normal on the side to which the sign of κ refers; detached
+    κ: mi.Float  # curvature of a sphere (> 0: convex), 0 for a plane, infinite for other surfaces; detached
 
 
 def held_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> HeldPoint:
-    """The point that ``ray`` hit, glued to its surface.
+    """The point that ``ray`` hit, with fixed surface coordinates.
 
-    On meshes A is taken from the triangle itself: derivatives by texture coordinates would lose it where these are
-    degenerate, and follow them where they move.
+    On meshes A is computed from the triangle itself. Derivatives with respect to texture coordinates would vanish where
+    these are degenerate, and would follow the texture coordinates where these move.
     """
     flags = mi.RayFlags.FollowShape
     on_mesh = active & hit.shape.is_mesh()
@@ -83,7 +83,7 @@ def held_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
 
 
 def _curvature(y: mi.SurfaceInteraction3f) -> mi.Float:
-    """κ with dn = κ dp for all tangents, infinite where there is none."""
+    """The curvature κ with dn = κ dp for all tangents; infinite if no such κ exists."""
     turn = dr.squared_norm(y.dn_du) + dr.squared_norm(y.dn_dv)
     κ = dr.dot(y.dn_du, y.dp_du) / dr.squared_norm(y.dp_du)
     rest = dr.squared_norm(y.dn_du - κ * y.dp_du) + dr.squared_norm(y.dn_dv - κ * y.dp_dv)

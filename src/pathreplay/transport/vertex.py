@@ -1,4 +1,4 @@
-"""The records that pass between the step and its drivers: options, random numbers, what is kept, the result."""
+"""Records passed between the step and the drivers: configuration, random numbers, recorded choices, results."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from pathreplay.transport.volume.media import Media
 
 @dataclass(frozen=True)
 class TraceConfig:
-    """The scene and the options of a trace: Python values, fixed when the kernel is recorded.
+    """The scene and the options of a trace: Python values, constant in a recorded kernel.
 
-    ``attach`` says what the path follows when parameters move: ``none`` nothing, ``delta`` hit points and directions
-    sampled from delta lobes, ``all`` also directions from the BSDFs in ``traits.attachables``. ``hide_emitters``
-    leaves out emitters that the camera sees directly. ``max_depth`` and ``rr_depth`` are Mitsuba's; an unbounded depth
-    is 2^32 - 1. ``media`` is None in a scene without them, which then walks as Mitsuba's `path` does; with media all
-    conventions are those of `volpath`: null boundaries are no vertices. ``baseline`` (MediumInteraction3f, extinction,
-    majorant, Bool) -> Spectrum guesses the radiance that arrives at a point of a medium from beyond (None: zero); a
-    better guess makes gradients less noisy, and none makes them wrong. ``edges`` says that what vertices slide over is
-    looked for.
+    ``attach`` selects what follows the parameters when they move things: ``none`` nothing, ``delta`` hit points and the
+    directions of delta lobes, ``all`` also the directions of the BSDFs in ``traits.attachables``. ``hide_emitters``
+    hides directly visible emitters. ``max_depth`` and ``rr_depth`` are Mitsuba's; unbounded depth is 2^32 - 1.
+    ``media`` is None in a scene without media, where paths follow the conventions of Mitsuba's `path`. With media they
+    follow `volpath`: null boundaries do not count as vertices. ``baseline`` maps (MediumInteraction3f, extinction,
+    majorant, Bool) to a Spectrum, an estimate of the radiance that arrives at a point of a medium from the rest of the
+    ray (None: zero). Its quality affects noise only, not the mean. ``edges`` says that boundary terms are
+    estimated, for which smooth continuations move differently (see `scatter`).
     """
 
     scene: mi.Scene
@@ -32,34 +32,34 @@ class TraceConfig:
     hide_emitters: bool
     max_depth: int
     rr_depth: int
-    skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]  # Mitsuba's, an integrator's method
-    media: Media = None  # type: ignore[assignment]  # not in scenes without media
+    skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]  # a method of Mitsuba's integrators
+    media: Media = None  # type: ignore[assignment]  # None in scenes without media
     baseline: Callable[..., mi.Spectrum] | None = None
-    # To keep a null collision of each path, for derivatives where collisions are never real: how much it counts (Float,
-    # see `branch_weight`); else None.
+    # Relative weight of null collisions (Float, see `branch_weight`) if one null collision per path is kept, for
+    # derivatives where collisions are never real; else None.
     branching: mi.Float = None
     edges: bool = False
-    # Null boundaries are passed as if they were not there, and ``media`` is None: what edges are looked for with.
+    # Rays skip null boundaries, and ``media`` is None: the configuration of the search for edges.
     clear: bool = False
-    # Shading frames of meshes are `steady` ones.
+    # Shading frames of meshes come from `steady`.
     steady: bool = False
-    # A ray that leaves the scene arrives at no vertex: whoever walks so asks for the `background` when all paths ended.
+    # A ray that leaves the scene arrives at no vertex: the caller adds the `background` after all paths have ended.
     leaves: bool = False
 
     @property
     def resamples(self) -> bool:
-        """Whether a later pass samples BSDFs once more, with the random numbers of the first walk."""
+        """Whether later passes sample BSDFs again with the random numbers of the sampling pass."""
         return self.traits.lobes > 0 or self.follows
 
     @property
     def follows(self) -> bool:
-        """Whether smooth lobes may be sampled attached: all that can be, or where nothing has an outline the narrow."""
+        """Whether smooth lobes may be attached: all attachable ones, or narrow ones where nothing has an outline."""
         narrow = self.attach == "delta" and not self.traits.outlines
         return bool(self.traits.attachables) and (narrow or self.attach == "all")
 
     @property
     def branch(self) -> bool:
-        """Whether a null collision of each path is kept."""
+        """Whether one null collision per path is kept."""
         return self.branching is not None
 
     @property
@@ -70,78 +70,78 @@ class TraceConfig:
 
 @dataclass
 class VertexSamples:
-    """The random numbers of one vertex: an input of the step, so that a second walk repeats the first exactly."""
+    """The random numbers of one vertex: an input of the step, so that later passes repeat it exactly."""
 
-    light: mi.Point2f  # which emitter, and where on it
-    lobe: mi.Float  # which lobe of the BSDF
-    direction: mi.Point2f  # which direction in the lobe
-    roulette: mi.Float  # whether the path goes on
+    light: mi.Point2f  # choice of the emitter and of the point on it
+    lobe: mi.Float  # choice of the BSDF's lobe
+    direction: mi.Point2f  # direction within the lobe
+    roulette: mi.Float  # Russian roulette
 
     @staticmethod
     def draw(sampler: mi.Sampler) -> VertexSamples:
-        """Draw the numbers of one vertex, in the order that all drivers share."""
+        """Draw the random numbers of one vertex, in the order that all drivers share."""
         return VertexSamples(sampler.next_2d(), sampler.next_1d(), sampler.next_2d(), sampler.next_1d())
 
 
 @dataclass
 class Arrival:
-    """How the path came to a vertex: the ray, its nearest hit, and the density with which it was sampled."""
+    """The arrival of a path at a vertex: the ray, its nearest hit, and its sampling density."""
 
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f
     pdf: mi.Float  # solid-angle density of ray.d at the previous vertex
-    delta: mi.Bool  # it was a delta lobe, or the camera
+    delta: mi.Bool  # the direction comes from a delta lobe or from the camera
     camera: mi.Bool  # the previous vertex is the camera
-    # With media only, else None:
-    medium: mi.MediumPtr = None  # what the ray goes through
-    behind: mi.Float = None  # distance to the previous vertex behind the ray's origin, through null boundaries
+    # None in scenes without media:
+    medium: mi.MediumPtr = None  # the medium around the ray
+    behind: mi.Float = None  # distance from the ray's origin back to the previous vertex, through null boundaries
 
 
 @dataclass
 class SampledContinuation:
-    """What a first walk chose at a vertex. Later passes hold these values while derivatives flow around them."""
+    """The choices of the sampling pass at a vertex. Later passes keep these values and attach derivatives to them."""
 
     d: mi.Vector3f  # sampled direction, world space
     pdf: mi.Float  # its solid-angle density, or the probability of the delta lobe
     delta: mi.Bool  # a delta lobe was sampled
     black: mi.Bool  # the weight of the continuation was zero in all channels
     lobe: mi.UInt32  # the BSDF component that was sampled
-    lit: mi.Bool  # an emitter sample was taken, and nothing is in its way
-    media: SampledInMedia = None  # type: ignore[assignment]  # not in scenes without media
-    known: KnownLight | None = None  # on surfaces, if nothing about emitters is differentiated, else None
-    light: mi.DirectionSample3f = None  # the emitter sample, where it is still at hand
+    lit: mi.Bool  # the emitter sample is valid and unoccluded
+    media: SampledInMedia = None  # type: ignore[assignment]  # None in scenes without media
+    known: KnownLight | None = None  # on surfaces, if no emitter parameter has gradients; else None
+    light: mi.DirectionSample3f = None  # the emitter sample, if it is still available
 
 
 @dataclass
 class SampledInMedia:
-    """What was chosen besides in a scene with media."""
+    """Additional choices in a scene with media."""
 
-    null: mi.Bool  # the lobe passes straight through
-    flight: Flight  # on the way to the vertex
-    shadow: Shadow  # between the vertex and its emitter sample
+    null: mi.Bool  # the continuation passes through without scattering
+    flight: Flight  # the flight to the vertex
+    shadow: Shadow  # the shadow ray from the vertex to its emitter sample
 
 
 @dataclass
 class Flight:
-    """What a first walk found between two vertices."""
+    """The flight between two vertices, as sampled."""
 
-    event: mi.Bool  # a real collision, before any surface
-    t: mi.Float  # distance to it
-    density: mi.Float  # probability density of a collision there, p σ̄; 1 if there was none
-    W: mi.Spectrum  # weight of the null collisions on the way; 1 where the medium is grey
-    along: mi.Float  # shifts the points at which its derivative is taken, in [0, 1) of their distance
-    p: mi.Float = None  # probability that the collision was real (if the walk branches, else None)
-    # Of walks with emission only, else None:
-    E: mi.Spectrum = None  # emission gathered on the way
+    event: mi.Bool  # a real collision happened before any surface
+    t: mi.Float  # distance to that collision
+    density: mi.Float  # its probability density p σ̄; 1 without a collision
+    W: mi.Spectrum  # weight of the null collisions before it; 1 in grey media
+    along: mi.Float  # random offset in [0, 1) of the points at which the derivative is taken
+    p: mi.Float = None  # probability that the collision was real (None if no null collisions are kept)
+    # None without emissive media:
+    E: mi.Spectrum = None  # emission accumulated along the flight
     t_emit: mi.Float = None  # distance of the tentative collision at which emission is differentiated
-    c_emit: mi.Spectrum = None  # weight of the emission there
-    # Only the first walk needs these; they are None in a record that is read back.
+    c_emit: mi.Spectrum = None  # weight of the emission at that distance
+    # Used by the sampling pass only; None when read from a record:
     σ_s: mi.Spectrum = None  # scattering coefficient at the collision
-    null: NullCollision = None  # type: ignore[assignment]  # one of those on the way, if the walk branches
+    null: NullCollision = None  # type: ignore[assignment]  # a null collision of the flight, if one is kept
 
     @staticmethod
     def none(media: Media) -> Flight:
-        """One that met nothing, as a first walk has it."""
+        """An empty flight, as the sampling pass represents it."""
         zero, nothing = mi.Float(0), mi.Spectrum(0)
         flight = Flight(mi.Bool(False), zero, mi.Float(1), mi.Spectrum(1), mi.Float(0), σ_s=nothing)
         if media.emissive:
@@ -150,7 +150,7 @@ class Flight:
 
     @property
     def weight(self) -> mi.Spectrum:
-        """Of what comes from its end: scattering coefficient over density at a collision, times that of null ones."""
+        """Weight of the radiance from the end: σ_s over density at a collision, times the weight of null collisions."""
         return dr.select(self.event, self.σ_s * dr.rcp(self.density), 1) * self.W
 
 
@@ -158,63 +158,63 @@ class Flight:
 class NullCollision:
     """A null collision, kept with a probability proportional to ``mass``: see `branch_weight`."""
 
-    t: mi.Float  # distance
-    ω: mi.Spectrum  # weight of the collision and of those before, over the probability that it was kept
-    bare: mi.Float  # the same without those before
-    mass: mi.Float  # of all null collisions on the way
-    number: mi.Float  # of null collisions on the way
-    pick: mi.Float  # a random number, to choose among flights
+    t: mi.Float
+    ω: mi.Spectrum  # weight of this collision and of those before it, over the probability of keeping it
+    bare: mi.Float  # the same without the collisions before it
+    mass: mi.Float  # sum over all null collisions of the flight
+    number: mi.Float  # number of null collisions of the flight
+    pick: mi.Float  # a random number for choosing among flights
 
 
 @dataclass
 class Shadow:
-    """What a first walk found between a vertex and its emitter sample."""
+    """The transmittance between a vertex and its emitter sample, as sampled."""
 
-    T: mi.Spectrum  # estimate of the transmittance, 0 if something is in the way
-    y: mi.Float  # distance of the point where its derivative is taken
-    medium: mi.MediumPtr  # the medium there; null if there is none on the way
-    length: mi.Float  # length of medium on the ray
+    T: mi.Spectrum  # estimate of the transmittance, 0 if occluded
+    y: mi.Float  # distance of the point at which its derivative is taken
+    medium: mi.MediumPtr  # the medium at y; null if the ray crosses none
+    length: mi.Float  # length of the ray inside media
 
 
 @dataclass
 class KnownLight:
-    """What emitters bring to a surface, where later passes need not find it out again."""
+    """The contribution of emitters to a surface, recorded where no later pass differentiates it."""
 
-    glow: mi.Spectrum  # emission, a part of e
+    glow: mi.Spectrum  # emission at the vertex, a part of e
     d: mi.Vector3f  # direction of the emitter sample
-    w: mi.Spectrum  # its radiance over its density, MIS weighted
+    w: mi.Spectrum  # its radiance over density, MIS weighted
 
 
 @dataclass
 class Lighting:
-    """What a surface adds by itself, e, as a function of what emitters emit: see `relight`."""
+    """The e of a surface as a linear function of emitted radiance: see `relight`."""
 
     si: mi.SurfaceInteraction3f
-    seen: mi.Bool  # what is emitted there counts
+    seen: mi.Bool  # emission at the vertex counts
     light: mi.DirectionSample3f  # the emitter sample
-    w: mi.Spectrum  # weight of its radiance: scattering over density, MIS weighted
+    w: mi.Spectrum  # weight of its radiance: f / density, MIS weighted
     lit: mi.Bool
 
 
 @dataclass
 class VertexRecord:
-    """What later passes know about a vertex and its continuation."""
+    """The data on a vertex and its continuation that later passes use."""
 
     at: Arrival
     u: VertexSamples
     kept: SampledContinuation
     go_on: mi.Bool  # there is a next vertex
-    hit_next: mi.PreliminaryIntersection3f  # of the next vertex
+    hit_next: mi.PreliminaryIntersection3f  # hit point of the next vertex
     rr_weight: mi.Float  # 1 / survival probability
     β: mi.Spectrum  # throughput before the vertex
 
 
 @dataclass
 class Signature:
-    """Where a vertex lies among the discontinuities of its path: two paths that differ in it have an edge between."""
+    """The discrete choices at a vertex: between two paths with different signatures lies a discontinuity."""
 
-    met: mi.Bool  # the ray met something: a surface or, in a medium, a particle
-    shape: mi.UInt32  # registry index of the shape, 0 for a particle or none
+    met: mi.Bool  # the ray met a surface or had a real collision in a medium
+    shape: mi.UInt32  # registry index of the shape, 0 in a medium or on a miss
     lobe: mi.UInt32  # the lobe of the continuation
 
 
@@ -231,23 +231,23 @@ class Step:
 
 @dataclass
 class SampledStep(Step):
-    """A step of a first walk, with what it chose and what the walk needs to go on."""
+    """A step of the sampling pass, with its choices and the state that the next vertex needs."""
 
     kept: SampledContinuation
-    eta: mi.Float  # relative index of refraction that the continuation crosses
-    null: mi.Bool  # the continuation passes straight through
+    eta: mi.Float  # relative index of refraction across the continuation
+    null: mi.Bool  # the continuation passes through without scattering
     active: mi.Bool  # there is a continuation
-    medium: mi.MediumPtr = None  # what the continuation goes through, with media only
-    lighting: Lighting = None  # type: ignore[assignment]  # of surfaces, if emitters have gradients, else None
+    medium: mi.MediumPtr = None  # medium along the continuation; None in scenes without media
+    lighting: Lighting = None  # type: ignore[assignment]  # on surfaces, if emitters have gradients; else None
 
     @property
     def seen(self) -> mi.Bool:
-        """Mitsuba's alpha: the ray met something that does not merely let it pass."""
+        """Mitsuba's alpha: the ray met something and does not pass through it unscattered."""
         return self.signature.met & ~self.null
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
-    """Power heuristic of Veach, p_a² / (p_a² + p_b²); zero where that is not finite."""
+    """Veach's power heuristic, p_a² / (p_a² + p_b²); zero where that is not finite."""
     a2 = dr.square(pdf_a)
     weight = a2 / dr.fma(pdf_b, pdf_b, a2)
     return dr.select(dr.isfinite(weight), weight, 0)
@@ -259,5 +259,5 @@ def reciprocal(x: mi.Float) -> mi.Float:
 
 
 def is_smooth(bsdf: mi.BSDFPtr) -> mi.Bool:
-    """True where next-event estimation can reach a lobe of the BSDF."""
+    """Lanes whose BSDF has a lobe that next-event estimation can reach."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)

@@ -1,1 +1,1 @@
-"""Facts about a scene that are found out on the host, before a kernel is recorded."""
+"""Facts about a scene, computed on the host before a kernel is recorded."""

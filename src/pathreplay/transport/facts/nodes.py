@@ -1,9 +1,9 @@
-"""The objects of a scene and their parameters, found without leaving cycles that keep some of the objects alive.
+"""Traverse the objects and parameters of a scene without reference cycles that would keep the objects alive.
 
-A class that is defined in a function is a reference cycle: the class, and what its methods close over, stay until the
-cyclic garbage collector runs. Were that a set of scene objects, an area light could outlive its shape, to which it has
-a bare pointer, and Dr.Jit would still trace it with every virtual call. So the class of a traversal is made once for
-each variant, and closes over nothing.
+A class defined inside a function is a reference cycle: the class, and all objects in the closures of its methods, live
+until the cyclic garbage collector runs. If such a closure holds scene objects, an area light can outlive its shape, to
+which it has a raw pointer, and Dr.Jit still traces it in every virtual function call. The traversal class is therefore
+created once per variant, with an empty closure.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import drjit as dr
 import mitsuba as mi
 
 _COLLECTORS: dict[type, type] = {}
-"""By the class of the variant from which they derive."""
+"""Traversal classes by the variant's base class."""
 
 
 def _collector() -> Any:
-    """A traversal callback of the active variant: it lists the objects and the values that a node names."""
+    """A traversal callback of the active variant, which collects the child objects and values of a node."""
     base = mi.TraversalCallback
     if base not in _COLLECTORS:
 
@@ -33,7 +33,7 @@ def _collector() -> Any:
 
 
 def _contents(node: mi.Object) -> tuple[list[tuple[str, mi.Object]], list[tuple[str, object, type | None]]]:
-    """What a node names: objects, and values with their C++ types."""
+    """The child objects of a node, and its values with their C++ types."""
     callback = _collector()
     callback.children, callback.values = [], []
     node.traverse(callback)
@@ -41,7 +41,7 @@ def _contents(node: mi.Object) -> tuple[list[tuple[str, mi.Object]], list[tuple[
 
 
 def nodes_of(root: mi.Object) -> set[mi.Object]:
-    """All objects of a scene, or below one of its objects."""
+    """All objects reachable from ``root``, a scene or one of its objects."""
     seen: set[mi.Object] = set()
     waiting = [root]
     while waiting:
@@ -53,9 +53,10 @@ def nodes_of(root: mi.Object) -> set[mi.Object]:
 
 
 def with_gradients(root: mi.Object, *names: str) -> list[dr.ArrayBase]:
-    """The parameters of an object, and of those below it, that have gradients; with names, those under one of them.
+    """Find the parameters of an object and its descendants that have gradients.
 
-    A parameter ``a.b`` is under ``a.b`` and under ``a``.
+    If ``names`` are given, only parameters under one of them count: a parameter ``a.b`` is under ``a.b`` and under
+    ``a``.
     """
     found: list[dr.ArrayBase] = []
     seen, waiting = {root}, [("", root)]
@@ -65,7 +66,7 @@ def with_gradients(root: mi.Object, *names: str) -> list[dr.ArrayBase]:
         for name, value, cpptype in values:
             if not names or any(f"{prefix}{name}.".startswith(f"{n}.") for n in names):
                 value = value if cpptype is None else mi.get_property(value, cpptype, node)
-                if value is not None:  # as ``sigma_a`` of hair with ``eumelanin``
+                if value is not None:  # None for ``sigma_a`` of hair with ``eumelanin``
                     found.append(value)
         for name, child in children:
             if child not in seen:

@@ -1,6 +1,7 @@
-"""Textures that jump within themselves: checkerboards, bitmaps without interpolation, attributes of faces.
+"""Textures with discontinuities: checkerboards, bitmaps with nearest-neighbour lookup, face attributes of meshes.
 
-No edge is looked for at their seams, so that nothing that stands still may slide over them.
+Boundary terms do not cover these discontinuities. Where such a texture exists, smooth continuations must not slide over
+static surfaces.
 """
 
 from __future__ import annotations
@@ -12,16 +13,16 @@ import mitsuba as mi
 import numpy as np
 
 CHECKERBOARD, BITMAP, ATTRIBUTE = "Checkerboard", "BitmapTextureImpl", "MeshAttribute"
-"""By class; that of bitmaps has the type of their texels behind it."""
+"""Class names; that of a bitmap ends with its texel type."""
 PROBES, BESIDE = 64, 1e-3
-"""Texels of a bitmap that are looked at, and how far beside their borders, in texels."""
+"""Number of texels of a bitmap that are probed, and the distance of the probes from texel borders, in texels."""
 WAVELENGTHS = 440.0, 510.0, 580.0, 650.0
 JUMPS = 0.5
-"""Share of what two texels differ by, from which on a difference beside their border is a jump."""
+"""A difference across a texel border counts as a jump above this fraction of the difference of the two texels."""
 
 
 def has_seams(textures: Iterable[mi.Texture]) -> bool:
-    """Whether one of the textures jumps within itself. Bitmaps do not tell their filter, so they are evaluated."""
+    """Whether one of the textures is discontinuous. Bitmaps do not expose their filter, so they are evaluated."""
     return any(map(_jumps, textures))
 
 
@@ -33,7 +34,7 @@ def _jumps(texture: mi.Texture) -> bool:
 
 
 def _is_nearest(texture: mi.Texture) -> bool:
-    """Whether a bitmap differs as much close to the borders of texels as between their middles."""
+    """Whether a bitmap differs as much across texel borders as between texel centres."""
     params = mi.traverse(texture)
     height, width, channels = params["data"].shape
     raw = texture.eval_3 if channels == 3 else texture.eval_1
@@ -46,7 +47,7 @@ def _is_nearest(texture: mi.Texture) -> bool:
     from_texels = np.linalg.inv(np.array(params["to_uv"].matrix, np.float64))
 
     def differences(beside: float) -> np.ndarray:
-        """How much values differ that are so many texels before and after a border."""
+        """Differences between values ``beside`` texels before and after a texel border."""
         sides = []
         for side in (-1, 1):
             at = (border + side * beside) / along, middle

@@ -1,7 +1,7 @@
 """Smoothing groups of meshes: sets of triangles that are shaded as one surface. Edges lie where two groups meet.
 
-Triangles share the normal of a vertex that they share. At a visible edge, and at a seam of texture coordinates,
-programs write vertices twice: the triangles on both sides then have two positions in common and no vertex.
+Triangles share the shading normal of a common vertex. At a visible edge, and at a seam of texture coordinates,
+modelling programs duplicate vertices: the triangles on both sides then share two positions but no vertex.
 """
 
 from __future__ import annotations
@@ -13,25 +13,26 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 WELD, ULPS = 1e-5, 4
-"""Largest distance of two vertices in one place: a share of the mesh's diagonal, and units in the last place."""
+"""Largest distance of coincident vertices: a fraction of the mesh's diagonal, and a number of units in the last place.
+"""
 
 
 def mesh_smoothing_groups(mesh: mi.Mesh) -> np.ndarray:
-    """The `smoothing_groups` of a mesh that has vertex normals; Mitsuba's rectangle, which hides its mesh, is one."""
+    """The `smoothing_groups` of a mesh with vertex normals; one group for Mitsuba's rectangle, which hides its mesh."""
     params = mi.traverse(mesh)
     if "faces" not in params:
         return np.zeros(mesh.face_count(), int)
     faces, positions = (np.array(params[key]).reshape(-1, 3) for key in ("faces", "vertex_positions"))
-    # What a lamp emits has no seam: lines that find one would be lost for its outline.
+    # Emission has no seams: segments that found one would be wasted, and missing for the emitter's outline.
     return smoothing_groups(faces, positions, 0 if mesh.is_emitter() else WELD)
 
 
 def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WELD) -> np.ndarray:
-    """The index of each triangle's group; it differs on the two sides of an edge and is zero in a mesh without edges.
+    """Index of each triangle's group: different on the two sides of an edge, zero in a mesh without edges.
 
-    Triangles that are connected by vertices form a group. Where a group meets itself without sharing vertices, as at
-    the end of an edge, each triangle is a group of its own. Vertices coincide if their distance is at most ``weld``
-    times the mesh's diagonal, plus rounding; with 0 only if they are equal.
+    Triangles connected by vertices form a group. Where a group meets itself without sharing vertices, as at the end of
+    an edge, each triangle is a group of its own. Vertices coincide if their distance is at most ``weld`` times the
+    mesh's diagonal plus rounding, or, for ``weld`` = 0, if they are equal.
     """
     count = len(positions)
     links = coo_matrix((np.ones(faces.size, bool), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), (count, count))
@@ -40,7 +41,7 @@ def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WEL
     _, side, shared = np.unique(sides[:, 0] * count + sides[:, 1], return_inverse=True, return_counts=True)
     alone = np.flatnonzero(shared[side] == 1)
     places = _places(positions, sides[alone].ravel(), weld)
-    of = alone // 3  # triangles
+    of = alone // 3  # triangle indices
     meeting = np.column_stack([np.sort(places.reshape(-1, 2), axis=1), groups[of]])
     _, where, together = np.unique(meeting, axis=0, return_inverse=True, return_counts=True)
     torn = of[together[where.ravel()] > 1]
@@ -49,9 +50,10 @@ def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WEL
 
 
 def _places(positions: np.ndarray, vertices: np.ndarray, weld: float) -> np.ndarray:
-    """A number for each of some vertices, the same where they are in one place but for rounding.
+    """Index of the position of each vertex, equal for vertices that coincide up to rounding.
 
-    Programs compute both ends of a seam, say by sines of 0 and of 2π, which differ in the last bits.
+    Modelling programs compute both ends of a seam separately, say by sines of 0 and of 2π, which differ in the last
+    bits.
     """
     ends, at = np.unique(vertices, return_inverse=True)
     if not len(ends):

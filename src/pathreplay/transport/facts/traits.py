@@ -1,4 +1,4 @@
-"""Facts about a scene, found on the host before a kernel is traced: its lobes, and lights that change shape."""
+"""Facts about a scene, computed on the host before a kernel is traced: lobes, emitters, outlines, gradients."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from pathreplay.transport.facts.seams import CHECKERBOARD
 from pathreplay.transport.facts.smoothing_groups import mesh_smoothing_groups
 from pathreplay.transport.velocity import blend_length
 
-# Classes by name: Mitsuba's objects do not tell these things of themselves.
-# Sampling is a smooth function of the random numbers, and no choice among lobes depends on a parameter.
+# Class names, because Mitsuba's objects do not expose these properties. The sampling of ATTACHABLE BSDFs is a smooth
+# function of the random numbers, and their choice of lobe depends on no parameter.
 ATTACHABLE = frozenset({"SmoothDiffuse", "RoughConductor", "RoughDielectric"})
 MASK, TWO_SIDED = "MaskBSDF", "TwoSidedBRDF"
 RELIEFS = frozenset({"NormalMap", "BumpMap"})
 FRAMES = RELIEFS | {TWO_SIDED}
-# Those without a narrow lobe of their own.
+# BSDFs without a narrow lobe of their own.
 DULL = FRAMES | {MASK, "SmoothDiffuse"}
 INSTANCE, PROJECTOR, SPOT = "Instance", "Projector", "SpotLight"
 WHOLE, FACETS = 0, 0xFFFFFFFF
-"""Shapes without edges but their outlines, and meshes that are shaded flat, in the table of smoothing groups."""
+"""Table entries of shapes whose only edges are outlines, and of flat-shaded meshes."""
 COARSE = 1.0
-"""Degrees between triangles and shading normals from which on it matters that they are not the same."""
+"""Mean angle in degrees between triangles and shading normals above which their difference matters."""
 
 MOST_RUNS = 4096
-"""Of equal values, that a recording writes one by one."""
+"""Largest number of runs of equal values that a frozen recording writes one by one."""
 
 T = TypeVar("T")
 V = TypeVar("V")
@@ -40,57 +40,57 @@ V = TypeVar("V")
 
 @dataclass
 class Tables:
-    """Facts about BSDFs and shapes by registry index, in arrays for kernels to look them up.
+    """Facts about BSDFs and shapes by registry index, as arrays for lookup in kernels.
 
-    A frozen function is handed them, or finds them with the integrator; else it has to write them: see `_array`.
+    A frozen function receives them as input or from the integrator; otherwise the recording writes them, see `_array`.
     """
 
     attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: nowhere)
-    blend_lengths: mi.Float  # those of `velocity`, by shape
-    groups_at: mi.UInt32  # by shape: offset of its triangles, or `WHOLE` or `FACETS`
-    groups: mi.UInt32  # of all such meshes (see `smoothing_groups`), in a row; the first is no triangle's
-    lamp_balls: mi.Float  # of emitters that are meshes: see `lamp_balls`
+    blend_lengths: mi.Float  # `velocity.blend_length` by shape
+    groups_at: mi.UInt32  # by shape: offset of its triangles in `groups`, or `WHOLE` or `FACETS`
+    groups: mi.UInt32  # concatenated `smoothing_groups` of these meshes; entry 0 is unused
+    lamp_balls: mi.Float  # bounding spheres of mesh emitters: see `lamp_balls`
 
 
 @dataclass(frozen=True)
 class Traits:
-    """What the drivers want to know about a scene."""
+    """Facts about a scene on which the drivers depend."""
 
-    mirrors: tuple[mi.BSDF, ...]  # those with delta lobes
+    mirrors: tuple[mi.BSDF, ...]  # BSDFs with delta lobes
     lobes: int  # one more than the largest component index of a delta lobe, 0 if there is none
-    attachables: tuple[mi.BSDF, ...]  # those whose smooth lobes may be sampled attached
-    detached_names: tuple[str, ...]  # classes of the others with smooth lobes
-    area_lights: bool  # there are emitters with an edge
-    hard_lights: bool  # there are emitters whose shadows are hard
-    projectors: tuple[mi.Emitter, ...]  # of these also the border of what they light is hard
-    spots: tuple[mi.Emitter, ...]  # and of these where beam_width is at least cutoff_angle
-    mesh_lights: bool  # there are meshes that emit
-    ball_lights: bool  # there are spheres that emit
-    coarse_meshes: bool  # there are meshes that are shaded as if they were smooth, and are not: see `is_coarse`
-    brushed_meshes: bool  # of these, some with BSDFs that tell one tangent from another
-    painted_meshes: bool  # there are meshes that emit, with a texture
-    two_sides: bool  # a surface may have another BSDF on its back
+    attachables: tuple[mi.BSDF, ...]  # BSDFs whose smooth lobes may be sampled attached
+    detached_names: tuple[str, ...]  # class names of the other BSDFs with smooth lobes
+    area_lights: bool  # some emitter has an outline
+    hard_lights: bool  # some emitter casts hard shadows
+    projectors: tuple[mi.Emitter, ...]  # projectors: the region that they light has a hard boundary
+    spots: tuple[mi.Emitter, ...]  # spot lights: the same where beam_width is at least cutoff_angle
+    mesh_lights: bool  # some mesh emits
+    ball_lights: bool  # some sphere emits
+    coarse_meshes: bool  # some smooth-shaded mesh is coarse: see `is_coarse`
+    brushed_meshes: bool  # some coarse mesh has a BSDF that depends on the tangent
+    painted_meshes: bool  # some mesh emits with a textured radiance
+    two_sides: bool  # some surface may have a different BSDF on its back
     copies: bool  # there are instances
     splines: bool  # there are B-spline curves
-    veils: bool  # a surface may scatter some light and let some straight through
-    masks_mirrors: bool  # a mask lies over delta lobes
-    narrow: bool  # a surface may have a narrow smooth lobe
-    glossy: bool  # a surface may have a narrow smooth lobe, and no texture has a seam that it would slide over
-    outlines: bool  # a point of a surface may see where a shape, a lamp or a texture ends
-    tables: Tables = None  # type: ignore[assignment]  # of single BSDFs and shapes; of now, as all that follows
-    # What has gradients:
-    lights_deform: bool = False  # vertex positions of a mesh that emits
+    veils: bool  # some surface may scatter part of the light and pass the rest unscattered
+    masks_mirrors: bool  # some mask covers delta lobes
+    narrow: bool  # some surface may have a narrow smooth lobe
+    glossy: bool  # the same, and no checkerboard has seams over which such a lobe would slide
+    outlines: bool  # some surface point may see the outline of a shape or emitter, or a texture seam
+    tables: Tables = None  # type: ignore[assignment]  # per BSDF and shape; updated per pass, as is the rest
+    # Whether these have gradients:
+    lights_deform: bool = False  # vertex positions of an emissive mesh
     instances_move: bool = False  # the to_world of an instance
     opacity_moves: bool = False  # the opacity of a mask
-    lights_vary: bool = False  # something about an emitter, or about a shape that emits
-    moving: tuple[mi.Shape, ...] | None = None  # the shapes that may move, or None: all, and the camera, too
+    lights_vary: bool = False  # any parameter of an emitter, or of an emissive shape
+    moving: tuple[mi.Shape, ...] | None = None  # shapes that may move; None: all shapes and the camera
 
 
 def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
-    """Look at all BSDFs and shapes of a scene, those nested in other BSDFs and in instanced shapes included.
+    """Inspect all BSDFs and shapes of a scene, including nested BSDFs and instanced shapes.
 
-    Tables and what depends on gradients are left out: see `SceneFacts`. With media, null boundaries are not mirrors:
-    the step sends light straight through them.
+    Tables and facts about gradients are left out: see `SceneFacts`. In scenes with media, null boundaries do not count
+    as mirrors: the step passes light through them.
     """
     media = any(isinstance(node, mi.Medium) for node in nodes)
     bsdfs = [node for node in nodes if isinstance(node, mi.BSDF) and not (media and is_null(node))]
@@ -126,7 +126,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
 def tables_of(
     attachables: Iterable[mi.BSDF], shapes: list[mi.Shape], emitters: list[mi.Emitter], edges: bool = True
 ) -> Tables:
-    """The tables of a scene, as it is now; without ``edges`` smoothing groups, which may be long, are left out."""
+    """The tables of a scene in its present state; without ``edges``, the possibly long smoothing groups are left out."""
     attachable = _by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)
     return Tables(
         _array(mi.Bool, attachable) if attachables else None,
@@ -139,8 +139,8 @@ def tables_of(
 def _array(kind: type, values: Any) -> Any:
     """An array of these values.
 
-    While `dr.freeze` records, arrays from the host are unknown to it. Then the recording writes them, in runs of equal
-    values.
+    `dr.freeze` does not know host arrays that are created while it records. There the recording writes the array
+    instead, in runs of equal values.
     """
     if not dr.flag(dr.JitFlag.FreezingScope):
         return kind(values)
@@ -159,7 +159,7 @@ def _array(kind: type, values: Any) -> Any:
 
 
 def blend_lengths(shapes: list[mi.Shape]) -> mi.Float:
-    """The table of each shape's `blend_length`."""
+    """The `blend_length` of each shape, by registry index."""
     return _array(mi.Float, _by_index(mi.ShapePtr, shapes, blend_length, 0.0))
 
 
@@ -183,9 +183,9 @@ def smoothing_groups_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
 
 
 def is_coarse(mesh: mi.Mesh) -> bool:
-    """Whether triangles of a mesh leave the normals at their corners by `COARSE` degrees, on average.
+    """Whether triangles of a mesh deviate from their shading normals by `COARSE` degrees or more on average.
 
-    Along their sides, where the shading is smooth, lamps are then hidden that the shading would see.
+    Near their silhouette such triangles hide emitters that the smooth shading would see.
     """
     params = mi.traverse(mesh)
     if mesh.has_face_normals() or not mesh.has_vertex_normals() or "faces" not in params:
@@ -200,17 +200,17 @@ def is_coarse(mesh: mi.Mesh) -> bool:
 
 
 def is_brushed(bsdf: mi.BSDF) -> bool:
-    """Whether a BSDF tells one tangent from another: it, or one nested in it."""
+    """Whether a BSDF, or one nested in it, depends on the shading tangent."""
     if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Anisotropic):
         return True
     return any(isinstance(node, mi.BSDF) and node.class_name() in RELIEFS for node in {bsdf, *nodes_of(bsdf)})
 
 
 def lamp_balls(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:
-    """For each emitter, in the order of the scene, a ball around its mesh: centre, and radius, 0 without one."""
+    """Bounding sphere of each mesh emitter, in the order of the scene's emitters: centre, and radius (0 for others)."""
     lamps = {lamp.emitter(): lamp for lamp in _mesh_lamps(shapes)}
     balls = [_ball(lamps[emitter]) if emitter in lamps else np.zeros(4) for emitter in emitters]
-    return _array(mi.Float, np.ravel(balls or [np.zeros(4)]))  # an empty array would end the process
+    return _array(mi.Float, np.ravel(balls or [np.zeros(4)]))  # an empty array would crash the process
 
 
 def _mesh_lamps(shapes: list[mi.Shape]) -> list[mi.Shape]:
@@ -218,7 +218,7 @@ def _mesh_lamps(shapes: list[mi.Shape]) -> list[mi.Shape]:
 
 
 def _ball(mesh: mi.Mesh) -> np.ndarray:
-    """Around the middle of its box. Mitsuba's rectangle hides its mesh: none."""
+    """Bounding sphere around the centre of the bounding box. Radius 0 for Mitsuba's rectangle, which hides its mesh."""
     params = mi.traverse(mesh)
     if "vertex_positions" not in params:
         return np.zeros(4)
@@ -228,19 +228,19 @@ def _ball(mesh: mi.Mesh) -> np.ndarray:
 
 
 def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], otherwise: V) -> list[V]:
-    """The values of objects by their index in Dr.Jit's registry."""
+    """A list of the objects' values, ordered by Dr.Jit's registry index."""
     found = {dr.reinterpret_array(mi.UInt32, pointer(x))[0]: value(x) for x in objects}
     return [found.get(i, otherwise) for i in range(max(found, default=0) + 1)]
 
 
 def is_null(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:
-    """Whether (or where) a BSDF does nothing but let light straight through."""
+    """Whether (or in which lanes) a BSDF does nothing but pass light unscattered."""
     others = mi.BSDFFlags.Smooth | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
     return bsdf.flags() & (others | mi.BSDFFlags.Null) == +mi.BSDFFlags.Null
 
 
 def _attachables(nodes: set[mi.Object], shapes: list[mi.Shape]) -> list[mi.BSDF]:
-    # A lamp for which the scene names no BSDF has a diffuse one all the same: nobody asked to have that attached.
+    # Mitsuba gives an emissive shape without BSDF a diffuse one; a BSDF that the user did not ask for is not attached.
     of_lamps = {shape.bsdf() for shape in shapes if shape.is_emitter()}
     seen = {shape.bsdf() for shape in shapes if not shape.is_emitter()}
     bsdfs = {node for node in nodes if isinstance(node, mi.BSDF)} - (of_lamps - seen)
@@ -248,7 +248,7 @@ def _attachables(nodes: set[mi.Object], shapes: list[mi.Shape]) -> list[mi.BSDF]
 
 
 def is_painted(emitter: mi.Emitter | mi.EmitterPtr) -> bool | mi.Bool:
-    """Whether (or where) an emitter glows with a texture."""
+    """Whether (or in which lanes) the radiance of an emitter is textured."""
     return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 
@@ -258,9 +258,9 @@ def _is_narrow(bsdfs: list[mi.BSDF]) -> bool:
 
 
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
-    """Whether no point of a surface sees an end of anything: there is one shape only, which sees no end of itself.
+    """Whether no surface point sees an edge: the scene has a single shape, which sees no edge of itself.
 
-    A flat shape does not see itself at all. A sphere does from the inside, where a texture would have a seam.
+    A flat shape does not see itself at all. A sphere sees itself from the inside, where a texture would have a seam.
     """
     if len(shapes) != 1 or shapes[0].is_emitter():
         return False

@@ -1,12 +1,13 @@
-"""Free flight through a medium: delta tracking to the next real collision, and what later passes make of it.
+"""Free flight through a medium: delta tracking to the next real collision, and its derivative in later passes.
 
-Tentative collisions are drawn from a majorant; at each, chance decides whether it is real. Real ones end the flight,
-as does the surface that bounds the medium. This walk is not differentiated. The derivative is that of the integrand,
-transmittance times scattering coefficient, where it was found:
+Tentative collisions are sampled from a majorant; each is real with some probability. The first real collision ends the
+flight, as does the surface that bounds the medium. The sampling is not differentiated. The derivative is that of the
+integrand, transmittance times scattering coefficient, at the sampled distance:
 
     d log T = -∫ dσ_t ds,  estimated at evenly spaced points y of the flight:  -(t - a) · mean of dσ_t(y).
 
-It divides by nothing that may be zero, so that it also holds where null collisions are never drawn (a constant grid).
+This estimator divides by nothing that may be zero. It is therefore also correct where null collisions are never sampled
+(a constant grid).
 """
 
 from __future__ import annotations
@@ -19,18 +20,18 @@ import mitsuba as mi
 from pathreplay.transport.vertex import Arrival, Flight, NullCollision, TraceConfig, reciprocal
 from pathreplay.transport.volume.media import Media, carried, interaction, is_grid, majorant, span
 
-# Points of a flight at which the derivative of its transmittance is taken. Few leave a variance of their own, many take
-# time; of the cloud of `pathreplay bench media` four make the least of both.
+# Number of points of a flight at which the derivative of its transmittance is taken. Fewer add variance, more take
+# time; four give the lowest variance at equal time for the cloud of `pathreplay bench media`.
 POINTS = 4
 
 
 def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
-    """1 / (p + c (1 - p)), where p is the probability of a real collision and c counts null ones.
+    """1 / (p + c (1 - p)), where p is the probability of a real collision and c the relative weight of null collisions.
 
-    The derivative of a collision, dσ_s L_s, is needed also where σ_s is zero and collisions are never real. Real ones
-    estimate it with p / (p + c (1 - p)) of their weight, and null ones with c (1 - p) / (p + c (1 - p)): together all.
-    Each real collision has an estimate of L_s, but only one null collision of a path has. With c the inverse of their
-    number all estimates count alike.
+    The derivative of a collision, dσ_s L_s, is needed also where σ_s is zero and collisions are never real. Real
+    collisions estimate the fraction p / (p + c (1 - p)) of it and null collisions the rest, c (1 - p) / (p + c (1 -
+    p)). Each real collision has an estimate of L_s, but only one null collision per path has. With c the inverse of the
+    number of null collisions, all estimates have equal weight.
     """
     return dr.rcp(p + c * (1 - p))
 
@@ -39,8 +40,8 @@ def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
 def fly(trace: TraceConfig, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: mi.Bool) -> Flight:
     """Sample the flight along ``at.ray``, in ``at.medium``, up to the surface ``at.hit``. Detached.
 
-    ``β`` is the throughput: in chromatic media a collision is real with probability p = Σ_k β_k σ_k / (σ̄ Σ_k β_k), the
-    history of all channels.
+    ``β`` is the throughput. In chromatic media a collision is real with probability p = Σ_k β_k σ_k / (σ̄ Σ_k β_k),
+    which takes the history of all channels into account.
     """
     media = trace.media
     ray, medium = dr.detach(at.ray), at.medium
@@ -49,7 +50,7 @@ def fly(trace: TraceConfig, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, a
     a, b = span(medium, ray, reach, flying)
     flying &= a < b
     σ_max = majorant(medium, ray, flying)
-    if dr.hint(trace.branch, mode="scalar"):  # null collisions are wanted also where the whole medium is empty
+    if dr.hint(trace.branch, mode="scalar"):  # null collisions are needed also where the medium is empty
         σ_max = dr.maximum(σ_max, dr.select(dr.isfinite(b), dr.rcp(b - a), 0))
 
     t = mi.Float(a)
@@ -120,7 +121,7 @@ def _tentative(
     σ: mi.Float,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:
-    """How far it is from ``t`` to the next tentative collision, and the majorant there: σ, but in grids."""
+    """Distance from ``t`` to the next tentative collision, and the majorant there: σ, except in grids."""
     step = dr.select(σ > 0, -dr.log(1 - u) * dr.rcp(σ), dr.inf)
     for grid in trace.media.grids:
         mine = active & is_grid(grid, medium)
@@ -142,26 +143,26 @@ def _reality(media: Media, βW: mi.Spectrum, σ_t: mi.Spectrum, σ_bar: mi.Float
 
 @dataclass
 class Flown:
-    """A flight once more, differentiable."""
+    """A recorded flight, evaluated again differentiably."""
 
-    mei: mi.MediumInteraction3f  # of the collision
-    w: mi.Spectrum  # weight of what comes after, σ_s/density at a collision, times transmittance (1, relative)
-    e: mi.Spectrum  # emission on the way, and a control variate: value zero, derivative of mean zero
+    mei: mi.MediumInteraction3f  # the interaction at the collision
+    w: mi.Spectrum  # weight of the radiance from the end: σ_s/density at a collision, times 1 = relative transmittance
+    e: mi.Spectrum  # emission along the flight, and a control variate with value zero and a derivative of mean zero
 
 
 def fly_again(
     trace: TraceConfig, at: Arrival, flight: Flight, reach: mi.Float, attached: bool, active: mi.Bool
 ) -> Flown:
-    """The kept flight, differentiable in the coefficients of the medium and, if ``attached``, in ray and ``reach``.
+    """The recorded flight, differentiable in the medium's coefficients and, if ``attached``, in ray and ``reach``.
 
-    ``reach`` is the distance to the surface (infinity if there is none). A collision keeps its place relative to the
-    two ends of the medium on its ray, so that it moves with the ray and with the surface, and no derivative is lost
-    where the flight is cut off. With b any function of position and direction (`TraceConfig.baseline`),
+    ``reach`` is the distance to the surface (infinity if there is none). A collision keeps its position relative to the
+    two ends of the medium on its ray. It thus moves with the ray and with the surface, and no derivative is lost at the
+    end of the flight. With b any function of position and direction (`TraceConfig.baseline`),
 
         (t - a) dσ_t(y) b(y) - dσ_t(x) b(x) / density        (the last term at a collision x only)
 
-    is the score of the sampling itself, times b: its mean is zero. It takes out the variance that comes from the
-    radiance being large and its change with the medium small.
+    is the score of the sampling density times b, whose mean is zero. It removes the variance that arises because the
+    radiance is large while its derivative with respect to the medium is small.
     """
     medium, ray = at.medium, at.ray
     in_medium = active & (medium != None)  # noqa: E711
@@ -179,7 +180,7 @@ def fly_again(
 
     σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
     σ_y = [medium.get_scattering_coefficients(y, through)[2] for y in points]
-    if trace.branch:  # The rest of the derivative of a collision, but not by its place, is left to null ones.
+    if trace.branch:  # null collisions estimate the rest of the collision's derivative, except that by its position
         rest = 1 - flight.p * branch_weight(flight.p, trace.branching)
         still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
         σ_s, σ_t = (σ - rest * (σ_0 - dr.detach(σ_0)) for σ, σ_0 in ((σ_s, still[0]), (σ_t, still[2])))
@@ -220,6 +221,6 @@ def fly_again(
 def _guess(
     trace: TraceConfig, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool
 ) -> mi.Spectrum:
-    """The baseline; where collisions are never real, and null ones not asked, it would be a bias, and is left out."""
+    """The baseline; zero where it would cause bias, where collisions are never real and no null ones are kept."""
     b = trace.baseline(mei, σ_t, σ_bar, active)  # type: ignore[misc]
     return b if trace.branch else mi.Spectrum(dr.select(dr.detach(σ_t) != 0, b, 0))

@@ -1,4 +1,4 @@
-"""Facts about the media of a scene, found on the host before a kernel is traced, and what a medium is at one place."""
+"""Facts about the media of a scene, computed before a kernel is traced, and medium interactions along rays."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from pathreplay.transport.facts.nodes import nodes_of, with_gradients
 
 @dataclass(frozen=True)
 class Media:
-    """What the walk wants to know about the media of a scene."""
+    """Facts about the media of a scene on which the trace depends."""
 
-    grids: tuple[mi.Medium, ...]  # those with functions of their own for free flight and transmittance (`gridmedium`)
-    plain: bool  # there are others, which only Mitsuba knows
-    homogeneous: bool  # some of those have the same coefficients everywhere
+    grids: tuple[mi.Medium, ...]  # media with their own free flight and transmittance (`gridmedium`)
+    plain: bool  # there are other media, accessible only through Mitsuba's interface
+    homogeneous: bool  # some of these other media have constant coefficients
     chromatic: bool  # some extinction differs between channels
     emissive: bool  # some medium emits
-    passes: bool  # some surface may let light straight through by chance
-    branches: bool  # the gradient by some extinction would miss what collisions tell where there are none
-    around: mi.Medium | None  # the one that the sensor is in
+    passes: bool  # some surface may randomly pass light unscattered
+    branches: bool  # see `wants_branch`
+    around: mi.Medium | None  # the medium that contains the sensor
 
 
 def scene_media(
     media: Sequence[mi.Medium], passes: bool, sensor: mi.Sensor | None, branches: bool | None = None
 ) -> Media | None:
-    """Look at the media of a scene; None if there are none. ``passes`` is that of `Media`; the sensor may be in one.
+    """Inspect the media of a scene; None without media. ``passes`` is a field of `Media`.
 
-    So is ``branches``, if it is known already.
+    The sensor may be inside a medium. ``branches`` is the result of `wants_branch`, if it is known already.
     """
     if not media:
         return None
@@ -63,19 +63,19 @@ def _is_chromatic(medium: mi.Medium) -> bool:
 
 
 def wants_branch(media: Sequence[mi.Medium]) -> bool:
-    """Whether the gradient by some extinction would miss what collisions tell where there are none."""
+    """Whether some extinction gradient needs null collisions, to include scattering where collisions are never real."""
     return any(map(_misses, media))
 
 
 def _misses(medium: mi.Medium) -> bool:
-    """Whether the extinction has gradients, and varies in space or is zero, or may be while `dr.freeze` records."""
+    """Whether the extinction has gradients and varies in space or is zero (unknown while `dr.freeze` records)."""
     moving = with_gradients(medium, "sigma_t", "scale")
     known = medium.is_homogeneous() and not dr.flag(dr.JitFlag.FreezingScope)
     return bool(moving) and not (known and all(dr.all(dr.detach(value) != 0, axis=None) for value in moving))
 
 
 def interaction(medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float) -> mi.MediumInteraction3f:
-    """The interaction at distance ``t`` along ``ray``; it follows both."""
+    """The medium interaction at distance ``t`` along ``ray``, differentiable in both."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.t = t
     mei.p = ray.o + t * ray.d
@@ -88,7 +88,7 @@ def interaction(medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float) -> mi.MediumIn
 
 
 def span(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """The part [a, b] of the ray up to distance ``reach`` in which the medium may interact; empty (a = b = 0) outside.
+    """The part [a, b] of the ray, up to ``reach``, in which the medium may interact; a = b = 0 if it is empty.
 
     Differentiable in the ray and in ``reach``.
     """
@@ -100,10 +100,10 @@ def span(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) 
 
 
 def carried(t: mi.Float, a: mi.Float, b: mi.Float, where: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """A distance that keeps its place relative to the ends of [a, b] as they move, and how much that stretches.
+    """A distance with fixed position relative to the moving ends of [a, b], and the stretch factor of the interval.
 
-    Values are those without motion, ``t`` and 1; derivatives are those of a + x (b - a) and (b - a) / (b₀ - a₀), with
-    x the place. Where ``where`` is false, or the end is infinitely far, nothing moves.
+    The values are those without motion, ``t`` and 1. The derivatives are those of a + x (b - a) and (b - a) / (b₀ -
+    a₀), with x the relative position. Where ``where`` is false or b is infinite, nothing moves.
     """
     a0, b0 = dr.detach(a), dr.detach(b)
     held = where & dr.isfinite(b0) & (a0 < b0)
@@ -113,10 +113,10 @@ def carried(t: mi.Float, a: mi.Float, b: mi.Float, where: mi.Bool) -> tuple[mi.F
 
 
 def majorant(medium: mi.MediumPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-    """An upper bound of the extinction in all channels, everywhere in the medium. Detached."""
+    """An upper bound of the extinction in all channels and everywhere in the medium. Detached."""
     return dr.max(dr.detach(medium.get_majorant(interaction(medium, dr.detach(ray), mi.Float(0)), active)))
 
 
 def is_grid(grid: mi.Medium, medium: mi.MediumPtr) -> mi.Bool:
-    """Where an array of media points at this grid."""
+    """Lanes whose medium is this grid."""
     return medium == mi.MediumPtr(grid)

@@ -1,6 +1,6 @@
-"""Passage: what a straight line meets behind null boundaries, and what media on the way leave of its light.
+"""Rays through null boundaries: the first hit behind them, and the transmittance of the media on the way.
 
-Edges are looked for as if null boundaries were not there: light goes straight through them, so that they hide nothing.
+The search for edges ignores null boundaries: light passes straight through them, so they occlude nothing.
 """
 
 from __future__ import annotations
@@ -14,20 +14,21 @@ from pathreplay.transport.vertex import TraceConfig
 from pathreplay.transport.volume.shadow import Stretch, shadow, transmittance
 
 SHORT_OF = 1 - 1e-3
-"""Of the way to an edge, the part that its sides share: a little less than all, so that both still meet something."""
+"""Fraction of the distance to an edge over which both sides share the transmittance: slightly below 1, so that the rays
+of both sides still intersect the surfaces behind."""
 STEP = 1e-5
-"""Share of distance and coordinates that lie between a boundary and what is looked for behind it."""
+"""Offset behind a null boundary at which the next ray starts, relative to distance and coordinates."""
 
 
 @dr.syntax
 def skip_null(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """The hit, or the first one behind null boundaries; distances are told along ``ray``."""
+    """The hit, or the first hit behind null boundaries; distances are measured along ``ray``."""
     here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
     passing = active & _is_boundary(here)
     while dr.hint(passing, exclude=[trace, ray], label="pathreplay: beyond null boundaries"):
-        # On the same line, from which `spawn_ray` would depart.
+        # Stays on the line of the ray; `spawn_ray` would offset the origin sideways.
         gone = t + STEP * (1 + dr.max(dr.abs(ray.o)) + t)
         onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
         here = meet(trace, onward, passing)
@@ -45,7 +46,7 @@ def _is_boundary(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
 def transmittance_up_to(
     trace: TraceConfig, ray: mi.Ray3f, reach: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.MediumPtr]:
-    """The transmittance of the first ``reach`` of a ray that starts in ``medium``, and the medium there. Detached."""
+    """Transmittance over the first ``reach`` of a ray from inside ``medium``, and the medium at its end. Detached."""
     ray = mi.Ray3f(ray)
     ray.maxt = reach
     stretch = Stretch.begin(ray, medium, active)
@@ -60,9 +61,10 @@ def transmittance_up_to(
 def transmittance_past_edge(
     trace: TraceConfig, ray: mi.Ray3f, t: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
 ) -> mi.Spectrum:
-    """The transmittance of a shadow ray that passes an edge at distance ``t``. Detached.
+    """Transmittance of a shadow ray that passes an edge at distance ``t``. Detached.
 
-    In two parts, so that it passes on its side: null boundaries push rays aside by more than they are off the edge.
+    It is computed in two parts, so that the ray passes the edge on its own side: `spawn_ray` at null boundaries shifts
+    rays sideways by more than their distance from the edge.
     """
     t = SHORT_OF * t
     T, medium = transmittance_up_to(trace, ray, t, medium, sampler, active)

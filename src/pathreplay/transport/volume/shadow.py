@@ -1,7 +1,8 @@
-"""Shadow rays through media and null boundaries: ratio tracking, and the derivative of the transmittance it found.
+"""Shadow rays through media and null boundaries: ratio tracking, and the derivative of the estimated transmittance.
 
-T = exp(-∫ σ_t ds) is estimated by walking from boundary to boundary; in homogeneous media it is known. Its derivative
-is taken at one point y, uniform over the whole length Λ of medium on the ray:  d log T = -Λ dσ_t(y).
+T = exp(-∫ σ_t ds) is estimated from boundary to boundary; in homogeneous media it is known in closed form. Its
+derivative is taken at one point y, uniformly distributed over the total length Λ of medium on the ray:  d log T = -Λ
+dσ_t(y).
 """
 
 from __future__ import annotations
@@ -18,22 +19,22 @@ from pathreplay.transport.volume.media import carried, interaction, is_grid, maj
 
 @dataclass
 class Stretch:
-    """A shadow ray on its way (loop state): the stretch up to the next surface, in one medium or in none."""
+    """Loop state of a shadow ray: the segment up to the next surface, inside one medium or none."""
 
-    ray: mi.Ray3f  # from the last surface on
-    far: mi.Float  # length of the whole
-    gone: mi.Float  # distance from its origin
+    ray: mi.Ray3f  # the ray from the last surface on
+    far: mi.Float  # length of the whole shadow ray
+    gone: mi.Float  # distance from the shadow ray's origin to the last surface
     medium: mi.MediumPtr
     active: mi.Bool
 
     @staticmethod
     def begin(ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool) -> Stretch:
-        """The first one of a ray that starts in ``medium``. Detached."""
+        """The first segment of a ray that starts in ``medium``. Detached."""
         ray = mi.Ray3f(dr.detach(ray))
         return Stretch(ray, mi.Float(ray.maxt), mi.Float(0), mi.MediumPtr(medium), mi.Bool(active))
 
     def part(self, trace: TraceConfig) -> tuple[mi.PreliminaryIntersection3f, mi.Float, mi.Float, mi.Bool]:
-        """The surface at its end, the part [a, b] of the ray that a medium fills, and whether there is one."""
+        """The surface at the segment's end, the part [a, b] of the ray inside a medium, and where it is non-empty."""
         self.ray.maxt = self.far - self.gone
         hit = meet(trace, self.ray, self.active)
         inside = self.active & (self.medium != None)  # noqa: E711 (an array of pointers)
@@ -41,7 +42,7 @@ class Stretch:
         return hit, a, b, inside & (a < b)
 
     def beyond(self, hit: mi.PreliminaryIntersection3f, T: mi.Spectrum) -> tuple[Stretch, mi.Spectrum]:
-        """The stretch behind that surface, and ``T`` times what the surface lets pass."""
+        """The segment behind that surface, and ``T`` times the null transmission of the surface."""
         met, ray = self.active & hit.is_valid(), mi.Ray3f(self.ray)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, met)
         T = dr.select(met, T * si.bsdf(ray).eval_null_transmission(si, met), T)
@@ -54,7 +55,7 @@ class Stretch:
 
 @dr.syntax
 def shadow(trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool) -> Shadow:
-    """Estimate the transmittance along a shadow ray, which starts in ``medium``. Detached."""
+    """Estimate the transmittance along a shadow ray that starts in ``medium``. Detached."""
     stretch = Stretch.begin(ray, medium, active)
     T = mi.Spectrum(1)
     y, y_medium, length = mi.Float(0), dr.zeros(mi.MediumPtr), mi.Float(0)
@@ -81,7 +82,7 @@ def transmittance(
     sampler: mi.Sampler,
     active: mi.Bool,
 ) -> mi.Spectrum:
-    """An unbiased estimate of the transmittance of one medium between the distances a and b."""
+    """Unbiased estimate of the transmittance of one medium between the distances a and b."""
     media = trace.media
     T = mi.Spectrum(1)
     rest = mi.Bool(active)
@@ -105,7 +106,7 @@ def transmittance(
 def ratio_tracking(
     medium: mi.MediumPtr, ray: mi.Ray3f, a: mi.Float, b: mi.Float, sampler: mi.Sampler, active: mi.Bool
 ) -> mi.Spectrum:
-    """T = Π (1 - σ_t/σ̄) over tentative collisions between a and b, with Mitsuba's majorant of the whole medium."""
+    """T = Π (1 - σ_t/σ̄) over tentative collisions between a and b, with Mitsuba's global majorant of the medium."""
     σ_bar = majorant(medium, ray, active)
     active = active & (σ_bar > 0)
     t = mi.Float(a)
@@ -120,9 +121,9 @@ def ratio_tracking(
 
 
 def shadow_again(trace: TraceConfig, ray: mi.Ray3f, kept: Shadow, attached: bool, active: mi.Bool) -> mi.Spectrum:
-    """The kept transmittance, differentiable in σ_t and, if ``attached``, in the two ends of the ray.
+    """The recorded transmittance, differentiable in σ_t and, if ``attached``, in the two ends of the ray.
 
-    The point y keeps its place between the two surfaces (or ends of the ray) next to it.
+    The point y keeps its position relative to the two surfaces (or ray ends) next to it.
     """
     walked = active & (kept.medium != None)  # noqa: E711
     y, growth = kept.y, mi.Float(1)
@@ -142,15 +143,15 @@ def shadow_again(trace: TraceConfig, ray: mi.Ray3f, kept: Shadow, attached: bool
 
 
 def _boundary(trace: TraceConfig, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int, active: mi.Bool) -> mi.Float:
-    """Distance along ``ray`` of the first surface that is met from y on towards its end (sign 1) or origin (sign -1).
+    """Distance along ``ray`` to the first surface beyond y, towards the end (sign 1) or the origin (sign -1).
 
-    Where none is met it is the end of the ray, or its origin (0). Differentiable in the ray and in the surface.
+    If there is none, the distance is that of the ray's end, or 0. Differentiable in the ray and in the surface.
     """
     probe = mi.Ray3f(still.o + y * still.d, sign * still.d, still.time, still.wavelengths)
     probe.maxt = still.maxt - y if sign > 0 else y
     hit = meet(trace, probe, active)
     met = active & hit.is_valid()
-    # The same surface, as the attached ray meets it from y on: a sphere answers for what a ray meets first.
+    # Intersect the attached ray from y on: the interaction with a sphere is that of the first hit along the ray.
     probe.o, probe.d = ray.o + y * ray.d, sign * ray.d
     si = hit.compute_surface_interaction(probe, mi.RayFlags.All, met)
     return dr.select(met, dr.replace_grad(y + sign * hit.t, y + sign * si.t), ray.maxt if sign > 0 else 0)
