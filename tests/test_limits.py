@@ -30,7 +30,7 @@ def test_a_container_s_limit_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     statistics.write_text("")
     limit.write_text("1\n")
     assert memory.available() == 0
-    with pytest.raises(PathreplayError, match=r"A film needs about 5 GB of memory, 0 GB are left; take less"):
+    with pytest.raises(PathreplayError, match=r"A film needs about 5 GB of memory, 0 GB is available; take less"):
         memory.require(5 * 10**9, "A film", "take less")
 
 

@@ -203,9 +203,7 @@ def test_a_budget_holds_within_its_block(monkeypatch: pytest.MonkeyPatch) -> Non
         memory.require_kept()
         monkeypatch.setattr(memory, "taken", lambda: 5 * 10**9)
         assert memory.available() == 0
-        with pytest.raises(
-            PathreplayError, match=r"takes 5 GB of memory, and its 'memory_limit' is 4 GB; take smaller"
-        ):
+        with pytest.raises(PathreplayError, match=r"uses 5 GB of memory, and its 'memory_limit' is 4 GB; use smaller"):
             memory.require_kept()
     memory.require_kept()
     assert not memory.is_crowded()

@@ -119,7 +119,7 @@ def test_passes_add_up_to_one_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     ("output", "changes", "line"),
     [
         ("image.jpg", {}, r"ends in '\.jpg'; give -o a name"),
-        ("nowhere/image.exr", {}, "nowhere for image.exr does not exist; make it first"),
+        ("nowhere/image.exr", {}, "nowhere for image.exr does not exist; create it first"),
         ("image.exr", {"sensor": "back"}, "No sensor 'back' in the scene; it has sensor"),
         ("image.exr", {"sensor": "1"}, "No sensor '1'"),
         ("image.exr", {"size": "12x"}, "--size '12x' is not a size"),

@@ -127,9 +127,9 @@ def test_too_few_addresses_are_told(limit: int, room: Path) -> None:
     limited = f"import resource; resource.setrlimit(resource.RLIMIT_AS, 2 * [{limit * 1024}]); import sys; "
     done = python(limited + "sys.argv[1:] = ['optimize', 'job.json']; from pathreplay.cli import main; main()")
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
-    assert done.stderr.startswith(f"{ERROR}{limit} kB of addresses (ulimit -v) are too little")
+    assert done.stderr.startswith(f"{ERROR}{limit} kB of address space (ulimit -v) is too little")
     done = python(limited + "import pathreplay; pathreplay.optimize('job.json')")
-    assert f"PathreplayError: {limit} kB of addresses" in done.stderr.splitlines()[-1]
+    assert f"PathreplayError: {limit} kB of address space" in done.stderr.splitlines()[-1]
 
 
 def test_a_library_that_is_not_loaded_for_want_of_addresses_is_told(

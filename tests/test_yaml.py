@@ -103,7 +103,7 @@ def test_what_a_program_writes_comes_back() -> None:
 
 def test_a_file_that_would_take_long_to_read_is_no_job() -> None:
     Path("job.yaml").write_text("- [1, 2]\n" * 40_000)
-    with pytest.raises(PathreplayError, match="has 360000 bytes, more than the 262144 that are read"):
+    with pytest.raises(PathreplayError, match="has 360000 bytes, more than the limit of 262144"):
         load_config(Path("job.yaml"))
 
 

@@ -1,1 +1,1 @@
-"""The machine: LLVM and variants, devices, memory, threads, signals and files."""
+"""The platform: LLVM and variants, devices, memory, threads, signals and files."""

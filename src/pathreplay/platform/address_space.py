@@ -1,4 +1,4 @@
-"""The limit on this process's addresses (``ulimit -v``): under a low one native code hangs or dies as it is loaded."""
+"""The limit on the address space (``ulimit -v``): if it is too low, native libraries hang or crash on loading."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 LEAST = 700_000 * 1024
-"""Bytes: with 600 000 kB matplotlib's libraries are not mapped, and with 450 000 Mitsuba's hang."""
+"""Bytes. With 600 000 kB matplotlib's libraries cannot be mapped; with 450 000 kB loading Mitsuba hangs."""
 
 _SIGNS = ("failed to map segment", "cannot allocate memory")
 
 
 def is_too_small() -> bool:
-    """Whether Mitsuba and the rest cannot be loaded under the limit."""
+    """Whether the limit is too low to load Mitsuba and its dependencies."""
     if resource is None:
         return False
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
@@ -24,20 +24,20 @@ def is_too_small() -> bool:
 
 
 def require() -> None:
-    """Raise PathreplayError if the limit is too small."""
+    """Raise PathreplayError if the limit is too low."""
     if is_too_small():
         raise PathreplayError(_line())
 
 
 def told(error: ImportError) -> str:
-    """What is to be said of a library that could not be loaded for want of addresses; "" for another reason."""
+    """A one-line message if a library failed to load for lack of address space; "" for any other reason."""
     return f"{_line()} ({error})" if any(sign in str(error).lower() for sign in _SIGNS) else ""
 
 
 def _line() -> str:
     limit = None if resource is None else resource.getrlimit(resource.RLIMIT_AS)[0]
-    limited = "" if limit in (None, -1) else f"{limit // 1024} kB of addresses (ulimit -v) are "
+    limited = "" if limit in (None, -1) else f"{limit // 1024} kB of address space (ulimit -v) is "
     return (
-        f"{limited or 'The memory that is left is '}too little to load Mitsuba and LLVM, which want {LEAST // 1024} kB "
-        "and more with many cores; raise it: ulimit -v unlimited"
+        f"{limited or 'The available memory is '}too little to load Mitsuba and LLVM, which need {LEAST // 1024} kB, "
+        "and more with many cores; raise the limit: ulimit -v unlimited"
     )

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all: written beside their place first, and renamed once they are on the disk."""
+"""Atomic file writes: a temporary file beside the target is written, flushed to disk, and renamed."""
 
 from __future__ import annotations
 
@@ -18,32 +18,38 @@ from pathreplay.platform.interrupts import undisturbed
 
 Chunk: TypeAlias = "bytes | memoryview"
 Content: TypeAlias = "bytes | Callable[[], Iterable[Chunk]]"
-"""What is written into a file: bytes, or what makes them, chunk by chunk, when it is called."""
+"""Content of a file: bytes, or a function that yields them in chunks when called."""
 
 
 def chunks(content: Content) -> Iterable[Chunk]:
-    """What a file shall hold, a chunk after the other."""
+    """The content of a file in chunks."""
     return (content,) if isinstance(content, bytes) else content()
 
 
 def made(make: Callable[..., bytes], *arguments: object) -> Content:
-    """The bytes that a function makes of the arguments, when they are written and not before."""
+    """Content that ``make(*arguments)`` computes when the file is written, not before."""
     return lambda: (make(*arguments),)
 
 
 def require_writable(path: Path, option: str) -> None:
-    """Raise PathreplayError where no file can be written: a folder or a device of that name, no folder, no right."""
+    """Raise PathreplayError if no file can be written at ``path``.
+
+    Reasons: it is a folder or a device, its folder does not exist, or permissions are missing.
+    """
     problem = file_problem(path)
     if problem.startswith(("is ", "cannot be reached")):
         raise PathreplayError(f"{path} {problem}; give {option} the name of a file")
     if not path.parent.is_dir():
-        raise PathreplayError(f"Folder {path.parent} for {path.name} does not exist; make it first")
+        raise PathreplayError(f"Folder {path.parent} for {path.name} does not exist; create it first")
     if not os.access(path.parent, os.W_OK):
-        raise PathreplayError(f"{path} may not be written (permissions of its folder); give {option} another file")
+        raise PathreplayError(f"{path} cannot be written (permissions of its folder); give {option} another file")
 
 
 def write_whole(path: Path, data: bytes, option: str) -> None:
-    """Write the file, in the place of one that is there. Raises PathreplayError where that fails; nothing is left."""
+    """Write the file atomically, replacing an existing one.
+
+    Raises PathreplayError if that fails, and leaves nothing behind.
+    """
     part = None
     try:
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name[:100]}.", delete=False) as file:
@@ -78,7 +84,7 @@ def whole_folder(path: Path, option: str) -> Iterator[Path]:
         yield part
         with undisturbed():
             part.chmod(0o777 & ~_umask())
-            os.replace(part, path)  # in the place of an empty folder, too
+            os.replace(part, path)  # also replaces an empty folder
     except BaseException as error:
         if part is not None:
             shutil.rmtree(part, ignore_errors=True)
@@ -88,7 +94,7 @@ def whole_folder(path: Path, option: str) -> Iterator[Path]:
 
 
 def _umask() -> int:
-    """What the user wants taken from permissions: temporary files have none for others."""
+    """The process's umask: temporary files are created without permissions for others, so it is applied by hand."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

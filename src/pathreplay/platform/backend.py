@@ -1,9 +1,9 @@
-"""Points Dr.Jit at a libLLVM that works, and picks a variant of Mitsuba when asked.
+"""Point Dr.Jit to a working libLLVM, and select a variant of Mitsuba on request.
 
-Dr.Jit looks for libLLVM once, while `drjit` is imported: it takes the file that DRJIT_LIBLLVM_PATH names, otherwise
-the newest in a few folders. So the variable has to be right by then, and `point_drjit` is the first thing that
-`import pathreplay` does. It runs no trial: pip's library is known to work. Trials (pathreplay.platform.llvm) are for
-`set_variant` and the doctor.
+Dr.Jit searches libLLVM once, when `drjit` is imported: it loads the file named by DRJIT_LIBLLVM_PATH, otherwise the
+newest one in a few folders. The variable must therefore be correct before that, and `import pathreplay` calls
+`point_drjit` first. It does not test the library, because pip's library is known to work. Tests in a subprocess
+(pathreplay.platform.llvm) are left to `set_variant` and the doctor.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ logger = logging.getLogger("pathreplay")
 
 
 def point_drjit() -> None:
-    """Make Dr.Jit load a libLLVM that works, without a trial. Raises nothing.
+    """Make Dr.Jit load a working libLLVM, without testing it. Raises nothing.
 
-    Before drjit is imported: sets DRJIT_LIBLLVM_PATH, unless it names a file that can be loaded, to pip's library,
-    otherwise to the system's newest that is not known to fail. Afterwards: reloads one that is known to fail.
+    Before drjit is imported: unless DRJIT_LIBLLVM_PATH names a loadable file, set it to pip's library, otherwise to the
+    newest system library that is not known to fail. After drjit is imported: replace a loaded library that is known to
+    fail.
     """
     if "drjit" in sys.modules:
         path = None if loaded_is_plausible() else _untried_choice()
@@ -42,7 +43,7 @@ def point_drjit() -> None:
 
 
 def _known_problem(path: str) -> str:
-    """What can be said against a libLLVM without a trial: too old by its name, or not loadable."""
+    """The known defect of a libLLVM, found without a test: too old by its file name, or not loadable."""
     version = llvm.version_in_path(os.path.realpath(path))
     if version and version < (OLDEST_USABLE_MAJOR,):
         return f"LLVM {version[0]} is refused by Dr.Jit or aborts the process"
@@ -61,7 +62,7 @@ def _untried_choice() -> str | None:
 
 
 def _preload(paths: list[str]) -> str:
-    """Load shared libraries into this process; the reason in one line if one cannot be loaded, otherwise ""."""
+    """Load shared libraries into this process; return a one-line reason if one cannot be loaded, otherwise ""."""
     for path in paths:
         try:
             ctypes.CDLL(path)
@@ -71,23 +72,23 @@ def _preload(paths: list[str]) -> str:
 
 
 def loaded_version() -> tuple[int, ...]:
-    """Version of the libLLVM that Dr.Jit uses in this process, e.g. (23, 1, 4); empty if its LLVM back end is off."""
+    """Version of the libLLVM that Dr.Jit has loaded, e.g. (23, 1, 4); empty if the LLVM back end is inactive."""
     import drjit as dr
 
     return tuple(dr.detail.llvm_version()) if dr.has_backend(dr.JitBackend.LLVM) else ()
 
 
 def loaded_is_plausible() -> bool:
-    """Whether Dr.Jit's LLVM back end is on, with a version that is not known to abort the process."""
+    """Whether Dr.Jit's LLVM back end is active, with a version that is not known to abort the process."""
     return loaded_version() >= (OLDEST_USABLE_MAJOR,)
 
 
 def reload_llvm(path: str) -> bool:
-    """Have Dr.Jit, which is loaded already, give up its libLLVM and load `path`; False if that is impossible.
+    """Make an imported Dr.Jit release its libLLVM and load `path`; return False if that is impossible.
 
-    Done only while Dr.Jit holds neither variables nor a CUDA device, which would be lost. Uses two functions of
-    libdrjit-core that Python does not offer (`jit_shutdown`, `jit_init`). Impossible as well where Dr.Jit found no
-    file at all that it could load: it never looks a second time.
+    It is impossible while Dr.Jit holds variables or a CUDA device, which would be lost, and where Dr.Jit found no
+    loadable file at all, because it does not search a second time. Uses two functions of libdrjit-core without Python
+    bindings (`jit_shutdown`, `jit_init`).
     """
     import drjit as dr
 
@@ -98,7 +99,7 @@ def reload_llvm(path: str) -> bool:
     try:
         core = ctypes.CDLL(os.path.join(os.path.dirname(dr.__file__), "libdrjit-core.so"))
         shutdown, init = core._Z12jit_shutdowni, core._Z8jit_initj
-    except (OSError, AttributeError):  # another platform, or another Dr.Jit
+    except (OSError, AttributeError):  # unsupported platform or Dr.Jit version
         return False
     before = os.environ.get(ENVIRONMENT_VARIABLE)
     os.environ[ENVIRONMENT_VARIABLE] = path
@@ -114,7 +115,7 @@ def reload_llvm(path: str) -> bool:
 
 
 def warn_of_bad_llvm() -> None:
-    """Log a warning if the libLLVM in this process is one that aborts it; for the moment an LLVM variant is set."""
+    """Log a warning if this process has loaded a libLLVM that aborts it; called when an LLVM variant is set."""
     if not loaded_is_plausible():
         logger.warning(
             "Dr.Jit has loaded libLLVM %s, which aborts the process at the first minimum or maximum: %s",
@@ -123,10 +124,11 @@ def warn_of_bad_llvm() -> None:
 
 
 def ensure_llvm() -> None:
-    """See to it that Dr.Jit's LLVM back end works in this process.
+    """Ensure that Dr.Jit's LLVM back end works in this process.
 
-    Pip's library is trusted once it is loaded; any other is tried (0.3 s), and replaced if it fails.
-    Raises PathreplayError if there is none that works, or if it is too late to change.
+    Pip's library is trusted once it is loaded. Any other library is tested (0.3 s), and replaced if the test fails.
+
+    Raises PathreplayError if no library works, or if the loaded one can no longer be replaced.
     """
     current = os.environ.get(ENVIRONMENT_VARIABLE, "")
     plausible = loaded_is_plausible()
@@ -141,22 +143,22 @@ def ensure_llvm() -> None:
     if not reload_llvm(library.path):
         raise PathreplayError(
             f"Dr.Jit has loaded {current or 'a libLLVM'} that does not work ({tried.message or 'back end inactive'}), "
-            f"and cannot change it any more: start again with {ENVIRONMENT_VARIABLE}={library.path}"
+            f"and can no longer replace it: start again with {ENVIRONMENT_VARIABLE}={library.path}"
         )
 
 
 def is_usable_variant(name: str) -> bool:
-    """Whether pathreplay can differentiate in this variant of Mitsuba: automatic differentiation, no polarisation."""
+    """Whether a Mitsuba variant is usable: with automatic differentiation and without polarisation."""
     return "_ad_" in name and not name.endswith("_polarized")
 
 
 def set_variant(name: str | None = None) -> str:
-    """Set a variant of Mitsuba that runs here, and return its name.
+    """Set a Mitsuba variant that runs on this machine, and return its name.
 
-    Without a name an active variant with automatic differentiation is kept; otherwise CUDA is taken if there is a
-    device (`cuda_ad_rgb`), otherwise LLVM (`llvm_ad_rgb`).
+    Without a name, an active variant with automatic differentiation is kept. Otherwise CUDA is used if there is a
+    device (`cuda_ad_rgb`), and LLVM if not (`llvm_ad_rgb`).
 
-    Raises PathreplayError for a name that does not exist, has no derivatives or is polarised, and if nothing runs here.
+    Raises PathreplayError for a name that does not exist, has no derivatives or is polarised, and if no variant runs.
     """
     try:
         import drjit as dr
@@ -175,9 +177,9 @@ def set_variant(name: str | None = None) -> str:
         ensure_llvm()
     try:
         mi.set_variant(name)
-    except ImportError as error:  # Mitsuba's way to say that a back end is off
+    except ImportError as error:  # raised by Mitsuba if a back end is unavailable
         if (error.name or "").startswith("pathreplay"):
-            raise  # a module of ours is missing: nothing that the user can mend
+            raise  # one of our own modules is missing: not an error that the user can fix
         reason = " ".join(str(error).split())
         raise PathreplayError(f"variant {name} does not run here ({reason}): see `pathreplay doctor`") from error
     return name

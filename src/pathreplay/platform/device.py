@@ -1,11 +1,11 @@
-"""Where kernels run, and all that is decided by that: what a lane may remember, what memory there is, what is random.
+"""The device that runs kernels, and what depends on it: local memory per lane, total memory, order of additions.
 
-On LLVM a kernel has as many lanes under way as threads have places in a packet, and local memory is a part of each
-thread's stack. A GPU sets local memory aside for every thread that can be resident, whatever is launched: a record of
-124 bytes x depth 2048 x 2048 threads x 132 multiprocessors is 69 GB. So deep records are for processors.
+On LLVM as many lanes run at once as the threads' vector packets hold, and local memory is part of each thread's stack.
+A GPU reserves local memory for every thread that can be resident, whatever the launch size: records of 124 bytes at
+depth 2048, for 2048 threads on each of 132 multiprocessors, take 69 GB. Deep records are therefore for CPUs only.
 
-What stands here about GPUs was measured on an H100 (docs/memory.md), is tested with devices that are made up, and is
-measured by `pathreplay doctor --gpu` elsewhere.
+The statements about GPUs were measured on an H100 (docs/memory.md) and are tested with simulated devices. On other GPUs
+`pathreplay doctor --gpu` measures them.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from pathreplay.errors import PathreplayError
 from pathreplay.platform import memory
 
 SHARE = 0.25
-"""Of a GPU's memory that records may take: the rest is for scene, film, and what else runs there."""
+"""Fraction of GPU memory that records may take; the rest is for the scene, the film and other processes."""
 LARGEST_LOCAL = 56 * 1024
-"""Bytes that a CUDA thread may remember: OptiX gives it a stack of 64 KiB, and ends the process where that is not
-enough. A record of 560 x 96 bytes fits, one of 700 x 96 does not."""
+"""Largest number of bytes of local memory per CUDA thread. OptiX provides a stack of 64 KiB and crashes the process if
+it overflows. A record of 560 x 96 bytes fits; one of 700 x 96 does not."""
 FEWEST_RECORDS = 9
-"""That a GPU makes room for: an array of up to eight is kept in registers, and reading one of these by its index makes
-a pass take more than twice as long."""
+"""Smallest number of records allocated on a GPU. Arrays of up to eight entries are kept in registers, where dynamic
+indexing makes a pass more than twice as slow."""
 
-# CUDA's numbers for what it is asked.
+# CUDA device attributes.
 _MULTIPROCESSORS, _THREADS_EACH = 16, 39
 
 
 @dataclass(frozen=True)
 class Device:
-    """Where kernels of a variant run.
+    """The device that runs the kernels of a variant.
 
-    ``lanes`` is how many hold local memory at once, and ``memory`` how many bytes the device has of its own; both are 0
-    for processors, whose limits are those of stack and machine.
+    ``lanes`` is the number of lanes that hold local memory at once, and ``memory`` the device's own memory in bytes.
+    Both are 0 for CPUs, which are limited by stack and main memory instead.
     """
 
-    backend: str  # llvm, cuda, metal: how names of variants begin
+    backend: str  # llvm, cuda or metal: the first part of the variant's name
     name: str = ""
     lanes: int = 0
     memory: int = 0
@@ -49,40 +49,40 @@ class Device:
 
     @property
     def keeps_order(self) -> bool:
-        """Whether one thread adds in an order that is always the same. On a GPU it is random."""
+        """Whether a single thread adds in a reproducible order. On a GPU the order is random."""
         return not self.is_gpu
 
     def local_bytes(self) -> int | None:
-        """Bytes that a lane may remember in local memory; None: as much as the drivers are made for."""
+        """Bytes of local memory that a lane may use; None: no limit besides those of the drivers."""
         if not self.is_gpu:
             return None
         known = self.lanes > 0 and self.memory > 0
         return min(LARGEST_LOCAL, int(SHARE * self.memory) // self.lanes) if known else LARGEST_LOCAL
 
     def most_records(self, size: int, otherwise: int) -> int:
-        """How many records of ``size`` bytes a lane may hold, and ``otherwise`` at most."""
+        """Largest number of records of ``size`` bytes per lane, up to ``otherwise``."""
         room = self.local_bytes()
         return otherwise if room is None else min(otherwise, room // size)
 
     def room(self, records: int) -> int:
-        """For how many records to make room, where so many are needed."""
+        """Number of records to allocate if ``records`` are needed."""
         return max(records, FEWEST_RECORDS) if self.is_gpu else records
 
 
 def backend_of(variant: str) -> str:
-    """The back end of a variant, by its name."""
+    """The back end of a variant, from its name."""
     return variant.split("_")[0]
 
 
 def device_of(variant: str) -> Device:
-    """The device that a variant of Mitsuba runs on; a GPU that cannot be asked is taken as one without limits."""
+    """The device that a Mitsuba variant runs on; a GPU that cannot be queried is treated as unlimited."""
     kind = backend_of(variant)
     return _cuda_device() if kind == "cuda" else Device(kind)
 
 
 @cache
 def _cuda_device() -> Device:
-    """What the driver tells of the device that Dr.Jit takes, the first one."""
+    """Query the CUDA driver for the first device, which is the one that Dr.Jit uses."""
     try:
         driver = ctypes.CDLL("libcuda.so.1")
         device, count, threads = ctypes.c_int(), ctypes.c_int(), ctypes.c_int()
@@ -103,13 +103,13 @@ def _cuda_device() -> Device:
 
 
 def available(variant: str) -> int:
-    """Bytes that renderings can still get: of the machine, and on a GPU no more than it has."""
+    """Bytes available to renderings: the free memory of the machine, and on a GPU at most the device's memory."""
     device, left = device_of(variant), memory.available()
     return min(left, device.memory) if device.memory else left
 
 
 def require_order(variant: str) -> None:
-    """Raise PathreplayError where the additions of a variant have a random order."""
+    """Raise PathreplayError if a variant adds in random order."""
     if not device_of(variant).keeps_order:
         raise PathreplayError(
             f"deterministic = true needs an LLVM variant, this is '{variant}': on a GPU the order of additions "

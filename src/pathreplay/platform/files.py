@@ -1,4 +1,4 @@
-"""Files and their names: which of the user's are opened, since pipes and devices block, and how ours are called."""
+"""Checks of user files before they are opened, because pipes and devices block, and safe names for our own files."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ _KINDS = {
 
 
 def file_problem(path: str | Path, most_bytes: int | None = None) -> str:
-    """Why ``path`` cannot be read as a file, to stand behind its name in a message; "" for one that can.
+    """Why ``path`` cannot be read as a file, as the predicate of an error message; "" if it can.
 
-    Follows symbolic links. ``most_bytes`` is the size beyond which the file cannot be what it is taken for.
+    Follows symbolic links. ``most_bytes`` is the size above which the file cannot be of the expected kind.
     """
     try:
         found = os.stat(path)
     except (FileNotFoundError, NotADirectoryError):
         return MISSING
-    except (OSError, ValueError) as error:  # a name that is too long, a folder that may not be entered, a NUL
+    except (OSError, ValueError) as error:  # name too long, folder without search permission, or a NUL character
         return f"cannot be reached ({getattr(error, 'strerror', None) or error})"
     if not stat.S_ISREG(found.st_mode):
-        return _KINDS.get(stat.S_IFMT(found.st_mode), "is no regular file")
+        return _KINDS.get(stat.S_IFMT(found.st_mode), "is not a regular file")
     if not os.access(path, os.R_OK):
-        return "may not be read (its permissions)"
+        return "cannot be read (its permissions)"
     if most_bytes is not None and found.st_size > most_bytes:
-        return f"has {found.st_size} bytes, more than the {most_bytes} that are read"
+        return f"has {found.st_size} bytes, more than the limit of {most_bytes}"
     return ""
 
 
-# Bytes. File systems take 255 in all; words in front, an ending and the mark of an unfinished file are added to this.
+# Bytes. File systems allow 255 in total; prefixes, a suffix and the mark of an unfinished file are added to this.
 LONGEST = 150
 
 
 def file_names(names: Iterable[str]) -> dict[str, str]:
-    """Each name -> the file name (without ending) that stands for it; no two are the same, whatever their capitals.
+    """A file name (without suffix) for each name; all are distinct, even if case is ignored.
 
-    Letters, digits, ``_``, ``.`` and ``-`` stay, other characters become ``_``. A name that is too long is cut. Where
-    two names would meet, or one was cut, a short hash of the name follows.
+    Letters, digits, ``_``, ``.`` and ``-`` stay; other characters become ``_``. Long names are truncated. Where two
+    names would collide, or one was truncated, a short hash of the name is appended.
     """
     safe = {name: re.sub(r"[^\w.-]", "_", name) for name in names}
-    # Some file systems ignore capitals: casefold.
+    # Some file systems ignore case, hence casefold.
     met = Counter(text.casefold() for text in safe.values())
     for name, text in safe.items():
         cut = text.encode()[:LONGEST].decode(errors="ignore")

@@ -1,4 +1,4 @@
-"""Signals that ask a command, or the run that it does, to end: Ctrl-C, a scheduler's SIGTERM, a terminal's SIGHUP."""
+"""Signals that request the end of a command or run: Ctrl-C, a scheduler's SIGTERM, a terminal's SIGHUP."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from pathreplay.errors import PathreplayError
 
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-# Two signals that are closer than this are one wish to end: the second may not disturb what the first one set going.
+# Signals within this interval count as one request: the second must not interrupt what the first one started.
 ONE_WISH_S = 1.0
 
-_raised_at: list[float] = []  # when a signal last raised something
+_raised_at: list[float] = []  # time at which a signal handler last raised an exception
 
 
 def raise_once(error: BaseException) -> None:
-    """Raise ``error``, unless a signal has raised one a moment ago: that one is on its way out."""
+    """Raise ``error``, unless a signal handler raised an exception a moment ago that is still propagating."""
     now = time.monotonic()
     if _raised_at and now - _raised_at[-1] < ONE_WISH_S:
         return
@@ -31,7 +31,7 @@ def raise_once(error: BaseException) -> None:
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal ended the command. ``number`` is the signal's."""
+    """A signal ended the command; ``number`` is the signal number."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"ended by {name_of(number)}")
@@ -39,19 +39,19 @@ class Interrupted(KeyboardInterrupt):
 
 
 def name_of(number: int) -> str:
-    """The signal as users know it."""
+    """The signal's name for users."""
     return "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
 
 
 @contextmanager
 def handled(handle: Callable[[int, FrameType | None], Any], keep: Callable[[], bool] = lambda: False) -> Iterator[None]:
-    """Within this block ``handle`` gets the signals of `ENDING`; in threads other than the main one nothing happens.
+    """Within this block ``handle`` receives the signals in `ENDING`, if this is the main thread.
 
-    SIGTERM and SIGHUP stay ignored where the parent process ignores them (nohup). Handlers come back at the end,
-    unless ``keep`` says that it is the end of the process.
+    SIGTERM and SIGHUP stay ignored if the parent process ignores them (nohup). The previous handlers are restored at
+    the end, unless ``keep`` returns True because the process is about to exit.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield  # signals belong to the main thread
+        yield  # only the main thread can set handlers
         return
     before = {number: signal.getsignal(number) for number in ENDING}
     ours = [n for n, old in before.items() if old is not None and (n == signal.SIGINT or old != signal.SIG_IGN)]
@@ -67,9 +67,9 @@ def handled(handle: Callable[[int, FrameType | None], Any], keep: Callable[[], b
 
 @contextmanager
 def raised() -> Iterator[None]:
-    """Around a command: each of the signals raises `Interrupted`, also where a library made another error of it.
+    """Make each signal raise `Interrupted` while a command runs, even if a library converts the exception.
 
-    Once that has happened the signals keep their handlers: the process is about to end, in peace.
+    Once a signal has arrived, the handlers stay in place, so that nothing disturbs the end of the process.
     """
     numbers: list[int] = []
 
@@ -81,14 +81,14 @@ def raised() -> Iterator[None]:
         try:
             yield
         except (RuntimeError, ImportError, SystemError):
-            if numbers:  # Dr.Jit turns what is raised while it traces into errors of its own
+            if numbers:  # Dr.Jit converts exceptions raised during tracing
                 raise Interrupted(numbers[0]) from None
             raise
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Within this short block signals wait for its end, by an error too; then each comes as often as it was sent."""
+    """Defer signals to the end of this short block, also if it ends with an exception; each is then raised again."""
     late: list[int] = []
     try:
         with handled(lambda number, frame: late.append(number)):
@@ -100,20 +100,20 @@ def undisturbed() -> Iterator[None]:
 
 @dataclass
 class Stop:
-    """Tells a run to end when it has done what is under way."""
+    """A request to end a run after the current iteration."""
 
     by: str | None = None
-    """Who asked for it: 'Ctrl-C', 'SIGTERM' or 'SIGHUP'; None if nobody did."""
+    """Source of the request: 'Ctrl-C', 'SIGTERM' or 'SIGHUP'; None without a request."""
     aborted: bool = False
 
 
 @contextmanager
 def stopping(say: Callable[[str], None], way_out: str, stop: Stop | None = None) -> Iterator[Stop]:
-    """Within this block a first signal asks for a stop, and a second one that is a Ctrl-C raises KeyboardInterrupt.
+    """Within this block the first signal requests a stop, and a second one that is Ctrl-C raises KeyboardInterrupt.
 
-    SIGTERM and SIGHUP only ask, however often they come: schedulers and terminals send them more than once. ``say`` is
-    told what is going on; ``way_out`` is the message of the KeyboardInterrupt; ``stop`` is what is asked, if it is
-    there before.
+    SIGTERM and SIGHUP only request a stop, however often they arrive: schedulers and terminals send them repeatedly.
+    ``say`` receives status messages; ``way_out`` is the message of the KeyboardInterrupt; ``stop`` is the request to
+    set, if the caller has one already.
     """
     stop = Stop() if stop is None else stop
 
@@ -129,6 +129,6 @@ def stopping(say: Callable[[str], None], way_out: str, stop: Stop | None = None)
         try:
             yield stop
         except (RuntimeError, PathreplayError):
-            if stop.aborted:  # Dr.Jit turns what is raised while it traces into errors of its own
+            if stop.aborted:  # Dr.Jit converts exceptions raised during tracing
                 raise KeyboardInterrupt(way_out) from None
             raise

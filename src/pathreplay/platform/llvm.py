@@ -1,9 +1,9 @@
-"""Finds a libLLVM with which Dr.Jit works.
+"""Find a libLLVM that works with Dr.Jit.
 
-LLVM 14 and older are refused by Dr.Jit 1.5; 15 and 16 it accepts, and then they abort the process at the first
-minimum or maximum, which they cannot select for x86. A trial in this process is too dangerous, so candidates are tried
-in a process of their own (0.2-0.3 s each). Their order: DRJIT_LIBLLVM_PATH, the one that `pip install pathreplay`
-brought (karellen-llvm-core), the system's from new to old.
+Dr.Jit 1.5 rejects LLVM 14 and older. It accepts 15 and 16, which then abort the process at the first minimum or maximum
+because they cannot select these instructions for x86. Testing a library in this process is too dangerous, so candidates
+are tested in subprocesses (0.2-0.3 s each). Their order: DRJIT_LIBLLVM_PATH, the library installed by `pip install
+pathreplay` (karellen-llvm-core), the system's libraries from new to old.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from pathlib import Path
 from pathreplay.errors import PathreplayError
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
-#: What the user set, before `import pathreplay` fills the variable in or replaces a value that cannot work.
+#: The user's value, before `import pathreplay` sets the variable or replaces a value that cannot work.
 ASKED_FOR = os.environ.get(ENVIRONMENT_VARIABLE, "")
 PIP_DISTRIBUTION = "karellen-llvm-core"
 OLDEST_USABLE_MAJOR = 17
-#: A trial takes 0.3 s; a machine under load may need more, a hanging library must not hold us for ever.
+#: A test takes 0.3 s. A machine under load may need more, and a library that hangs must not block forever.
 PROBE_TIMEOUT_S = 60.0
 
 WAY_OUT = (
@@ -40,10 +40,10 @@ WAY_OUT = (
 
 @dataclass(frozen=True)
 class LlvmLibrary:
-    """A libLLVM and the verdict of its trial.
+    """A libLLVM and the result of its test.
 
-    `version` is the one it reports itself ("23.1.4"), or what its name says if it died before it could; "" if neither
-    tells. `message` is empty for one that works, otherwise the reason in one line.
+    `version` is the version that the library reports ("23.1.4"), or that of its file name if it crashed before; "" if
+    neither is known. `message` is empty if the library works, otherwise a one-line reason.
     """
 
     path: str
@@ -54,16 +54,17 @@ class LlvmLibrary:
 
 
 def pip_library() -> str | None:
-    """Path of the libLLVM that the wheel karellen-llvm-core installed, None without it.
+    """Path of the libLLVM that the wheel karellen-llvm-core installed; None without it.
 
-    Read from the wheel's own list of files, which is right in virtual environments and user installs alike.
-    (`pip install --target` drops the wheel's lib folder: nothing to find there.)
+    The path comes from the wheel's own list of files, which is correct in virtual environments and user installs alike.
+    (`pip install --target` omits the wheel's lib folder, so that nothing is found.)
     """
     try:
         files = importlib.metadata.files(PIP_DISTRIBUTION) or []
     except importlib.metadata.PackageNotFoundError:
         return None
-    # The plain file, not one of its symbolic links: those appear only at the first start of Python after the install.
+    # Use the file itself, not its symbolic links: these are created only at the first start of Python after
+    # installation.
     found = (Path(str(f.locate())).resolve() for f in files if re.fullmatch(r"libLLVM\.so\.[\d.]+", f.name))
     return next((str(path) for path in found if path.is_file()), None)
 
@@ -90,10 +91,10 @@ _SYSTEM_PATTERNS = {
 
 
 def version_in_path(path: str) -> tuple[int, ...]:
-    """The LLVM version that a path spells out, as a tuple; empty if it does not.
+    """The LLVM version in a path, as a tuple; empty if it contains none.
 
-    libLLVM.so.19.1 -> (19, 1); libLLVM-15.so.1 -> (15,); .../llvm@20/20.1.8/lib/libLLVM.dylib -> (20, 1, 8). A lone
-    digit after .so is the version of the interface, not LLVM's.
+    libLLVM.so.19.1 -> (19, 1); libLLVM-15.so.1 -> (15,); .../llvm@20/20.1.8/lib/libLLVM.dylib -> (20, 1, 8). A single
+    digit after .so is the version of the interface, not of LLVM.
     """
     name = os.path.basename(path)
     for text, pattern in (
@@ -109,7 +110,7 @@ def version_in_path(path: str) -> tuple[int, ...]:
 
 
 def _known_to_linker() -> list[str]:
-    """What ldconfig lists, so that folders which only this system knows are found as well."""
+    """The libLLVM files listed by ldconfig, which include folders specific to this system."""
     for program in ("ldconfig", "/sbin/ldconfig", "/usr/sbin/ldconfig") if sys.platform == "linux" else ():
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
             listing = subprocess.run([program, "-p"], capture_output=True, text=True, timeout=10).stdout
@@ -125,9 +126,9 @@ def system_libraries() -> list[str]:
 
 
 def candidates() -> Iterator[tuple[str, str]]:
-    """(path, origin) of every libLLVM worth a look, best first, each file once."""
+    """(path, origin) of each libLLVM to test, in order of preference, each file once."""
     pip = pip_library() or ""
-    # A process that we started has inherited the variable from us; then the library is still pip's.
+    # A subprocess inherits the variable that we set; the origin of the library is then still pip.
     named = ((ASKED_FOR, "pip" if ASKED_FOR == pip else ENVIRONMENT_VARIABLE), (pip, "pip"))
     seen = {""}
     for path, origin in (*named, *((path, "system") for path in system_libraries())):
@@ -137,7 +138,7 @@ def candidates() -> Iterator[tuple[str, str]]:
             yield path, origin
 
 
-#: What every trial begins with: Python as it is here, no core dump (an abort is an answer), the library's siblings.
+#: Start of every test: the parent's sys.path, no core dump (a crash is a valid result), the library's siblings.
 _BEGIN = """
 import ctypes, json, sys
 task = json.loads(sys.argv[1])
@@ -156,7 +157,7 @@ if not dr.has_backend(dr.JitBackend.LLVM):
     raise SystemExit("refused by Dr.Jit")
 print(".".join(str(number) for number in dr.detail.llvm_version()), flush=True)
 from drjit.llvm.ad import Float
-x = Float([1.0, 2.0, 3.0] * 7)  # more lanes than any vector register has, so that both full and partial packets run
+x = Float([1.0, 2.0, 3.0] * 7)  # more lanes than a vector register, so that full and partial packets run
 dr.enable_grad(x)
 y = dr.minimum(x, 2.0) * dr.maximum(x, 1.5)
 dr.backward(dr.sum(y))
@@ -170,9 +171,9 @@ if [y[i] for i in range(3)] != [1.5, 4.0, 6.0] or [gradient[i] for i in range(3)
 def unlinked_siblings(path: str) -> list[str]:
     """Run-time libraries that the wheel's libLLVM needs but cannot find yet.
 
-    The wheel makes the links libc++.so.1 -> libc++.so.1.0 (and two more) at the first start of Python after it was
-    installed. Where it could not (a folder that is not ours to write to), loading these files beforehand does the
-    same: the loader matches the names inside them.
+    At the first start of Python after installation the wheel creates the links libc++.so.1 -> libc++.so.1.0 (and two
+    more). Where it could not (a folder without write permission), loading these files first has the same effect,
+    because the loader matches the names stored inside them.
     """
     folder = Path(path).parent / "x86_64-unknown-linux-gnu"
     files = [folder / name for name in ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")]
@@ -181,8 +182,8 @@ def unlinked_siblings(path: str) -> list[str]:
 
 
 def _reason(returncode: int, stderr: str) -> str:
-    """One line that says why a trial failed, from what the process left behind."""
-    # We switch the kernel cache off ourselves (see `probe`), and Dr.Jit says so.
+    """A one-line reason for the failure of a test, from the exit status and standard error of the subprocess."""
+    # `probe` disables the kernel cache, which Dr.Jit reports.
     told = [line.strip() for line in stderr.splitlines() if line.strip() and "kernel cache" not in line]
     lines = [re.sub(r"^\w+\(\): ", "", line) for line in told] or [""]
     crash = returncode < 0 and returncode != -signal.SIGTERM
@@ -197,12 +198,12 @@ def _reason(returncode: int, stderr: str) -> str:
 
 
 def run_trial(code: str, task: Mapping[str, object], environment: Mapping[str, str]) -> tuple[str, str]:
-    """Run `code` in a Python of its own, in which `task` is known and its "preload" is loaded.
+    """Run `code` in a Python subprocess in which `task` is defined and its "preload" libraries are loaded.
 
-    Returns what it printed, and why it failed in one line ("" if it did not). Raises nothing.
+    Returns the standard output, and a one-line reason if it failed ("" otherwise). Raises nothing.
     """
     if not sys.executable:
-        return "", "cannot be tried: this Python does not know its own executable"
+        return "", "cannot be tested: sys.executable is not set"
     try:
         done = subprocess.run(
             [sys.executable, "-c", _BEGIN + code, json.dumps({"sys_path": sys.path, "preload": [], **task})],
@@ -216,19 +217,19 @@ def run_trial(code: str, task: Mapping[str, object], environment: Mapping[str, s
     except subprocess.TimeoutExpired:
         return "", f"gave no answer within {PROBE_TIMEOUT_S:g} s"
     except OSError as error:
-        return "", f"cannot be tried: {error}"
+        return "", f"cannot be tested: {error}"
     return done.stdout, "" if done.returncode == 0 else _reason(done.returncode, done.stderr)
 
 
 @functools.cache
 def probe(path: str, origin: str = "") -> LlvmLibrary:
-    """Try one libLLVM in a process of its own: minimum, maximum and a gradient, compared with known values.
+    """Test one libLLVM in a subprocess: minimum, maximum and a gradient are compared with known values.
 
-    An empty `path` tries what Dr.Jit chooses by itself.
-    The verdict is kept for the life of this process. Nothing is raised: whatever happens is in `works` and `message`.
+    An empty `path` tests the library that Dr.Jit chooses itself. The result is cached for the lifetime of this process.
+    Raises nothing: failures are reported in `works` and `message`.
     """
     version = ".".join(map(str, version_in_path(os.path.realpath(path))))
-    # A kernel from the cache would never meet the compiler that is on trial.
+    # A cached kernel would bypass the compiler under test.
     environment = os.environ | {ENVIRONMENT_VARIABLE: path, "DRJIT_CACHE_DIR": os.devnull}
     stdout, message = run_trial(_PROBE, {"preload": unlinked_siblings(path)}, environment)
     return LlvmLibrary(path, origin, stdout.strip() or version, not message, message)

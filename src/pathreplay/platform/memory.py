@@ -1,4 +1,4 @@
-"""How much memory is left, so that what cannot fit is refused before anything of it is made; and budgets, kept."""
+"""Available memory, so that requests that cannot fit are refused before anything is allocated; and memory budgets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import psutil
 
 from pathreplay.errors import PathreplayError
 
-# Limit, use and statistics of a container, in the two versions of Linux' control groups.
+# Limit, usage and statistics of a container, in versions 2 and 1 of Linux control groups.
 _CONTAINERS = tuple(
     tuple(Path("/sys/fs/cgroup", name) for name in names)
     for names in (
@@ -22,14 +22,14 @@ _CONTAINERS = tuple(
 
 
 def available() -> int:
-    """Bytes that this process can still get without swapping: of the machine, and of its container if it has one."""
+    """Bytes that this process can still allocate without swapping, on the machine and in its container, if any."""
     left = int(psutil.virtual_memory().available)
     for limit, used, statistics in _CONTAINERS:
         try:
-            # Files that a container counts as used, and gives up when memory is wanted.
+            # Cached files count as used by a container, but are evicted when memory is needed.
             cached = dict(re.findall(r"^(?:total_)?((?:in)?active_file) (\d+)$", statistics.read_text(), re.MULTILINE))
             left = min(left, int(limit.read_text()) - int(used.read_text()) + sum(map(int, cached.values())))
-        except (OSError, ValueError):  # no such group, or 'max': no limit
+        except (OSError, ValueError):  # no such group, or 'max' (no limit)
             continue
     if _budget is not None:
         left = min(left, _budget - taken())
@@ -37,12 +37,12 @@ def available() -> int:
 
 
 _budget: int | None = None
-"""Bytes that this process may take, where somebody has said so."""
+"""Bytes that this process may use, if a budget is set."""
 
 
 @contextmanager
 def within(budget: int | None) -> Iterator[None]:
-    """Within this block the process may take so many bytes: `available` knows, `require_kept` holds it to that."""
+    """Set the process's memory budget within this block: `available` respects it, `require_kept` enforces it."""
     global _budget
     before = _budget
     _budget = budget
@@ -53,30 +53,30 @@ def within(budget: int | None) -> Iterator[None]:
 
 
 def taken() -> int:
-    """Bytes that this process has to itself: pages of files, which can be read again, do not count."""
+    """Bytes of memory private to this process: file-backed pages, which can be read again, do not count."""
     info = psutil.Process().memory_info()
     return int(info.rss - getattr(info, "shared", 0))
 
 
 def is_crowded() -> bool:
-    """Whether there is a budget, and half of it is taken: what is kept for later should go."""
+    """Whether more than half of a budget is used, so that caches should be dropped."""
     return _budget is not None and taken() > _budget // 2
 
 
 def require_kept() -> None:
-    """Raise PathreplayError if the process has taken more than its budget."""
+    """Raise PathreplayError if the process has exceeded its budget."""
     if _budget is not None and (now := taken()) > _budget:
         raise PathreplayError(
-            f"The run takes {_readable(now)} of memory, and its 'memory_limit' is {_readable(_budget)}; take smaller "
-            "films or parameters, or raise it"
+            f"The run uses {_readable(now)} of memory, and its 'memory_limit' is {_readable(_budget)}; use smaller "
+            "films or parameters, or raise the limit"
         )
 
 
 def require(needed: int, thing: str, way_out: str) -> None:
-    """Raise PathreplayError, from ``thing`` to ``way_out``, unless ``needed`` bytes are available."""
+    """Raise PathreplayError unless ``needed`` bytes are available; it names ``thing`` and the remedy ``way_out``."""
     if needed > (left := available()):
         asked = f"needs about {_readable(needed)} of memory"
-        raise PathreplayError(f"{thing} {asked}, {_readable(left)} are left; {way_out}")
+        raise PathreplayError(f"{thing} {asked}, {_readable(left)} is available; {way_out}")
 
 
 def _readable(count: int) -> str:

@@ -1,8 +1,9 @@
-"""Registers our plugins for the active variant of Mitsuba and for every later one.
+"""Register our plugins for the active variant of Mitsuba and for every variant set later.
 
-A Python plugin is known to Mitsuba in the variant it was registered in, and a variant callback is called only for
-variants set after it was added. Where nothing can be differentiated, as in scalar variants, stand-ins say so and name
-the variant to use. Polarised variants get the plugins themselves, which say that they are not supported.
+Mitsuba knows a Python plugin only in the variant in which it was registered, and calls a variant callback only for
+variants set after the callback was added. In variants without derivatives, such as scalar ones, stand-ins are
+registered whose error names the variant to use. Polarised variants get the plugins themselves, which report that they
+are unsupported.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from typing import Any
 from pathreplay.errors import PathreplayError
 from pathreplay.platform.device import backend_of
 
-#: Each by name: what it is to Mitsuba, and the template of its class (see `on_base`).
+#: Plugin name -> its Mitsuba plugin type, and the module and class of its template (see `on_base`).
 PLUGINS = {
     "pathreplay": ("integrator", "pathreplay.integrators.integrator", "PathReplayIntegrator"),
     "dielectric_ad": ("bsdf", "pathreplay.plugins.dielectric_ad", "DielectricAD"),
     "gridmedium": ("medium", "pathreplay.plugins.gridmedium", "GridMedium"),
 }
-#: Integrators to compare with, which `pathreplay.baselines` registers on request.
+#: Integrators for comparison, which `pathreplay.baselines` registers on request.
 BASELINES = {
     "naive_ad": ("integrator", "pathreplay.integrators.baselines.plugins", "NaiveIntegrator"),
     "radiative_backprop": ("integrator", "pathreplay.integrators.baselines.plugins", "RadiativeIntegrator"),
@@ -31,7 +32,7 @@ Plugins = Mapping[str, tuple[str, str, str]]
 
 
 def register(variant: str, plugins: Plugins = PLUGINS) -> None:
-    """Register ``plugins`` for the active variant, named ``variant``; stand-ins where it has no derivatives."""
+    """Register ``plugins`` for the active variant, named ``variant``; stand-ins if it has no derivatives."""
     import mitsuba as mi
 
     if "_ad_" not in variant:
@@ -48,19 +49,19 @@ def register(variant: str, plugins: Plugins = PLUGINS) -> None:
 
 
 def mitsuba_integrator() -> Any:
-    """Mitsuba's ADIntegrator of the active variant: what it does to prepare a pass is what its users' seeds mean."""
-    # The name under which Mitsuba runs its Python modules anew for every variant. Of `mitsuba.ad`, the public name, an
-    # import statement makes a copy, which stays what it was in the first variant.
+    """Mitsuba's ADIntegrator of the active variant; with its setup of a pass, seeds mean the same as in Mitsuba."""
+    # The module that Mitsuba executes again for every variant. Importing from the public `mitsuba.ad` creates a copy
+    # that stays bound to the first variant.
     from mitsuba.python.ad.integrators.common import ADIntegrator
 
     return ADIntegrator
 
 
 def on_base(template: type, base: type) -> type:
-    """The class that a template describes, on a base class of Mitsuba's.
+    """Build the class that a template describes, on a base class of Mitsuba.
 
-    Each variant has a base class of its own. A template exists before any of them and cannot inherit from one; its
-    methods call those of the base by their class.
+    Each variant has its own base class. A template exists before all of them and cannot inherit from one; its methods
+    call base methods through the base class.
     """
     parts = [vars(part) for part in reversed(template.__mro__[:-1])]
     body = {name: value for part in parts for name, value in part.items() if name not in ("__dict__", "__weakref__")}
@@ -84,7 +85,7 @@ def _register_stand_ins(variant: str, plugins: Plugins) -> None:
 
 
 def install(plugins: Plugins = PLUGINS) -> None:
-    """Register ``plugins`` for the active variant, if any, and for each one set later. Sets no variant."""
+    """Register ``plugins`` for the active variant, if any, and for each variant set later. Sets no variant."""
     import mitsuba as mi
 
     mi.detail.add_variant_callback(lambda _old, new: register(new, plugins))

@@ -1,6 +1,6 @@
-"""Safetensors files that are made while they are written: no tensor is copied, and one at a time is held.
+"""Write safetensors files in chunks: no tensor is copied, and only one is in memory at a time.
 
-The library's own `save` holds all of the file, and twice what it is made of.
+The library's own `save` holds the whole file in memory, in addition to two copies of its tensors.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ _KINDS |= {"float16": "F16", "int32": "I32", "uint64": "U64"}
 def safetensors_chunks(
     arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str], room: Mapping[str, int] | None = None
 ) -> Iterator[Chunk]:
-    """The bytes of a file of these arrays (by name), a chunk at a time. Each is asked for twice: see `WhenAsked`.
+    """The bytes of a safetensors file with these arrays (by name), in chunks.
 
-    ``room`` names tensors of so many bytes at the end of the file, which the caller writes.
+    Each array is accessed twice: see `WhenAsked`. ``room`` maps names to sizes in bytes of tensors at the end of the
+    file, which the caller writes.
 
-    Raises PathreplayError for numbers of a kind that such files do not have.
+    Raises PathreplayError for a data type that the format does not support.
     """
     header: dict[str, object] = {"__metadata__": dict(metadata)} if metadata else {}
     end = 0
@@ -32,9 +33,7 @@ def safetensors_chunks(
     for name in names:
         array = np.asarray(arrays[name])
         if array.dtype.name not in _KINDS:
-            raise PathreplayError(
-                f"'{name}' holds numbers of the kind {array.dtype}; only {', '.join(_KINDS)} are kept"
-            )
+            raise PathreplayError(f"'{name}' has the data type {array.dtype}; only {', '.join(_KINDS)} can be stored")
         begin, end = end, end + array.nbytes
         header[name] = {"dtype": _KINDS[array.dtype.name], "shape": list(array.shape), "data_offsets": [begin, end]}
         del array
@@ -42,7 +41,7 @@ def safetensors_chunks(
         begin, end = end, end + size
         header[name] = {"dtype": "U8", "shape": [size], "data_offsets": [begin, end]}
     text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)  # so that tensors begin where eight bytes do
+    text += b" " * (-len(text) % 8)  # aligns the tensors to eight bytes
     yield len(text).to_bytes(8, "little") + text
     for name in names:
         array = np.ascontiguousarray(arrays[name])

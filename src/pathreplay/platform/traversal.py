@@ -1,6 +1,6 @@
-"""The parameters of a scene or an object that have a value.
+"""Parameters of a scene or object, without those that have no value.
 
-Hair with ``eumelanin`` has such a ``sigma_a``: it is None, and Mitsuba raises a TypeError where it is read.
+An example is ``sigma_a`` of hair with ``eumelanin``: it is None, and Mitsuba raises a TypeError when it is read.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import mitsuba as mi
 
 
 def traversed(thing: Any) -> Any:
-    """`mi.traverse(thing)`, without parameters that are None."""
+    """`mi.traverse(thing)` without parameters that are None."""
     params = mi.traverse(thing)
     known = {key for key, _ in known_values(params)}
     for key in set(params.keys()) - known:
@@ -21,7 +21,7 @@ def traversed(thing: Any) -> Any:
 
 
 def known_values(params: Any) -> Iterator[tuple[str, Any]]:
-    """The parameters with their values, to be looked at: `update` does not see what is written into them."""
+    """Iterate over the parameters with their values, for reading only: `update` does not notice in-place changes."""
     for key, (value, kind, node, _) in params.properties.items():
         found = value if kind is None else params.get_property(value, kind, node)
         if found is not None:

@@ -1,1 +1,1 @@
-"""Random numbers: counter-based, Owen-scrambled Sobol points, and those of pixels."""
+"""Samplers: counter-based and Owen-scrambled Sobol samplers, sample sets per pixel, and named random streams."""

@@ -1,4 +1,4 @@
-"""Random numbers that are counted: those of a key are the same each time, for paths and lines side by side."""
+"""Counter-based random numbers: a pure function of key and index, for paths and boundary segments."""
 
 from __future__ import annotations
 
@@ -10,31 +10,33 @@ import mitsuba as mi
 from pathreplay.samplers.streams import Stream
 
 STEPS = tuple(round(2**32 * (root % 1)) for root in ((1 + 5**0.5) / 2, 2**0.5))
-"""Of lattices. No rational multiples of both add up to a rational number, so that they fill a square evenly, too."""
+"""Steps of Kronecker lattices. No rational combination of the two is rational, so that they also fill a square evenly.
+"""
 ROUNDS = 8
-"""Of the cipher that makes them. With Mitsuba's default of 4, neighbours of one key go together: light that came by two
-bounces had 4 % too little shadow."""
+"""Rounds of the TEA cipher. With Mitsuba's default of 4, samples of neighbouring keys are correlated: shadows in
+two-bounce light were 4 % too weak."""
 
 
 @dataclass
 class CounterSampler:
-    """Random numbers that are counted: those of a key are the same each time. Takes a sampler's place."""
+    """Counter-based sampler with the interface of Mitsuba's samplers: equal keys give equal samples."""
 
     key: mi.UInt32
     index: mi.UInt32
 
     @staticmethod
     def of(key: mi.UInt32) -> CounterSampler:
+        """Sampler at index 0 of a key."""
         return CounterSampler(mi.UInt32(key), mi.UInt32(0))
 
     @staticmethod
     def stream(key: mi.UInt32, stream: Stream) -> CounterSampler:
-        """Those of a key that a stream has for itself."""
+        """Sampler at the first index that a stream owns in a key."""
         return CounterSampler(mi.UInt32(key), mi.UInt32(int(stream)))
 
     @staticmethod
     def at_vertex(key: mi.UInt32, k: mi.UInt32) -> CounterSampler:
-        """Those of the k-th vertex (see `VertexSamples.draw`) of a path whose first has the first."""
+        """Sampler at vertex k of a path whose key this is (six dimensions per vertex, see `VertexSamples.draw`)."""
         return CounterSampler(mi.UInt32(key), mi.UInt32(6 * k))
 
     def next_1d(self, active: bool | mi.Bool = True) -> mi.Float:
@@ -43,16 +45,16 @@ class CounterSampler:
         return x
 
     def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
-        x, y = mi.sample_tea_32(self.key, self.index, ROUNDS)  # both halves of one block of the cipher
-        self.index += 2  # as for two single numbers: see `at_vertex`
+        x, y = mi.sample_tea_32(self.key, self.index, ROUNDS)  # the two halves of one block of the cipher
+        self.index += 2  # the same as two 1D samples: see `at_vertex`
         return mi.Point2f(_in_unit(x), _in_unit(y))
 
 
 def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-    """The key of the i-th line of a pass.
+    """The key of the i-th segment of a pass.
 
-    No function of i ^ seed: with that, passes would deal out the same keys to other lines, and their mean would keep
-    the error of one.
+    It must not be a function of i ^ seed. Otherwise passes would assign the same set of keys to different segments, and
+    their mean would keep the error of a single pass.
     """
     return mi.sample_tea_32(i, seed, ROUNDS)[0]
 
@@ -65,5 +67,5 @@ def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32, dimensions: int = 2) -> 
 
 
 def _in_unit(x: mi.UInt32) -> mi.Float:
-    """An integer as a number in [0, 1)."""
+    """Map a 32-bit integer to a float in [0, 1)."""
     return mi.Float(x >> 8) * 2**-24

@@ -1,4 +1,4 @@
-"""Random numbers of all paths of a pixel, in sets that know nothing of each other, so that one may judge another."""
+"""Samples of all paths of a pixel in mutually independent sets, so that one set can weight the gradient of another."""
 
 from __future__ import annotations
 
@@ -9,25 +9,29 @@ from typing import Any, Protocol
 import mitsuba as mi
 
 SETS = 4
-"""Of even numbers, where a pixel has so many paths: fewer are judged by fewer others, more are less even."""
+"""Number of low-discrepancy sets per pixel, if it has that many paths. With fewer sets, each is weighted by fewer other
+paths; with more, each is less evenly distributed."""
 
 
 class PixelSamples(Protocol):
-    """Random numbers of all paths of each lane's pixel."""
+    """Samples of all paths of each lane's pixel."""
 
     def together(self, paths: int) -> int:
-        """How many of so many paths make a set."""
+        """Number of paths per set, of ``paths`` in total."""
 
     def first(self) -> Any:
-        """What the first path draws from: a sampler, or what takes its place."""
+        """Sampler of the first path."""
 
     def of(self, before: Any, place: mi.UInt32, size: int, number: mi.UInt32) -> Any:
-        """What a path draws from, by its place in the set of that number, and what the path ``before`` drew from."""
+        """Sampler of the path at index ``place`` in set ``number`` of ``size`` paths.
+
+        ``before`` is the sampler of the previous path.
+        """
 
 
 @dataclass(frozen=True)
 class Alone:
-    """Those of a sampler whose numbers know nothing of each other: each path is a set of its own."""
+    """Samples of a sampler with independent samples: each path is its own set."""
 
     sampler: mi.Sampler
 
@@ -40,13 +44,13 @@ class Alone:
         return self.sampler
 
     def of(self, before: Any, place: mi.UInt32, size: int, number: mi.UInt32) -> Any:
-        """See `PixelSamples`: its numbers go on."""
+        """See `PixelSamples`: the sampler continues its sequence."""
         return before
 
 
 @dataclass(frozen=True)
 class EvenSets:
-    """Even ones, in up to `SETS` sets."""
+    """Low-discrepancy samples, in up to `SETS` sets."""
 
     numbers: Callable[[mi.UInt32, int, mi.UInt32], Any]
 

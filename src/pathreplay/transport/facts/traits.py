@@ -77,7 +77,7 @@ class Traits:
     narrow: bool  # some surface may have a narrow smooth lobe
     glossy: bool  # the same, and no checkerboard has seams over which such a lobe would slide
     outlines: bool  # some surface point may see the outline of a shape or emitter, or a texture seam
-    tables: Tables = None  # type: ignore[assignment]  # per BSDF and shape; updated per pass, as is the rest
+    tables: Tables = None  # type: ignore[assignment]  # of the current pass, as all fields below
     # Whether these have gradients:
     lights_deform: bool = False  # vertex positions of an emissive mesh
     instances_move: bool = False  # the to_world of an instance
@@ -126,7 +126,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
 def tables_of(
     attachables: Iterable[mi.BSDF], shapes: list[mi.Shape], emitters: list[mi.Emitter], edges: bool = True
 ) -> Tables:
-    """The tables of a scene in its present state; without ``edges``, the possibly long smoothing groups are left out."""
+    """The tables of a scene in its present state; without ``edges``, the possibly long smoothing groups are omitted."""
     attachable = _by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)
     return Tables(
         _array(mi.Bool, attachable) if attachables else None,
