@@ -94,7 +94,7 @@ def test_judgement_is_free_of_the_noise_of_rendering(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("baseline", "words"),
-    [({"type": "path"}, "'path' computes no gradients"), ({"type": "prbb"}, "'prbb' cannot be made")],
+    [({"type": "path"}, "'path' computes no gradients"), ({"type": "prbb"}, "'prbb' cannot be created")],
 )
 def test_a_rival_that_cannot_run_is_told_before_anything_is_rendered(baseline: dict[str, object], words: str) -> None:
     with pytest.raises(PathreplayError, match=words):

@@ -79,7 +79,7 @@ def test_a_texture_may_have_another_size(render: Any) -> None:
 
 def test_what_does_not_fit_is_told(render: Any) -> None:
     values = render.initial_values()
-    with pytest.raises(PathreplayError, match=r"there is a difference: 'red\.reflectance\.value'"):
+    with pytest.raises(PathreplayError, match=r"missing or unexpected: 'red\.reflectance\.value'"):
         render({TEXTURE: values[TEXTURE]})
     with pytest.raises(PathreplayError, match=r"shape \(4,\) given for the parameter 'red.*' of shape \(3,\)"):
         render({**values, WALL: jnp.zeros(4)})

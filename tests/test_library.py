@@ -359,7 +359,7 @@ def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
         (bad(parameters={WALL: Parameter(parameterization="cube")}), "parameterization"),
         (bad(parameters={BODY: Parameter(pose="rigid", initial=np.eye(4))}), "'initial' of a pose is a displacement"),
         (bad(scene=5), "scene: 'int' is no scene of the active variant"),
-        (bad(scene={"type": "sphere"}), "describes no scene but a Shape"),
+        (bad(scene={"type": "sphere"}), "describes a Shape, not a scene"),
         (bad(scene="no-such-scene"), "No scene 'no-such-scene'"),
     ],
 )  # fmt: skip

@@ -78,7 +78,7 @@ def test_resolve_suggests_the_nearest_key(params: Any, wrong: str, suggested: st
 
 
 def test_resolve_says_when_nothing_is_near(params: Any) -> None:
-    with pytest.raises(PathreplayError, match=r"No parameter 'q\*' .* none like it"):
+    with pytest.raises(PathreplayError, match=r"No parameter 'q\*' .* no similar one"):
         resolve_keys(params, "q*")
 
 

@@ -127,7 +127,7 @@ def test_passes_add_up_to_one_picture(monkeypatch: pytest.MonkeyPatch) -> None:
         ("image.exr", {"spp": 0}, "--spp 0 is out of range"),
         ("image.exr", {"spp": 10**7}, "samples from 1 to 1000000"),
         ("image.exr", {"seed": -1}, "--seed -1 is out of range"),
-        ("image.exr", {"integrator": "paht"}, "Integrator 'paht' cannot be made"),
+        ("image.exr", {"integrator": "paht"}, "Integrator 'paht' cannot be created"),
         ("image.exr", {"integrator": "path", "options": ["max_depth=deep"]}, "max_depth"),
         ("image.exr", {"integrator": "path", "options": ["a.b=1"]}, "-I a is {'b': 1}; give a number"),
         ("image.exr", {"options": ["max_depth=3"]}, "name it with --integrator"),

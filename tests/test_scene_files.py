@@ -94,7 +94,7 @@ def test_included_files_are_regular_ones(tmp_path: Path) -> None:
 
 def test_nesting_has_a_bound_in_included_files_too(tmp_path: Path) -> None:
     deep = "<bsdf>" * 50_000 + "</bsdf>" * 50_000
-    assert f"more than {DEEPEST} elements inside each other" in refused(tmp_path, deep)
+    assert f"more than {DEEPEST} nested elements" in refused(tmp_path, deep)
     (tmp_path / "part.xml").write_text(f'<scene version="3.0.0">{deep}</scene>')
     assert "part.xml has more than" in refused(tmp_path, '<include filename="part.xml"/>')
     (tmp_path / "part.xml").write_text('<scene version="3.0.0"><include filename="part.xml"/></scene>')

@@ -58,7 +58,7 @@ def test_what_does_not_fit_is_told(function: SceneFunction) -> None:
     for wrong in ((5, 7, 1), (0, 7, 3), (7, 3)):
         with pytest.raises(PathreplayError, match="given for the parameter 'back"):
             function.require({**shapes, TEXTURE: wrong})
-    with pytest.raises(PathreplayError, match=r"there is a difference: 'red\.reflectance\.value'"):
+    with pytest.raises(PathreplayError, match=r"missing or unexpected: 'red\.reflectance\.value'"):
         function.require({TEXTURE: shapes[TEXTURE]})
     with pytest.raises(PathreplayError, match="there is a difference: 'blue'"):
         function.require({**shapes, "blue": (3,)})

@@ -79,7 +79,7 @@ BAD = {
     "missing file": ("rom.xml", {}, "did you mean 'room.xml'"),
     "not XML": ("broken.xml", {}, "broken.xml cannot be loaded: Parsing of XML"),
     "unknown plugin": ("plugin.xml", {}, 'Plugin "spher" not found'),
-    "not a scene": ("shape.xml", {}, "describes no <scene>"),
+    "not a scene": ("shape.xml", {}, "not a <scene>"),
     "unknown argument": ("cornell-box", {"size": 3}, "has no parameter 'size'; it has: resolution"),
     "bad argument": ("cornell-box", {"resolution": 0}, "'resolution' of scene 'cornell-box' is 0"),
 }

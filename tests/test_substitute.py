@@ -96,7 +96,7 @@ def test_failure_leaves_mitsubas_search_paths_alone(tmp_path):
 
 def test_what_mitsuba_would_die_of_or_wait_for_is_told(tmp_path):
     (tmp_path / "deep.xml").write_text('<scene version="3.0.0">' + "<bsdf>" * 50_000 + "</bsdf>" * 50_000 + "</scene>")
-    with pytest.raises(PathreplayError, match="elements inside each other"):
+    with pytest.raises(PathreplayError, match="nested elements"):
         load_file_with(tmp_path / "deep.xml", SMOOTH)
     os.mkfifo(tmp_path / "sky.exr")
     with pytest.raises(PathreplayError, match="is a pipe"):

@@ -122,8 +122,8 @@ def flipped(content: bytes, at: int) -> bytes:
 @pytest.mark.parametrize(
     ("file", "at", "words"),
     [
-        ("two.nvdb", 3, "no NanoVDB file"),
-        ("two.nvdb", 11, "of NanoVDB version"),
+        ("two.nvdb", 3, "not a NanoVDB file"),
+        ("two.nvdb", 11, "has NanoVDB version"),
         ("two.nvdb", 13, "damaged"),  # number of grids
         ("two.nvdb", 18, "damaged"),  # size in memory
         ("two.nvdb", 23, "damaged"),  # the same, beyond any memory
@@ -188,10 +188,10 @@ def test_bad_files_get_one_line(tmp_path: Path) -> None:
     (tmp_path / "fog.raw").write_bytes(good)
     for name, words in {
         "short.vol": "3 x 4 x 5 x 1 numbers",
-        "text.vol": "no Mitsuba volume of version 3",
+        "text.vol": "not a Mitsuba volume of version 3",
         "half.vol": "encoding 2",
         "nan.vol": "NaN",
-        "fog.raw": "unknown ending '.raw'",
+        "fog.raw": "unknown extension '.raw'",
         "none.vol": "No volume file",
     }.items():
         with pytest.raises(PathreplayError, match=words):

@@ -1,1 +1,1 @@
-"""Scenes: loading and looking through files, the built-in ones, and parameters by their keys."""
+"""Scenes: loading, built-in scenes, parameters by key, and checks of scene files."""

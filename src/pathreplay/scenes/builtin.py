@@ -1,4 +1,4 @@
-"""Built-in scenes: small rooms for the examples and the tests, as Mitsuba dictionaries that functions return."""
+"""Built-in scenes: small rooms for examples and tests, as functions that return Mitsuba dictionaries."""
 
 from __future__ import annotations
 
@@ -13,48 +13,48 @@ from pathreplay.scenes.bodies import ball, knobs, mesh
 SceneDict = dict[str, Any]
 
 COSTS: dict[str, Callable[[int], int]] = {
-    "texture": lambda n: 64 * n**2,  # three numbers a texel, and copies in double precision
-    "grid": lambda n: 256 * n**3,  # a voxel: its noise is summed from 12 waves, all at once
+    "texture": lambda n: 64 * n**2,  # three numbers per texel, with copies in double precision
+    "grid": lambda n: 256 * n**3,  # per voxel: the noise sums 12 waves, all in memory at once
     "views": lambda n: 100_000 * n,  # a sensor with its film
-    "ball_splits": lambda n: 2000 * 4 ** min(n, 40),  # eight faces, each split into four so often
+    "ball_splits": lambda n: 2000 * 4 ** min(n, 40),  # eight faces, each split into four n times
 }
-"""Arguments of which a scene may get too large -> bytes that making it takes, roughly."""
+"""Arguments that can make a scene too large -> approximate memory to build it, in bytes."""
 
 
 def _picture(pixels: np.ndarray, **options: Any) -> SceneDict:
-    """A texture of numbers that are used as they are."""
+    """A bitmap texture whose values are used without colour conversion."""
     return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, **options}
 
 
 def _centres(*counts: int) -> tuple[np.ndarray, ...]:
-    """Coordinates in [0, 1] of the middles of a grid's cells, one array for each axis."""
+    """Coordinates in [0, 1] of the cell centres of a grid, one array per axis."""
     return tuple(np.meshgrid(*((np.arange(n) + 0.5) / n for n in counts), indexing="ij"))
 
 
 def cornell_box(resolution: int = 256) -> SceneDict:
-    """Mitsuba's own Cornell box: two white boxes, a red and a green wall, one area light."""
+    """Mitsuba's Cornell box: two white boxes, a red and a green wall, one area light."""
     scene: SceneDict = mi.cornell_box()
     scene["sensor"]["film"].update(width=resolution, height=resolution)
     return scene
 
 
 def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
-    """The Cornell box with a grey picture (``texture`` x ``texture`` texels) as its back wall, seen by two sensors.
+    """The Cornell box with a grey texture (``texture`` x ``texture`` texels) on its back wall, seen by two sensors.
 
-    ``overview`` is the classical camera. ``closeup`` stands in the box, behind the two white boxes, which were moved
-    to the front so that it sees every texel of the wall. Key of the picture: ``back.bsdf.reflectance.data``.
+    ``overview`` is the classic camera. ``closeup`` stands inside the box, behind the two white boxes, which are moved
+    to the front so that it sees every texel of the wall. Key of the texture: ``back.bsdf.reflectance.data``.
     """
     T = mi.ScalarTransform4f
     scene = cornell_box(resolution)
     overview = scene.pop("sensor")
-    # A texel is little wider than a pixel: a wider filter would blur neighbours into each other, slow to undo.
+    # A texel is hardly wider than a pixel: a wider filter would blur neighbouring texels, which is slow to invert.
     overview["film"]["rfilter"] = {"type": "box"}
-    # 1.3 from the wall, whose half side is 1: tan(fov / 2) = 1 / 1.3 and a margin of one per cent.
+    # Distance 1.3 from the wall of half width 1: tan(fov / 2) = 1 / 1.3, plus a margin of 1 %.
     near = T().look_at(origin=[0, 0, 0.3], target=[0, 0, -1], up=[0, 1, 0])
     scene |= {"overview": overview, "closeup": {**overview, "to_world": near, "fov": 75.8}}
     scene["large-box"]["to_world"] = T().translate([-0.45, -0.65, 0.42]).rotate([0, 1, 0], 18).scale([0.26, 0.35, 0.26])
     scene["small-box"]["to_world"] = T().translate([0.45, -0.78, 0.5]).rotate([0, 1, 0], -17).scale(0.22)
-    # v is turned round: the first row of an image belongs at the top of the wall.
+    # v is flipped, so that the first row of an image is at the top of the wall.
     upright = T().translate([0, 1, 0]).scale([1, -1, 1])
     grey = _picture(np.full((texture, texture, 3), 0.5, np.float32), wrap_mode="clamp", to_uv=upright)
     scene["back"]["bsdf"] = {"type": "diffuse", "reflectance": grey}
@@ -62,10 +62,11 @@ def cornell_box_photo(resolution: int = 128, texture: int = 96) -> SceneDict:
 
 
 def _room(radius: float) -> SceneDict:
-    """A hollow ball of light around the origin, poles above and below, painted smoothly in all directions.
+    """An emissive sphere around the origin, poles above and below, with a smooth radiance texture.
 
-    Smooth, so that a picture tells which way to move from far away; of finite size, so that it also tells where from.
-    Radiance towards direction d, colour c: 0.6 + 0.08 Σ_j cos(k_cj · d + φ_cj), waves of 30 to 90 degrees.
+    The texture is smooth, so that an image tells the direction towards the optimum from far away. The sphere has finite
+    size, so that an image also depends on position. Radiance towards direction d, colour channel c: 0.6 + 0.08 Σ_j
+    cos(k_cj · d + φ_cj), with wavelengths of 30 to 90 degrees.
     """
     v, u = _centres(64, 128)
     θ, φ = np.pi * v, 2 * np.pi * u
@@ -91,18 +92,19 @@ def _camera(origin: list[float], target: list[float], fov: float, resolution: in
 
 
 def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
-    """A thick pane of glass (index 1.5) whose front is uneven, in a painted room, seen by three sensors.
+    """A thick pane of glass (index 1.5) with an uneven front in a textured room, seen by three sensors.
 
-    ``front`` looks through it straight, ``left`` and ``right`` at 55 degrees, where the thickness shifts what is seen
-    and the front mirrors more of the room: that tells the index from the slope of the surface. Keys: ``glass.eta`` and
-    ``front_face.bsdf.normalmap.data``, ``texture`` x ``texture`` normals (n + 1) / 2 over the middle of the pane.
+    ``front`` looks straight through the pane; ``left`` and ``right`` look at 55 degrees, where the thickness shifts the
+    view and the front reflects more of the room. This separates the index from the slope of the surface. Keys:
+    ``glass.eta`` and ``front_face.bsdf.normalmap.data``, ``texture`` x ``texture`` normals (n + 1) / 2 over the middle
+    of the pane.
     """
     T = mi.ScalarTransform4f
-    # So wide that no path sees the rim; its corners stay within the room.
+    # So wide that no path sees the rim; the corners stay inside the room.
     half, thick, distance = [2.8, 2.0, 1.0], 0.6, 2.9
     angle = np.radians(55)
     side = [float(distance * np.sin(angle)), 0.0, float(distance * np.cos(angle))]
-    # The picture of the normals covers -0.8 to 0.8 in x and y; around it, in view too, its flat edge goes on.
+    # The normal map covers -0.8 to 0.8 in x and y. Its flat border continues around it, which is also visible.
     middle = T().translate([0.5, 0.5, 0]).scale([half[0] / 0.8, half[1] / 0.8, 1]).translate([-0.5, -0.5, 0])
     normals = _picture(_bumps(texture), wrap_mode="clamp", to_uv=middle)
     glass = {"type": "ref", "id": "glass"}
@@ -128,7 +130,7 @@ def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
 
 
 def _bumps(size: int) -> np.ndarray:
-    """Normals of h(x, y) = 0.03 w (sin 5x cos 4y + cos(3x + 5y)), w = (1 - x²)²(1 - y²)², flat towards the rim."""
+    """Normal map of h(x, y) = 0.03 w (sin 5x cos 4y + cos(3x + 5y)), w = (1 - x²)²(1 - y²)², flat at the border."""
     y, x = (2 * each - 1 for each in _centres(size, size))
 
     def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -143,9 +145,9 @@ def _bumps(size: int) -> np.ndarray:
 
 
 def mirror_camera(resolution: int = 48) -> SceneDict:
-    """An old, blotched mirror that hangs in a painted room, seen by a tripod that stays and a camera that is carried.
+    """An old mirror with blotches in a textured room, seen by a fixed camera on a tripod and by a moving camera.
 
-    Both see the mirror with some of the room around it. The blotches tell where in its plane the mirror is. Keys:
+    Both see the mirror and some of the room around it. The blotches determine the mirror's position in its plane. Keys:
     ``camera.to_world`` and ``mirror.to_world``.
     """
     place = mi.ScalarTransform4f().translate([-0.4, -0.1, -1.0])
@@ -174,7 +176,7 @@ def _blotches(size: int) -> np.ndarray:
 def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
     """A small cloud (``grid``³ voxels, albedo 0.95) under a sky with a sun, seen by ``views`` sensors around it.
 
-    The medium fills a cube of side 2 without surface of its own. Key of the density (extinction per length):
+    The medium fills a cube of side 2 with a null boundary. Key of the density (extinction per length):
     ``cloud.interior_medium.sigma_t.data``.
     """
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
@@ -188,7 +190,7 @@ def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
     }
     for view in range(views):
         angle = 2 * np.pi * (view + 0.3) / views
-        # In turn from below, from the side and from above: what lies behind what shows only from different heights.
+        # Alternate between views from below, the side and above: hidden parts are visible from other heights only.
         height = (-1.6, 0.3, 2.2)[view % 3]
         origin = [float(4 * np.cos(angle)), height, float(4 * np.sin(angle))]
         scene[f"view{view + 1}"] = _camera(origin, [0, -0.1, 0], 34, resolution)
@@ -196,9 +198,9 @@ def cloud(resolution: int = 40, grid: int = 32, views: int = 6) -> SceneDict:
 
 
 def silhouettes(resolution: int = 32, views: int = 2) -> SceneDict:
-    """A black body with four knobs, 1 long, before a white sky: there is nothing to see of it but its outline.
+    """A black body with four knobs, 1 long, in front of a white sky: only its silhouette is visible.
 
-    Key of its vertices: ``body.vertex_positions``. The cameras stand around it at equal angles (two: 90 degrees).
+    Key of its vertices: ``body.vertex_positions``. The cameras stand around it at equal angles (two: 90 degrees apart).
     """
     black = {"type": "diffuse", "reflectance": 0.0}
     vertices, faces = ball(4)
@@ -216,10 +218,10 @@ def silhouettes(resolution: int = 32, views: int = 2) -> SceneDict:
 
 
 def shadows(resolution: int = 32, views: int = 4, ball_splits: int = 0) -> SceneDict:
-    """The body of `silhouettes`, black, over a white floor on which a lamp casts its shadow.
+    """The body of `silhouettes`, black, above a white floor on which an area light casts its shadow.
 
-    Cameras look down on it from around. With ``ball_splits`` (4) there is a ball in its place, with as many vertices:
-    what one starts from.
+    Cameras look down on it from all sides. With ``ball_splits`` (4) a sphere with the same number of vertices replaces
+    the body: the initial value of an optimisation.
     """
     T = mi.ScalarTransform4f
     vertices, faces = ball(ball_splits or 4)
@@ -247,9 +249,9 @@ def shadows(resolution: int = 32, views: int = 4, ball_splits: int = 0) -> Scene
 
 
 def silhouette_in_mirror(resolution: int = 32) -> SceneDict:
-    """The body of `silhouettes`, seen by one camera, directly and from its other side in a mirror.
+    """The body of `silhouettes`, seen by one camera directly and, from its other side, in a mirror.
 
-    The picture is twice as wide as high. The rim of the mirror is not seen: it reflects what is beside it.
+    The image is twice as wide as high. The mirror's rim is invisible, because it reflects its own surroundings.
     """
     scene = silhouettes(resolution, views=1)
     camera = _camera([0.5, 0, 4], [0.5, 0, 0], 36, resolution)
@@ -267,7 +269,7 @@ def _panel(place: Any, *colour: float) -> SceneDict:
 
 
 def flat_colours(resolution: int = 32) -> SceneDict:
-    """Panels that glow, each in one colour, at different distances before the dark: all there is to see are edges.
+    """Emissive panels of one colour each at different distances in front of black: an image shows nothing but edges.
 
     The camera, key ``camera.to_world``, looks at them from three units away.
     """
@@ -287,7 +289,7 @@ def flat_colours(resolution: int = 32) -> SceneDict:
 
 
 def glass_ball(resolution: int = 32) -> SceneDict:
-    """A ball of glass (index 1.5, radius 0.5) before panels of one colour each: it is seen by what it bends.
+    """A glass sphere (index 1.5, radius 0.5) in front of single-colour panels: only its refraction makes it visible.
 
     Keys: ``glass.eta`` and ``ball.to_world``.
     """
@@ -311,8 +313,8 @@ def glass_ball(resolution: int = 32) -> SceneDict:
 def _cumulus(size: int) -> np.ndarray:
     """Extinction max(0, 8 b(y) Σ_i exp(-|x - c_i|² / r_i²) (0.75 + n(x)) - 1.5) at the voxel centres of [-1, 1]³.
 
-    Six balls, cut off below by b to a flat base; the noise n is a sum of 12 plane waves of wavelengths 0.5 to 1.2. The
-    shape is (z, y, x, 1).
+    Six Gaussian blobs, cut off below by b to a flat base; the noise n is a sum of 12 plane waves of wavelengths 0.5 to
+    1.2. The shape is (z, y, x, 1).
     """
     z, y, x = (2 * each - 1 for each in _centres(size, size, size))
     shape = np.zeros_like(x)
@@ -332,13 +334,13 @@ def _cumulus(size: int) -> np.ndarray:
 
 
 def _sky(rows: int) -> np.ndarray:
-    """Blue above, dim below, and a sun 50 degrees above the horizon, spread over 8 degrees so that it can be met."""
+    """Blue above, dim below, with a sun 50 degrees above the horizon, blurred over 8 degrees so that paths hit it."""
     v, u = _centres(rows, 2 * rows)
     θ, φ = np.pi * v, 2 * np.pi * u
     d = np.stack([np.sin(θ) * np.sin(φ), np.cos(θ), -np.sin(θ) * np.cos(φ)], axis=-1)  # Mitsuba's envmap
     up = 0.5 + 0.5 * d[..., 1:2]
     sky = up * np.array([0.2, 0.3, 0.5]) + (1 - up) * np.array([0.14, 0.12, 0.11])
-    # At the side of the cameras that look up from below, so that no picture shows it.
+    # On the side of the cameras that look up from below, so that no image contains it.
     elevation, azimuth = np.radians(50), np.radians(108)
     sun = np.array([np.cos(elevation) * np.cos(azimuth), np.sin(elevation), np.cos(elevation) * np.sin(azimuth)])
     glow = np.exp((d @ sun - 1) / (1 - np.cos(np.radians(8))))[..., None]

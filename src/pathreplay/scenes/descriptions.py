@@ -1,4 +1,4 @@
-"""Loads what a dictionary describes, after a look for what Mitsuba does not survive; Mitsuba's errors as one line."""
+"""Load objects from dictionaries, with checks for input that crashes Mitsuba, and report errors in one line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathreplay.errors import PathreplayError
 
 
 def require_values(description: Mapping[str, Any]) -> None:
-    """Raise PathreplayError if a value of a dictionary, or of one in it, is None: Mitsuba dies of that (SIGSEGV)."""
+    """Raise PathreplayError if a value of a dictionary, nested or not, is None: Mitsuba crashes on it (SIGSEGV)."""
     for name, value in description.items():
         if value is None:
             raise PathreplayError(
@@ -24,25 +24,25 @@ def require_values(description: Mapping[str, Any]) -> None:
 
 
 def load_integrator(description: Mapping[str, Any]) -> mi.Integrator:
-    """The integrator that a dictionary describes. Raises PathreplayError if it describes none that Mitsuba can make."""
+    """Load the integrator that a dictionary describes. Raises PathreplayError if Mitsuba cannot create it."""
     require_values(description)
     name = description.get("type")
-    with told(f"Integrator '{name}' cannot be made", (Exception,)):  # plugins in Python raise whatever they like
+    with told(f"Integrator '{name}' cannot be created", (Exception,)):  # plugins in Python raise exceptions of any type
         integrator = mi.load_dict(dict(description))
     if not isinstance(integrator, mi.Integrator):
         raise PathreplayError(
-            f"'{name}' is a {type(integrator).__name__}, which is no integrator; name one, such as 'pathreplay' (or "
-            "'path' for targets)"
+            f"'{name}' is a {type(integrator).__name__}, not an integrator; give the name of one, such as 'pathreplay' "
+            "(or 'path' for targets)"
         )
     return integrator
 
 
 @contextmanager
 def told(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -> Iterator[None]:
-    """An error of these kinds within becomes a PathreplayError, whose line begins with ``what``.
+    """Convert exceptions of these kinds into a PathreplayError whose message begins with ``what``.
 
-    It tells the error that came first: Dr.Jit's calls and loops raise others that say nothing. A Ctrl-C that Dr.Jit has
-    turned into such an error comes out as what it was.
+    The message is that of the first exception in the chain, because those that Dr.Jit's calls and loops raise
+    afterwards are uninformative. A Ctrl-C that Dr.Jit converted into such an exception is raised as KeyboardInterrupt.
     """
     try:
         yield
@@ -58,9 +58,9 @@ def told(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -> Ite
 
 
 def one_line(error: BaseException) -> str:
-    """A Mitsuba or Dr.Jit error as one readable line: without C++ source positions, without a plugin's traceback."""
+    """A Mitsuba or Dr.Jit error as one readable line, without C++ source positions and Python tracebacks."""
     text = str(error)
-    if "PathreplayError: " in text:  # raised by a plugin of ours: it already is what the user should read
+    if "PathreplayError: " in text:  # raised by one of our plugins: already a message for users
         return " ".join(text.rsplit("PathreplayError: ", 1)[1].split())
     text = re.sub(r"Traceback \(most recent call last\):\n(?:[ ]+.*\n)*", "", text)
     text = re.sub(r"\[[A-Za-z_]+\.cpp:\d+\] ", "", text)

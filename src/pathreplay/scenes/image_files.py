@@ -1,6 +1,6 @@
-"""The heads of picture files: how large a picture is, before anything of it is unpacked, and how it is stored.
+"""Headers of image files: size and storage format, read before any pixel is decoded.
 
-A file of some hundred bytes can claim four thousand million pixels, and who unpacks it takes memory for all of them.
+A file of a few hundred bytes can claim four billion pixels, and decoding it allocates memory for all of them.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from pathreplay.platform import memory
 from pathreplay.scenes.tga_files import is_tga, require_sound_tga, tga_size
 
 MOST_PIXELS = 2**27
-"""Of a picture that is brought to another size."""
+"""Largest number of pixels of an image that is to be resized."""
 _A_PIXEL = 32
-"""Bytes for each pixel while a picture is read: as it is stored, and as single floats, which are copied once."""
+"""Bytes per pixel while an image is read: the stored format, and single precision, which is copied once."""
 MOST_HEAD = 2**16
-"""Bytes in which a head of text has to end."""
+"""Bytes within which a text header has to end."""
 _MOST_PARTS = 2**12
-"""Segments of a JPEG, or attributes of an EXR, before the size. Real files have some twenty."""
+"""Largest number of JPEG segments or EXR attributes before the size. Real files have about twenty."""
 
 _GAP = rb"(?:\s|#[^\n]*\n)+"
 _PIXMAP = re.compile(rb"P([56])" + _GAP + rb"(\d{1,10})" + _GAP + rb"(\d{1,10})" + _GAP + rb"(\d{1,5})\s")
@@ -32,54 +32,54 @@ _RESOLUTION = re.compile(r"([+-])([XY]) (\d{1,10}) ([+-])([XY]) (\d{1,10})")
 
 @dataclass(frozen=True)
 class PixmapHead:
-    """Of a binary PGM or PPM."""
+    """The header of a binary PGM or PPM."""
 
     channels: int
     width: int
     height: int
     highest: int
-    """The value of white."""
+    """Value of white."""
     length: int
-    """Bytes of the head."""
+    """Bytes of the header."""
 
 
 @dataclass(frozen=True)
 class RadianceHead:
-    """Of a Radiance HDR picture."""
+    """The header of a Radiance HDR image."""
 
     axes: str
-    """Of the scanlines and of the pixels in them: YX or XY."""
+    """Axes of the scanlines and of the pixels in a scanline: YX or XY."""
     signs: str
-    """Of both. Rows from top to bottom have -Y, columns from left to right +X."""
+    """Directions of both axes. Rows from top to bottom have -Y, columns from left to right +X."""
     counts: tuple[int, int]
-    """Of scanlines, and of the pixels in one."""
+    """Number of scanlines, and of pixels per scanline."""
     exposure: float
-    """What the values were multiplied by."""
+    """Factor by which the stored values were multiplied."""
     xyz: bool
-    """Whether they are CIE XYZ, not RGB."""
+    """Whether the values are CIE XYZ instead of RGB."""
     length: int
-    """Bytes of the head."""
+    """Bytes of the header."""
 
 
 def pixmap_head(data: bytes) -> PixmapHead:
-    """The head of a PGM or PPM, with comments. Raises ValueError."""
+    """The header of a PGM or PPM, with comments. Raises ValueError."""
     if not (found := _PIXMAP.match(data)) or not 0 < int(found[4]) < 2**16:
-        raise ValueError("its head is no PGM's and no PPM's")
+        raise ValueError("it has no PGM or PPM header")
     width, height, highest = (int(found[n]) for n in (2, 3, 4))
     return PixmapHead(1 if found[1] == b"5" else 3, width, height, highest, found.end())
 
 
 def radiance_head(data: bytes) -> RadianceHead:
-    """The head of a Radiance picture: lines, an empty one, and the resolution. Raises ValueError."""
+    """The header of a Radiance image: lines, an empty line, and the resolution. Raises ValueError."""
     text, gap, rest = data.partition(b"\n\n")
     resolution, end, _ = rest.partition(b"\n")
     found = _RESOLUTION.fullmatch(resolution.decode("latin-1"))
     if not found or found[2] == found[5]:
-        raise ValueError("its head is no Radiance picture's")
+        raise ValueError("it has no Radiance header")
     exposure, xyz = 1.0, False
     for line in text.decode("latin-1").split("\n")[1:]:
         name, _, value = line.partition("=")
-        if name == "EXPOSURE":  # several are multiplied
+        if name == "EXPOSURE":  # several factors are multiplied
             exposure *= float(value)
         elif name == "FORMAT":
             xyz = value.strip() == "32-bit_rle_xyze"
@@ -94,36 +94,36 @@ def radiance_head(data: bytes) -> RadianceHead:
 
 
 def size_of_picture(path: Path) -> tuple[int, int] | None:
-    """Width and height by the head of a file; None where that is of no format that we know.
+    """Width and height from the header of a file; None for an unknown format.
 
-    Raises PathreplayError where it is of a format that we know, and tells no size.
+    Raises PathreplayError if the format is known and the header contains no size.
     """
     try:
         with path.open("rb") as file:
             return _size(file, file.read(MOST_HEAD), path)
     except (OSError, ValueError, IndexError, struct.error):
-        raise PathreplayError(f"Image {path} has a damaged head, which tells no size; replace the file") from None
+        raise PathreplayError(f"Image {path} has a damaged header without a size; replace the file") from None
 
 
 def require_readable_picture(path: Path, pixels: int = MOST_PIXELS) -> None:
-    """Raise PathreplayError for a picture without pixels, with more than ``pixels``, or too large for the memory.
+    """Raise PathreplayError for an image without pixels, with more than ``pixels``, or too large for the memory.
 
-    Also for a TGA that Mitsuba would unpack beyond its last pixel.
+    Also raises it for a TGA that Mitsuba would decode beyond its last pixel.
     """
     size = size_of_picture(path)
     if size is None:
-        return  # who reads it says what is wrong
+        return  # the reader reports unknown formats
     what = f"Image {path} is {size[0]} x {size[1]}"
     if not prod(size):
-        raise PathreplayError(f"{what}, which is no picture; replace the file")
+        raise PathreplayError(f"{what}, which has no pixels; replace the file")
     if prod(size) > pixels:
-        raise PathreplayError(f"{what}, and images of up to {pixels} pixels are read; scale it down")
+        raise PathreplayError(f"{what}, and the limit is {pixels} pixels; scale it down")
     memory.require(prod(size) * _A_PIXEL, f"{what}, and", "scale it down")
     require_sound_tga(path)
 
 
 def _size(file: BinaryIO, data: bytes, path: Path) -> tuple[int, int] | None:
-    """Raises struct.error, ValueError or IndexError where a head is damaged."""
+    """Width and height; raises struct.error, ValueError or IndexError for a damaged header."""
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return struct.unpack_from(">II", data, 16)
     if data[:2] == b"\xff\xd8":
@@ -131,7 +131,7 @@ def _size(file: BinaryIO, data: bytes, path: Path) -> tuple[int, int] | None:
     if data[:4] == b"\x76\x2f\x31\x01":
         return _exr_size(file)
     if data[:2] == b"BM":
-        old = struct.unpack_from("<I", data, 14)[0] == 12  # a head of OS/2
+        old = struct.unpack_from("<I", data, 14)[0] == 12  # OS/2 header
         width, height = struct.unpack_from("<HH" if old else "<ii", data, 18)
         return abs(width), abs(height)
     if data[:2] in (b"P5", b"P6"):
@@ -149,7 +149,7 @@ def _size(file: BinaryIO, data: bytes, path: Path) -> tuple[int, int] | None:
 
 
 def _jpeg_size(file: BinaryIO) -> tuple[int, int]:
-    """By the frame's head, which follows other segments."""
+    """Size from the frame header, which follows other segments."""
     file.seek(2)
     for _ in range(_MOST_PARTS):
         if file.read(1) != b"\xff":
@@ -165,7 +165,7 @@ def _jpeg_size(file: BinaryIO) -> tuple[int, int]:
 
 
 def _exr_size(file: BinaryIO) -> tuple[int, int]:
-    """By the data window, one of the attributes of the first head: name, type, length of the value, value."""
+    """Size from the data window, an attribute of the first header: name, type, length of the value, value."""
     file.seek(8)
     for _ in range(_MOST_PARTS):
         name, kind = _text(file), _text(file)
@@ -178,7 +178,7 @@ def _exr_size(file: BinaryIO) -> tuple[int, int]:
 
 
 def _text(file: BinaryIO) -> bytes:
-    """Up to a zero, which comes soon."""
+    """Read up to the next zero byte, which must be near."""
     begin, text = file.tell(), file.read(256).split(b"\0")[0]
     file.seek(begin + len(text) + 1)
     return text

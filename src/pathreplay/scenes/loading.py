@@ -1,4 +1,4 @@
-"""Scenes by name or file: the one door through which every command loads a scene, with its names kept."""
+"""Load scenes by name or file, with parameter keys preserved: the single entry point of all commands."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ from pathreplay.scenes.builtin import BUILTINS, COSTS, SceneDict
 from pathreplay.scenes.descriptions import told
 from pathreplay.scenes.substitute import Cameras, load_dict_with, load_file_with
 
-# What Mitsuba calls the class of a `bitmap` in 8 bits.
+# Class name of a `bitmap` stored in 8 bits.
 _COARSE = "BitmapTextureImpl[uint8]"
 
 
 def load_scene(spec: str | Path, base: Path | None = None, /, **parameters: Any) -> mi.Scene:
-    """Load a scene so that its parameter keys keep the names that the file gives.
+    """Load a scene so that its parameter keys keep the names in the file.
 
-    ``spec`` is the path of a Mitsuba XML file (relative paths start at ``base``, or else at the current folder) or the
-    name of a built-in scene (see ``BUILTINS``). ``parameters`` replace ``$name`` in the file, or are the arguments of
-    the built-in. Needs an active Mitsuba variant.
+    ``spec`` is the path of a Mitsuba XML file (relative paths start at ``base``, or at the current folder) or the name
+    of a built-in scene (see ``BUILTINS``). ``parameters`` replace ``$name`` in the file, or are the arguments of the
+    built-in. Needs an active Mitsuba variant.
 
-    Raises PathreplayError for no such file or built-in, a wrong parameter, what Mitsuba cannot read, no variant.
+    Raises PathreplayError if the scene does not exist, a parameter is wrong, Mitsuba cannot read the scene, or no
+    variant is active.
     """
     return load_scene_with(spec, {}, base, **parameters)[0]
 
@@ -48,9 +49,9 @@ def load_scene_with(
     /,
     **parameters: Any,
 ) -> tuple[mi.Scene, list[str]]:
-    """`load_scene` with plugins exchanged (old type -> new type), and one line for each that was: id and place.
+    """`load_scene` with plugins replaced (old type -> new type); also returns id and position of each, one line each.
 
-    ``spec`` may be a dictionary, too. ``cameras`` are added to those of the scene. For ``floats`` see `load_file_with`.
+    ``spec`` may also be a dictionary. ``cameras`` are added to those of the scene. For ``floats`` see `load_file_with`.
     """
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
@@ -58,10 +59,10 @@ def load_scene_with(
         with told("The scene's dictionary cannot be loaded", (RuntimeError, ValueError, TypeError)):
             scene, exchanged = load_dict_with(_copied(spec), plugins, cameras, floats)
         if not isinstance(scene, mi.Scene):
-            raise PathreplayError(f"The dictionary describes no scene but a {type(scene).__name__}; give a 'scene'")
+            raise PathreplayError(f"The dictionary describes a {type(scene).__name__}, not a scene; give a 'scene'")
         return scene, exchanged
     if str(spec) in BUILTINS:
-        with told(f"Built-in scene '{spec}' cannot be made of {parameters}"):
+        with told(f"Built-in scene '{spec}' cannot be created with {parameters}"):
             return load_dict_with(builtin_dict(str(spec), parameters), plugins, cameras, floats)
     path = Path(spec) if base is None else Path(base) / spec
     if (problem := file_problem(path)) == MISSING:
@@ -72,12 +73,12 @@ def load_scene_with(
     with told(f"Scene {path} cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene, exchanged = load_file_with(path, plugins, arguments, cameras, floats)
     if not isinstance(scene, mi.Scene):
-        raise PathreplayError(f"{path} describes no <scene> but a {type(scene).__name__}; wrap it in <scene>")
+        raise PathreplayError(f"{path} describes a {type(scene).__name__}, not a <scene>; wrap it in <scene>")
     return scene, exchanged
 
 
 def _copied(description: Mapping[str, Any]) -> SceneDict:
-    """A dictionary with tensors of its own: Mitsuba moves those of a dictionary into what it loads."""
+    """Copy a dictionary and its tensors: Mitsuba moves tensors out of a dictionary that it loads."""
     return {
         name: _copied(value) if isinstance(value, Mapping) else type(value)(value) if dr.is_array_v(value) else value
         for name, value in description.items()
@@ -85,7 +86,7 @@ def _copied(description: Mapping[str, Any]) -> SceneDict:
 
 
 def as_xml_has_them(parameters: Mapping[str, Any]) -> dict[str, str]:
-    """Scene parameters as texts: true and not True."""
+    """Scene parameters as XML text: true instead of True."""
     return {name: str(v).lower() if isinstance(v, bool) else str(v) for name, v in parameters.items()}
 
 
@@ -97,13 +98,13 @@ def load_scene_for(
     /,
     **parameters: Any,
 ) -> tuple[mi.Scene, tuple[str, ...]]:
-    """Load a scene in which the ``wanted`` keys and globs carry derivatives, as far as exchanging plugins brings it.
+    """Load a scene in which ``wanted`` keys and globs are differentiable, replacing plugins where that is necessary.
 
-    Where a pattern that ends in ``eta`` matches the index of a ``dielectric``, the scene is loaded once more with
-    `dielectric_ad` in the place of every ``dielectric``; where one that ends in ``data`` matches a texture of 8
-    bits, with its texels as floating-point numbers. ``cameras`` are added to those of the scene. Returns the scene and
-    what is to be said about it, one line each. Patterns that match nothing are left for others to complain about.
-    Raises what `load_scene` does.
+    Where a pattern ending in ``eta`` matches the index of a ``dielectric``, the scene is loaded again with
+    `dielectric_ad` in place of every ``dielectric``. Where one ending in ``data`` matches an 8-bit texture, it is
+    loaded again with floating-point texels. ``cameras`` are added to those of the scene. Returns the scene and a note
+    on each change, one line each. Patterns without a match are left to the caller to report. Raises the same errors as
+    `load_scene`.
     """
     scene, _ = load_scene_with(spec, {}, base, cameras, **parameters)
     params = traversed(scene)
@@ -112,7 +113,8 @@ def load_scene_for(
     plugins, floats = {"dielectric": "dielectric_ad"} if smooth else {}, coarse_pictures(params, wanted)
     if not plugins and not floats:
         return scene, ()
-    # Dr.Jit traces calls through every instance alive, so the first scene has to go before the second one comes.
+    # Dr.Jit traces virtual calls through every live instance, so the first scene must be freed before loading the
+    # second.
     del scene, params
     gc.collect()
     scene, exchanged = load_scene_with(spec, plugins, base, cameras, floats, **parameters)
@@ -126,7 +128,7 @@ def load_scene_for(
 def load_scene_with_floats(
     spec: str | Path, wanted: Iterable[str], base: Path | None = None, /, **parameters: Any
 ) -> mi.Scene:
-    """`load_scene` with textures of 8 bits as floating-point numbers where ``wanted`` keys and globs name them."""
+    """`load_scene` with floating-point texels in those 8-bit textures that ``wanted`` keys and globs name."""
     scene = load_scene(spec, base, **parameters)
     if not (floats := coarse_pictures(traversed(scene), wanted)):
         return scene
@@ -136,14 +138,14 @@ def load_scene_with_floats(
 
 
 def coarse_pictures(params: Any, wanted: Iterable[str]) -> tuple[str, ...]:
-    """The files of the textures that keys and globs ending in ``data`` name and Mitsuba holds as 8-bit integers."""
+    """Files of the 8-bit textures that keys and globs ending in ``data`` name."""
     owners = [params.properties[key][2] for key in _matching(params, wanted, "data")]
     found = [re.search(r'name = "(.*)"', str(owner)) for owner in owners if owner.class_name() == _COARSE]
     return tuple(dict.fromkeys(match[1] for match in found if match))
 
 
 def _matching(params: Any, wanted: Iterable[str], name: str) -> list[str]:
-    """The keys that patterns with this last part name."""
+    """Keys that match the patterns whose last part is ``name``."""
     keys: list[str] = []
     for pattern in wanted:
         if pattern.rsplit(".", 1)[-1] == name:
@@ -153,7 +155,7 @@ def _matching(params: Any, wanted: Iterable[str], name: str) -> list[str]:
 
 
 def builtin_dict(name: str, parameters: Mapping[str, Any]) -> SceneDict:
-    """The built-in scene of that name. Raises PathreplayError for a wrong parameter."""
+    """The dictionary of a built-in scene. Raises PathreplayError for a wrong parameter."""
     make = BUILTINS[name]
     known = inspect.signature(make).parameters
     for key, value in parameters.items():
@@ -163,7 +165,7 @@ def builtin_dict(name: str, parameters: Mapping[str, Any]) -> SceneDict:
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise PathreplayError(f"{what}; give a whole number above 0")
         if key in COSTS:
-            memory.require(COSTS[key](value), f"{what} and", "take a smaller number")
+            memory.require(COSTS[key](value), f"{what} and", "give a smaller number")
     return make(**parameters)
 
 
@@ -172,4 +174,4 @@ def _unknown(spec: str, path: Path) -> str:
     neighbours = [p.name for p in path.parent.glob("*.xml")] if path.parent.is_dir() else []
     close = difflib.get_close_matches(Path(spec).name, [*BUILTINS, *neighbours], n=1, cutoff=0.5)
     hint = f"; did you mean '{close[0]}'?" if close else ""
-    return f"No scene '{spec}': {path} is no file and no built-in has that name{hint} (built-ins: {names})"
+    return f"No scene '{spec}': neither the file {path} nor a built-in of that name exists{hint} (built-ins: {names})"

@@ -1,4 +1,4 @@
-"""A look into PLY files and Mitsuba's serialized meshes before Mitsuba reads them, which trusts their numbers."""
+"""Checks of PLY files and Mitsuba's serialized meshes before Mitsuba reads them without validating indices."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class _Element:
         return [kinds[0] for kinds in self.properties]
 
     def layout(self, form: str) -> np.dtype[Any]:
-        """Of one entry, where lists have three members. The numbers of a text are taken in double precision."""
+        """Data type of one entry, with lists of three items. Numbers in text files are read in double precision."""
         order = "<" if form == "binary_little_endian" else ">"
         fields: list[Any] = []
         for i, (*kinds, _) in enumerate(self.properties):
@@ -43,13 +43,13 @@ class _Element:
 
 
 def require_sound_ply(path: Path) -> None:
-    """Raise PathreplayError for what is no PLY file, for one without vertices or faces, and for faces without vertices.
+    """Raise PathreplayError for a file that is not PLY, has no vertices or faces, or has faces with invalid indices.
 
-    Damage of other kinds is left to Mitsuba, which sees it.
+    Mitsuba detects other damage itself.
     """
     with path.open("rb") as file:
         if file.read(3) != b"ply":
-            raise PathreplayError(f"Mesh {path} is no PLY file: it does not begin with 'ply'; get it anew")
+            raise PathreplayError(f"Mesh {path} is not a PLY file: it does not begin with 'ply'; replace it")
         form, elements = _ply_header(file)
         names = [element.name for element in elements[:2]]
         if form is None or names != ["vertex", "face"] or "list" in elements[0].kinds:
@@ -57,11 +57,11 @@ def require_sound_ply(path: Path) -> None:
         vertices, faces = elements[0].count, elements[1].count
         if not vertices or not faces:
             has = f"has {vertices} vertices and {faces} faces"
-            raise PathreplayError(f"Mesh {path} {has}; give it some, or leave it out")
+            raise PathreplayError(f"Mesh {path} {has}; add some, or leave the mesh out")
         try:
             indices = _triangles(file, elements, form)
         except (KeyError, ValueError, IndexError):
-            return  # not what we know: Mitsuba may
+            return  # unknown to us, possibly known to Mitsuba
     if indices is not None:
         _require_vertices(path, indices, vertices)
 
@@ -82,10 +82,10 @@ def _ply_header(file: Any) -> tuple[str | None, list[_Element]]:
 
 
 def _triangles(file: Any, elements: list[_Element], form: str) -> NDArray[Any] | None:
-    """Vertices of the faces, (n, 3); None where some are missing, or are no triangles: Mitsuba refuses these."""
+    """Vertex indices of the faces, (n, 3); None for missing data or non-triangular faces, which Mitsuba rejects."""
     vertex, face = (element.layout(form) for element in elements[:2])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # where numbers end and text begins
+        warnings.simplefilter("ignore")  # numpy warns where numbers end and text begins
         text = form == "ascii"
         data = np.fromfile(file, np.float64, sep=" ") if text else np.memmap(file, np.uint8, "r", file.tell())
     skipped, faces = vertex.itemsize * elements[0].count, elements[1].count
@@ -96,14 +96,14 @@ def _triangles(file: Any, elements: list[_Element], form: str) -> NDArray[Any] |
     return entries[f"{at}"] if (entries[f"count {at}"] == 3).all() else None
 
 
-# How a file of version 3 or 4 begins -> bytes of an entry in the table at its end.
+# First bytes of a file of version 3 or 4 -> bytes per entry of the table at its end.
 _ENTRIES = {b"\x1c\x04\x03\0": 4, b"\x1c\x04\x04\0": 8}
 
 
 def require_sound_serialized(path: Path, index: Any) -> None:
-    """Raise PathreplayError unless the table of shapes fits into the file, and shape ``index`` has its faces' vertices.
+    """Raise PathreplayError unless the table of shapes fits into the file and shape ``index`` has valid vertex indices.
 
-    Damage of other kinds is left to Mitsuba, which sees it.
+    Mitsuba detects other damage itself.
     """
     with path.open("rb") as file:
         entry, size = _ENTRIES.get(file.read(4)), path.stat().st_size
@@ -113,9 +113,11 @@ def require_sound_serialized(path: Path, index: Any) -> None:
         return
     count = int.from_bytes(last, "little")
     if count < 1 or size - 4 - entry * count < 4:
-        raise PathreplayError(f"Mesh {path} of {size} bytes should hold {count} shapes; it is damaged, write it anew")
+        raise PathreplayError(
+            f"Mesh {path} of {size} bytes should contain {count} shapes; it is damaged, write it again"
+        )
     try:
-        # With normals of faces Mitsuba makes none of vertices, by indices that it has not looked at.
+        # With face normals Mitsuba does not compute vertex normals, which would use the unchecked indices.
         description = {"type": "serialized", "filename": str(path), "shape_index": index, "face_normals": True}
         mesh = mi.load_dict(description)
     except RuntimeError:
@@ -125,10 +127,10 @@ def require_sound_serialized(path: Path, index: Any) -> None:
 
 
 def _require_vertices(path: Path, indices: NDArray[Any], vertices: int) -> None:
-    """Raise PathreplayError if the faces of a mesh name a vertex that it does not have."""
+    """Raise PathreplayError if a face refers to a vertex that does not exist."""
     low, high = int(indices.min()), int(indices.max())
     if low < 0 or high >= vertices:
         raise PathreplayError(
-            f"Mesh {path} has a face with vertex {low if low < 0 else high}, but its {vertices} vertices count from 0 "
-            f"to {vertices - 1}; it is damaged, write it anew"
+            f"Mesh {path} has a face with vertex {low if low < 0 else high}, but its {vertices} vertices are numbered "
+            f"0 to {vertices - 1}; it is damaged, write it again"
         )

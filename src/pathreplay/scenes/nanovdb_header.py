@@ -1,7 +1,8 @@
-"""Does a NanoVDB file hold what its header says? Asked before a reader gets it that would die of one that does not.
+"""Validate the headers of a NanoVDB file, because the reader crashes on a damaged one.
 
-A file is a row of segments, each 16 bytes (magic, version, number of grids, compression), what is to be known of every
-grid (176 bytes and a name), and the grids. A grid begins with a header of 672 bytes, which tells where its tree is.
+A file is a sequence of segments. Each has 16 bytes (magic, version, number of grids, compression), a description of
+every grid (176 bytes and a name), and the grids. A grid begins with a header of 672 bytes, which is followed by the
+positions of its tree nodes.
 """
 
 from __future__ import annotations
@@ -16,18 +17,18 @@ from pathreplay.errors import PathreplayError
 
 MAGICS = (b"NanoVDB0", b"NanoVDB2")
 MAJOR = 32
-"""Of the version of the format, which is in the upper 11 bits of the number in the file."""
+"""Major version of the format, the upper 11 bits of the version number in the file."""
 NONE, ZIP = 0, 1
 
-# No zip is smaller than 1 in 1032.
+# The largest compression ratio of zip is 1032.
 _MOST_PACKED = 1032
 
 _SEGMENT = struct.Struct("<8sIHH")
-# Size in memory and in the file, hash of the name, voxels, type, class; two boxes and the voxel's size are passed over,
-# then the length of the name.
+# Size in memory and in the file, hash of the name, voxels, type, class; then two boxes and the voxel size, which are
+# skipped, and the length of the name.
 _GRID = struct.Struct("<4Q2I96xI36x")
 _GRID_HEADER = 672
-# Where leaves, lower and upper nodes and the root begin, counted from here, and how many there are of the first three.
+# Offsets of leaves, lower nodes, upper nodes and root from this position, and the counts of the first three.
 _TREE = struct.Struct("<4Q3I")
 _FLOAT, _FLOAT_SIZES = 1, (2144, 33856, 270400)
 
@@ -41,15 +42,15 @@ class _Place(NamedTuple):
 
 
 def require_whole_nanovdb(path: Path) -> bool:
-    """Whether a NanoVDB file's first grid is compressed, once headers, sizes and the places of its trees agree.
+    """Check headers, sizes and tree positions of a NanoVDB file; return whether its first grid is compressed.
 
-    Grids that are compressed by zip are unpacked, which tells whether their bytes are what was written. Values and the
-    links inside of an uncompressed tree are not looked at.
+    Zip-compressed grids are decompressed, which verifies their checksum. Values, and links inside an uncompressed tree,
+    are not checked.
 
-    Raises PathreplayError if it is no such file, of an unknown version, or damaged.
+    Raises PathreplayError if the file is not NanoVDB, has an unknown version, or is damaged.
     """
     if path.stat().st_size < _SEGMENT.size:
-        raise _damaged(path, "its header is cut off")
+        raise _damaged(path, "its header is truncated")
     try:
         with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
             places = _places(path, content)
@@ -57,7 +58,7 @@ def require_whole_nanovdb(path: Path) -> bool:
                 _require_grid(path, content, place)
             return places[0].codec != NONE
     except (struct.error, UnicodeDecodeError):
-        raise _damaged(path, "a header is cut off or holds no text where a name should be") from None
+        raise _damaged(path, "a header is truncated or contains an invalid name") from None
 
 
 def _places(path: Path, content: mmap) -> list[_Place]:
@@ -66,11 +67,11 @@ def _places(path: Path, content: mmap) -> list[_Place]:
     while at < len(content) or not places:
         magic, version, grids, codec = _SEGMENT.unpack_from(content, at)
         if magic not in MAGICS:
-            raise PathreplayError(f"Volume {path} is no NanoVDB file (no 'NanoVDB' at byte {at}); save it as one")
+            raise PathreplayError(f"Volume {path} is not a NanoVDB file (no 'NanoVDB' at byte {at}); save it as one")
         if version >> 21 != MAJOR:
-            raise PathreplayError(f"Volume {path} is of NanoVDB version {version >> 21}; save it as version {MAJOR}")
+            raise PathreplayError(f"Volume {path} has NanoVDB version {version >> 21}; save it as version {MAJOR}")
         if not grids:
-            raise _damaged(path, "it says that it has no grid")
+            raise _damaged(path, "it contains no grid")
         at += _SEGMENT.size
         found = []
         for _ in range(grids):
@@ -82,14 +83,14 @@ def _places(path: Path, content: mmap) -> list[_Place]:
             places.append(_Place(grid_size, file_size, kind, at, codec))
             at += file_size
         if at > len(content):
-            raise _damaged(path, f"its header speaks of {at} bytes, it has {len(content)}")
+            raise _damaged(path, f"its header describes {at} bytes, and it has {len(content)}")
     return places
 
 
 def _require_grid(path: Path, content: mmap, place: _Place) -> None:
     data = content[place.begin : place.begin + place.file_size]
     if place.grid_size > _MOST_PACKED * place.file_size:
-        raise _damaged(path, f"{place.file_size} bytes cannot unpack to {place.grid_size}")
+        raise _damaged(path, f"{place.file_size} bytes cannot decompress to {place.grid_size}")
     if place.codec == ZIP:
         unpacker = zlib.decompressobj()
         try:
@@ -97,9 +98,9 @@ def _require_grid(path: Path, content: mmap, place: _Place) -> None:
         except zlib.error as error:
             raise _damaged(path, str(error)) from None
     elif place.codec != NONE:
-        return  # the reader refuses those itself
+        return  # the reader itself rejects other codecs
     if len(data) != place.grid_size or len(data) < _GRID_HEADER + _TREE.size or data[:7] != b"NanoVDB":
-        raise _damaged(path, f"a grid of {place.grid_size} bytes is not there as a whole")
+        raise _damaged(path, f"a grid of {place.grid_size} bytes is incomplete")
     *begins, root, leaves, lowers, uppers = _TREE.unpack_from(data, _GRID_HEADER)
     room = len(data) - _GRID_HEADER
     ends = [root + 96]
@@ -107,8 +108,8 @@ def _require_grid(path: Path, content: mmap, place: _Place) -> None:
         counts = (leaves, lowers, uppers)
         ends += [b + n * size for b, n, size in zip(begins, counts, _FLOAT_SIZES, strict=True) if n]
     if max(ends) > room or any(value < _TREE.size for value in (root, *(b for b in begins if b))):
-        raise _damaged(path, "its tree reaches beyond its end")
+        raise _damaged(path, "its tree extends beyond its end")
 
 
 def _damaged(path: Path, why: str) -> PathreplayError:
-    return PathreplayError(f"Volume {path} cannot be read: it is damaged ({why}); get it anew")
+    return PathreplayError(f"Volume {path} cannot be read: it is damaged ({why}); replace it")

@@ -1,7 +1,7 @@
-"""Scene parameters by name: find them, say which can be differentiated, and carry them to NumPy and back.
+"""Scene parameters by key: find them, report which are differentiable, and convert them to and from NumPy.
 
-A parameter is addressed by its key in ``mi.traverse(scene)``. Values keep their type: ``Float``, ``Color3f`` and its
-kind, ``TensorXf`` (textures, grids) and ``AffineTransform4f`` go through NumPy and come back as what they were.
+A parameter is addressed by its key in ``mi.traverse(scene)``. Conversion to NumPy and back preserves types: ``Float``,
+``Color3f`` and similar types, ``TensorXf`` (textures, grids) and ``AffineTransform4f``.
 """
 
 from __future__ import annotations
@@ -19,42 +19,42 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 
-# What to do instead, for values that Mitsuba 3.9 stores without derivative: (class of the owner, last part of the key).
+# Remedies for values that Mitsuba 3.9 stores without derivative: (class of the owner, last part of the key).
 _WAY_OUT = {
     ("SmoothDielectric", "eta"): (
-        "BSDF 'dielectric' keeps it as a plain number; use BSDF 'dielectric_ad' of this package instead, "
-        "its eta is differentiable"
+        "BSDF 'dielectric' stores it as a plain number; use BSDF 'dielectric_ad' of this package instead, "
+        "whose eta is differentiable"
     ),
     ("SmoothPlastic", "eta"): (
-        "BSDF 'plastic' keeps it as a plain number and there is no replacement yet; "
-        "fix it, and differentiate the reflectances"
+        "BSDF 'plastic' stores it as a plain number and there is no replacement yet; "
+        "keep it constant, and differentiate the reflectances"
     ),
     ("BitmapTextureImpl[uint8]", "data"): (
-        "Mitsuba keeps the texels of this picture as 8-bit integers; give the 'bitmap' texture the option "
+        "Mitsuba stores the texels of this image as 8-bit integers; give the 'bitmap' texture the option "
         "format='variant', which stores them as floating-point numbers"
     ),
     ("HeterogeneousMedium", "scale"): (
-        "medium 'heterogeneous' keeps it as a plain number; leave it at 1 and multiply the values of 'sigma_t' instead"
+        "medium 'heterogeneous' stores it as a plain number; leave it at 1 and multiply the values of 'sigma_t' instead"
     ),
     ("HomogeneousMedium", "scale"): (
-        "medium 'homogeneous' keeps it as a plain number; leave it at 1 and multiply the value of 'sigma_t' instead"
+        "medium 'homogeneous' stores it as a plain number; leave it at 1 and multiply the value of 'sigma_t' instead"
     ),
 }
 
 
 def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> list[str]:
-    """The keys that ``patterns`` name, in the order of the patterns, then of the scene; each key once.
+    """The keys that match ``patterns``, in the order of the patterns, then of the scene; each key once.
 
-    A pattern is an exact key or a shell-like glob (``*``, ``?``, ``[abc]``); globs match whole keys, dots included.
-    Names may hold brackets themselves: where a glob matches nothing, its brackets are taken as they are.
-    ``params`` is what ``mi.traverse(scene)`` returns.
+    A pattern is an exact key or a shell-style glob (``*``, ``?``, ``[abc]``). Globs match whole keys, dots included.
+    Names may contain brackets: if a glob matches nothing, its brackets are taken literally. ``params`` is the result of
+    ``mi.traverse(scene)``.
 
     Raises PathreplayError, with the nearest keys, if a pattern matches nothing.
     """
     known = list(params.keys())
     found: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        # '[[]' is how a glob says '['.
+        # '[[]' matches a literal '['.
         literal = pattern.replace("[", "[[]")
         matches = [pattern] if pattern in known else fnmatch.filter(known, pattern) or fnmatch.filter(known, literal)
         if not matches:
@@ -64,31 +64,32 @@ def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> li
 
 
 def keep_only(params: Any, keys: Iterable[str]) -> None:
-    """Reduce ``mi.traverse(scene)`` to exactly these keys; Mitsuba's own ``keep`` takes them as regular expressions."""
+    """Reduce ``mi.traverse(scene)`` to exactly these keys; Mitsuba's own ``keep`` treats them as regexes."""
     params.keep([rf"{re.escape(key)}\Z" for key in keys])
 
 
 def _no_match(known: list[str], pattern: str) -> str:
     if not known:
         return f"No parameter '{pattern}': the scene has no parameters"
-    # Lower case: a wrong capital should not hide the neighbour. 0.5 lets 'red.bsdf' find 'red.bsdf.reflectance.value'.
+    # Lower case, so that a wrong capital does not hide the neighbour. 0.5 lets 'red.bsdf' find
+    # 'red.bsdf.reflectance.value'.
     lower = {key.lower(): key for key in known}
     close = [lower[match] for match in difflib.get_close_matches(pattern.lower(), lower, n=3, cutoff=0.5)]
     if close:
         return f"No parameter '{pattern}' in the scene; nearest: {', '.join(close)}"
-    return f"No parameter '{pattern}' in the scene, and none like it; mitsuba.traverse(scene) lists all {len(known)}"
+    return f"No parameter '{pattern}' in the scene, and no similar one; mitsuba.traverse(scene) lists all {len(known)}"
 
 
 def owner_class(params: Any, key: str) -> str:
-    """Name of the class (not of the plugin: 'SmoothDielectric', not 'dielectric') that owns a parameter."""
+    """Name of the class that owns a parameter (not of the plugin: 'SmoothDielectric', not 'dielectric')."""
     return str(params.properties[key][2].class_name())
 
 
 def require_differentiable(params: Any, key: str, integrator: Any = None) -> None:
-    """Raise PathreplayError unless ``integrator`` (None: any of Mitsuba's) can carry a derivative to ``key``.
+    """Raise PathreplayError unless ``integrator`` (None: any of Mitsuba's) can differentiate ``key``.
 
     It cannot if the key does not exist, is a plain number, holds integers, or is marked
-    ``mi.ParamFlags.NonDifferentiable``; where there is a replacement the message names it.
+    ``mi.ParamFlags.NonDifferentiable``. Where a replacement exists, the message names it.
     """
     if key not in params:
         raise PathreplayError(_no_match(list(params.keys()), key))
@@ -101,14 +102,14 @@ def require_differentiable(params: Any, key: str, integrator: Any = None) -> Non
     if needs_ray_adjoint(params, key):
         raise PathreplayError(
             f"Parameter '{key}' carries no derivative through this integrator: only 'pathreplay' differentiates "
-            "cameras and the motion of lights; use it, with attach = 'delta' (its default) or 'all'"
+            "cameras and the motion of emitters; use it, with attach = 'delta' (its default) or 'all'"
         )
     if _is_float(value) and is_empty(value):
         raise PathreplayError(
-            f"Parameter '{key}' is empty: its {owner} has none of these; give the file some, or leave the key out"
+            f"Parameter '{key}' is empty: its {owner} has no such values; add them to the file, or leave the key out"
         )
     if isinstance(value, (bool, int, float)):
-        why = f"its {owner} keeps it as a plain number ({value!r})"
+        why = f"its {owner} stores it as a plain number ({value!r})"
     elif not _is_float(value):
         why = f"it is a {type(value).__name__}"
     else:
@@ -117,7 +118,7 @@ def require_differentiable(params: Any, key: str, integrator: Any = None) -> Non
 
 
 def require_settable(params: Any, key: str) -> None:
-    """Raise PathreplayError, with the way out, unless a parameter can be given floating-point numbers, one or many."""
+    """Raise PathreplayError, with the remedy, unless floating-point numbers can be assigned to a parameter."""
     value = params[key]
     if isinstance(value, float) or _is_float(value):
         return
@@ -127,9 +128,9 @@ def require_settable(params: Any, key: str) -> None:
 
 
 def resolve_differentiable(params: Any, patterns: str | Iterable[str], integrator: Any = None) -> list[str]:
-    """Like :func:`resolve_keys`, but a glob takes only those matches that carry a derivative.
+    """Like :func:`resolve_keys`, but a glob selects only matches that carry a derivative.
 
-    Raises PathreplayError if a pattern matches nothing, or nothing that carries one.
+    Raises PathreplayError if a pattern matches nothing, or nothing that carries a derivative.
     """
     found: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
@@ -142,9 +143,10 @@ def resolve_differentiable(params: Any, patterns: str | Iterable[str], integrato
 
 
 def carries_derivative(params: Any, key: str, integrator: Any = None) -> bool:
-    """Whether a derivative reaches a parameter: Dr.Jit floats, at least one, that Mitsuba does not mark as excluded.
+    """Whether a parameter is differentiable: a non-empty Dr.Jit float array that Mitsuba does not exclude.
 
-    Of those that it does mark, ``pathreplay`` (unless ``attach`` is 'none') reaches cameras and the motion of lights.
+    Of the parameters that Mitsuba excludes, ``pathreplay`` (unless ``attach`` is 'none') differentiates cameras and the
+    motion of emitters.
     """
     if not _is_float(params[key]) or is_empty(params[key]):
         return False
@@ -153,28 +155,29 @@ def carries_derivative(params: Any, key: str, integrator: Any = None) -> bool:
     return getattr(integrator, "moves_rays", False) and needs_ray_adjoint(params, key)
 
 
-# Marked NonDifferentiable by Mitsuba, whose integrators drop their derivatives. Each is held to finite differences in
-# tests/test_cameras_and_lights.py.
+# Marked NonDifferentiable by Mitsuba, whose integrators drop their derivatives. tests/test_cameras_and_lights.py
+# compares each with finite differences.
 _PRINCIPAL_POINT = {"principal_point_offset_x", "principal_point_offset_y"}
 _CAMERA = {"to_world", "x_fov", "aperture_radius", "focus_distance"} | _PRINCIPAL_POINT
 _LIGHT = {"to_world", "position"}
 
 
 def needs_ray_adjoint(params: Any, key: str) -> bool:
-    """Whether a parameter is one of a camera, or moves a light that is no shape: Mitsuba's integrators drop these."""
+    """Whether a parameter belongs to a camera or moves an emitter without a shape; Mitsuba's integrators drop these."""
     node, name = params.properties[key][2], key.rsplit(".", 1)[-1]
     placed = (isinstance(node, mi.Sensor) and name in _CAMERA) or (isinstance(node, mi.Emitter) and name in _LIGHT)
     return placed and _is_float(params[key])
 
 
 def is_transform(value: Any) -> bool:
-    """Whether a value is a transform of Dr.Jit floats, such as a ``to_world``."""
-    # Every Dr.Jit array answers to .matrix too. Scalar transforms (texture to_uv) hold no Dr.Jit array: no derivative.
+    """Whether a value is a transform of Dr.Jit floats, like ``to_world``."""
+    # Every Dr.Jit array also has .matrix. Scalar transforms (texture to_uv) hold no Dr.Jit array and have no
+    # derivative.
     return not dr.is_array_v(value) and hasattr(value, "matrix") and dr.is_diff_v(value.matrix)
 
 
 def _array(value: Any) -> Any:
-    """The Dr.Jit array that holds a value: of a transform its matrix."""
+    """The Dr.Jit array of a value; for a transform, its matrix."""
     return value.matrix if is_transform(value) else value
 
 
@@ -184,14 +187,14 @@ def _is_float(value: Any) -> bool:
 
 
 def is_empty(value: Any) -> bool:
-    """Whether an array holds no entry, such as the texture coordinates of a mesh that has none."""
+    """Whether an array has no entries, like the texture coordinates of a mesh without any."""
     return 0 in dr.shape(_array(value))
 
 
 def require_finite(params: Any) -> None:
-    """Raise PathreplayError, with the key and the index, if a parameter holds a NaN or an infinity.
+    """Raise PathreplayError, with key and index, if a parameter holds a NaN or an infinity.
 
-    A plain number may be infinite (distances are). Costs one reduction per array.
+    A plain number may be infinite, as distances can be. The cost is one reduction per array.
     """
     counts: dict[str, Any] = {}
     for key in params.keys():
@@ -208,15 +211,15 @@ def require_finite(params: Any) -> None:
             first = tuple(bad[0].tolist())
             raise PathreplayError(
                 f"Parameter '{key}' holds {len(bad)} NaN or infinite of {values.size} values, the first "
-                f"({values[first]}) at index {first}; mend the source file (numpy.nan_to_num helps)"
+                f"({values[first]}) at index {first}; fix the source file (numpy.nan_to_num helps)"
             )
 
 
 def get_array(value: Any) -> np.ndarray:
-    """A floating-point parameter value as a NumPy array of its own precision; a copy, without derivatives.
+    """A floating-point parameter value as a NumPy array in its own precision; a copy, without derivatives.
 
-    Shapes: a plain number (1,); ``Float`` (n,); ``Color3f`` and its kind (3,), or (3, n) where it holds n colours;
-    ``TensorXf`` its own; ``AffineTransform4f`` (4, 4).
+    Shapes: a plain number (1,); ``Float`` (n,); ``Color3f`` and similar types (3,), or (3, n) for n colours;
+    ``TensorXf`` its own shape; ``AffineTransform4f`` (4, 4).
     """
     if isinstance(value, float):
         return np.array([value], np.float32)
@@ -227,7 +230,10 @@ def get_array(value: Any) -> np.ndarray:
 
 
 def to_value(like: Any, array: Any) -> Any:
-    """The inverse of :func:`get_array`: ``array`` as a value like ``like``. Raises PathreplayError for other shapes."""
+    """The inverse of :func:`get_array`: ``array`` as a value of the type of ``like``.
+
+    Raises PathreplayError if the shapes differ.
+    """
     expected = get_array(like)
     given = np.asarray(array)
     if given.shape != expected.shape:
@@ -241,10 +247,10 @@ def to_value(like: Any, array: Any) -> Any:
 
 
 def displaced(value: Any, direction: np.ndarray, t: Any) -> Any:
-    """``value + t * direction``, for a differentiable scalar ``t`` (``mi.Float`` of size 1), in the type of ``value``.
+    """``value + t * direction`` for a differentiable scalar ``t`` (``mi.Float`` of size 1), in the type of ``value``.
 
-    ``direction`` has the shape of ``get_array(value)``. For transforms the sum is one of matrices, so ``direction``
-    need not be invertible. Derivatives flow from ``t``.
+    ``direction`` has the shape of ``get_array(value)``. For transforms the matrices are added, so that ``direction``
+    need not be invertible. Derivatives propagate from ``t``.
     """
     if is_transform(value):
         return type(value)(value.matrix + to_value(value.matrix, direction) * t)

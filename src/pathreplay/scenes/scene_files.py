@@ -1,6 +1,6 @@
-"""Cheap looks into the files of a scene, before a library reads them that would die of what is in there.
+"""Checks of scene files before they reach a library that crashes on their content.
 
-What Mitsuba itself refuses with a message (OBJ indices, truncated meshes, unknown formats) is left to Mitsuba.
+Errors that Mitsuba itself reports (OBJ indices, truncated meshes, unknown formats) are left to Mitsuba.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from pathreplay.scenes.mesh_files import require_sound_ply, require_sound_serial
 from pathreplay.scenes.volume_files import require_whole_vol
 
 DEEPEST = 64
-"""Elements inside each other in a scene file. Real ones have ten; Mitsuba's parser runs out of stack at some 10 000."""
+"""Largest depth of nested elements in a scene file. Real files have ten; Mitsuba's parser overflows its stack at about
+10 000."""
 
 LONGEST = 2**28
-"""Bytes of a scene file. Mitsuba takes some ten times as much memory to read one."""
+"""Largest size of a scene file in bytes. Mitsuba takes about ten times as much memory to read one."""
 
 
 def require_shallow(path: Path) -> None:
-    """Raise PathreplayError where a scene file, or one that it includes, is too long, or an element nested too deep."""
+    """Raise PathreplayError if a scene file, or one that it includes, is too long or nested too deeply."""
     waiting, seen = [path], set()
     while waiting:
         file = waiting.pop()
         problem = file_problem(file, LONGEST)
         if file.resolve() in seen or problem == MISSING:
-            continue  # Mitsuba tells of circles and of what is missing
+            continue  # Mitsuba reports cycles and missing files
         if problem:
-            raise PathreplayError(f"Scene {file} {problem}; keep meshes and textures in files of their own")
+            raise PathreplayError(f"Scene {file} {problem}; store meshes and textures in separate files")
         seen.add(file.resolve())
         waiting += [path.parent / name for name in _included(file)]
 
@@ -47,7 +48,7 @@ def _included(path: Path) -> list[str]:
         inside.append(tag)
         if len(inside) > DEEPEST:
             raise PathreplayError(
-                f"Scene {path} has more than {DEEPEST} elements inside each other (line {parser.CurrentLineNumber}); "
+                f"Scene {path} has more than {DEEPEST} nested elements (line {parser.CurrentLineNumber}); "
                 "flatten it with <ref id=…/>"
             )
         if tag == "include" and "filename" in attributes:
@@ -58,15 +59,15 @@ def _included(path: Path) -> list[str]:
         with path.open("rb") as file:
             parser.ParseFile(file)
     except (expat.ExpatError, OSError):
-        pass  # Mitsuba says where it is no XML
+        pass  # Mitsuba reports the position of XML errors
     return names
 
 
 def require_sound_files(state: Any) -> None:
-    """Raise PathreplayError where a file that a parsed scene (`mi.parser`) names cannot be given to Mitsuba.
+    """Raise PathreplayError if a parsed scene (`mi.parser`) refers to a file that is unsafe to give to Mitsuba.
 
-    Looks for pipes and devices, where Mitsuba would wait or read for ever; at the indices of PLY and serialized meshes
-    and at the sizes of volumes and pictures; and for groups without a shape.
+    Checked are pipes and devices, on which Mitsuba would block, the indices of PLY and serialized meshes, the sizes of
+    volumes and images, and groups without a shape.
     """
     for node in state.nodes:
         kind, name = node.props.plugin_name(), node.props.get("filename")
@@ -77,7 +78,7 @@ def require_sound_files(state: Any) -> None:
         path = Path(str(mi.file_resolver().resolve(name)))
         if problem := file_problem(path):
             if problem == MISSING:
-                continue  # Mitsuba says what is missing
+                continue  # Mitsuba reports missing files
             where = mi.parser.file_location(state, node)
             raise PathreplayError(f"File '{name}' of the scene {problem}; name a regular file ({where})")
         if kind == "ply":
@@ -85,13 +86,13 @@ def require_sound_files(state: Any) -> None:
         elif kind == "gridvolume":
             require_whole_vol(path)
         elif kind in ("bitmap", "envmap"):
-            require_readable_picture(path, pixels=2**31)  # of its size only memory decides
+            require_readable_picture(path, pixels=2**31)  # only memory limits its size
         elif kind == "serialized":
             require_sound_serialized(path, node.props.get("shape_index", 0))
 
 
 def _require_shapes(state: Any, group: Any) -> None:
-    """Raise PathreplayError for a group in which nothing is; Dr.Jit dies of its instances."""
+    """Raise PathreplayError for an empty shape group; Dr.Jit crashes on its instances."""
     by_id = {node.props.id(): node for node in state.nodes}
     for key in group.props.keys():
         child, kind = group.props.get(key), group.props.type(key)
@@ -102,4 +103,4 @@ def _require_shapes(state: Any, group: Any) -> None:
             node = by_id.get(child.id())
         if kind == mi.Properties.Type.Object or (node is not None and node.type == mi.ObjectType.Shape):
             return
-    raise PathreplayError(f"Shape group '{group.props.id()}' holds no shape; put one into it, or leave it out")
+    raise PathreplayError(f"Shape group '{group.props.id()}' contains no shape; add one, or leave the group out")

@@ -1,8 +1,9 @@
-"""A scene as a function of the values of some of its parameters: pictures, and gradients of what is linear in them.
+"""A scene as a pure function of some of its parameters: images, and vector-Jacobian products with image gradients.
 
-A pure function of values, view and seed. The scene holds the values of the call before, on which nothing depends:
-pictures of several views may be added up before any gradient is asked for, which sets each call's values again.
-(`drjit.wrap` around `mi.render` would give the gradients of all calls to the values of the last one.)
+The result depends on values, view and seed only. The scene holds the values of the previous call, and nothing depends
+on these: images of several views may be summed before a gradient is computed, because the gradient sets the values of
+its call again. (With `drjit.wrap` around `mi.render`, the gradients of all calls would be taken at the values of the
+last one.)
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from pathreplay.scenes.stored import form_of
 
 
 class View(NamedTuple):
-    """What is looked at, and by which samples."""
+    """A sensor, with the seed and the number of samples of its image."""
 
     sensor: int
     seed: int
@@ -32,15 +33,15 @@ class View(NamedTuple):
 
 
 class SceneFunction:
-    """Rendering as a pure function of Dr.Jit tensors, in the order of ``keys``, which PyTorch and JAX functions call.
+    """Rendering as a pure function of Dr.Jit tensors, in the order of ``keys``; PyTorch and JAX functions build on it.
 
     Args:
-        scene: a scene, or the path of an XML file or the name of a built-in, with ``arguments`` for it.
-        keys: parameters by key or glob, those of `mi.traverse(scene)`.
-        integrator: what renders and differentiates, as a dictionary of Mitsuba's; `pathreplay` if there is none.
-        spp: samples per pixel, for the picture and for its derivative.
+        scene: a scene, or the path of an XML file or the name of a built-in scene, with its ``arguments``.
+        keys: parameters by key or glob, from `mi.traverse(scene)`.
+        integrator: the integrator as a Mitsuba dictionary; `pathreplay` by default.
+        spp: samples per pixel, for the image and for its derivative.
 
-    Raises PathreplayError for no such scene or parameter, and for parameters without derivative.
+    Raises PathreplayError if the scene or a parameter does not exist, or a parameter is not differentiable.
     """
 
     def __init__(
@@ -65,19 +66,17 @@ class SceneFunction:
         self._forms = {key: form_of(self.params, key) for key in self.keys}
         seen = {key: self._forms[key].see(self.params[key]) for key in self.keys}
         self._types = {key: type(value) for key, value in seen.items()}
-        # Copies: the scene is about to change.
+        # Copies, because the scene is about to change.
         self._start = {key: get_array(value).copy() for key, value in seen.items()}
 
     def require(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """Raise PathreplayError if these are not the parameters, or cannot have these shapes.
+        """Raise PathreplayError if the keys differ from the function's or a parameter cannot have its shape.
 
-        Textures and grids may have other sizes.
+        Textures and grids may be resized.
         """
         for key in (*self.keys, *shapes):
             if key not in shapes or key not in self._forms:
-                raise PathreplayError(
-                    f"Values of {', '.join(self.keys)} are needed, and there is a difference: '{key}'"
-                )
+                raise PathreplayError(f"Values of {', '.join(self.keys)} are needed; missing or unexpected: '{key}'")
         for key, shape in shapes.items():
             wanted = self._start[key].shape
             resizable = len(wanted) >= 3 and len(shape) == len(wanted) and shape[-1] == wanted[-1] and min(shape) > 0
@@ -85,7 +84,7 @@ class SceneFunction:
                 raise PathreplayError(f"Value of shape {shape} given for the parameter '{key}' of shape {wanted}")
 
     def picture(self, values: Sequence[mi.TensorXf], view: View) -> mi.TensorXf:
-        """What a sensor sees (height, width, channels; linear)."""
+        """Render the image of a sensor (height, width, channels; linear)."""
         with dr.suspend_grad(), told("The scene cannot be rendered"):
             self._put(values, grad=False)
             sensor, seed, spp = view
@@ -94,7 +93,7 @@ class SceneFunction:
             return image
 
     def gradient(self, values: Sequence[mi.TensorXf], view: View, weights: mi.TensorXf) -> list[mi.TensorXf]:
-        """The derivative of the sum of weights times picture, by samples of its own, which the seed decides, too."""
+        """Gradient of the weighted sum of the image, from separate samples whose seed is derived from the view's."""
         sensor, seed, spp = view
         other = int(np.random.SeedSequence([seed, 1]).generate_state(1)[0])
         with dr.resume_grad(), told("The gradient cannot be computed"):
@@ -111,12 +110,12 @@ class SceneFunction:
             dr.backward_from(dr.sum(image * weights, axis=None))
             found = [dr.grad(value) for value in seen]
             dr.eval(found)
-            self._put(values, grad=False)  # the scene lets go of the graph
+            self._put(values, grad=False)  # releases the AD graph held by the scene
         return found
 
     def _put(self, values: Sequence[mi.TensorXf], grad: bool) -> list[mi.TensorXf]:
-        """Give the scene these values; returns them, attached if wanted."""
-        one = dr.opaque(mi.Float, 1)  # optimisers change memory in its place: Dr.Jit gets its own
+        """Set the parameters of the scene; return the values, attached if ``grad``."""
+        one = dr.opaque(mi.Float, 1)  # optimisers modify memory in place, so Dr.Jit needs a copy
         seen = [dr.detach(value) * one for value in values]
         dr.eval(seen)
         if grad:
@@ -128,7 +127,7 @@ class SceneFunction:
 
 
 def _typed(kind: type, tensor: Any) -> Any:
-    """A tensor as a value of that type; derivatives flow."""
+    """Convert a tensor to a value of the given type, differentiably."""
     if dr.is_tensor_v(kind):
         return tensor
     flat = tensor.array

@@ -1,10 +1,10 @@
-"""Colours in spectral variants: the coefficients that Mitsuba keeps of them, and numbers that people can handle.
+"""Colours in spectral variants: the coefficients that Mitsuba stores, and better-scaled values for steps.
 
-There a colour is a smooth spectrum S(p(λ)) with p(λ) = c_0 λ² + c_1 λ + c_2, λ in nm, S(p) = 1/2 + p / (2 √(1 + p²)).
-What is kept are c_0, c_1, c_2 (environment maps and grids: and a factor, as fourth channel): a step of 0.01 in c_0
-moves p by thousands, and one in c_2 by hardly anything. So steps are taken in the values of p or S at three
-wavelengths. The former follow from c by a constant matrix; S, a reflectance, is nearly linear in them for colours that
-are not vivid.
+There a colour is a smooth spectrum S(p(λ)) with p(λ) = c_0 λ² + c_1 λ + c_2, λ in nm, and S(p) = 1/2 + p / (2 √(1 +
+p²)). Mitsuba stores c_0, c_1 and c_2 (for environment maps and grids also a factor, as fourth channel). A step of 0.01
+in c_0 changes p by thousands, the same step in c_2 by almost nothing. Steps are therefore taken in the values of p or S
+at three wavelengths. The values of p are a constant matrix times c; S, a reflectance, is nearly linear in these values
+for colours of low saturation.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ import mitsuba as mi
 import numpy as np
 
 WAVELENGTHS = (610.0, 545.0, 460.0)
-"""Where p and S are taken (nm): what Mitsuba makes of a moderate red, green or blue is nearly S there."""
+"""Wavelengths (nm) at which p and S are sampled: a moderate red, green or blue is nearly equal to S there."""
 
 TO_COEFFICIENTS = np.linalg.inv(np.vander(WAVELENGTHS))
-"""c is this matrix times the values of p at `WAVELENGTHS`."""
+"""Matrix that maps the values of p at `WAVELENGTHS` to c."""
 
 _COLOURS = ("SRGBReflectanceSpectrum", "D65Spectrum")
 
 
 def coefficient_channels(params: Any, key: str) -> int:
-    """Channels of a parameter of ``mi.traverse(scene)`` that holds coefficients: 3, or 4 with a factor; else 0."""
+    """Number of channels of a parameter that holds coefficients: 3, or 4 with a factor; 0 for all others."""
     if not mi.is_spectral:
         return 0
     owner, name = params.properties[key][2], key.rsplit(".", 1)[-1]
@@ -41,7 +41,7 @@ def coefficient_channels(params: Any, key: str) -> int:
 
 
 def coefficients(p: np.ndarray) -> np.ndarray:
-    """Coefficients of the values of p at `WAVELENGTHS` (along the last axis; a fourth channel stays what it is)."""
+    """Coefficients from the values of p at `WAVELENGTHS` (last axis; a fourth channel is copied)."""
     return np.concatenate([p[..., :3] @ TO_COEFFICIENTS.T, p[..., 3:]], axis=-1)
 
 
@@ -51,6 +51,6 @@ def values_of_p(c: np.ndarray) -> np.ndarray:
 
 
 def spectrum(c: Any, wavelength: float) -> Any:
-    """S at a wavelength (nm), of Dr.Jit coefficients."""
+    """S at a wavelength (nm), from Dr.Jit coefficients."""
     p = (c[0] * wavelength + c[1]) * wavelength + c[2]
     return 0.5 + 0.5 * p * dr.rsqrt(1 + dr.square(p))

@@ -1,18 +1,18 @@
-"""Parameters that Mitsuba stores in another form than people see them: from the one to the other, and back.
+"""Convert parameters between the form that Mitsuba stores and the decoded values that users see.
 
 ============================  ======================================  =================================================
-parameter                     what Mitsuba stores                     what people see
+parameter                     stored by Mitsuba                       decoded value
 ============================  ======================================  =================================================
-``data`` of an ``envmap``     a column more on the left and on the    the columns of the picture; in mono variants one
-                              right, which repeat the other end; in   channel
-                              mono variants three channels alike
+``data`` of an ``envmap``     an additional column on both sides,     the columns of the image; in mono variants one
+                              equal to the column of the other end;   channel
+                              in mono variants three equal channels
 textures of 16 bits           half precision                          single precision
-colours in spectral variants  coefficients of a smooth spectrum S,    S at three wavelengths, red, green and blue; where
-                              see `spectra`; for                      there is a factor (environment maps, volumes)
-                              some with a factor                      multiplied by it
+colours in spectral variants  coefficients of a smooth spectrum S,    S at three wavelengths, red, green and blue,
+                              see `spectra`; for                      multiplied by the factor where there is one
+                              some with a factor                      (environment maps, volumes)
 ============================  ======================================  =================================================
 
-Jobs optimise, save and compare what people see, so that bounds, learning rates and resolutions mean what they say.
+Jobs optimise, save and compare decoded values, to which bounds, learning rates and resolutions refer.
 """
 
 from __future__ import annotations
@@ -31,23 +31,26 @@ from pathreplay.scenes.spectra import TO_COEFFICIENTS, WAVELENGTHS, coefficient_
 
 Array = NDArray[np.float32]
 
-# S is kept so far from 0 and 1, where p is infinite.
+# Distance of S from 0 and 1, where p is infinite.
 _MARGIN = 1e-4
 
 
 class Form:
-    """Most parameters: seen as they are stored."""
+    """The form of most parameters: decoded values are the stored ones."""
 
     def see(self, stored: Any) -> Any:
-        """The Dr.Jit value that people see, without derivatives."""
+        """The decoded Dr.Jit value, without derivatives."""
         return stored
 
     def store(self, seen: Any) -> Any:
-        """The Dr.Jit value for Mitsuba; derivatives flow from it to what is seen."""
+        """The Dr.Jit value for Mitsuba, differentiable in the decoded value."""
         return seen
 
     def of_colours(self, key: str, colours: Array) -> Array:
-        """What is seen of linear RGB colours (or grey numbers), in its shape. Raises PathreplayError if it cannot."""
+        """Decoded values of linear RGB colours (or grey values), in the same shape.
+
+        Raises PathreplayError if they cannot be represented.
+        """
         return colours
 
 
@@ -55,7 +58,7 @@ AS_STORED = Form()
 
 
 class Half(Form):
-    """Textures in half precision."""
+    """Textures stored in half precision."""
 
     def see(self, stored: Any) -> Any:
         return mi.TensorXf(dr.detach(stored))
@@ -66,7 +69,7 @@ class Half(Form):
 
 @dataclass(frozen=True)
 class Sky(Form):
-    """Environment maps: stored columns are the last, then all, then the first."""
+    """Environment maps: the stored columns are the last, then all, then the first."""
 
     mono: bool
 
@@ -86,7 +89,7 @@ class Sky(Form):
 
 @dataclass(frozen=True)
 class Spectra(Form):
-    """Coefficients of smooth spectra: a colour, a texture, or with a factor as fourth channel."""
+    """Coefficients of smooth spectra: a colour or a texture, with an optional factor as fourth channel."""
 
     scaled: bool = False
     inner: Form = AS_STORED
@@ -99,7 +102,7 @@ class Spectra(Form):
 
     def store(self, seen: Any) -> Any:
         S = mi.Vector3f(*_entries(seen, 3))
-        # As Mitsuba does: the largest entry becomes a half, where spectra are smooth.
+        # As in Mitsuba, the largest entry is scaled to one half, where spectra are smooth.
         factor = dr.maximum(2 * dr.max(S), 1e-8) if self.scaled else mi.Float(1)
         x = 2 * dr.clip(S / factor, _MARGIN, 1 - _MARGIN) - 1
         p = x * dr.rsqrt(1 - dr.square(x))
@@ -123,17 +126,17 @@ class Spectra(Form):
 
 
 class Lamp(Spectra):
-    """The radiance of a light, whose brightness is not among its coefficients."""
+    """The radiance of an emitter, whose brightness is not part of its coefficients."""
 
     def of_colours(self, key: str, colours: Array) -> Array:
         raise PathreplayError(
-            f"Parameter '{key}' holds the colour of a light without its brightness in variant {mi.variant()}, so that "
-            "it cannot be given a value; give the light its colour in the scene file, or use an rgb variant"
+            f"Parameter '{key}' holds the colour of an emitter without its brightness in variant {mi.variant()}, so "
+            "that it cannot be set; set the colour of the emitter in the scene file, or use an rgb variant"
         )
 
 
 def form_of(params: Any, key: str) -> Form:
-    """How the parameter ``key`` of ``mi.traverse(scene)`` is stored."""
+    """The form in which the parameter ``key`` of ``mi.traverse(scene)`` is stored."""
     value, owner = params[key], params.properties[key][2]
     kind, name = str(owner.class_name()), key.rsplit(".", 1)[-1]
     form: Form = Half() if isinstance(value, mi.TensorXf16) else AS_STORED
@@ -145,13 +148,13 @@ def form_of(params: Any, key: str) -> Form:
 
 
 def _entries(value: Any, channels: int) -> Any:
-    """The channels of a colour or of a tensor, one flat array each."""
+    """The channels of a colour or tensor, one flat array each."""
     kind = mi.Vector3f if channels == 3 else mi.Vector4f
     return dr.unravel(kind, value.array) if dr.is_tensor_v(value) else value
 
 
 def _like(value: Any, entries: Any) -> Any:
-    """Channels as a colour or a tensor like ``value``, but for their number."""
+    """Combine channels into a colour or tensor like ``value``, with as many channels as given."""
     if not dr.is_tensor_v(value):
         return type(value)(entries)
     return mi.TensorXf(dr.ravel(entries), (*value.shape[:-1], len(entries)))

@@ -1,6 +1,6 @@
-"""Loads a scene with some of its plugins exchanged for others that read the same parameters.
+"""Load a scene with some plugins replaced by others that read the same parameters.
 
-Where textures of 8 bits are to be floating-point numbers, the plugin `bitmap` gets another option.
+The plugin `bitmap` gets an additional option where 8-bit textures are to be stored as floating-point numbers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathreplay.scenes.descriptions import require_values
 from pathreplay.scenes.scene_files import require_shallow, require_sound_files
 
 Cameras = Mapping[str, Mapping[str, Any]]
-"""Sensors by their ids, as dictionaries of Mitsuba's."""
+"""Sensors by id, as Mitsuba dictionaries."""
 
 
 def load_file_with(
@@ -28,21 +28,21 @@ def load_file_with(
     cameras: Cameras | None = None,
     floats: Collection[str] = (),
 ) -> tuple[Any, list[str]]:
-    """`mi.load_file(path, optimize=False, **parameters)` with plugins exchanged, included files' plugins too.
+    """`mi.load_file(path, optimize=False, **parameters)` with plugins replaced, also in included files.
 
-    `plugins` maps the type named in the scene to the type to load in its place, {"dielectric": "dielectric_ad"} for
-    one. The new plugin has to be registered and is given the properties and the id of the old one, so that parameter
-    keys stay what they were. ``cameras`` are added to what the scene has. ``floats`` are names of picture files
-    (without their folders) whose `bitmap` textures are stored as floating-point numbers, whatever the files have.
+    `plugins` maps the type named in the scene to the type to load instead, e.g. {"dielectric": "dielectric_ad"}. The
+    new plugin must be registered; it receives the properties and the id of the old one, so that parameter keys are
+    preserved. ``cameras`` are added to those of the scene. ``floats`` are names of image files (without folders) whose
+    `bitmap` textures are stored as floating-point numbers, whatever the file format.
 
-    Returns the scene (or object) and one line per exchanged plugin, its id and where it stands in the file.
-    Raises RuntimeError (Mitsuba's) for a file that cannot be read or holds a property unknown to the new plugin, and
-    PathreplayError for a file that would end the process: see `require_shallow` and `require_sound_files`.
+    Returns the scene (or object) and one line per replaced plugin, with its id and position in the file. Raises
+    RuntimeError (Mitsuba's) for a file that cannot be read or has a property unknown to the new plugin, and
+    PathreplayError for a file that would crash the process: see `require_shallow` and `require_sound_files`.
     """
     path = Path(path)
     parameters = parameters or {}
     for name in {"config", "filename"}.intersection(parameters):
-        raise PathreplayError(f"Scene parameter '{name}' has a name that Mitsuba's parser keeps; rename ${name}")
+        raise PathreplayError(f"Scene parameter '{name}' has a name reserved by Mitsuba's parser; rename ${name}")
     require_shallow(path)
     with _parsing() as config:
         mi.file_resolver().prepend(mi.filesystem.path(str(path.parent)))
@@ -56,9 +56,9 @@ def load_dict_with(
     cameras: Cameras | None = None,
     floats: Collection[str] = (),
 ) -> tuple[Any, list[str]]:
-    """`mi.load_dict(scene, optimize=False)` with plugins exchanged; otherwise as `load_file_with`.
+    """`mi.load_dict(scene, optimize=False)` with plugins replaced; otherwise like `load_file_with`.
 
-    Objects that stand in the dictionary already loaded stay what they are. Raises PathreplayError for a None.
+    Objects in the dictionary that are already loaded are left unchanged. Raises PathreplayError for a value of None.
     """
     require_values(scene)
     with _parsing() as config:
@@ -66,7 +66,7 @@ def load_dict_with(
 
 
 def exchange(props: Any, plugins: Mapping[str, str], floats: Collection[str]) -> bool:
-    """Exchange the plugin of an object, by its properties, or its option; whether it has another plugin now."""
+    """Replace the plugin of an object, or set its option, in its properties; return whether the plugin was replaced."""
     if (new := plugins.get(props.plugin_name())) is not None:
         props.set_plugin_name(new)
         return True
@@ -77,9 +77,9 @@ def exchange(props: Any, plugins: Mapping[str, str], floats: Collection[str]) ->
 
 @contextmanager
 def _parsing() -> Iterator[mi.parser.ParserConfig]:
-    """How to parse, which within this block finds files by a resolver of its own."""
+    """Parser options; within this block files are found by a separate file resolver."""
     config = mi.parser.ParserConfig(mi.variant())
-    # Merging equal objects would rename parameters.
+    # Merging equal objects would change parameter keys.
     config.merge_equivalent = config.merge_meshes = False
     outer = mi.file_resolver()
     mi.set_file_resolver(mi.FileResolver(outer))
@@ -96,7 +96,9 @@ def _instantiate(
     taken = {node.props.id() for node in state.nodes}
     for name, camera in (cameras or {}).items():
         if name in taken:
-            raise PathreplayError(f"The scene has an object '{name}', as a camera is called that joins it; rename one")
+            raise PathreplayError(
+                f"The scene has an object '{name}', which is also the name of an added camera; rename one"
+            )
         state.root.props[name] = mi.load_dict(dict(camera))
     for node in state.nodes:
         if exchange(node.props, plugins, floats):

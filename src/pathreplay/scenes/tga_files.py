@@ -1,6 +1,6 @@
-"""A look into TGA files before Mitsuba reads them, which unpacks runs without asking whether they end with the picture.
+"""Check of TGA files before Mitsuba decodes them, because it does not test whether runs end with the image.
 
-The format has no mark at its beginning. Mitsuba takes for a TGA what ends with the mark of the second version.
+The format has no magic number at its beginning. Mitsuba recognises a TGA by the footer of version 2.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from pathreplay.errors import PathreplayError
 _HEAD = struct.Struct("<BBB9xHHBx")
 _END = b"TRUEVISION-XFILE.\0"
 _MOST = 2**15 - 1
-"""Pixels in a row, or rows. Mitsuba takes the number as signed."""
+"""Largest width and height in pixels. Mitsuba reads them as signed numbers."""
 _RUNS = {10: (24, 32), 11: (8,)}
-"""Types of picture that are packed, colour and grey, and the bits that a pixel of theirs may have."""
+"""Run-length encoded image types, colour and grey, and their possible bits per pixel."""
 
 
 def is_tga(file: BinaryIO) -> bool:
-    """Whether a file ends as a TGA. Moves in the file."""
+    """Whether a file ends like a TGA. Moves the file position."""
     length = file.seek(0, os.SEEK_END)
     file.seek(max(0, length - len(_END)))
     return file.read() == _END
 
 
 def tga_size(data: bytes) -> tuple[int, int]:
-    """Width and height, by the head. Raises struct.error."""
+    """Width and height from the header. Raises struct.error."""
     return _HEAD.unpack_from(data)[3:5]
 
 
@@ -42,25 +42,27 @@ def require_sound_tga(path: Path) -> None:
             return
         file.seek(0)
         skipped, colours, kind, width, height, bits = _HEAD.unpack(file.read(_HEAD.size))
-        if colours:  # a palette, which Mitsuba refuses; or the second byte of another format's mark
+        if colours:  # a palette, which Mitsuba rejects, or the second byte of another format's magic number
             return
         if max(width, height) > _MOST:
-            raise PathreplayError(f"Image {path} is {width} x {height}, and TGA files of up to {_MOST} a side are read")
+            raise PathreplayError(
+                f"Image {path} is {width} x {height}, and the limit for TGA files is {_MOST} per side"
+            )
         if bits not in _RUNS.get(kind, ()):
             return
         file.seek(skipped, os.SEEK_CUR)
         pixels, pixel = width * height, bits // 8
         found = _filled(file.read(pixels * (1 + pixel)), pixels, pixel)
     if found != pixels:
-        what = f"its packets are of {found} pixels and its head is of {pixels}"
+        what = f"its packets hold {found} pixels and its header claims {pixels}"
         raise PathreplayError(f"Image {path} is a damaged TGA: {what}; replace the file")
 
 
 def _filled(data: bytes, pixels: int, pixel: int) -> int:
-    """Number of pixels in the packets of a file; counting ends once there are ``pixels`` or more.
+    """Number of pixels in the packets of a file; counting stops once there are ``pixels`` or more.
 
-    A packet is a byte, with the number of its pixels less one, and then these pixels, of ``pixel`` bytes each, or where
-    the highest bit of the byte is set a single one for all. Ends with the last that is whole.
+    A packet is a byte with the number of its pixels minus one, followed by these pixels of ``pixel`` bytes each, or by
+    a single pixel for all if the highest bit of the byte is set. Truncated packets do not count.
     """
     at = found = 0
     while found < pixels and at < len(data):

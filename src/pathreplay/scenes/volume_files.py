@@ -1,7 +1,7 @@
 """Volumes in files: Mitsuba's `.vol`, and OpenVDB and NanoVDB through the package tinyvdb (the extra `vdb`).
 
-A grid holds samples at the centres of its voxels, as Mitsuba's `gridvolume` does. A sparse grid becomes a dense one
-over the bounding box of its active voxels; what is inactive in there takes the background value.
+A grid holds samples at the centres of its voxels, like Mitsuba's `gridvolume`. A sparse grid becomes a dense one over
+the bounding box of its active voxels; inactive voxels inside it take the background value.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ _VOL_MAGIC = b"VOL\x03"
 _VOL_HEADER = struct.Struct("<4s5i6f")
 _FLOAT32 = 1
 
-# 4 GiB of float32: beyond, a wrong bounding box is likelier than a volume that anyone can render.
+# 4 GiB of float32. Above, a wrong bounding box is more likely than a volume that can be rendered.
 _MOST_VOXELS = 2**30
-# NanoVDB's are asked for one by one, a million a second: half a minute, whatever box a file claims.
+# NanoVDB voxels are read one by one, a million per second: half a minute at most, whatever box a file claims.
 _MOST_ASKED_FOR = 2**25
 
-# An extinction beyond has free paths far below what single precision tells apart.
+# Above this extinction, free paths are far shorter than single precision resolves.
 _LARGEST = 1e12
 
 
 @dataclass(frozen=True)
 class Volume:
-    """A dense grid: ``data`` of shape (z, y, x, channels), float32, and where it is."""
+    """A dense grid: ``data`` of shape (z, y, x, channels), float32, and its position."""
 
     data: NDArray[np.float32]
     to_world: NDArray[np.float64]
-    """4 x 4 matrix that takes the unit cube, over which ``data`` is spread, to the world of the file."""
+    """4 x 4 matrix that maps the unit cube, which ``data`` fills, to the world space of the file."""
     name: str
     """Name of the grid in the file; empty for `.vol`."""
 
     def bounds(self) -> Bounds:
-        """Smallest and largest corner of the volume in the world."""
+        """Minimum and maximum corner of the volume in world space."""
         corners = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) @ self.to_world.T
         (x, y, z), (X, Y, Z) = corners[:, :3].min(axis=0).tolist(), corners[:, :3].max(axis=0).tolist()
         return (x, y, z), (X, Y, Z)
@@ -60,15 +60,17 @@ class Volume:
 def load_volume(path: str | Path, grid: str | None = None) -> Volume:
     """Read a volume from a `.vol`, `.vdb` or `.nvdb` file.
 
-    ``grid`` names one of several grids in a VDB file; without it the file must hold one only.
+    ``grid`` names one of several grids in a VDB file; without it the file must contain exactly one.
 
-    Raises PathreplayError for no such file or grid, an unknown or damaged format, values that are not float, without
-    the extra `vdb`, and where the reader would give wrong values (see docs/volumes.md).
+    Raises PathreplayError if the file or grid does not exist, the format is unknown or damaged, values are not float,
+    the extra `vdb` is missing, or the reader would return wrong values (see docs/volumes.md).
     """
     path = Path(path)
     read = {".vol": _read_vol, ".vdb": _read_vdb, ".nvdb": _read_nvdb}.get(path.suffix.lower())
     if read is None:
-        raise PathreplayError(f"Volume {path} has the unknown ending '{path.suffix}'; give a .vol, .vdb or .nvdb file")
+        raise PathreplayError(
+            f"Volume {path} has the unknown extension '{path.suffix}'; give a .vol, .vdb or .nvdb file"
+        )
     if problem := file_problem(path):
         raise PathreplayError(f"No volume file {path}: it {problem}; correct the path")
     volume = read(path, grid)
@@ -81,8 +83,7 @@ def load_volume(path: str | Path, grid: str | None = None) -> Volume:
 def _require_small(path: Path, data: NDArray[np.float32]) -> None:
     if (extreme := float(max(data.max(), -data.min()))) > _LARGEST:
         raise PathreplayError(
-            f"Volume {path} holds values up to {extreme:g}, through which no path would come to an end; scale it "
-            f"below {_LARGEST:g}"
+            f"Volume {path} holds values up to {extreme:g}, in which paths would never end; scale it below {_LARGEST:g}"
         )
 
 
@@ -92,14 +93,14 @@ def save_vol(path: str | Path, data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -
 
 
 def vol_bytes(data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -> bytes:
-    """The `.vol` file of a grid; ``bounds`` is the box that it fills, used where `use_grid_bbox` is set.
+    """The `.vol` file of a grid; ``bounds`` is the box that it fills, used if `use_grid_bbox` is set.
 
-    Raises PathreplayError for data of neither three nor four dimensions, or without voxels.
+    Raises PathreplayError for data that have neither three nor four dimensions, or no voxels.
     """
     grid = data[..., None] if data.ndim == 3 else data
     if grid.ndim != 4 or not grid.size:
         raise PathreplayError(
-            f"Volume of shape {data.shape}; a volume has the shape (z, y, x) or (z, y, x, channels), none 0"
+            f"Volume of shape {data.shape}; give the shape (z, y, x) or (z, y, x, channels) without zeros"
         )
     z, y, x, channels = grid.shape
     header = _VOL_HEADER.pack(_VOL_MAGIC, _FLOAT32, x, y, z, channels, *bounds[0], *bounds[1])
@@ -107,10 +108,11 @@ def vol_bytes(data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -> bytes:
 
 
 def grid_volume(path: str | Path, grid: str | None = None, **options: Any) -> dict[str, Any]:
-    """A volume file as a `gridvolume` for a scene dictionary, at its place in the world of the file.
+    """A volume file as a `gridvolume` for a scene dictionary, positioned in the world space of the file.
 
-    ``options`` go to the plugin (``filter_type``, ``wrap_mode``, ``raw``); ``to_world`` replaces the file's. The key of
-    the values is ``….data``, differentiable; the place is not. Needs an active Mitsuba variant.
+    ``options`` are properties of the plugin (``filter_type``, ``wrap_mode``, ``raw``); ``to_world`` replaces that of
+    the file. The values have the key ``….data`` and are differentiable; the position is not. Needs an active Mitsuba
+    variant.
     """
     volume = load_volume(path, grid)
     return {
@@ -122,9 +124,9 @@ def grid_volume(path: str | Path, grid: str | None = None, **options: Any) -> di
 
 
 def require_whole_vol(path: Path) -> None:
-    """Raise PathreplayError for a `.vol` file of impossible length or size, or with channels or values for no scene.
+    """Raise PathreplayError for a `.vol` file of impossible length or size, or with unusable channels or values.
 
-    Mitsuba tells of other damage.
+    Mitsuba reports other damage.
     """
     if (header := _vol_header(path)) is None:
         return
@@ -132,17 +134,17 @@ def require_whole_vol(path: Path) -> None:
     if encoding == _FLOAT32 and (min(shape) < 1 or path.stat().st_size < _VOL_HEADER.size + 4 * math.prod(shape)):
         raise _wrong_length(path, shape)
     if shape[3] not in _CHANNELS:
-        raise PathreplayError(f"Volume {path} has {shape[3]} channels, and scenes take 1, 3 or 6; convert it")
+        raise PathreplayError(f"Volume {path} has {shape[3]} channels, and scenes need 1, 3 or 6; convert it")
     if encoding == _FLOAT32:
         _require_small(path, np.memmap(path, "<f4", "r", _VOL_HEADER.size, math.prod(shape)))
 
 
 _CHANNELS = (1, 3, 6)
-"""Numbers, colours, and what SGGX phase functions take."""
+"""Scalars, colours, and the parameters of SGGX phase functions."""
 
 
 def _vol_header(path: Path) -> tuple[Any, ...] | None:
-    """Encoding, size and box of a `.vol` file; None for another file, or a stump of one."""
+    """Encoding, size and box of a `.vol` file; None for another format or a truncated header."""
     with path.open("rb") as file:
         header = file.read(_VOL_HEADER.size)
     whole = len(header) == _VOL_HEADER.size and header.startswith(_VOL_MAGIC)
@@ -152,15 +154,15 @@ def _vol_header(path: Path) -> tuple[Any, ...] | None:
 def _wrong_length(path: Path, shape: list[int]) -> PathreplayError:
     numbers, size = " x ".join(map(str, shape)), path.stat().st_size
     return PathreplayError(
-        f"Volume {path} should hold {numbers} numbers and has {size} bytes; it is damaged, get it anew"
+        f"Volume {path} should contain {numbers} numbers and has {size} bytes; it is damaged, replace it"
     )
 
 
 def _read_vol(path: Path, grid: str | None) -> Volume:
     if grid is not None:
-        raise PathreplayError(f"Volume {path} is asked for its grid '{grid}', but a .vol file holds one without name")
+        raise PathreplayError(f"Volume {path} was asked for grid '{grid}', but a .vol file holds one without name")
     if (header := _vol_header(path)) is None:
-        raise PathreplayError(f"Volume {path} is no Mitsuba volume of version 3; write it with mi.VolumeGrid.write")
+        raise PathreplayError(f"Volume {path} is not a Mitsuba volume of version 3; write it with mi.VolumeGrid.write")
     encoding, x, y, z, channels, *box = header
     if encoding != _FLOAT32:
         raise PathreplayError(f"Volume {path} has encoding {encoding}; write it as float32 (encoding 1)")
@@ -171,7 +173,7 @@ def _read_vol(path: Path, grid: str | None) -> Volume:
 
 
 def _scaled(scale: Any, translation: Any) -> NDArray[np.float64]:
-    """The matrix (4 x 4, for columns) that scales along the axes, then translates."""
+    """The 4 x 4 matrix (for column vectors) that scales along the axes, then translates."""
     matrix = np.diag([*map(float, scale), 1.0])
     matrix[:3, 3] = translation
     return matrix
@@ -197,21 +199,21 @@ def _read_vdb(path: Path, grid: str | None) -> Volume:
 
 
 def _require_all_voxels(where: str, source: Any, read: int) -> None:
-    """tinyvdb 0.9 reads leaves only: constant regions that are stored as one active tile would turn into background."""
+    """Raise PathreplayError for active tiles: tinyvdb 0.9 reads leaves only, and tiles would become background."""
     nodes = (source.tree.node(i) for i in range(source.tree.num_nodes))
     tiles = sum(node.active_voxel_count for node in nodes if node.type == "internal")
     active = source.metadata.get("file_voxel_count", read)
     if tiles or active != read:
         raise PathreplayError(
-            f"{where} stores constant regions as tiles, which the reader loses ({read} of {active} voxels read); "
+            f"{where} stores constant regions as tiles, which the reader skips ({read} of {active} voxels read); "
             "voxelise the active tiles, or save it as .nvdb"
         )
 
 
 def _index_to_world(transform: dict[str, Any]) -> NDArray[np.float64]:
-    """Index space to world as a matrix that acts on columns."""
+    """The index-to-world map as a matrix for column vectors."""
     if "affine" in transform["type"]:
-        return np.array(transform["matrix"]).T  # OpenVDB's vectors are rows
+        return np.array(transform["matrix"]).T  # OpenVDB uses row vectors
     return _scaled(transform["scale"], transform["translation"])
 
 
@@ -225,20 +227,22 @@ def _read_nvdb(path: Path, grid: str | None) -> Volume:
         where = f"Grid '{file.grid_name(index)}' of {path}"
         if file.grid_type(index) != "Float":
             raise PathreplayError(f"{where} is of type {file.grid_type(index)}; only grids of Float can be read")
-        # Seen with tinyvdb 0.9: wrong values in all but the first grid of such files.
+        # tinyvdb 0.9 returned wrong values in all but the first grid of such files.
         if index > 0 and not packed:
-            raise PathreplayError(f"{where} lies uncompressed behind another, which cannot be read; save it with zip")
+            raise PathreplayError(
+                f"{where} is uncompressed and not the first of its file, which cannot be read; save it with zip"
+            )
         low, high = (np.array(corner, np.int64) for corner in file.bbox(index))
         shape = _size(where, low, high, _MOST_ASKED_FOR)
         voxel = np.array([file.voxel_size(index, axis) for axis in range(3)])
         first, last = (np.array(corner) for corner in file.world_bbox(index))
-        # The file's matrix is not told. Without rotation the world box is the index box times the voxel size.
+        # tinyvdb does not expose the matrix. Without rotation the world box is the index box times the voxel size.
         if not np.allclose(last - first, voxel * shape, rtol=1e-4):
             raise PathreplayError(f"{where} is rotated or sheared in its world, which cannot be read; save it as .vdb")
         x, y, z = (range(a, b + 1) for a, b in zip(low.tolist(), high.tolist(), strict=True))
         values = (file.get(index, i, j, k) for i in x for j in y for k in z)
         data = np.fromiter(values, np.float32, int(np.prod(shape))).reshape(shape)
-        # World box: from the lower corner of the first voxel's index to that of the one after the last.
+        # The world box extends from the lower corner of the first voxel to the upper corner of the last.
         return _placed(data, _scaled(voxel, first - low * voxel), low, file.grid_name(index))
 
 
@@ -254,28 +258,28 @@ def _vdb_reader(path: Path) -> Iterator[Any]:
     try:
         yield tinyvdb
     except (tinyvdb.VDBError, OSError, UnicodeDecodeError) as error:
-        raise PathreplayError(f"Volume {path} cannot be read: {error}; get it anew, or save it with zip") from None
+        raise PathreplayError(f"Volume {path} cannot be read: {error}; replace it, or save it with zip") from None
 
 
 def _chosen(path: Path, grid: str | None, names: list[str]) -> int:
     if grid is None and len(names) == 1:
         return 0
     if grid not in names:
-        asked = "is asked for no grid" if grid is None else f"has no grid '{grid}'"
+        asked = "needs the name of a grid" if grid is None else f"has no grid '{grid}'"
         raise PathreplayError(f"Volume {path} {asked}; choose one of: {', '.join(names)}")
     return names.index(grid)
 
 
 def _size(where: str, low: NDArray[Any], high: NDArray[Any], most: int = _MOST_VOXELS) -> tuple[int, ...]:
-    """Number of voxels along x, y, z of an index box whose corners are both inside."""
+    """Number of voxels along x, y, z of an index box given by its first and last voxel."""
     shape = tuple(int(n) for n in np.asarray(high, np.int64) - low + 1)
     if min(shape) < 1 or np.prod(shape, dtype=np.float64) > most:
         spans = " x ".join(map(str, shape))
-        raise PathreplayError(f"{where} spans {spans} voxels, none or more than {most}; crop it first")
+        raise PathreplayError(f"{where} spans {spans} voxels, which is none or more than {most}; crop it first")
     return shape
 
 
 def _placed(data: NDArray[np.float32], index_to_world: NDArray[np.float64], low: NDArray[Any], name: str) -> Volume:
-    """``data`` by index (x, y, z) from ``low`` on; sample (i, j, k) is the centre of a voxel at index (i, j, k)."""
+    """Volume of ``data`` by index (x, y, z), from index ``low`` on; sample (i, j, k) is the centre of its voxel."""
     box = _scaled(data.shape, low - 0.5)
     return Volume(np.ascontiguousarray(data.transpose(2, 1, 0)[..., None]), index_to_world @ box, name)
