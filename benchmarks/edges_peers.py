@@ -198,7 +198,7 @@ SCENES = {
         grey_box, "box.vertex_positions", turning(0, 1, 0), "creases are missing, hidden faces shade outlines"
     ),
     "occluder of a shadow": Scene(shadow, "occluder.to_world", ASIDE, step=0.03),
-    "lamp of a shadow": Scene(shadow, "lamp.to_world", ASIDE, step=0.03),
+    "emitter of a shadow": Scene(shadow, "lamp.to_world", ASIDE, step=0.03),
     "receiver of a shadow, along its normal": Scene(
         lambda: shadow(wall(rgb(0.7, 0.6, 0.5))),
         "wall.to_world",
@@ -207,14 +207,14 @@ SCENES = {
         step=0.03,
     ),
     "shadow under a sky": Scene(under_sky, "occluder.to_world", ASIDE, "as for the glowing rectangle", step=0.01),
-    "lamp, seen from its back, lights a wall": Scene(
+    "emitter, seen from its back, lights a wall": Scene(
         lambda: lamp_from_behind(T().translate([0.9, 0.8, 0.6]).rotate([0, 1, 0], 160).scale([0.4, 0.3, 1]), 30, 10, 5),
         "lamp.to_world",
         ASIDE,
-        "the back of a lamp glows at its rim",
+        "the back of an emitter glows at its rim",
         step=0.03,
     ),
-    "lamp, seen from its back, turned": Scene(
+    "emitter, seen from its back, turned": Scene(
         lambda: lamp_from_behind(T().translate([0.2, 0.1, 0.3]).rotate([0, 1, 0], 200).scale([0.5, 0.4, 1]), 45, 6, 3),
         "lamp.to_world",
         ASIDE,

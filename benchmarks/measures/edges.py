@@ -28,8 +28,8 @@ from .scene import stopwatch
 from .spread import spreads
 
 #: Parts of our boundary alone, by method; and all that edges add, the film's flow included.
-PARTS = {"film edges alone": {"inner": False}, "inner edges alone": {"film": False}}
-ALL = "edges alone"
+PARTS = {"primary boundary": {"inner": False}, "secondary boundary": {"film": False}}
+ALL = "boundary alone"
 #: Around which axis vertices turn, by scene.
 AXES = {"shadow": (0, 0, 1)}
 UPRIGHT = (0, 1, 0)

@@ -90,8 +90,8 @@ def mesh_of(
 EDGE_SCENES: dict[str, Callable[[int], SceneDict]] = {
     "shadow": lambda n: _room(n, 30, object=mesh_of(*_cube(), [1.3, 0.9, 1.2], 0.25, _paint(0, 0, 0), flat=True)),
     "silhouette": lambda n: _room(n, 45, object=_box(_paint(0.5, 0.5, 0.2))),
-    "ears": lambda n: _room(n, 45, object=_ears(_paint(0.5, 0.5, 0.2))),
+    "bumps": lambda n: _room(n, 45, object=_ears(_paint(0.5, 0.5, 0.2))),
     "black silhouette": lambda n: _room(n, 45, glows=True, object=_box(_paint(0, 0, 0))),
-    "black ears": lambda n: _room(n, 45, glows=True, object=_ears(_paint(0, 0, 0))),
+    "black bumps": lambda n: _room(n, 45, glows=True, object=_ears(_paint(0, 0, 0))),
 }
 """Key of what moves: ``object.vertex_positions``."""

@@ -21,22 +21,22 @@ from ..tables import comparison, markdown, method_cell
 TITLE = "edges"
 TAKES = (60, 900)
 KEY = ("object.vertex_positions",)
-INNER, FILM = ("shadow", "silhouette", "ears"), ("black silhouette", "black ears")
+INNER, FILM = ("shadow", "silhouette", "bumps"), ("black silhouette", "black bumps")
 VERSUS = (
-    ("film edges alone", "edge list"),
-    ("inner edges alone", "unguided inner"),
-    ("projective inner", "inner edges alone"),
+    ("primary boundary", "edge list"),
+    ("secondary boundary", "unguided secondary"),
+    ("projective secondary", "secondary boundary"),
 )
 """What is compared with what that finds the same; the last the other way round, since it is many times as much."""
 ROUNDS, CHEAP_ROUNDS = 60, 480
 """The first say a ratio of variances within a third; where all takes little time there are more."""
-STEPS = tuple(f"{name}, {way}" for name in ("prb", "all edges") for way in (TRACED, RECORDED))
+STEPS = tuple(f"{name}, {way}" for name in ("prb", "all boundaries") for way in (TRACED, RECORDED))
 GUIDED = 120
 """Seconds after which `prb_projective` sits out, whose guiding takes most of them."""
 TINY, SMALL, LARGE = 16, 32, 128
 """Pixels along a side. On few the several kernels of edges do not fill the cores, as the one of `prb` does."""
 
-OURS = "edges and interior"
+OURS = "boundary and interior"
 PLACE, LOOK_FROM = "object.to_world", "camera.to_world"
 MOVING = {
     "head turns": (*KEY, 3),
@@ -56,12 +56,12 @@ MOVING = {
 
 def jobs(quick: bool) -> list[Job]:
     """Inner edges, edges on the film, recorded steps; guided baselines and large films have jobs of their own."""
-    inner = ("prb", "inner edges alone", "film edges alone", "edges alone", "unguided inner")
-    film = ("prb", "film edges alone", "edge list")
+    inner = ("prb", "secondary boundary", "primary boundary", "boundary alone", "unguided secondary")
+    film = ("prb", "primary boundary", "edge list")
     wanted = [(scene, inner, 0.0, SMALL) for scene in INNER] + [(scene, film, 0.0, SMALL) for scene in FILM]
-    wanted += [(scene, ("prb", "projective inner"), GUIDED, SMALL) for scene in INNER]
-    wanted += [(scene, ("prb", "edges alone"), 0.0, LARGE) for scene in INNER]
-    wanted += [("ears", STEPS, 0.0, SMALL)]
+    wanted += [(scene, ("prb", "projective secondary"), GUIDED, SMALL) for scene in INNER]
+    wanted += [(scene, ("prb", "boundary alone"), 0.0, LARGE) for scene in INNER]
+    wanted += [("bumps", STEPS, 0.0, SMALL)]
     numbers = [by_number(scene, key, depth, quick) for scene, (key, depth) in MOVING.items()]
     return numbers + [
         Job(
@@ -148,8 +148,8 @@ def by_job(points: list[Point]) -> list[dict[str, Point]]:
 
 def costs(found: list[dict[str, Point]]) -> str:
     """A row for each scene: times next to `prb`, and time x variance next to baselines."""
-    timed = ("film edges alone", "inner edges alone", "edges alone", "projective inner")
-    header = ["scene", *(f"{name} / prb" for name in timed), f"edges alone / prb, {LARGE} x {LARGE}"]
+    timed = ("primary boundary", "secondary boundary", "boundary alone", "projective secondary")
+    header = ["scene", *(f"{name} / prb" for name in timed), f"boundary alone / prb, {LARGE} x {LARGE}"]
     header += [f"time x variance of {a} / {b}" for a, b in VERSUS]
     rows = []
     for scene in (*INNER, *FILM):
@@ -158,7 +158,7 @@ def costs(found: list[dict[str, Point]]) -> str:
         large = {name: job for job in jobs for name, point in job.items() if point.paths > least}
         at = {name: job for job in jobs for name, point in job.items() if point.paths == least}
         times = [_versus(at[name][name], at[name].get("prb"))[1] if name in at else "" for name in timed]
-        times.append(_versus(large["edges alone"]["edges alone"], large["edges alone"]["prb"])[1] if large else "")
+        times.append(_versus(large["boundary alone"]["boundary alone"], large["boundary alone"]["prb"])[1] if large else "")
         rows.append(
             [scene, *times, *(_cost(at.get(ours), ours, at.get(baseline), baseline) for ours, baseline in VERSUS)]
         )
@@ -186,7 +186,7 @@ def _cost(job: dict[str, Point] | None, ours: str, other: dict[str, Point] | Non
 def _steps(steps: dict[str, Point]) -> str:
     """A step by the clock where it was recorded, and its kernels where it was traced."""
     rows = []
-    for name in ("prb", "all edges"):
+    for name in ("prb", "all boundaries"):
         found = [steps.get(f"{name}, {way}") for way in (RECORDED, TRACED)]
         if all(point is not None and not point.error for point in found):
             clock, kernels = (st.median(point.seconds) for point in found if point is not None)

@@ -41,7 +41,7 @@ def jobs(quick: bool) -> list[Job]:
 
 def what(parameters: tuple[str, ...]) -> str:
     """What is differentiated, in a word."""
-    return {SKY: "sky", LAMP: "lamp"}.get(parameters, "texture")
+    return {SKY: "sky", LAMP: "light"}.get(parameters, "texture")
 
 
 def table(record: Record) -> str:
