@@ -170,10 +170,8 @@ MEASURED: list[Sections] = []
 
 def measured() -> Sections:
     """What was measured here: pictures, gradients, the cells that are left out, with the reason, and hostile cases."""
-    from test_hostile import TOLD
-    from test_primal_media import PRIMALS
-    from test_primal_media import table as pictures
-    from test_truth_materials import EXCLUSIONS
+    from measured import EXCLUSIONS, PRIMALS, TOLD
+    from measured import table as pictures
     from truth import ROWS, table
 
     left_out = [f"left out: {name}: {reason}" for name, reason in EXCLUSIONS.items()]

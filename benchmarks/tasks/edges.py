@@ -158,7 +158,9 @@ def costs(found: list[dict[str, Point]]) -> str:
         large = {name: job for job in jobs for name, point in job.items() if point.paths > least}
         at = {name: job for job in jobs for name, point in job.items() if point.paths == least}
         times = [_versus(at[name][name], at[name].get("prb"))[1] if name in at else "" for name in timed]
-        times.append(_versus(large["boundary alone"]["boundary alone"], large["boundary alone"]["prb"])[1] if large else "")
+        times.append(
+            _versus(large["boundary alone"]["boundary alone"], large["boundary alone"]["prb"])[1] if large else ""
+        )
         rows.append(
             [scene, *times, *(_cost(at.get(ours), ours, at.get(baseline), baseline) for ours, baseline in VERSUS)]
         )

@@ -155,7 +155,7 @@ def carries_derivative(params: Any, key: str, integrator: Any = None) -> bool:
     return getattr(integrator, "moves_rays", False) and needs_ray_adjoint(params, key)
 
 
-# Marked NonDifferentiable by Mitsuba, whose integrators drop their derivatives. tests/test_cameras_and_lights.py
+# Marked NonDifferentiable by Mitsuba, whose integrators drop their derivatives. tests/scenes/test_cameras_and_lights.py
 # compares each with finite differences.
 _PRINCIPAL_POINT = {"principal_point_offset_x", "principal_point_offset_y"}
 _CAMERA = {"to_world", "x_fov", "aperture_radius", "focus_distance"} | _PRINCIPAL_POINT

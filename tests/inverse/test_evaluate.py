@@ -1,0 +1,168 @@
+"""Evaluations as a function of values and shard: they add up in any order of computing, and views cost no memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from pathreplay.inverse.dataset.targets import Targets
+from pathreplay.inverse.loop.events import Refined, Started, Stepped, Stopped
+from pathreplay.inverse.loop.loop import iterate, new_run, render_views, take_step
+from pathreplay.inverse.objective.evaluate import Evaluation, Evaluator, Shard, total
+from pathreplay.inverse.problem.problem import Problem, build_problem
+from pathreplay.jobs import make_config
+from pathreplay.platform.interrupts import Stop
+from pathreplay.platform.threads import one_thread
+from room_job import CLOUD, JOB, TEXTURE, room  # noqa: F401 (room: its folder, for every test)
+
+SWEEP = {"integrator": {"type": "pathreplay", "max_depth": 3, "boundary": "none"}}
+POSE = {
+    "parameters": [{"key": "wall.to_world", "pose": "rigid", "initial": {"translation": [0.1, 0, 0]}}],
+    "target": {"values": {}, "scene": "room.xml", "spp": 8},
+}
+KINDS: dict[str, dict[str, Any]] = {
+    "sweep": SWEEP,
+    "prb": {},
+    "l1": {**SWEEP, "loss": "l1"},
+    "pose": {**SWEEP, **POSE},
+    "medium": {**CLOUD, "scene_parameters": {**CLOUD["scene_parameters"], "views": 2}},
+}
+
+
+def problem_of(**changes: Any) -> Problem:
+    return build_problem(make_config({**JOB, **changes}), Path.cwd())
+
+
+def bits(evaluation: Evaluation) -> dict[str, bytes]:
+    arrays = {**evaluation.gradients, **{f"learned {name}": value for name, value in evaluation.learned.items()}}
+    return {"loss": np.float64(evaluation.loss).tobytes()} | {key: value.tobytes() for key, value in arrays.items()}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_shards_add_up_whatever_was_computed_before(kind: str) -> None:
+    """Two views at once, one by one, and in the other order: the same bits, since the sum has an order of its own."""
+    problem = problem_of(**KINDS[kind])
+    values = new_run(problem, problem.integrator).values
+    other = {key: value * np.float32(0.9) for key, value in values.items()}
+    left, right, both = Shard((0,), 4, (1,)), Shard((1,), 4, (2,)), Shard((0, 1), 4, (1, 2))
+    with one_thread(True):
+        evaluate = Evaluator(problem, problem.integrator, record=False)
+        known = evaluate(other, Shard((0,), 4, (7,)), {}).learned
+        assert bool(known) == (kind == "medium")
+        first = total([evaluate(values, left, known), evaluate(values, right, known)])
+        late, early = evaluate(values, right, known), evaluate(values, left, known)
+        assert bits(total([early, late])) == bits(first)
+        at_once = evaluate(values, both, known)
+    assert all(np.abs(gradient).max() > 0 for gradient in first.gradients.values())
+    assert early.loss != late.loss
+    assert bits(at_once) == bits(first)
+
+
+@pytest.mark.parametrize("kind", ["sweep", "medium"])
+def test_what_was_never_learned_is_forgotten(kind: str) -> None:
+    """An evaluator that has learned evaluates as a new one does, where it is told to know nothing."""
+    problem = problem_of(**KINDS[kind])
+    values, shard = new_run(problem, problem.integrator).values, Shard((0, 1), 4, (1, 2))
+    with one_thread(True):
+        evaluate = Evaluator(problem, problem.integrator, record=False)
+        first, again = evaluate(values, shard, {}), evaluate(values, shard, {})
+    assert bits(again) == bits(first)
+
+
+@pytest.mark.parametrize("kind", ["prb", "l1"])
+def test_the_graph_holds_one_view(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Variables under differentiation where a loss goes back: as many for four views as for one."""
+    problem = problem_of(**KINDS[kind])
+    values = new_run(problem, problem.integrator).values
+    backward, held = dr.backward, []
+
+    def counting(*arguments: Any, **options: Any) -> None:
+        held.append(len(dr.whos_ad(as_string=True).splitlines()))
+        backward(*arguments, **options)
+
+    monkeypatch.setattr(dr, "backward", counting)
+    evaluate = Evaluator(problem, problem.integrator, record=False)
+    evaluate(values, Shard((0, 1), 4, (1, 2)), {})
+    held.clear()
+    evaluate(values, Shard((0, 1, 0, 1), 4, (1, 2, 3, 4)), {})
+    print(f"{kind}: AD variables where each view goes back: {held}")
+    assert len(held) == 4 and max(held) == held[0]
+
+
+COLOURS = [*(f"{wall}.reflectance.value" for wall in ("red", "green", "white")), "light.emitter.radiance.value"]
+BOX = {
+    "scene": "cornell-box-photo",
+    "scene_parameters": {"resolution": 8, "texture": 8},
+    "parameters": [{"key": key} for key in COLOURS],
+    "target": {"values": {COLOURS[0]: 0.5}, "spp": 4},
+}
+
+
+RECORDED = pytest.mark.parametrize(
+    "changes", [SWEEP, {}, {**SWEEP, "loss": "l1"}, KINDS["medium"]], ids=["sweep", "prb", "l1", "medium"]
+)
+
+
+def times_recorded(evaluate: Any) -> list[int]:
+    """Of each view, by an evaluator that was asked for one number of samples."""
+    (recordings,) = evaluate._recordings.values()
+    return [each.n_recordings for each in recordings._frozen.values()]
+
+
+@RECORDED
+def test_each_view_is_recorded_once(changes: dict[str, Any]) -> None:
+    """Whatever memory NumPy has put the values in, which differs from step to step."""
+    config = make_config({**JOB, **BOX, **changes})
+    problem = build_problem(config, Path.cwd())
+    run = new_run(problem, problem.integrator)
+    for i in range(6):
+        take_step(problem, config, run, i)
+    assert times_recorded(run.executor.evaluate) == [1, 1]  # type: ignore[attr-defined]
+
+
+@RECORDED
+def test_a_view_that_comes_later_leaves_recordings_as_they_are(changes: dict[str, Any]) -> None:
+    """Its first evaluation changes its sensor, which all recordings hold. Actors take views from each other."""
+    problem = build_problem(make_config({**JOB, **BOX, **changes}), Path.cwd())
+    problem = build_problem(make_config({**JOB, **BOX, **changes}), Path.cwd(), Targets.of(problem.views))
+    values, learned = new_run(problem, problem.integrator).values, {}
+    evaluate = Evaluator(problem, problem.integrator)
+    for seed, view in enumerate((0, 0, 0, 1, 0, 1, 0, 1)):
+        learned = evaluate(values, Shard((view,), 4, (seed,)), learned).learned
+    assert times_recorded(evaluate) == [1, 1]
+
+
+@RECORDED
+def test_pictures_leave_recordings_as_they_are(changes: dict[str, Any]) -> None:
+    """Those of previews."""
+    config = make_config({**JOB, **BOX, **changes})
+    problem = build_problem(config, Path.cwd())
+    run = new_run(problem, problem.integrator)
+    for i in range(6):
+        take_step(problem, config, run, i)
+        if i % 2:
+            render_views(problem, config, run.values)
+    assert times_recorded(run.executor.evaluate) == [1, 1]  # type: ignore[attr-defined]
+
+
+def test_views_are_not_recorded_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each recording would hold all of them."""
+    problem = problem_of(**SWEEP)
+    sensors = len(problem.scene.sensors())
+    for most, records in ((sensors, True), (sensors - 1, False)):
+        monkeypatch.setattr("pathreplay.inverse.objective.evaluate.MOST_SENSORS", most)
+        assert Evaluator(problem, problem.integrator).freezes == records
+
+
+def test_observers_hear_of_everything_in_order() -> None:
+    grid = [{"key": TEXTURE, "initial": 0.5, "resolutions": [2, 4], "refine_at": [2]}]
+    config = make_config({**JOB, "iterations": 3, "parameters": grid})
+    problem = build_problem(config, Path.cwd())
+    run = new_run(problem, problem.integrator)
+    heard = list(iterate(problem, config, run, Stop()))
+    first, second, third = (Stepped(entry) for entry in run.history)
+    assert heard == [Started(0, 3), first, second, Refined(TEXTURE, (4, 4, 3)), third, Stopped(3)]

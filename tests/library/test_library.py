@@ -1,0 +1,413 @@
+"""The library: problems of objects and arrays, with the gradients and the bits of jobs."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import scipy.optimize
+from safetensors.numpy import load_file
+
+import pathreplay
+from library_scenes import BODY, GREY, SIDE, TEXTURE, WALL, Descent, photos_of_room, room, views
+from ordinary_scenes import SCENES, Write
+from pathreplay import Parameter, PathreplayError, Problem, View
+from pathreplay.inverse.images.io import exr_bytes
+from pathreplay.jobs import make_config, optimize
+from pathreplay.scenes.loading import load_scene
+from places import ROOT
+from variant import VARIANT
+
+README = ROOT / "README.md"
+PAGE = ROOT / "docs" / "library.md"
+
+
+@pytest.fixture(autouse=True)
+def _variant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mi.set_variant(VARIANT)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def photos() -> list[np.ndarray]:
+    return photos_of_room()
+
+
+def test_the_script_of_the_readme_recovers_a_texture_and_a_colour() -> None:
+    script = re.search(r"<!-- begin library-example -->\n```python\n(.*?)```", README.read_text(), re.S)
+    assert script is not None
+    assert len([line for line in script[1].splitlines() if line.strip()]) <= 12
+    names: dict[str, Any] = {}
+    exec(script[1].replace('"llvm_ad_rgb"', repr(VARIANT)), names)
+    errors = np.abs(names["result"].values["back.bsdf.reflectance.data"] - names["texels"])
+    assert np.median(errors) < 0.04  # boxes hide some texels
+    np.testing.assert_allclose(names["result"].values["red.reflectance.value"], [0.57, 0.043, 0.044], atol=0.02)
+
+
+def test_the_page_runs_as_it_stands() -> None:
+    names: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.S):
+        exec(block.replace('"llvm_ad_rgb"', repr(VARIANT)), names)
+    assert names["result"].history[-1].loss < names["result"].history[0].loss
+
+
+def test_a_job_and_the_library_give_the_same_bits(photos: list[np.ndarray], tmp_path: Path) -> None:
+    (tmp_path / "left.exr").write_bytes(exr_bytes(photos[0]))
+    settings = {"spp": 4, "learning_rate": 0.05, "seed": 7, "deterministic": True}
+    job = {
+        "scene": "cornell-box",
+        "scene_parameters": {"resolution": SIDE},
+        "parameters": [
+            {"key": "red.reflectance.value", "initial": 0.5, "lower": 0.0, "upper": 1.0},
+            {"key": "light.emitter.radiance.value", "initial": 9.0, "parameterization": "log"},
+        ],
+        "target": {"images": ["left.exr"]},
+        "iterations": 5,
+        **settings,
+    }
+    folder = optimize(make_config(job), output="run", progress=False).folder
+    wanted = {
+        "red.reflectance.value": GREY,
+        "light.emitter.radiance.value": Parameter(initial=9.0, parameterization="log"),
+    }
+    problem = Problem(load_scene("cornell-box", resolution=SIDE), wanted, View(0, photos[0]), **settings)
+    result = pathreplay.minimize(problem, steps=5, progress=False)
+    of_job = load_file(folder / "parameters.safetensors")
+    for key in wanted:
+        np.testing.assert_array_equal(result.values[key], of_job[key])
+    history = [json.loads(line) for line in (folder / "history.jsonl").read_text().splitlines()]
+    assert [entry.loss for entry in result.history] == [entry["loss"] for entry in history]
+
+
+def test_value_and_grad_is_the_gradient_of_the_loss(photos: list[np.ndarray]) -> None:
+    """By finite differences of the loss of images without noise, along a direction."""
+    problem = Problem(room(), {WALL: Parameter(initial=[0.4, 0.5, 0.6])}, views(photos), spp=64)
+    f = pathreplay.value_and_grad(problem)
+    found = np.array([f(seed=seed)[1][WALL] for seed in range(12)])
+    start, by = problem.initial[WALL], problem.built.integrator
+
+    def loss(value: np.ndarray) -> float:
+        """Of two independent images: their variance is not in it."""
+        problem.assign(problem.complete({WALL: value}), problem.scene)
+        total = 0.0
+        for n, photo in enumerate(photos):
+            a, b = (np.array(mi.render(problem.scene, sensor=n, integrator=by, spp=1024, seed=s)) for s in (1, 2))
+            total += float(np.mean((a - photo) * (b - photo))) / len(photos)
+        return total
+
+    h = 0.05
+    for k in range(3):
+        step = h * np.eye(3, dtype=np.float32)[k]
+        expected = (loss(start + step) - loss(start - step)) / (2 * h)
+        error = found[:, k].std(ddof=1) / np.sqrt(len(found))
+        assert abs(found[:, k].mean() - expected) < 4 * error + 0.01 * abs(expected), k
+
+
+def test_regularizers_are_in_loss_and_gradient(photos: list[np.ndarray]) -> None:
+    def narrow(values: Any) -> Any:
+        return 3 * dr.mean(dr.square(values - 0.25), axis=None)
+
+    plain = pathreplay.value_and_grad(Problem(room(), {WALL: GREY}, views(photos), deterministic=True))
+    entry = Parameter(initial=0.5, bounds=(0, 1), regularizer=narrow)
+    more = pathreplay.value_and_grad(Problem(room(), {WALL: entry}, views(photos), deterministic=True))
+    (loss, grads), (with_it, slopes) = plain(seed=3), more(seed=3)
+    assert with_it - loss == pytest.approx(3 * 0.25**2, rel=1e-5)
+    np.testing.assert_allclose(slopes[WALL] - grads[WALL], 3 * 2 * 0.25 / 3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["total_variation", "l2_to_initial", "laplacian_weight"])
+def test_regularizers_by_name_are_those_of_the_module(kind: str, photos: list[np.ndarray]) -> None:
+    """Of a texture or of a body that were shaken; a function of one's own may be made of them."""
+    rng, of = np.random.default_rng(5), pathreplay.regularizers
+    key = BODY if kind == "laplacian_weight" else TEXTURE
+    params = mi.traverse(mi.load_dict(room()))
+    own_value = np.array(params[key])
+    start = own_value + rng.normal(0, 0.1, own_value.shape)
+    function = {
+        "total_variation": of.total_variation,
+        "l2_to_initial": of.l2_to(start),
+        "laplacian_weight": of.laplacian(own_value, np.array(params["body.faces"])) if key == BODY else None,
+    }[kind]
+    values = {key: start + 0.1 * rng.normal(0, 0.1, start.shape)}
+    evaluated = [
+        pathreplay.value_and_grad(Problem(room(), {key: entry}, views(photos), spp=1, deterministic=True))(values)
+        for entry in (
+            Parameter(initial=start),
+            Parameter(initial=start, **{kind: 0.3}),
+            Parameter(initial=start, regularizer=lambda v: 0.3 * function(v)),
+        )
+    ]
+    (plain, none), (by_name, slopes), (own, others) = evaluated
+    assert by_name > plain * (1 + 1e-6) and own == pytest.approx(by_name, rel=1e-6)
+    np.testing.assert_allclose(others[key] - none[key], slopes[key] - none[key], rtol=1e-3, atol=1e-7)
+    assert np.abs(slopes[key] - none[key]).max() > 1e-5
+
+
+def test_arrays_tensors_bitmaps_and_files_are_targets(photos: list[np.ndarray], tmp_path: Path) -> None:
+    (tmp_path / "photo.exr").write_bytes(exr_bytes(photos[0]))
+    kinds = [photos[0], mi.TensorXf(photos[0]), mi.Bitmap(photos[0]), tmp_path / "photo.exr"]
+    for kind in kinds:
+        problem = Problem(room(), {WALL: GREY}, View(0, kind))
+        np.testing.assert_allclose(problem.built.views[0].target, photos[0], rtol=1e-6)
+
+
+XML = """<scene version="3.0.0">
+  <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/>
+  </film></sensor>
+  <emitter type="constant"/>
+  <shape type="rectangle" id="wall"><bsdf type="diffuse"><rgb name="reflectance" value="0.7 0.3 0.2"/></bsdf>
+    <transform name="to_world"><translate z="3"/></transform></shape>
+</scene>"""
+
+
+def test_scenes_are_objects_dictionaries_files_and_names(photos: list[np.ndarray], tmp_path: Path) -> None:
+    """A dictionary is given twice: it keeps its tensors."""
+    (tmp_path / "room.xml").write_text(XML)
+    description = room()
+    for scene, key in (
+        (mi.load_dict(room(), optimize=False), WALL),
+        (description, WALL),
+        (description, WALL),
+        (tmp_path / "room.xml", WALL),
+        ("room.xml", WALL),
+    ):
+        problem = Problem(scene, [key], View(0, photos[0]))
+        np.testing.assert_allclose(problem.initial[key], [0.7, 0.3, 0.2], rtol=1e-5)
+    by_name = Problem("cornell-box", ["red.reflectance.value"], View(0, np.zeros((256, 256, 3))))
+    assert by_name.render(spp=1).shape == (256, 256, 3)
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "rate"),
+    [
+        ("adam", 0.03),
+        ({"type": "sgd", "momentum": 0.5}, 1.0),
+        (lambda: mi.ad.Adam(lr=0.03), 0.5),
+        (Descent, 0.03),
+        ("l-bfgs-b", 0.03),
+        (partial(scipy.optimize.minimize, method="SLSQP"), 0.03),
+    ],
+    ids=["name", "table", "mitsuba", "own", "scipy", "any of scipy"],
+)
+def test_any_optimizer_lowers_the_loss(optimizer: Any, rate: float, photos: list[np.ndarray]) -> None:
+    problem = Problem(room(), {WALL: GREY}, views(photos), learning_rate=rate, spp=8)
+    made = optimizer() if callable(optimizer) and not isinstance(optimizer, partial) else optimizer
+    result = pathreplay.minimize(problem, made, steps=12, progress=False)
+    assert result.history[-1].loss < 0.8 * result.history[0].loss
+
+
+def test_mitsubas_adam_takes_the_steps_of_ours(photos: list[np.ndarray]) -> None:
+    settings = {"learning_rate": 0.03, "spp": 4, "deterministic": True}
+    problem = Problem(room(), {WALL: GREY}, views(photos), **settings)
+    ours = pathreplay.minimize(problem, {"type": "adam", "beta_2": 0.999}, steps=4, progress=False)
+    theirs = pathreplay.minimize(problem, mi.ad.Adam(lr=0.03), steps=4, progress=False)
+    np.testing.assert_allclose(theirs.values[WALL], ours.values[WALL], rtol=1e-4)
+
+
+@pytest.mark.parametrize("key", [WALL, "wall.*reflectance*", BODY])
+def test_learning_rates_of_parameters_are_those_of_mitsubas_optimizer(key: str, photos: list[np.ndarray]) -> None:
+    """The first step of Adam has the length of the rate: of a key, of a glob, and of a pose."""
+    entry = Parameter(pose="translation", learning_rate=0.01) if key == BODY else Parameter(learning_rate=0.01)
+    problem = Problem(room(), {key: entry, TEXTURE: None}, views(photos), spp=4)
+    result = pathreplay.minimize(problem, mi.ad.Adam(lr=0.1), steps=1, progress=False)
+    name = f"{BODY}:translation" if key == BODY else WALL
+    for each, rate in ((name, 0.01), (TEXTURE, 0.1)):
+        assert np.abs(result.values[each] - problem.initial[each]).max() == pytest.approx(rate, rel=1e-2)
+
+
+def test_losses_of_ones_own_and_by_name(photos: list[np.ndarray]) -> None:
+    def own(image: Any, target: Any) -> Any:
+        return dr.abs(image - target)
+
+    for loss in (own, "l1", pathreplay.losses.l1):
+        problem = Problem(room(), {WALL: GREY}, views(photos), loss=loss, learning_rate=0.03)
+        result = pathreplay.minimize(problem, steps=8, progress=False)
+        assert result.history[-1].loss < result.history[0].loss
+
+
+def test_a_pose_a_derived_parameter_and_arrays_as_starts(photos: list[np.ndarray]) -> None:
+    start = np.full((4, 4, 3), 0.4, np.float32)
+    start[0, 0] = [0.1, 0.2, 0.3]
+    wanted = {
+        BODY: Parameter(pose="translation", initial={"translation": [0.1, 0, 0]}),
+        TEXTURE: Parameter(initial=start),
+        "share": Parameter(initial=0.5, shape=[1]),
+    }
+
+    def grey(_: Any, share: Any) -> Any:
+        return mi.Color3f(share.array)
+
+    derived = {WALL: pathreplay.Derived(grey, of=["share"])}
+    problem = Problem(room(), wanted, views(photos), derived=derived)
+    assert set(problem.initial) == {f"{BODY}:translation", TEXTURE, "share"}
+    np.testing.assert_array_equal(problem.initial[TEXTURE], start)
+    result = pathreplay.minimize(problem, steps=2, progress=False)
+    assert {BODY, WALL, TEXTURE} <= set(result.values)
+    other = mi.load_dict(room())
+    result.apply(other)
+    np.testing.assert_allclose(np.array(mi.traverse(other)[BODY]), result.values[BODY].ravel(), atol=1e-6)
+
+
+def test_a_callback_ends_it_and_nothing_is_written(photos: list[np.ndarray], tmp_path: Path) -> None:
+    seen: list[tuple[int, float]] = []
+
+    def look(it: pathreplay.Iteration) -> bool:
+        seen.append((it.number, float(it.values[WALL][0])))
+        return it.number == 2
+
+    problem = Problem(room(), {WALL: GREY}, views(photos))
+    result = pathreplay.minimize(problem, steps=50, callbacks=[look], progress=False)
+    assert [number for number, _ in seen] == [0, 1, 2] and result.stopped == "a callback"
+    assert seen[-1][1] == pytest.approx(float(result.values[WALL][0]))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_stages_take_the_place_of_steps(photos: list[np.ndarray]) -> None:
+    problem = Problem(room(), {WALL: GREY, TEXTURE: Parameter(resolutions=[2, 4], refine_at=[2])}, views(photos))
+    stages = [{"iterations": 2, "downscale": 2, "parameters": [WALL]}, {"iterations": 3, "max_depth": 2}]
+    result = pathreplay.minimize(problem, stages=stages, progress=False)
+    assert len(result.history) == 5
+    assert set(result.history[0].gradient_norms) == {WALL} < set(result.history[-1].gradient_norms)
+    assert result.values[TEXTURE].shape == (4, 4, 3)
+    again = pathreplay.minimize(problem, steps=3, progress=False)  # the problem is as it was
+    assert len(again.history) == 3 and "3 iterations" in repr(again) and WALL in repr(problem)
+
+
+def test_a_problem_is_left_as_it_was(photos: list[np.ndarray]) -> None:
+    problem = Problem(room(), {WALL: GREY}, views(photos), deterministic=True)
+    f = pathreplay.value_and_grad(problem)
+    before = f(seed=5)
+    first, second = (pathreplay.minimize(problem, steps=3, progress=False) for _ in range(2))
+    np.testing.assert_array_equal(first.values[WALL], second.values[WALL])
+    after = f(seed=5)
+    assert after[0] == before[0] and np.array_equal(after[1][WALL], before[1][WALL])
+
+
+def test_what_one_minimisation_learns_of_media_is_not_known_to_others() -> None:
+    """Nor to gradients that a callback asks for on the way, nor to the minimisation what these have learned."""
+    scene, density = load_scene("cloud", resolution=12, grid=6, views=1), "*.sigma_t.data"
+    view = View(0, np.full((12, 12, 3), 0.4))
+    limits = {"type": "pathreplay", "max_depth": 4}
+    problem = Problem(
+        scene, {density: Parameter(initial=1.0)}, view, integrator=limits, spp=2, deterministic=True, seed=3
+    )
+    f = pathreplay.value_and_grad(problem)
+    before = f(seed=5)[0]
+
+    def losses(*callbacks: Any) -> list[float]:
+        result = pathreplay.minimize(problem, steps=4, progress=False, callbacks=callbacks)
+        return [entry.loss for entry in result.history]
+
+    found = losses(), losses(), losses(lambda it: f(it.values, seed=it.number))
+    assert found[0] == found[1] == found[2] and f(seed=5)[0] == before
+
+
+def test_an_iteration_that_is_kept_stays_as_it_was(photos: list[np.ndarray]) -> None:
+    kept: list[pathreplay.Iteration] = []
+    problem = Problem(room(), {WALL: GREY}, views(photos))
+    pathreplay.minimize(problem, steps=4, callbacks=[kept.append], progress=False)
+    assert len({float(it.values[WALL][0]) for it in kept}) == 4
+
+
+def test_weights_shares_and_test_views(photos: list[np.ndarray]) -> None:
+    mask = np.zeros((SIDE, SIDE))
+    mask[:8] = 1
+    pair = [View("left", photos[0], weight=mask, share=2.0), View("right", photos[1], test=True)]
+    problem = Problem(room(), {WALL: GREY}, pair)
+    left, right = problem.built.views
+    assert left.weight is not None and left.weight.mean() == pytest.approx(1) and not left.is_test
+    assert right.is_test and right.weight is None
+    assert problem.render(view=1).shape == (SIDE, SIDE, 3)
+
+
+def bad(**changes: Any) -> Callable[[list[np.ndarray]], Any]:
+    def make(photos: list[np.ndarray]) -> Any:
+        given = {"scene": room(), "parameters": {WALL: GREY}, "views": View(0, photos[0])} | changes
+        return Problem(given.pop("scene"), given.pop("parameters"), given.pop("views"), **given)
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (bad(parameters={"wal.reflectance": GREY}), "wal.reflectance"),
+        (bad(parameters={WALL: 0.5}), "parameters: 0.5 is no Parameter"),
+        (bad(views=np.zeros((16, 16, 3))), "is no View; write View"),
+        (bad(derived={WALL: len}), "is no Derived"),
+        (bad(views=[]), "views: there is none"),
+        (bad(views=View(0)), "Target of sensor 'left' is missing"),
+        (bad(views=View(0, np.zeros((3, 4, 3)))), "is 4 x 3, and its film 16 x 16"),
+        (bad(views=View(0, "no.exr")), "No image file 'no.exr'"),
+        (bad(views=View("middle", np.zeros((16, 16, 3)))), "No sensor 'middle'"),
+        (bad(views=[View(0, np.zeros((16, 16, 3))), View("left", np.zeros((16, 16, 3)))]), "is named twice"),
+        (bad(views=View(0, np.full((16, 16, 3), np.nan))), "NaN"),
+        (bad(views=View(0, np.zeros((16, 16, 3)), weight=np.zeros((16, 16)))), "is black"),
+        (bad(loss="l3"), "No loss 'l3'"),
+        (bad(loss=lambda a, b: "much"), "cannot be computed|returns the str"),
+        (bad(integrator={"type": "path"}), "computes no gradients"),
+        (bad(spp=0), "problem: 'spp' is 0"),
+        (bad(parameters={WALL: Parameter(bounds=(1, 0))}), "is not above lower bound"),
+        (bad(parameters={WALL: Parameter(initial=np.zeros(5))}), "of shape \\(5,\\)"),
+        (bad(parameters={WALL: Parameter(parameterization="cube")}), "parameterization"),
+        (bad(parameters={BODY: Parameter(pose="rigid", initial=np.eye(4))}), "'initial' of a pose is a displacement"),
+        (bad(scene=5), "scene: 'int' is no scene of the active variant"),
+        (bad(scene={"type": "sphere"}), "describes a Shape, not a scene"),
+        (bad(scene="no-such-scene"), "No scene 'no-such-scene'"),
+    ],
+)  # fmt: skip
+def test_what_cannot_work_is_told_in_one_line(make: Callable[..., Any], words: str, photos: list[np.ndarray]) -> None:
+    with pytest.raises(PathreplayError, match=words) as told:
+        make(photos)
+    assert "\n" not in str(told.value)
+
+
+def test_what_a_minimisation_cannot_do_is_told(photos: list[np.ndarray]) -> None:
+    problem = Problem(room(), {WALL: GREY}, views(photos))
+    held = mi.ad.Adam(lr=0.1)
+    held["x"] = mi.Float(1)
+    unbounded = partial(scipy.optimize.minimize, method="BFGS")
+    for optimizer, words in (
+        (object(), "has no step"),
+        (mi.ad.Adam, "is a class; create an object"),
+        (unbounded, "BFGS cannot handle bounds; remove the bounds"),
+        (held, "holds variables already"),
+        ("adem", "adem"),
+    ):
+        with pytest.raises(PathreplayError, match=words):
+            pathreplay.minimize(problem, optimizer, progress=False)
+    with pytest.raises(PathreplayError, match="No parameter 'x'"):
+        problem.render({"x": 1.0})
+    with pytest.raises(PathreplayError, match=r"has the shape \(2,\), the parameter \(3,\); reshape it"):
+        pathreplay.value_and_grad(problem)({WALL: [1.0, 2.0]})
+    textured = Problem(room(), [TEXTURE], views(photos))
+    with pytest.raises(PathreplayError, match=r"has the shape \(4, 4\), the parameter \(4, 4, 3\)"):
+        textured.render({TEXTURE: np.zeros((4, 4))})
+    assert textured.render({TEXTURE: np.zeros((8, 8, 3))}, spp=1).shape == (SIDE, SIDE, 3)
+    with pytest.raises(PathreplayError, match="'iterations' is 0"):
+        pathreplay.minimize(problem, steps=0, progress=False)
+
+
+@pytest.mark.parametrize("write", [pytest.param(s, id=s.__name__) for s in SCENES])
+def test_ordinary_scenes_one_after_the_other(write: Write, tmp_path: Path) -> None:
+    """Files of Blender and others, several cameras, media, mono and spectral variants: three steps lower the loss."""
+    use = write(tmp_path)
+    mi.set_variant(use.variant)
+    (tmp_path / "scene.xml").write_text(use.xml, encoding="utf-8")
+    sizes, limits = use.views, {"type": "pathreplay", "max_depth": 4}
+    nothing = [View(n, np.zeros((height, width, 1))) for n, (width, height) in enumerate(sizes)]
+    truth = Problem("scene.xml", {use.key: Parameter(initial=use.truth)}, nothing, integrator=limits)
+    photos = [View(n, truth.render(view=n, spp=64)) for n in range(len(sizes))]
+    wanted = {use.key: Parameter(initial=use.start, bounds=(0, None))}
+    problem = Problem("scene.xml", wanted, photos, integrator=limits, learning_rate=use.rate)
+    result = pathreplay.minimize(problem, steps=4, progress=False)
+    assert result.history[-1].loss < result.history[0].loss
+    assert all(np.isfinite(value).all() for value in result.values.values())

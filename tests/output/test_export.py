@@ -1,0 +1,342 @@
+"""`pathreplay export`: what comes out is loaded by Mitsuba alone, and renders to the picture of the run's values."""
+
+from __future__ import annotations
+
+import gc
+import json
+import shlex
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from pathreplay import cli
+from pathreplay.errors import PathreplayError
+from pathreplay.inverse.config.schema import PICTURE, Capture
+from pathreplay.inverse.dataset.capture import read_capture
+from pathreplay.inverse.images.io import exr_bytes, read_image
+from pathreplay.jobs import make_config, optimize
+from pathreplay.output.export import export_run, write_files
+from pathreplay.output.scene_folder import Exported, Source, exported, require_same
+from pathreplay.scenes.builtin import BUILTINS
+from pathreplay.scenes.parameters import get_array
+from pathreplay.scenes.volume_files import load_volume
+from room_job import JOB, SCENE
+
+
+def pictures(scene: mi.Scene, integrator: mi.Integrator, spp: int = 4) -> list[np.ndarray]:
+    views = range(len(scene.sensors()))
+    return [np.array(mi.render(scene, sensor=i, integrator=integrator, spp=spp, seed=3)) for i in views]
+
+
+def loaded(folder: Path) -> mi.Scene:
+    return mi.load_file(str(folder / "scene.xml"))  # as users do, with all that is optimised then
+
+
+def same_pictures(found: Exported, folder: Path) -> None:
+    """Write what was exported, load it, and compare what is seen in all sensors at the same seed."""
+    folder.mkdir()
+    write_files(found, folder)
+    require_same(found.scene, folder)
+    scene = mi.load_file(str(folder / "scene.xml"), optimize=False)
+    for ours, theirs in zip(*(pictures(s, scene.integrator()) for s in (found.scene, scene)), strict=True):
+        assert ours.mean() > 0.01
+        assert alike(ours, theirs) > 0.95 and abs(ours.mean() / theirs.mean() - 1) < 0.01
+
+
+def alike(image: np.ndarray, other: np.ndarray) -> float:
+    """The share of values that are the same but for rounding, which now and then turns a path at a random decision."""
+    return float(np.isclose(image, other, rtol=1e-4, atol=2e-5).mean())
+
+
+SMALL: dict[str, dict[str, int]] = {
+    "cornell-box-photo": {"texture": 6}, "glass-pane": {"texture": 6}, "cloud": {"grid": 6, "views": 2},
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BUILTINS)
+def test_every_built_in_scene_comes_out_as_it_is(name: str, tmp_path: Path) -> None:
+    scene = BUILTINS[name](resolution=12, **SMALL.get(name, {}))
+    same_pictures(exported(Source(scene, {}, {}, {}), {}), tmp_path / "out")
+
+
+#: Kinds of recovered values: a scene dictionary's own, and the values that a run may end with.
+CHANGED: dict[str, tuple[str, dict[str, Any]]] = {
+    "texture and colours": (
+        "cornell-box-photo",
+        {
+            "back.bsdf.reflectance.data": np.linspace(0, 1, 5 * 7 * 3).reshape(5, 7, 3),  # of another size
+            "red.reflectance.value": np.array([0.1, 0.7, 0.2]),
+            "light.emitter.radiance.value": np.array([3.0, 9.0, 20.0]),
+        },
+    ),
+    "vertices of a cube": (
+        "cornell-box",
+        {"small-box.vertex_positions": np.linspace(-0.7, 0.7, 72) ** 3},
+    ),
+    "poses": (
+        "mirror-camera",
+        {
+            "camera.to_world": np.array([[-0.8, 0, -0.6, 0.5], [0, 1, 0, 0.3], [0.6, 0, -0.8, 1.5], [0, 0, 0, 1]]),
+            "mirror.to_world": np.diag([1.1, 0.9, 1.0, 1.0]),
+        },
+    ),
+    "a grid of another size": (
+        "cloud",
+        {"cloud.interior_medium.sigma_t.data": np.linspace(0, 4, 3 * 4 * 5).reshape(3, 4, 5, 1)},
+    ),
+    "a field of view": ("flat-colours", {"camera.x_fov": np.array([61.0])}),
+    "a smooth mesh that came in made": (
+        "silhouettes",
+        {"body.bsdf.reflectance.value": np.array([0.5]), "sky.radiance.value": np.array([0.7, 0.6, 0.5])},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CHANGED)
+def test_values_come_out_with_the_scene(case: str, tmp_path: Path) -> None:
+    name, values = CHANGED[case]
+    scene = BUILTINS[name](resolution=8, **SMALL.get(name, {}))
+    found = exported(Source(scene, {}, {}, {}), {key: np.float32(value) for key, value in values.items()})
+    before = mi.load_dict(scene, optimize=False)
+    changed = pictures(found.scene, mi.load_dict({"type": "volpath", "max_depth": 4}))
+    plain = pictures(before, mi.load_dict({"type": "volpath", "max_depth": 4}))
+    assert any(alike(a, b) < 0.9 for a, b in zip(changed, plain, strict=True))
+    same_pictures(found, tmp_path / "out")
+
+
+def test_the_index_of_glass_comes_out_as_that_of_mitsubas_plugin(tmp_path: Path) -> None:
+    source = Source(BUILTINS["glass-ball"](resolution=8), {}, {"dielectric": "dielectric_ad"}, {})
+    found = exported(source, {"glass.eta": np.float32([1.31])})
+    same_pictures(found, tmp_path / "out")
+    assert b'type="dielectric"' in found.files["scene.xml"] and b"1.309" in found.files["scene.xml"]
+
+
+MANY = """<scene version="3.0.0"><default name="res" value="8"/>
+<integrator type="prb"><integer name="max_depth" value="4"/></integrator>
+<sensor type="perspective" id="eye"><float name="fov" value="40"/>
+  <transform name="to_world"><lookat origin="0.3,1,5" target="0,0,0" up="0,1,0"/></transform>
+  <film type="hdrfilm"><integer name="width" value="$res"/><integer name="height" value="$res"/>
+    <rfilter type="box"/></film></sensor>
+<bsdf type="twosided" id="satin"><bsdf type="roughplastic">
+  <rgb name="diffuse_reflectance" value="0.2 0.3 0.4"/><float name="alpha" value="0.1"/></bsdf></bsdf>
+<shape type="sphere" id="ball"><point name="center" value="0.1,0.2,0.3"/><float name="radius" value="0.5"/>
+  <ref id="satin"/></shape>
+<shape type="sphere"><point name="center" value="-1,0.2,0.3"/><boolean name="flip_normals" value="true"/>
+  <bsdf type="twosided"><bsdf type="diffuse"><spectrum name="reflectance" value="0.5"/></bsdf></bsdf></shape>
+<shape type="rectangle"><bsdf type="diffuse"><spectrum name="reflectance" value="400:0.1, 500:0.5, 700:0.8"/></bsdf>
+  <transform name="to_world"><scale value="3"/><rotate y="1" angle="20"/><translate z="-2"/></transform></shape>
+<shape type="ply" id="wedge"><string name="filename" value="meshes/wedge.ply"/>
+  <boolean name="face_normals" value="true"/>
+  <transform name="to_world"><rotate x="1" angle="33"/><translate y="-1"/></transform>
+  <bsdf type="twosided"><bsdf type="conductor"><string name="material" value="Au"/></bsdf></bsdf></shape>
+<shape type="shapegroup" id="group"><shape type="cube" id="brick"><transform name="to_world"><scale value="0.3"/>
+  </transform><bsdf type="diffuse"><texture name="reflectance" type="checkerboard"><rgb name="color0" value="1 0.5 0"/>
+  <transform name="to_uv"><scale x="3"/></transform></texture></bsdf></shape></shape>
+<shape type="instance" id="first"><ref id="group"/><transform name="to_world"><translate x="1"/></transform></shape>
+<shape type="instance" id="second"><ref id="group"/><transform name="to_world"><rotate y="1" angle="30"/>
+  <translate x="1" y="1"/></transform></shape>
+<emitter type="constant"><rgb name="radiance" value="0.3"/></emitter>
+<emitter type="point" id="lamp"><point name="position" value="2,3,2"/><rgb name="intensity" value="20"/></emitter>
+</scene>"""
+
+
+@pytest.fixture
+def many(tmp_path: Path) -> Path:
+    """An XML scene of many kinds of things, with a mesh of its own."""
+    (tmp_path / "scene/meshes").mkdir(parents=True)
+    mesh = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale([0.5, 0.2, 0.4])})
+    mesh.write_ply(str(tmp_path / "scene/meshes/wedge.ply"))
+    (tmp_path / "scene/many.xml").write_text(MANY)
+    return tmp_path / "scene/many.xml"
+
+
+def test_a_scene_from_xml_comes_out_with_its_files_names_and_numbers(many: Path, tmp_path: Path) -> None:
+    values = {
+        "ball.to_world": np.float32([[0.4, 0, 0, 0.4], [0, 0.3, 0, 0.1], [0, 0, 0.5, 0.2], [0, 0, 0, 1]]),
+        "satin.brdf_0.alpha": np.float32([0.3]),
+        "first.to_world": np.float32([[1, 0, 0, 0.7], [0, 1, 0, 0.1], [0, 0, 1, 0.2], [0, 0, 0, 1]]),
+        "lamp.position": np.float32([1, 3, 2]),
+    }
+    found = exported(Source(many, {"res": "12"}, {}, {}), values)
+    same_pictures(found, tmp_path / "out")
+    assert found.notes == ("'path' renders the exported scene instead of 'prb', a differentiable integrator",)
+    keys = set(mi.traverse(mi.load_file(str(tmp_path / "out/scene.xml"), optimize=False)).keys())
+    assert set(values) <= keys and "wedge.vertex_positions" in keys
+    assert (tmp_path / "out/files/wedge.ply").read_bytes() == (many.parent / "meshes/wedge.ply").read_bytes()
+
+
+def test_vertices_of_a_mesh_from_a_file_come_out(many: Path, tmp_path: Path) -> None:
+    moved = get_array(mi.traverse(mi.load_file(str(many), optimize=False))["wedge.vertex_positions"]) * 1.3
+    found = exported(Source(many, {}, {}, {}), {"wedge.vertex_positions": moved})
+    same_pictures(found, tmp_path / "out")
+    assert "meshes/wedge.ply" in found.files and not found.copies
+
+
+def test_what_nobody_knows_the_making_of_is_told(tmp_path: Path) -> None:
+    scene = mi.cornell_box()
+    scene["floor"]["bsdf"] = mi.load_dict({"type": "roughplastic"})
+    with pytest.raises(
+        PathreplayError, match=r"'bsdf' of rectangle .* is an existing RoughPlastic .*cannot be exported; describe"
+    ):
+        exported(Source(scene, {}, {}, {}), {})
+
+
+def test_a_value_that_does_not_come_back_is_told(tmp_path: Path) -> None:
+    found = exported(Source(BUILTINS["flat-colours"](resolution=4), {}, {}, {}), {})
+    (tmp_path / "out").mkdir()
+    write_files(found, tmp_path / "out")
+    params = mi.traverse(found.scene)
+    params["red.emitter.radiance.value"] = mi.Color3f(0.5, 0.2, 0.1)
+    params.update()
+    with pytest.raises(PathreplayError, match=r"'red\.emitter\.radiance\.value' of SRGB.* is missing or different"):
+        require_same(found.scene, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "plain"),
+    [
+        ({"type": "pathreplay"}, {"type": "path", "max_depth": 6}),
+        ({"type": "pathreplay", "max_depth": 3, "boundary": "all"}, {"type": "path", "max_depth": 3}),
+        ({"type": "direct_projective", "sppi": 0}, {"type": "path", "max_depth": 2}),
+        ({"type": "direct", "emitter_samples": 2}, {"type": "direct", "emitter_samples": 2}),
+        (None, {"type": "path", "max_depth": 8}),
+    ],
+)
+def test_integrators_for_gradients_have_one_for_pictures_in_their_place(wanted: Any, plain: dict[str, Any]) -> None:
+    """With the depth that they have, where none is said: `path` would go on for ever."""
+    found = exported(Source(BUILTINS["cornell-box"](resolution=4), {}, {}, {}), {}, wanted)
+    (element,) = ElementTree.fromstring(found.files["scene.xml"]).iter("integrator")
+    options = {each.get("name"): int(str(each.get("value"))) for each in element}
+    assert {"type": element.get("type"), **options} == plain
+    assert bool(found.notes) == (wanted is not None and wanted["type"] != "direct")
+
+
+# ------------------------------ A run ------------------------------
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a scene from XML and of a run of two iterations."""
+    folder = tmp_path_factory.mktemp("job")
+    (folder / "room.xml").write_text(SCENE)
+    texels = np.array([[0.1, 0.4], [0.6, 0.9]], np.float32)[:, :, None] * np.array([1, 0.8, 0.6], np.float32)
+    (folder / "texture.exr").write_bytes(exr_bytes(texels))
+    pose = {"key": "right.to_world", "pose": "rigid", "initial": {"translation": [0.1, 0.0, 0.0]}}
+    changes = {"iterations": 2, "parameters": [*JOB["parameters"], pose], "scene": str(folder / "room.xml")}
+    changes["integrator"] = {"type": "pathreplay", "max_depth": 3}
+    changes["target"] = {**JOB["target"], "scene": str(folder / "room.xml")}
+    optimize(make_config({**JOB, **changes}), output=folder / "run", progress=False)
+    return folder
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the run."""
+    return Path(shutil.copytree(finished / "run", tmp_path / "run"))
+
+
+def test_a_run_comes_out_as_its_result_pictures(run: Path, tmp_path: Path) -> None:
+    told = export_run(run)
+    folder = run / "export"
+    assert told.splitlines()[0].startswith(f"{folder}/scene.xml: render it with `pathreplay render ")
+    gc.collect()
+    scene = loaded(folder)
+    result = [read_image(run / f"images/result-{view}.exr") for view in ("left", "right")]
+    ours = mi.load_dict({"type": "pathreplay", "max_depth": 3})
+    config = make_config(json.loads((run / "config.json").read_text()))
+    for view, expected in enumerate(result):
+        image = mi.render(scene, sensor=view, integrator=ours, spp=16, seed=config.seeds(PICTURE, view)[0])
+        assert alike(np.array(image), expected) > 0.95
+    assert "PathIntegrator" in str(scene.integrator()) and "max_depth = 3" in str(scene.integrator())
+    key = "wall.bsdf.reflectance.data"
+    texels = read_image(folder / f"textures/{key}.exr")
+    assert (folder / f"textures/{key}.png").is_file() and texels.shape == (2, 2, 3)
+    numbers = json.loads((folder / "values.json").read_text())
+    assert len(numbers["floor.reflectance.value"]) == 3 and np.shape(numbers["right.to_world"]) == (4, 4)
+    found = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    assert found == {
+        "scene.xml", "values.json", "transforms.json", f"textures/{key}.exr", f"textures/{key}.png"
+    }  # fmt: skip
+
+
+def test_the_command_that_is_advised_renders_what_came_out(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, command, _ = export_run(run, tmp_path / "with a space").splitlines()[0].split("`")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [*shlex.split(command), "--spp", "1", "--quiet"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code in (0, None)
+    assert read_image(tmp_path / "scene.exr").shape == (10, 12, 3)
+
+
+def test_the_cameras_of_a_run_can_be_read_as_a_capture(run: Path) -> None:
+    export_run(run)
+    for view in ("left", "right"):
+        (run / f"export/{view}.exr").write_bytes((run / f"images/result-{view}.exr").read_bytes())
+    shots = read_capture(Capture(transforms="transforms.json"), run / "export", lambda path: (12, 10))
+    scene = loaded(run / "export")
+    for sensor in scene.sensors():
+        camera = mi.load_dict(shots[sensor.id()].camera)
+        ours, theirs = (mi.traverse(each) for each in (sensor, camera))
+        for key in ("to_world", "x_fov"):
+            np.testing.assert_allclose(get_array(theirs[key]), get_array(ours[key]), atol=1e-5)
+
+
+@pytest.mark.parametrize("trouble", ["no run", "no result", "a result that is none", "no scene", "a full folder"])
+def test_what_cannot_be_exported_is_told_and_leaves_nothing(trouble: str, run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    line = {
+        "no run": "is not a run folder",
+        "no result": "has no result yet",
+        "a result that is none": "cannot be read",
+        "no scene": "no longer exists; restore it",
+        "a full folder": "exists already; give -o a new folder",
+    }[trouble]
+    if trouble == "no result":
+        (run / "parameters.safetensors").unlink()
+    elif trouble == "a result that is none":
+        (run / "parameters.safetensors").write_bytes(b"none")
+    elif trouble == "no scene":
+        config = run / "config.json"
+        config.write_text(config.read_text().replace("room.xml", "gone.xml"))
+    elif trouble == "a full folder":
+        folder.mkdir()
+        (folder / "mine").write_text("")
+    before = sorted(path for path in tmp_path.rglob("*"))
+    with pytest.raises(PathreplayError, match=line):
+        export_run(tmp_path if trouble == "no run" else run, folder)
+    assert sorted(path for path in tmp_path.rglob("*")) == before
+
+
+@pytest.mark.slow
+def test_a_volume_and_a_mesh_of_runs_come_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    grid = "cloud.interior_medium.sigma_t.data"
+    jobs = {
+        "cloud": ({"grid": 4, "views": 1}, {"key": grid, "initial": 1.0, "resolutions": [3]}, "volpath"),
+        "silhouettes": ({"views": 1}, {"key": "body.vertex_positions", "large_steps_lambda": 5.0}, "path"),
+    }
+    for name, (arguments, parameter, plain) in jobs.items():
+        job = {
+            "scene": name, "scene_parameters": {"resolution": 8, **arguments}, "parameters": [parameter], "spp": 4,
+            "iterations": 1, "eval_spp": 4, "integrator": {"type": "pathreplay", "max_depth": 4, "boundary": "none"},
+            "target": {"scene": name, "scene_parameters": {"resolution": 8, **arguments}, "spp": 4},
+        }  # fmt: skip
+        job["target"]["integrator"] = {"type": plain, "max_depth": 4}
+        folder = optimize(make_config(job), output=name, progress=False).folder
+        export_run(folder, tmp_path / f"out-{name}")
+    assert load_volume(tmp_path / f"out-cloud/volumes/{grid}.vol").data.shape == (3, 3, 3, 1)
+    sizes = {
+        mi.load_dict({"type": ending, "filename": str(tmp_path / f"out-silhouettes/meshes/body.{ending}")}).face_count()
+        for ending in ("ply", "obj")
+    }
+    assert sizes == {2048}

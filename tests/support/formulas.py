@@ -1,0 +1,17 @@
+"""Pixelwise losses as formulas of NumPy arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pathreplay.inverse.losses.pixelwise import RELATIVE_FLOOR
+
+# What the docstrings say, in NumPy.
+FORMULAS = {
+    "l1": lambda i, t: np.abs(i - t).mean(),
+    "l2": lambda i, t: ((i - t) ** 2).mean(),
+    "relative-l2": lambda i, t: (((i - t) / (t + RELATIVE_FLOOR)) ** 2).mean(),
+    "relative-l1": lambda i, t: (np.abs(i - t) / (t + RELATIVE_FLOOR)).mean(),
+    "smape": lambda i, t: (np.abs(i - t) / (i + t + RELATIVE_FLOOR)).mean(),
+    "log": lambda i, t: ((np.log1p(i) - np.log1p(t)) ** 2).mean(),
+}

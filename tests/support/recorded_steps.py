@@ -1,0 +1,18 @@
+"""Optimisation steps, recorded or traced anew, as losses and norms of gradients."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pathreplay.inverse.loop.loop import new_run, take_step
+
+
+def steps(problem, config, passes: str) -> np.ndarray:
+    """Loss and norm of the gradient of four steps, recorded (from the second on) or traced anew each time."""
+    run = new_run(problem, problem.integrator, record=passes == "recorded")
+    for i in range(4):
+        take_step(problem, config, run, i)
+    # The first step is traced in any case; the others launch what the second recorded, view by view.
+    frozen = run.executor.evaluate._recordings[config.spp]._frozen.values()
+    assert [each.n_recordings for each in frozen] == [1] * len(problem.views) * (passes == "recorded")
+    return np.array([[entry.loss, *entry.gradient_norms.values()] for entry in run.history])
