@@ -1,6 +1,6 @@
-"""Rendering as a function of JAX arrays: pictures out, and gradients back from a loss of JAX's.
+"""Rendering as a function of JAX arrays: images, and gradients of a JAX loss.
 
-JAX calls back to Python for both, so that `jax.jit`, `jax.grad` and `jax.vmap` (one after the other) go over it.
+Both are callbacks from JAX to Python, so that `jax.jit`, `jax.grad` and `jax.vmap` (sequential) support them.
 """
 
 from __future__ import annotations
@@ -22,37 +22,38 @@ except ImportError:
     raise PathreplayError("JAX is not installed: pip install jax, or 'pathreplay[jax]'") from None
 
 Arrays = Mapping[str, jax.Array]
-"""By key of the parameter: what people see of it, in the shapes of `RenderFunction.initial_values`."""
+"""Decoded values by parameter key, in the shapes of `RenderFunction.initial_values`."""
 
 
 class RenderFunction(SceneFunction):
-    """Pictures of a scene as a function of some of its parameters: see `SceneFunction`.
+    """Images of a scene as a function of some of its parameters: see `SceneFunction`.
 
-    Arrays are float32, and go by way of the host.
+    Arrays are float32 and are copied through host memory.
     """
 
     @cached_property
     def _functions(self) -> dict[tuple[int, int], Any]:
-        """What JAX differentiates, by sensor and samples per pixel."""
+        """Differentiable JAX functions by sensor and samples per pixel."""
         return {}
 
     def initial_values(self) -> dict[str, jax.Array]:
-        """The values that the scene had.
+        """The parameter values of the scene when it was loaded.
 
-        Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices
-        (3 n,), transforms (4, 4).
+        Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices (3
+        n,), transforms (4, 4).
         """
         return {key: jnp.asarray(value) for key, value in self._start.items()}
 
     def __call__(
         self, values: Arrays, sensor: int = 0, *, seed: int | jax.Array = 0, spp: int | None = None
     ) -> jax.Array:
-        """The picture (height, width, channels; linear) that a sensor sees with these values.
+        """Render the image (height, width, channels; linear) of a sensor with these values.
 
-        Textures and grids may have other sizes. The picture is an unbiased estimate, and so is the gradient of what is
-        linear in it, by samples of its own; take another ``seed`` for every step, which may be an array in what JAX
-        compiles. Differentiated is what the integrator differentiates; there are no second derivatives. Raises
-        PathreplayError for missing values and wrong shapes; what the integrator cannot do JAX tells in its own words.
+        Textures and grids may be resized. The image is an unbiased estimate. So is the gradient of a loss that is
+        linear in the image, because it uses separate samples. Pass another ``seed`` in every step; it may be an array
+        in compiled functions. The integrator determines what is differentiated; there are no second derivatives. Raises
+        PathreplayError for missing values and wrong shapes. Errors of the integrator are reported by JAX as callback
+        errors.
         """
         self.require({key: tuple(np.shape(value)) for key, value in values.items()})
         arrays = tuple(jnp.asarray(values[key], jnp.float32) for key in self.keys)
@@ -64,7 +65,7 @@ class RenderFunction(SceneFunction):
 
 
 def _function(render: RenderFunction, sensor: int, spp: int) -> Any:
-    """The picture as a function of seed and values, with its derivative."""
+    """The image as a function of seed and values, with its vector-Jacobian product."""
     size = _size(render, sensor)
 
     def picture(seed: np.ndarray, *values: np.ndarray) -> np.ndarray:
@@ -93,7 +94,7 @@ def _function(render: RenderFunction, sensor: int, spp: int) -> Any:
 
 
 def _size(render: RenderFunction, sensor: int) -> tuple[int, ...]:
-    """Height, width and channels of a sensor's pictures, by the cheapest one."""
+    """Height, width and channels of a sensor's images, from a rendering with one sample per pixel."""
     start = [mi.TensorXf(render._start[key]) for key in render.keys]
     return tuple(render.picture(start, View(sensor, 0, 1)).shape)
 

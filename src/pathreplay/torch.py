@@ -1,4 +1,4 @@
-"""Rendering as a function of PyTorch tensors: pictures out, and gradients back from a loss of PyTorch's."""
+"""Rendering as a function of PyTorch tensors: images, and gradients of a PyTorch loss."""
 
 from __future__ import annotations
 
@@ -18,34 +18,35 @@ except ImportError:
     raise PathreplayError("PyTorch is not installed: pip install torch, or 'pathreplay[torch]'") from None
 
 Tensors = Mapping[str, torch.Tensor]
-"""By key of the parameter: what people see of it, in the shapes of `RenderFunction.initial_values`."""
+"""Decoded values by parameter key, in the shapes of `RenderFunction.initial_values`."""
 
 
 class RenderFunction(SceneFunction):
-    """Pictures of a scene as a function of some of its parameters: see `SceneFunction`.
+    """Images of a scene as a function of some of its parameters: see `SceneFunction`.
 
-    Tensors are float32 on ``device``: the CPU, or the GPU in variants with CUDA; others are brought there.
+    Tensors are float32 on ``device``: the CPU, or the GPU in CUDA variants. Other tensors are converted.
     """
 
     @cached_property
     def device(self) -> torch.device:
-        """Where pictures and gradients are."""
+        """The device of images and gradients."""
         return torch.device("cuda" if backend_of(mi.variant()) == "cuda" else "cpu")
 
     def initial_values(self) -> dict[str, torch.Tensor]:
-        """The values that the scene had.
+        """The parameter values of the scene when it was loaded.
 
-        Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices
-        (3 n,), transforms (4, 4).
+        Shapes: textures (height, width, channels), grids (z, y, x, channels), colours (3,), numbers (n,), vertices (3
+        n,), transforms (4, 4).
         """
         return {key: torch.tensor(value, device=self.device) for key, value in self._start.items()}
 
     def __call__(self, values: Tensors, sensor: int = 0, *, seed: int = 0, spp: int | None = None) -> torch.Tensor:
-        """The picture (height, width, channels; linear) that a sensor sees with these values.
+        """Render the image (height, width, channels; linear) of a sensor with these values.
 
-        Textures and grids may have other sizes. The picture is an unbiased estimate, and so is the gradient of what is
-        linear in it, by samples of its own; take another ``seed`` for every step. Differentiated is what the integrator
-        differentiates. Raises PathreplayError for missing values, wrong shapes, and what the integrator cannot do.
+        Textures and grids may be resized. The image is an unbiased estimate. So is the gradient of a loss that is
+        linear in the image, because it uses separate samples; pass another ``seed`` in every step. The integrator
+        determines what is differentiated. Raises PathreplayError for missing values, wrong shapes, and operations that
+        the integrator does not support.
         """
         self.require({key: tuple(value.shape) for key, value in values.items()})
         tensors = [values[key].to(self.device, torch.float32) for key in self.keys]
@@ -54,7 +55,7 @@ class RenderFunction(SceneFunction):
 
 
 class _Rendering(torch.autograd.Function):
-    """The picture of a `RenderFunction` with some view, and its derivative by the values."""
+    """The image of a `RenderFunction` for one view, with its vector-Jacobian product."""
 
     @staticmethod
     def forward(ctx: Any, render: RenderFunction, view: View, *tensors: torch.Tensor) -> torch.Tensor:
@@ -75,6 +76,6 @@ def _to_drjit(tensors: tuple[torch.Tensor, ...]) -> list[mi.TensorXf]:
 
 
 def _to_torch(tensor: Any, device: torch.device) -> torch.Tensor:
-    """A copy in PyTorch's own memory, which Dr.Jit does not take back."""
+    """A copy in memory that PyTorch owns, so that Dr.Jit cannot reuse it."""
     made: torch.Tensor = tensor.torch()
     return made.to(device).clone()

@@ -95,7 +95,7 @@ def test_a_check_has_the_edges_that_one_asks_for() -> None:
     assert integrator_name(integrator_under_test(None, scene)) == "pathreplay"
     with pytest.raises(PathreplayError, match="'boundary' is a property of 'pathreplay', and the integrator is 'prb'"):
         integrator_under_test("prb", scene, boundary={"boundary": "all"})
-    with pytest.raises(PathreplayError, match="boundary cannot be given along with a finished integrator"):
+    with pytest.raises(PathreplayError, match="boundary cannot be given along with an integrator object"):
         integrator_under_test(asked, scene, boundary={"boundary": "all"})
 
 

@@ -497,7 +497,7 @@ def test_the_supergrid_is_used_where_it_pays(values: np.ndarray, scale: float, p
         ({"albedo": "grey"}, "gridmedium: albedo is 'grey'; give a volume, a colour or a number"),
         (
             {"sigma_t": 2.0, "supergrid": True},
-            "gridmedium: sigma_t \\(ConstVolume\\) shows no voxels; give a gridvolume",
+            "gridmedium: sigma_t \\(ConstVolume\\) has no accessible voxels; give a gridvolume",
         ),
         ({"values": -smooth()}, "gridmedium: sigma_t is -1\\.\\d+ somewhere; give densities of at least 0"),
         ({"values": np.ones((2, 2, 2, 6))}, "gridmedium: sigma_t has 6 channels; give a grid with 1 or 3"),

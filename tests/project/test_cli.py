@@ -84,9 +84,9 @@ for words in (["--help"], ["bench", "surface"]):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--seed", "-1"), ["seed is -1", "from 0 on"]),
+        (("--seed", "-1"), ["seed is -1", "at least 0"]),
         (("--seeds", "1"), ["seeds is 1"]),
-        (("--seeds", "99999999999"), ["seeds is 99999999999", "up to"]),
+        (("--seeds", "99999999999"), ["seeds is 99999999999", "at most"]),
         (("--spp", "0"), ["spp is 0"]),
         (("--spp", "100000"), ["'spp' is 100000", "up to 65535"]),
         (("--fd-spp", "100000"), ["'fd_spp' is 100000", "up to 65535"]),

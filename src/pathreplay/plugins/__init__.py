@@ -1,1 +1,1 @@
-"""Plugins that Mitsuba lacks: a smooth dielectric with a differentiable index, and a medium on a grid."""
+"""Plugins that Mitsuba lacks: a smooth dielectric with a differentiable index, and a grid medium."""

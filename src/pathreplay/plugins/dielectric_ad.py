@@ -1,20 +1,20 @@
-"""`dielectric_ad`: Mitsuba's `dielectric` with an index of refraction that can be differentiated.
+"""`dielectric_ad`: Mitsuba's `dielectric` with a differentiable index of refraction.
 
-With η the index inside over the index outside, θ_i and θ_t the angles of incidence and refraction, F(θ_i, η) the
+With η the interior over the exterior index, θ_i and θ_t the angles of incidence and refraction, F(θ_i, η) the
 unpolarised Fresnel reflectance and η_ti = 1/η (from outside) or η (from inside):
 
     reflection      wo = (-wi_x, -wi_y, wi_z)                            f = F · specular_reflectance
     transmission    wo = (-η_ti wi_x, -η_ti wi_y, -sign(wi_z) cos θ_t)   f = (1 - F) · specular_transmittance · s
 
-where s = η_ti² in radiance mode and 1 in importance mode. Flags and values are those of Mitsuba's plugin, and so is the
-probability of reflection, F, but for one range: near the critical angle, coming from the denser side, transmission is
-chosen at least once in four. There dF grows beyond all bounds, and samples that are as rare as 1 - F is small would
+where s = η_ti² in radiance mode and 1 in importance mode. Flags and values are those of Mitsuba's plugin. So is the
+probability of reflection, F, with one exception: near the critical angle, coming from the denser side, transmission is
+sampled with a probability of at least 1/4. There dF is unbounded, and samples with the small probability 1 - F would
 carry nearly all of the derivative.
 
-Differentiated: wo and the weight with respect to `eta` and si.wi, the weight with respect to the tints.
-*Not* differentiated: the probability of choosing a lobe (bs.pdf is detached, and the weight is f / detach(pdf), so
-that its value is the tint while its derivative keeps the Fresnel term), and what total internal reflection switches
-on or off: F is continuous there, but an edge of the scene seen through the lobe is the business of the integrator.
+Differentiated: wo and the weight with respect to `eta` and si.wi, and the weight with respect to the tints. *Not*
+differentiated: the probability of choosing a lobe (bs.pdf is detached and the weight is f / detach(pdf), so that its
+value is the tint while its derivative keeps the Fresnel term), and the onset of total internal reflection. F is
+continuous there, but an edge of the scene seen through the lobe is a boundary term of the integrator.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError
 
-#: Highest probability of reflection from the denser side, unless it is total.
+#: Largest probability of reflection from the denser side, except for total internal reflection.
 MAX_REFLECTION = 0.75
 TINTS = ("specular_reflectance", "specular_transmittance")
 
 
 def _index(props: Any, name: str, default: str) -> float:
-    """Index of refraction given as a number or as the name of a material in Mitsuba's table."""
+    """Index of refraction, given as a number or as the name of a material in Mitsuba's table."""
     if name in props and props.type(name) == mi.Properties.Type.Integer:
         ior = float(props[name])
     else:
@@ -40,7 +40,7 @@ def _index(props: Any, name: str, default: str) -> float:
             ior = float(mi.lookup_ior(props, name, default))
         except RuntimeError:
             raise PathreplayError(
-                f"dielectric_ad: {name} = {props[name]!r:.60} is no material that Mitsuba knows; give a number, "
+                f"dielectric_ad: {name} = {props[name]!r:.60} is not a material known to Mitsuba; give a number, "
                 "or a name such as 'bk7' or 'water'"
             ) from None
     if not 0 < ior < float("inf"):
@@ -51,14 +51,14 @@ def _index(props: Any, name: str, default: str) -> float:
 class DielectricAD:
     """A smooth dielectric whose index of refraction is differentiable; a template, see `on_base`."""
 
-    specular_reflectance: mi.Texture | None  # None stands for one, at no cost
+    specular_reflectance: mi.Texture | None  # None means 1, at no cost
     specular_transmittance: mi.Texture | None
 
     def __init__(self, props: Any) -> None:
         mi.BSDF.__init__(self, props)
         if mi.is_polarized:
             raise PathreplayError(
-                f"dielectric_ad: the variant {mi.variant()} is polarised, which it does not support; use "
+                f"dielectric_ad: the polarised variant {mi.variant()} is not supported; use "
                 f"{mi.variant().replace('_polarized', '')}, or Mitsuba's dielectric without derivatives"
             )
         self.eta = mi.Float(_index(props, "int_ior", "bk7") / _index(props, "ext_ior", "air"))
@@ -75,14 +75,14 @@ class DielectricAD:
     # ------------------------------------------------ parameters ------------------------------------------------
 
     def traverse(self, cb: Any) -> None:
-        # Discontinuous, as in Mitsuba's other dielectrics: moving refracted light moves the edges seen in it.
+        # Discontinuous, as in Mitsuba's other dielectrics: when refracted light moves, the edges seen in it move.
         cb.put("eta", self.eta, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
         for name in TINTS:
             if getattr(self, name) is not None:
                 cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        dr.make_opaque(self.eta)  # a literal would be compiled into the kernel, anew after every update
+        dr.make_opaque(self.eta)  # a literal would become a kernel constant and force recompilation after every update
 
     def to_string(self) -> str:
         lines = [f"  eta = {self.eta},"]
@@ -100,12 +100,13 @@ class DielectricAD:
         if not (has_r or has_t):
             return bs, mi.Spectrum(0)
 
-        # Fresnel reflectance, and the relative index in (it) and against (ti) the direction of travel
+        # Fresnel reflectance, and relative index along (it) and against (ti) the direction of travel
         F, cos_t, η_it, η_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.eta)
-        # Under total reflection F is 1 at any angle, but fresnel's derivative is what rounding left, over cos θ_i.
+        # Under total internal reflection F is 1 at any angle, but mi.fresnel's derivative is rounding error over cos
+        # θ_i.
         F = dr.select(cos_t == 0, dr.detach(F), F)
 
-        # Choice of the lobe; its probability takes no part in differentiation
+        # Choose the lobe with a detached probability
         p_r = dr.detach(F)
         p_r = dr.select((η_it < 1) & (p_r < 1), dr.minimum(p_r, MAX_REFLECTION), p_r)
         selected_r = mi.Mask(active) & ((sample1 <= p_r) if has_t else True) & has_r
@@ -114,7 +115,7 @@ class DielectricAD:
         if has_r and has_t:
             bs.pdf = dr.select(selected_r, p_r, 1 - p_r)
             weight = f / bs.pdf
-            # Mostly the quotient's value is one; it may miss it by rounding, and no probability at all is 0 / 0.
+            # The quotient is 1 up to rounding unless p_r is clamped, and 0 / 0 where a probability is zero.
             weight = dr.replace_grad(dr.select(p_r == F, 1, weight), weight)
         else:
             bs.pdf = mi.Float(1)
@@ -133,7 +134,7 @@ class DielectricAD:
         if self.specular_transmittance is not None:
             tinted[selected_t] = tinted * self.specular_transmittance.eval(si, selected_t)
         if ctx.mode == mi.TransportMode.Radiance:
-            # Refraction squeezes solid angles by η_ti² and radiance grows (or shrinks) with that.
+            # Refraction scales solid angles by η_ti², and radiance accordingly.
             tinted[selected_t] = tinted * dr.square(η_ti)
         return bs, dr.select(active, tinted, 0)
 

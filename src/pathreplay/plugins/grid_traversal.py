@@ -1,8 +1,8 @@
-"""The walk of a ray from cell to cell: free flight with local majorants, transmittance with local control densities.
+"""Cell-by-cell ray traversal: free flight with local majorants, transmittance with local control densities.
 
-A walk (Amanatides and Woo 1987) keeps the cell and the distance. The distance at which axis k is crossed next is
-found anew from the cell, t_k = (cell_k + [d_k > 0] - o_k) / d_k: nothing is summed up, so that rounding cannot lead
-astray, and every step leaves a cell for good, which bounds their number.
+The traversal (Amanatides and Woo 1987) stores the cell and the distance. The distance at which axis k is crossed next
+is recomputed from the cell, t_k = (cell_k + [d_k > 0] - o_k) / d_k. Nothing is accumulated, so rounding errors do not
+grow, and every step leaves a cell for good, which bounds the number of steps.
 
 All of this is detached, and runs inside symbolic loops.
 """
@@ -20,23 +20,25 @@ from numpy.typing import NDArray
 
 from pathreplay.plugins.supergrid import Bounds
 
-#: The residual collisions come this much denser than the largest residual density. Twice as many halve the exponent of
-#: the variance; four times as many cost more time than they save noise (`pathreplay bench gridmedium`).
+#: Rate of residual collisions over the largest residual density. A factor of two halves the exponent of the variance; a
+#: factor of four costs more time than it saves noise (`pathreplay bench gridmedium`).
 DENSER = 2.0
-#: Largest relative variance that crossing one cell adds to the transmittance of a ray that meets nothing in it. A ray
-#: meets 10 to 50 cells; with the mean as control density, whatever the risk, dense grids with edges have wild outliers.
+#: Largest relative variance that the crossing of one cell adds to the transmittance of a ray through its empty part. A
+#: ray crosses 10 to 50 cells. With the mean as control density regardless of this risk, dense grids with sharp edges
+#: produce extreme outliers.
 RISK = 0.1
-#: Estimates below this go on by chance only, which adds a variance of at most FAINT times the transmittance.
+#: Estimates below this are continued with Russian roulette, which adds a variance of at most FAINT times the
+#: transmittance.
 FAINT = 1e-2
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Numbers by cell, ready to be walked through.
+    """Values per cell, ready for traversal.
 
-    One layer of empty cells surrounds them, since rounding may carry a walk one cell too far. ``to_cell`` (3 x 4) maps
-    the world to cell space, ``shape`` counts the cells along x, y, z; both include the layer. ``table`` (Float, flat)
-    has the same count of numbers for every cell, x running fastest.
+    One layer of empty cells surrounds the grid, because rounding may carry a ray one cell too far. ``to_cell`` (3 x 4)
+    maps world space to cell space; ``shape`` is the number of cells along x, y, z; both include the layer. ``table``
+    (Float, flat) holds the same number of values for every cell, with x varying fastest.
     """
 
     to_cell: NDArray[np.float64]
@@ -48,13 +50,13 @@ class Cells:
         return self.shape == (3, 3, 3)
 
     def lookup(self, kind: Any, cell: mi.Vector3f, active: mi.Bool) -> Any:
-        """The numbers of a cell (Vector3f of whole numbers), as a Float or as a vector."""
+        """The values of a cell (Vector3f of integers), as a Float or a vector."""
         index = mi.UInt32(dr.fma(dr.fma(cell.z, self.shape[1], cell.y), self.shape[0], cell.x))
         return dr.gather(kind, self.table, index, active)
 
 
 def make_cells(bounds: Bounds, values: Sequence[mi.Float]) -> Cells:
-    """Cells with these numbers (each with one entry per cell of ``bounds``)."""
+    """Cells with these values (each an array with one entry per cell of ``bounds``)."""
     shape = tuple(n + 2 for n in bounds.shape)
     count = int(np.prod(bounds.shape))
     i = dr.arange(mi.UInt32, count)
@@ -70,13 +72,13 @@ def make_cells(bounds: Bounds, values: Sequence[mi.Float]) -> Cells:
     return Cells(to_cell, shape, table)
 
 
-# ----------------------------------------------------- the walk -----------------------------------------------------
+# ---------------------------------------------------- traversal ----------------------------------------------------
 
 
 def through(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
-    """Distances at which the line of a ray enters and leaves a box; the first is larger where it misses. Attached.
+    """Distances at which the line of a ray enters and leaves a box; the first is larger on a miss. Attached.
 
-    What Mitsuba's `ray_intersect` of boxes finds: that one knows only the rays of the first variant of the process.
+    Mitsuba's `BoundingBox.ray_intersect` does the same, but accepts only rays of the first variant set in the process.
     """
     near, far = mi.Float(-dr.inf), mi.Float(dr.inf)
     for k in range(3):
@@ -92,7 +94,7 @@ def through(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
 
 
 def clip(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
-    """The part [a, b] of the ray that lies in a box (a = 0, b = -1 if there is none). Never NaN for a finite ray."""
+    """The part [a, b] of the ray inside a box (a = 0, b = -1 if there is none). Never NaN for a finite ray."""
     near, far = through(box, ray)
     a, b = dr.fmax(near, 0), dr.fmin(far, ray.maxt)
     met = a < b
@@ -104,36 +106,36 @@ class CellWalk:
     """A ray in cell space: axis k is crossed at the distance cell_k · inverse_k + offset_k."""
 
     inverse: mi.Vector3f  # 1/d, 0 along axes on which the ray does not move
-    offset: mi.Vector3f  # ([d > 0] - o)/d, infinite there
+    offset: mi.Vector3f  # ([d > 0] - o)/d, infinite on these axes
     stride: mi.Vector3f  # the step from cell to cell, ±1
     start: mi.Vector3f  # the cell at the first distance
-    end: mi.Float  # the distance at which the walk is over
+    end: mi.Float  # the distance at which the traversal ends
 
     def crossing(self, cell: mi.Vector3f) -> mi.Vector3f:
         """Distances at which the three axes are crossed next."""
         return dr.fma(cell, self.inverse, self.offset)
 
     def onward(self, cell: mi.Vector3f, crossings: mi.Vector3f, t: mi.Float) -> mi.Vector3f:
-        """The cell after the distance ``t``, which is at most the least of the crossings of this one."""
+        """The cell after the distance ``t``, which is at most the smallest crossing of this cell."""
         return dr.select(crossings <= t, cell + self.stride, cell)
 
 
 def begin(cells: Cells, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> CellWalk:
-    """A walk along the ray from distance a to b, both inside of the bounding box."""
+    """Start a traversal from distance a to b, both inside the bounding box."""
     o, d = _transformed(cells.to_cell, ray)
     still, forward = d == 0, d > 0
     inverse = dr.select(still, 0, dr.rcp(d))
     offset = dr.select(still, dr.inf, (dr.select(forward, mi.Vector3f(1), mi.Vector3f(0)) - o) * inverse)
     inner = mi.Vector3f([n - 2 for n in cells.shape])
     start = dr.clip(dr.floor(dr.fma(d, a, o)), 1, inner)
-    # The walk ends where the last inner cell ends, as the walk itself finds it.
+    # The end is the far side of the last inner cell, computed as in the traversal itself.
     last = dr.fma(dr.select(forward, inner, mi.Vector3f(1)), inverse, offset)
     stride = dr.select(forward, mi.Vector3f(1), mi.Vector3f(-1))
     return CellWalk(inverse, offset, stride, start, dr.minimum(b, dr.min(last)))
 
 
 def _transformed(m: NDArray[np.float64], ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Origin and direction of a ray under an affine map, whose zeros cost nothing."""
+    """Origin and direction of a ray under an affine map; zero matrix entries cost nothing."""
 
     def linear(row: NDArray[np.float64], v: mi.Vector3f) -> mi.Float:
         terms = [float(row[k]) * v[k] for k in range(3) if row[k] != 0]
@@ -149,9 +151,10 @@ def _transformed(m: NDArray[np.float64], ray: mi.Ray3f) -> tuple[mi.Vector3f, mi
 def free_flight(
     cells: Cells, box: mi.BoundingBox3f, ray: mi.Ray3f, u: mi.Float, active: mi.Bool
 ) -> tuple[mi.Float, mi.Float]:
-    """Distance of the next tentative collision, and the majorant there; infinity and 0 where there is none.
+    """Distance of the next tentative collision, and the majorant there; infinity and 0 if there is none.
 
-    The distance t solves ∫_0^t m ds = -log(1 - u), m the number of the cell (1 / unit length), 0 outside of ``box``.
+    The distance t solves ∫_0^t m ds = -log(1 - u), with m the value of the cell (1 / unit length), and 0 outside
+    ``box``.
     """
     a, b = clip(box, ray)
     τ = -dr.log(1 - u)
@@ -186,21 +189,21 @@ def free_flight(
 
 
 def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Control density c and rate m of the residual collisions, by cell, for the density ``scale`` times the volume.
+    """Control density c and rate m of residual collisions per cell, for the density ``scale`` times the volume.
 
     The relative variance of the estimate is exp(∫ (σ - c)²/m ds) - 1. The mean density is the best control on average,
-    but where a dense cell has empty parts, a ray through those sees (σ - c)²/m = c²/m. So c lies above the lowest
-    density by no more than keeps this below RISK in a crossing of the cell.
+    but in the empty part of a dense cell a ray sees (σ - c)²/m = c²/m. c therefore exceeds the lowest density only as
+    far as this term stays below RISK for a crossing of the cell.
     """
     lowest, highest = _scaled(bounds, scale)
-    length = 2 / bounds.faces_per_length  # three faces are crossed in 2 mean sides
+    length = 2 / bounds.faces_per_length  # a ray crosses three faces per 2 mean cell sides
     room = dr.sqrt(RISK / length * (highest - lowest))  # m is at least highest - lowest
     c = dr.fmin(bounds.mean * scale, lowest + room)
     return c, DENSER * dr.fmax(highest - c, c - lowest)
 
 
 def majorants(bounds: Bounds, scale: mi.Float) -> mi.Float:
-    """Upper bound of the density by cell, 0 where that is negative (an optimiser may overshoot)."""
+    """Upper bound of the density per cell, 0 where it is negative (an optimiser may overshoot)."""
     return dr.fmax(_scaled(bounds, scale)[1], 0)
 
 
@@ -211,10 +214,10 @@ def _scaled(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
 
 @dr.syntax
 def transmittance(cells: Cells, box: Any, ray: Any, density: Callable[..., Any], sampler: Any, active: Any) -> Any:
-    """Unbiased estimate of exp(-∫ σ ds) along the ray, by channel (UnpolarizedSpectrum): residual ratio tracking.
+    """Unbiased estimate of exp(-∫ σ ds) along the ray per channel (UnpolarizedSpectrum): residual ratio tracking.
 
-    With control density c and rate m by cell (Novák et al. 2014), T = exp(-∫ c ds) Π (1 - (σ - c)/m), the product over
-    residual collisions, which come with rate m. ``density(t, active)`` evaluates σ.
+    With control density c and rate m per cell (Novák et al. 2014), T = exp(-∫ c ds) Π (1 - (σ - c)/m), the product over
+    residual collisions with rate m. ``density(t, active)`` evaluates σ.
     """
     a, b = clip(box, ray)
     trace = begin(cells, ray, a, b)
@@ -238,7 +241,7 @@ def transmittance(cells: Cells, box: Any, ray: Any, density: Callable[..., Any],
         active &= hit | (t_next < trace.end)
         if dr.hint(hit, exclude=[cells, box, ray, trace, density]):
             T *= 1 - (density(t, mi.Mask(True)) - c) / m
-            # Whether the estimate is worth going on with.
+            # Russian roulette on small estimates
             kept = dr.minimum(dr.max(dr.abs(T)) * dr.exp(-depth) / FAINT, 1)
             survives = sampler.next_1d() < kept
             T = dr.select(survives, T / kept, 0)

@@ -1,14 +1,15 @@
-"""`gridmedium`: Mitsuba's `heterogeneous` with a differentiable scale, emission, and majorants that follow the grid.
+"""`gridmedium`: Mitsuba's `heterogeneous` with differentiable scale, emission, and majorants that follow the grid.
 
 With V, A and Q the volumes `sigma_t`, `albedo` and `emission`, and s the `scale`,
 
     σ_t = s V(x),   σ_s = A(x) σ_t,   emitted radiance per unit length = Q(x)   (Q is not scaled) .
 
-Mitsuba's own integrators see one majorant for the whole medium and no emission. Ours calls `free_flight` (local
-majorants), `transmittance` (residual ratio tracking) and `emission_at`.
+Mitsuba's integrators use a global majorant and see no emission. Ours call `free_flight` (local majorants),
+`transmittance` (residual ratio tracking) and `emission_at`.
 
-Differentiated: the coefficients and the emission, by V, A, Q, s and the position. *Not* differentiated: majorants,
-free-flight distances and the estimate of transmittance (all detached), the bounding box and `to_world` of the volumes.
+Differentiated: the coefficients and the emission with respect to V, A, Q, s and the position. *Not* differentiated:
+majorants, free-flight distances and the transmittance estimate (all detached), the bounding box and `to_world` of
+volumes.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ from pathreplay.plugins.supergrid import (
     voxel_bounds,
 )
 
-#: A density that is given as a number reaches this far from the origin along each axis: beyond any scene, and far from
-#: overflow. (A `constvolume` ends at the unit cube.)
+#: Half extent of a constant density given as a number: larger than any scene, and far from overflow. (A `constvolume`
+#: by default fills the unit cube only.)
 FAR = 1e6
 
 
@@ -47,7 +48,7 @@ class GridMedium:
         if mi.has_flag(phase.flags(), mi.PhaseFunctionFlags.Microflake):
             raise PathreplayError(
                 f"gridmedium: with the phase function {phase.class_name()} the density depends on the "
-                "direction, and majorants do not follow that; use Mitsuba's heterogeneous"
+                "direction, which majorants do not support; use Mitsuba's heterogeneous"
             )
         self.sigma_t = _volume(props, "sigma_t", 1.0)
         self.albedo = _volume(props, "albedo", 0.75)
@@ -71,7 +72,7 @@ class GridMedium:
     def parameters_changed(self, keys: list[str]) -> None:
         if keys and "sigma_t" not in keys and "scale" not in keys:
             return
-        dr.make_opaque(self.scale)  # a literal would be compiled into the kernel, anew after every update
+        dr.make_opaque(self.scale)  # a literal would become a kernel constant and force recompilation at every update
         with dr.suspend_grad():
             if not keys or "sigma_t" in keys:
                 self.box = self.sigma_t.bbox()
@@ -80,9 +81,9 @@ class GridMedium:
             self._choose_cells()
 
     def _choose_cells(self) -> None:
-        """Tables of majorants and of control densities for the present scale, each with the cells that pay."""
+        """Build tables of majorants and control densities for the present scale, each with the cheapest cell size."""
         scale = dr.detach(self.scale)
-        # Where something glows or is differentiated, empty cells want (null) collisions, too: one a crossing.
+        # With emission or gradients, empty cells need (null) collisions as well: one per crossing of the volume.
         with dr.resume_grad():
             params = mi.traverse(self.sigma_t)
             moves = dr.grad_enabled(self.scale) or any(dr.grad_enabled(params[key]) for key in params.keys())
@@ -95,7 +96,7 @@ class GridMedium:
         dr.make_opaque(self.majorant)
 
     def _cheapest_cells(self, values: list[tuple[Any, ...]]) -> grid_traversal.Cells:
-        """Of the numbers by cell, one tuple per level and the rate of collisions last, those that pay."""
+        """Cells of the cheapest level; ``values`` has a tuple per level, whose last entry is the collision rate."""
         rates = [dr.mean(numbers[-1]) for numbers in values]
         dr.eval(values, rates)
         last = len(values) - 1
@@ -108,7 +109,7 @@ class GridMedium:
 
     @property
     def constants(self) -> tuple[object, ...]:
-        """All that kernels take for constants: one that was recorded is of no use where they are others."""
+        """Values that kernels treat as constants: a recorded kernel is invalid if they change."""
         cells = self.flight_cells, self.shadow_cells
         box = *map(float, self.box.min), *map(float, self.box.max)
         return self.is_chromatic, box, *((each.shape, tuple(each.to_cell.ravel().tolist())) for each in cells)
@@ -119,7 +120,7 @@ class GridMedium:
         lines += [f"scale = {self.scale}", f"cells = {cells}"]
         return "GridMedium[\n  " + ",\n".join(lines).replace("\n", "\n  ") + "\n]"
 
-    # -------------------------------------- what Mitsuba's integrators call --------------------------------------
+    # ---------------------------------------- interface of Mitsuba's media ----------------------------------------
 
     def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
         return mi.UnpolarizedSpectrum(self.majorant)
@@ -132,20 +133,20 @@ class GridMedium:
         near, far = grid_traversal.through(self.box, ray)
         return near <= far, near, far
 
-    # -------------------------------------------- what our own calls ---------------------------------------------
+    # ------------------------------------------ interface of pathreplay ------------------------------------------
 
     def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool = True) -> tuple[mi.Float, mi.Float]:
         """Distance to the next tentative collision and the local majorant there. Detached.
 
-        The distance t solves ∫_0^t m ds = -log(1 - u) with m the local majorant, at least σ_t in all channels and
-        0 outside of the medium's bounding box. It is infinite, and the majorant 0, if there is no such t below
-        ray.maxt. ``u`` lies in [0, 1).
+        The distance t solves ∫_0^t m ds = -log(1 - u). The local majorant m is at least σ_t in all channels, and 0
+        outside the medium's bounding box. If no t below ray.maxt solves this, the distance is infinite and the majorant
+        0. ``u`` lies in [0, 1).
         """
         with dr.suspend_grad():
             return grid_traversal.free_flight(self.flight_cells, self.box, dr.detach(ray), dr.detach(u), active)
 
     def transmittance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
-        """Unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) by channel. Detached."""
+        """Unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) per channel. Detached."""
         with dr.suspend_grad():
             ray, scale = dr.detach(ray), dr.detach(self.scale)
 
@@ -165,7 +166,7 @@ class GridMedium:
 
 
 def _volume(props: Any, name: str, default: float | None) -> Any:
-    """The volume of that name, or None; textures, colours and numbers become a `constvolume`, without end."""
+    """The volume of that name, or None; textures, colours and numbers become a very large `constvolume`."""
     value = props[name] if name in props else default
     if value is None or isinstance(value, mi.Volume):
         return value
@@ -191,11 +192,11 @@ def _choice(props: Any) -> bool | str:
     return value
 
 
-# ----------------------------------------------- looking at the density -----------------------------------------------
+# ----------------------------------------------- bounds of the density -----------------------------------------------
 
 
 def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
-    """Whether the volume differs between channels, and its bounds by cell, from fine to a single cell."""
+    """Whether the volume differs between channels, and its bounds per cell, from finest to a single cell."""
     params = mi.traverse(volume)
     values = [dr.detach(params[key]) for key in params.keys()]
     if volume.class_name() == "GridVolume":
@@ -206,7 +207,7 @@ def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
             return channels > 1 and not mi.is_monochromatic, all_bounds(voxel_bounds(lattice, values[0]))
     if needs_grid:
         raise PathreplayError(
-            f"gridmedium: sigma_t ({volume.class_name()}) shows no voxels; give a gridvolume, or leave supergrid "
+            f"gridmedium: sigma_t ({volume.class_name()}) has no accessible voxels; give a gridvolume, or leave supergrid "
             "at 'auto'"
         )
     grey = all(dr.is_diff_v(value) and not dr.is_vector_v(value) and dr.width(value) == 1 for value in values)

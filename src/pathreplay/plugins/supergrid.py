@@ -1,11 +1,11 @@
-"""Bounds of a volume's values in coarse cells, and the choice of the cells that make delta tracking cheapest.
+"""Bounds of a volume's values in coarse cells, and the cell size for which delta tracking is cheapest.
 
-`voxel_bounds` finds for every cell of BASE³ voxels the lowest, mean and highest value that an interpolated lookup in
-it can give; `coarser` merges 2 x 2 x 2 cells; `cheapest` picks a size between those and one cell for everything.
+`voxel_bounds` computes, for every cell of BASE³ voxels, the lowest, mean and highest value that an interpolated lookup
+in it can return. `coarser` merges 2 x 2 x 2 cells. `cheapest` selects a size between these and a single cell.
 
-The bounds hold for both filters and all wrap modes of `gridvolume`, which cannot be asked for them: a cell counts the
-voxels next to it, and beyond the faces of the grid whatever any wrap mode puts there. They therefore also hold at
-least half a voxel beyond the faces of the cell, so that rounding in a walk from cell to cell does no harm.
+The bounds hold for both filters and all wrap modes of `gridvolume`, which does not expose them: a cell includes
+adjacent voxels and, beyond the faces of the grid, the values of every wrap mode. They also hold at least half a voxel
+beyond the faces of the cell, so that rounding in a traversal is harmless.
 
 Nothing here is differentiated.
 """
@@ -24,21 +24,21 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-#: Voxels along the side of the smallest cell. Half of it makes eight times the cells, and more steps between them.
+#: Voxels along the side of the smallest cell. Half of it gives eight times as many cells, and more steps between them.
 BASE = 4
-#: Lowest, mean and highest (TensorXf, z y x), one entry for each voxel or cell.
+#: Lowest, mean and highest value (TensorXf, z y x), one entry per voxel or cell.
 Values = tuple[Any, Any, Any]
-#: Cost of a step from cell to cell over that of a tentative collision: see `pathreplay bench supergrid`.
+#: Cost of a step between cells relative to a tentative collision: see `pathreplay bench supergrid`.
 STEP_COST = 0.15
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where the voxels of a volume lie in the world.
+    """Position of a volume's voxels in world space.
 
-    Voxel i of an axis covers [i, i + 1] in voxel space; its value belongs to the middle. ``to_voxel`` (3 x 4) maps the
-    world there. ``size`` is that of the data. ``low`` and ``high`` (voxels, per axis x, y, z) cover
-    the volume's bounding box, which is larger than the grid where that is turned against the axes of the world.
+    Voxel i of an axis covers [i, i + 1] in voxel space; its value is at the centre. ``to_voxel`` (3 x 4) maps world
+    space to voxel space. ``size`` is the size of the data. ``low`` and ``high`` (voxels, per axis x, y, z) cover the
+    volume's bounding box, which is larger than the grid if the grid is rotated in world space.
     """
 
     to_voxel: NDArray[np.float64]
@@ -49,10 +49,10 @@ class Lattice:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Lowest, mean and highest value in cubic cells, x running fastest (Float, one entry per cell).
+    """Lowest, mean and highest value in cubic cells, with x varying fastest (Float, one entry per cell).
 
-    ``to_cell`` (3 x 4) maps the world to cell space, where cell i of an axis covers [i, i + 1]; ``shape`` counts the
-    cells along x, y, z. Of several channels they are the lowest, the mean and the highest.
+    ``to_cell`` (3 x 4) maps world space to cell space, where cell i of an axis covers [i, i + 1]. ``shape`` is the
+    number of cells along x, y, z. The values are taken over all channels.
     """
 
     to_cell: NDArray[np.float64]
@@ -63,7 +63,7 @@ class Bounds:
 
     @property
     def faces_per_length(self) -> float:
-        """Cell faces crossed per unit length by a ray of random direction (its |d_k| has the mean 1/2)."""
+        """Cell faces crossed per unit length by a ray of random direction (the mean of |d_k| is 1/2)."""
         return float(np.linalg.norm(self.to_cell[:, :3], axis=1).sum() / 2)
 
     @property
@@ -71,24 +71,24 @@ class Bounds:
         return self.shape == (1, 1, 1)
 
 
-# ----------------------------------------------- where the voxels are -----------------------------------------------
+# ------------------------------------------------ voxel positions ------------------------------------------------
 
 
 def find_lattice(volume: mi.Volume, shape: tuple[int, ...]) -> Lattice | None:
-    """The lattice of a `gridvolume` with data of that shape (z, y, x, channels), or None if it cannot be made out.
+    """The lattice of a `gridvolume` with data of shape (z, y, x, channels); None if it cannot be determined.
 
-    Mitsuba keeps the volume's `to_world` to itself; it is read from what the volume prints, the translation from the
-    bounding box, which has all digits.
+    Mitsuba does not expose the volume's `to_world`. Its linear part is parsed from the volume's string representation,
+    and the translation comes from the bounding box, which has full precision.
     """
     row = r"\[" + ", ".join([r"([-+.\de]+)"] * 4) + r"\]"
     printed = re.search(r"to_local = Transform\[\s*matrix=\[" + r",\s*".join([row] * 3), repr(volume))
     if printed is None:
         return None
     to_local = np.array(printed.groups(), dtype=np.float64).reshape(3, 4)[:, :3]
-    to_local[np.abs(to_local) < 1e-6 * np.abs(to_local).max(axis=1, keepdims=True)] = 0  # rounding of a rotation
+    to_local[np.abs(to_local) < 1e-6 * np.abs(to_local).max(axis=1, keepdims=True)] = 0  # rounding error of a rotation
     if np.linalg.matrix_rank(to_local) < 3:
         return None
-    linear = np.linalg.inv(to_local)  # its columns are the edges of the grid in the world
+    linear = np.linalg.inv(to_local)  # the columns are the edges of the grid in world space
     low, high = _corners(volume)
     corner = low - np.minimum(linear, 0).sum(axis=1)
     extent = high - low
@@ -99,7 +99,7 @@ def find_lattice(volume: mi.Volume, shape: tuple[int, ...]) -> Lattice | None:
     to_voxel = np.concatenate([to_local, -(to_local @ corner)[:, None]], axis=1) * np.array(size)[:, None]
     corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1)
     reached = to_voxel[:, :3] @ corners + to_voxel[:, 3:]
-    # A hundredth of a voxel is rounding, and there are bounds for half a voxel beyond the range.
+    # A hundredth of a voxel is rounding error; the bounds hold for half a voxel beyond the range.
     first = np.floor(reached.min(axis=1) + 0.01).astype(int)
     last = np.ceil(reached.max(axis=1) - 0.01).astype(int)
     return Lattice(to_voxel, size, tuple(first.tolist()), tuple(np.maximum(last, first + 1).tolist()))
@@ -114,7 +114,7 @@ def _corners(volume: mi.Volume) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def constant_bounds(volume: mi.Volume, lowest: float, mean: float, highest: float) -> Bounds:
-    """One cell for a volume of which no more is known than its extreme values."""
+    """A single cell for a volume of which only extreme values are known."""
     low, high = _corners(volume)
     scale = 1 / np.maximum(high - low, 1e-30)
     to_cell = np.concatenate([np.diag(scale), (-low * scale)[:, None]], axis=1)
@@ -146,7 +146,7 @@ def coarser(bounds: Bounds) -> Bounds:
 
 
 def all_bounds(bounds: Bounds) -> list[Bounds]:
-    """These bounds and ever coarser ones, down to a single cell."""
+    """These bounds and successively coarser ones, down to a single cell."""
     found = [bounds]
     while not found[-1].is_single:
         found.append(coarser(found[-1]))
@@ -155,21 +155,22 @@ def all_bounds(bounds: Bounds) -> list[Bounds]:
 
 
 def _channels(data: mi.TensorXf) -> Values:
-    """Lowest, mean and highest of the channels of every voxel."""
+    """Lowest, mean and highest value over the channels of every voxel."""
     if data.shape[3] == 1:
         return 3 * (mi.TensorXf(data.array, data.shape[:3]),)
     each = [data[..., k] for k in range(data.shape[3])]
     if len(each) == 4:
-        # Coefficients of a spectrum between 0 and 1, and its factor; of the spectrum no more is known.
+        # Coefficients of a spectrum with values between 0 and 1, and its factor; the spectrum is bounded by 0 and 1
+        # only.
         return dr.fmin(each[3], 0), each[3] * 0, each[3]
     return reduce(dr.fmin, each), reduce(operator.add, each) / len(each), reduce(dr.fmax, each)
 
 
 def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np.int64]:
-    """Per cell of the range low..high of an axis with n voxels: the voxels that lookups in it may use (cells x voxels).
+    """Voxels that lookups in each cell may use (cells x voxels), for the range low..high of an axis with n voxels.
 
-    With trilinear interpolation those are its own and one more on either side. Outside of the grid they are the
-    last voxel (clamp), that of the other end (repeat), or the mirror image. Short rows repeat their first entry.
+    With trilinear interpolation these are the cell's own voxels and one more on either side. Outside the grid they are
+    the last voxel (clamp), the voxel at the other end (repeat), or the mirror image. Short rows repeat their entries.
     """
     rows = []
     for start in range(low, high, BASE):
@@ -185,7 +186,7 @@ def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np
 
 
 def _merged(values: Values, axis: int, near: NDArray[np.int64], inside: NDArray[np.int64]) -> Values:
-    """Merge along one axis (x, y, z): extremes by the table ``near``, means by ``inside``."""
+    """Merge along one axis (x, y, z): extremes over the indices in ``near``, means over those in ``inside``."""
 
     def pool(value: mi.TensorXf, table: NDArray[np.int64], merge: Callable) -> mi.TensorXf:
         before = [slice(None)] * (2 - axis)
@@ -202,8 +203,8 @@ def _merged(values: Values, axis: int, near: NDArray[np.int64], inside: NDArray[
 def cheapest(levels: list[Bounds], rates: list[float], chord: float) -> int:
     """Index of the level whose cells make a ray through the volume cheapest.
 
-    The cost is that of the tentative collisions, ``rates[i]`` per unit length on average, and of the steps from cell
-    to cell, over the mean length ``chord`` of a ray in the volume. A single cell needs no steps.
+    The cost is that of the tentative collisions, ``rates[i]`` per unit length on average, and of the steps between
+    cells, over the mean length ``chord`` of a ray in the volume. A single cell needs no steps.
     """
     costs = [
         rate * chord + (0 if level.is_single else STEP_COST * (1 + level.faces_per_length * chord))
@@ -213,6 +214,6 @@ def cheapest(levels: list[Bounds], rates: list[float], chord: float) -> int:
 
 
 def mean_chord(box: mi.BoundingBox3f) -> float:
-    """Mean length of a random line in a box: four times the volume over the surface (Cauchy)."""
+    """Mean length of a random line in a box: four times the volume over the surface area (Cauchy)."""
     x, y, z = (float(e) for e in box.extents())
     return 0.0 if x * y * z == 0 else 2 * x * y * z / (x * y + y * z + z * x)

@@ -1,4 +1,4 @@
-"""Independent estimates of a gradient, and the verdict on one."""
+"""Independent estimates of a gradient, and a verdict on it."""
 
 from pathreplay.testing.gradient import GradientCheck, check_gradient
 

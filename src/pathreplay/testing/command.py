@@ -1,4 +1,4 @@
-"""Checks for a reader: how far they are, each when it is done, a JSON file for other programs."""
+"""User interface of gradient checks: progress, printed results, and a JSON file for other programs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from pathreplay.scenes.parameters import resolve_differentiable
 from pathreplay.testing.gradient import GradientCheck, check_gradient
 from pathreplay.testing.reference import Spec, integrator_under_test
 
-# Seconds between two lines where standard error is no terminal.
+# Seconds between two progress lines if standard error is not a terminal.
 _PAUSE_S = 10.0
 _STYLES = {"pass": "green", "zero": "green", "fail": "bold red", "inconclusive": "yellow"}
 
@@ -40,10 +40,10 @@ def check_all(
     boundary: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Iterator[GradientCheck]:
-    """``check_gradient(scene, key, **options)`` of each key that the patterns name, as soon as it is there.
+    """Yield ``check_gradient(scene, key, **options)`` for each key that matches the patterns, as soon as it is done.
 
-    Standard error tells how far it is. ``boundary`` holds further properties of `pathreplay`. Raises what
-    :func:`check_gradient` and :func:`resolve_differentiable` do.
+    Progress goes to standard error. ``boundary`` holds additional properties of `pathreplay`. Raises the same errors as
+    :func:`check_gradient` and :func:`resolve_differentiable`.
     """
     tested = integrator_under_test(integrator, scene, max_depth, boundary)
     keys = resolve_differentiable(traversed(scene), patterns, tested)
@@ -55,7 +55,7 @@ def check_all(
 
 @contextmanager
 def _told(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar on standard error that goes when all is done; where that is no terminal, a line now and then."""
+    """A transient progress bar on standard error; if that is not a terminal, occasional lines."""
     console = Console(stderr=True, force_jupyter=False)
     if console.is_terminal:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -80,9 +80,9 @@ def _told(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def print_checks(results: Iterable[GradientCheck]) -> list[GradientCheck]:
-    """Print what is compared, then for each parameter the verdict, the two estimates, and what the verdict means.
+    """Print the compared integrators, then per parameter the verdict, both estimates and an explanation.
 
-    Each is printed when it comes. Returns them all.
+    Each result is printed as soon as it arrives. Returns all results.
     """
     console = Console(highlight=False, soft_wrap=True)
     printed: list[GradientCheck] = []
@@ -105,7 +105,7 @@ def print_checks(results: Iterable[GradientCheck]) -> list[GradientCheck]:
 
 
 def _with_error(value: float, error: float) -> str:
-    """'+0.03199 ± 0.00015': the value as far as its error, which has two digits, lets it be known."""
+    """'+0.03199 ± 0.00015': the value, rounded to the last digit of its error, which has two digits."""
     if not (math.isfinite(value) and math.isfinite(error)):
         return f"{value:+.4g}"
     if error == 0:
@@ -117,7 +117,7 @@ def _with_error(value: float, error: float) -> str:
 
 
 def write_checks(results: Sequence[GradientCheck], path: Path) -> None:
-    """Write all fields of the checks as a JSON list, the samples too; NaN and infinity become null."""
+    """Write all fields of the checks, including samples, as a JSON list; NaN and infinity become null."""
     records = [{**asdict(result), "passed": result.passed, "variant": mi.variant()} for result in results]
     finite = json.loads(json.dumps(records), parse_constant=lambda name: None)
     try:
@@ -127,11 +127,11 @@ def write_checks(results: Sequence[GradientCheck], path: Path) -> None:
 
 
 def require_writable(path: Path) -> None:
-    """Raise PathreplayError for what is no regular file, has no folder, or may not be written."""
+    """Raise PathreplayError if ``path`` is no regular file, its folder does not exist, or permissions are missing."""
     problem = file_problem(path)
     if problem.startswith(("is ", "cannot be reached")):
         raise PathreplayError(f"{path} {problem}; give --json the name of a file")
     if not path.parent.is_dir():
-        raise PathreplayError(f"Folder {path.parent} for {path.name} does not exist; make it first")
+        raise PathreplayError(f"Folder {path.parent} for {path.name} does not exist; create it first")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise PathreplayError(f"{path} may not be written (its permissions); give --json another file")
+        raise PathreplayError(f"{path} cannot be written (its permissions); give --json another file")

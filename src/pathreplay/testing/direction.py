@@ -1,8 +1,8 @@
-"""Where to look: the direction in parameter space along which a gradient is checked, and the points on it.
+"""The direction in parameter space along which a gradient is checked, and the points on that line.
 
-A gradient of a thousand texels is checked through one number, its product with a direction. The direction is random,
-so that no particular error can hide, and all its entries are of one sign: contributions then add up, where random
-signs would make the derivative smaller by the square root of their number and leave its noise as it is.
+A gradient with respect to a thousand texels is checked through one number, its product with a direction. The direction
+is random, so that no particular error can stay hidden, and all its entries have the same sign. Contributions then add
+up; random signs would reduce the derivative by the square root of their number without reducing its noise.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ from pathreplay.scenes.spectra import coefficients, values_of_p
 from pathreplay.testing.stencil import BACKWARD, CENTRAL, FORWARD, Stencil
 
 RELATIVE_STEP = 1e-2
-"""h over the size of the parameter: truncation (h² after division) near 1e-4, float32 rounding of images near 1e-5."""
+"""Step h relative to the size of the parameter: truncation error (h² after division) near 1e-4, float32 rounding of
+images near 1e-5."""
 
-# Parameters in which a sign means nothing; all others that are nowhere negative are taken as bounded by 0.
+# Parameters whose sign has no meaning. All others that are nowhere negative are treated as bounded by 0.
 _SIGNED = ("vertex_positions", "vertex_normals", "vertex_texcoords", "to_world", "to_uv", "position", "direction")
 
 
 @dataclass(frozen=True)
 class Line:
-    """The points value + t * direction of a parameter, and the step h that the finite differences take along it."""
+    """The points value + t * direction of a parameter, and the step h of finite differences along it."""
 
     value: np.ndarray
     direction: np.ndarray
     description: str
     size: float
-    """The size of the parameter: its largest absolute entry along the direction, but at least 1."""
+    """Size of the parameter: its largest absolute entry along the direction, but at least 1."""
     step: float
     stencil: Stencil
 
     def move(self, value: Any, t: mi.Float) -> Any:
-        """The point at t, from the parameter's own ``value``, whose type it has."""
+        """The point at t, computed from the parameter's own ``value`` and of the same type."""
         return displaced(value, self.direction, t)
 
 
@@ -55,14 +56,14 @@ def choose_line(
 ) -> Line:
     """The line through ``value`` along ``direction``, or along a random direction whose largest entry is 1.
 
-    The default step moves the entry that moves most by a hundredth of the parameter's size. Where a parameter that is
-    nowhere negative would become so (a black texel), the differences are one-sided: a negative reflectance is no
-    harm to a linear texture, but a negative roughness or density is. Transforms move by a random translation, those
-    of things infinitely ``far`` away (sun, sky), which no translation moves, turn about a random axis. Coefficients of
-    ``spectra`` move so that what they stand for changes by such steps: see :mod:`pathreplay.scenes.spectra`.
+    By default the entry that moves most moves by a hundredth of the parameter's size. If this would make a non-negative
+    parameter negative (a black texel), the differences are one-sided: a linear texture tolerates negative reflectances,
+    but a roughness or density must not be negative. Transforms are translated randomly; those of infinitely ``far``
+    emitters (sun, sky), which translation does not change, are rotated about a random axis. Coefficients of ``spectra``
+    move such that the decoded values change by such steps: see :mod:`pathreplay.scenes.spectra`.
 
-    Raises PathreplayError for a direction of another shape, zero or not finite, and for a step that is not a positive
-    number, or too long or too short for the parameter.
+    Raises PathreplayError for a direction that has another shape, is zero or not finite, and for a step that is not a
+    positive number, or is too long or too short for the parameter.
     """
     if value.size == 0:
         raise PathreplayError(f"Parameter '{key}' is empty; there is nothing to check")
@@ -77,26 +78,26 @@ def choose_line(
             raise PathreplayError(f"Direction for '{key}' is zero, NaN or infinite; give finite numbers, not all zero")
     else:
         v, description = _random_direction(value, transform, far, spectra, seed)
-    # Black is p = -8192: the size of such texels must not decide how far the others move.
+    # Black is p = -8192; such texels must not determine the step of the others.
     size = 1.0 if spectra else max(1.0, float(np.abs(value[v != 0]).max()))
     if step is None:
         step = RELATIVE_STEP * size / ((float(np.abs(values_of_p(v)[..., :3]).max()) if spectra else 0) or 1)
     elif not (np.isfinite(step) and step > 0):
         raise PathreplayError(
-            f"Step {step} for '{key}' is not a positive number; leave it out, or give one such as 0.01"
+            f"Step {step} for '{key}' is not a positive number; leave it out, or give one, for example 0.01"
         )
     else:
         _require_seen(key, value, v, step, size)
     return Line(value, v, description, size, float(step), _choose_stencil(key, value, v * step))
 
 
-# A parameter a million times as large or small is that of another scene.
+# A parameter that is a million times larger or smaller belongs to a different scene.
 _LONGEST_STEP = 1e6
 
 
 def _require_seen(key: str, value: np.ndarray, direction: np.ndarray, step: float, size: float) -> None:
-    """Raise PathreplayError for a step beyond the parameter's size, or that single precision does not see."""
-    way_out = f"leave it out, or give one such as {RELATIVE_STEP * size:g}"
+    """Raise PathreplayError for a step far larger than the parameter, or lost in single precision."""
+    way_out = f"leave it out, or give one near {RELATIVE_STEP * size:g}"
     if step * float(np.abs(direction).max()) > _LONGEST_STEP * size:
         raise PathreplayError(f"Step {step} for '{key}' is too long for values up to {size:g}; {way_out}")
     if (np.float32(value + step / 2 * direction) == np.float32(value)).all():
@@ -106,7 +107,7 @@ def _require_seen(key: str, value: np.ndarray, direction: np.ndarray, step: floa
 def _random_direction(
     value: np.ndarray, transform: bool, far: bool, spectra: bool, seed: int
 ) -> tuple[np.ndarray, str]:
-    """A direction in the shape of ``value``, and how it was chosen: see `choose_line`."""
+    """A direction of the shape of ``value``, and a description of its choice: see `choose_line`."""
     if value.size == 1:
         return np.ones(value.shape), "scalar"
     v = np.zeros(value.shape)
@@ -135,5 +136,6 @@ def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
             return FORWARD
         if (value - 2 * move >= 0).all():
             return BACKWARD
-    # Or both ways lead below zero (a given direction of mixed signs over zeros): linear parameters do not mind.
+    # Central also if both directions lead below zero (a given direction of mixed signs at zeros): linear parameters
+    # tolerate it.
     return CENTRAL

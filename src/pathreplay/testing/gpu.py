@@ -1,7 +1,7 @@
-"""Truths and timings on a machine with a GPU, into one file that can be sent in: `pathreplay doctor --gpu`.
+"""Gradient checks and timings on a machine with a GPU, written to one file: `pathreplay doctor --gpu`.
 
-Each item runs in a process of its own, since what does not fit a device may bring the process down; an item that does
-is told in the file, and the others go on.
+Each item runs in its own process, because running out of device memory may crash the process. The file then contains
+the error of that item, and the others continue.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from pathreplay.platform.atomic_files import require_writable, write_whole
 from pathreplay.platform.device import device_of
 
 TIMEOUT_S = 300
-"""Of an item: far above what any takes on a processor."""
+"""Timeout per item in seconds: far more than any item takes on a CPU."""
 ROUNDS = 7
 WALLS = "red.reflectance.value"
 
-# Scene, its arguments, the parameter, and options of `check_gradient`: surfaces, what moves, textures, media.
+# Scene, its arguments, the parameter, and options of `check_gradient`: surfaces, geometry, textures, media.
 TRUTHS: dict[str, tuple[str, dict[str, int], str, dict[str, Any]]] = {
     "colour of a wall": ("cornell-box", {"resolution": 32}, WALLS, {}),
     "texture": ("cornell-box-photo", {"resolution": 32, "texture": 16}, "back.bsdf.reflectance.data", {}),
     "index of glass": ("glass-pane", {"resolution": 24}, "glass.eta", {}),
     "density": ("cloud", {"resolution": 16, "grid": 8, "views": 1}, "cloud.interior_medium.sigma_t.data", {}),
 }
-# Integrator and options, side of the picture, samples per pixel, depth.
+# Integrator and options, side of the image, samples per pixel, depth.
 TIMINGS: dict[str, tuple[dict[str, Any], int, int, int]] = {
     f"{name}, {side} x {side}, depth {depth}": ({"type": kind, **more}, side, 16, depth)
     for side in (128, 512)
@@ -50,7 +50,7 @@ TIMINGS: dict[str, tuple[dict[str, Any], int, int, int]] = {
         ("replay", "pathreplay", {"adjoint": "replay"}),
     )
 }
-# What `auto` is to decide: what records of so many vertices cost, and where there are none.
+# The choice that `auto` has to make: the cost of deep records, and of replay.
 TIMINGS |= {
     f"{adjoint}, 512 x 512, depth {depth}": ({"type": "pathreplay", "adjoint": adjoint}, 512, 16, depth)
     for adjoint, depth in (("recorded", 256), ("recorded", 448), ("replay", 448), ("replay", 2048))
@@ -59,7 +59,7 @@ TIMINGS |= {
 
 @dataclass(frozen=True)
 class Item:
-    """What came of one item: facts, or why there are none."""
+    """The result of one item: facts, or the reason why there are none."""
 
     name: str
     facts: dict[str, Any]
@@ -67,9 +67,9 @@ class Item:
 
 
 def examine(variant: str | None, output: Path, names: Sequence[str] = (), tell: Callable[[str], None] = print) -> str:
-    """Run all items (or those named) in a variant (default: cuda_ad_rgb), and write the file; returns the last line.
+    """Run all items (or those named) in a variant (default: cuda_ad_rgb), write the file, return a summary line.
 
-    Raises PathreplayError where the variant does not run here, or the file cannot be written.
+    Raises PathreplayError if the variant does not run on this machine, or the file cannot be written.
     """
     require_writable(output, "--output")
     with interrupts.undisturbed():
@@ -108,7 +108,7 @@ def _in_process(variant: str, name: str) -> Item:
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        return Item(name, {}, f"gave no answer within {TIMEOUT_S} s")
+        return Item(name, {}, f"no result within {TIMEOUT_S} s")
     lines = [line for line in done.stdout.splitlines() if '{"facts"' in line]
     if done.returncode or not lines:
         last = [line for line in done.stderr.splitlines() if line.strip()] or [f"ended with status {done.returncode}"]
@@ -117,7 +117,7 @@ def _in_process(variant: str, name: str) -> Item:
 
 
 def truth(name: str) -> dict[str, Any]:
-    """The gradient of a truth next to finite differences."""
+    """Compare a gradient with finite differences."""
     from pathreplay.scenes.loading import load_scene_for
     from pathreplay.testing.gradient import check_gradient
 
@@ -129,7 +129,7 @@ def truth(name: str) -> dict[str, Any]:
 
 
 def timing(name: str) -> dict[str, Any]:
-    """Seconds of a gradient pass (the fastest and the median of some), and of the first."""
+    """Time gradient passes in seconds: the first, and median and minimum of the others."""
     import drjit as dr
     import mitsuba as mi
 
@@ -154,12 +154,12 @@ def timing(name: str) -> dict[str, Any]:
 
 
 def main(variant: str, name: str) -> None:
-    """One item, in this process: its facts go to stdout as a line of JSON."""
+    """Run one item in this process and print its facts to stdout as a line of JSON."""
     backend.set_variant(variant)
     kind, _, what = name.partition(": ")
     facts = truth(what) if kind == "truth" else timing(what)
     print(json.dumps({"facts": facts}), flush=True)
-    os._exit(0)  # what a driver does at the end of the process is no part of the item
+    os._exit(0)  # errors of a GPU driver at process exit are not part of the item
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""Check a gradient: any integrator's derivative against finite differences of a plain path tracer.
+"""Gradient checks: the derivative of any integrator against finite differences of a plain path tracer.
 
-Two sets of independent samples of one directional derivative, their standard errors, and a verdict.
+Each check draws two sets of independent samples of one directional derivative, and derives standard errors and a
+verdict.
 """
 
 from __future__ import annotations
@@ -28,20 +29,20 @@ _MOST_SEEDS = 1_000_000
 
 @dataclass(frozen=True)
 class GradientCheck(Judgement):
-    """One directional derivative, estimated twice, and what follows. Derivatives are those of the objective."""
+    """A directional derivative of the objective, estimated in two ways, and the verdict."""
 
     key: str
     direction: str
-    """How the direction was chosen: 'scalar', 'random, seed 0', 'given'."""
+    """Choice of the direction: 'scalar', 'random, seed 0', 'given'."""
     integrator: str
     reference_integrator: str
     mode: Mode
     objective: float
-    """Value of the objective F where the gradient was taken."""
+    """Value of the objective F at the point of the gradient."""
     step: float
-    """h: how far the entry with direction 1 moves."""
+    """Step h: the distance that an entry with direction 1 moves."""
     stencil: str
-    """'central', or 'one-sided' where the parameter stands at its bound 0."""
+    """'central', or 'one-sided' if the parameter is at its bound 0."""
     seeds: int
     spp: int
     fd_spp: int
@@ -58,7 +59,7 @@ class GradientCheck(Judgement):
         rows = (
             (f"gradient ({self.integrator}, {self.mode})", f"{self.gradient:+.6g} ± {self.gradient_se:.2g}"),
             (f"reference ({tracer}, {self.stencil})", f"{self.reference:+.6g} ± {self.reference_se:.2g}"),
-            ("step, error left by it", f"{self.step:.3g}, {self.step_error:.2g}"),
+            ("step, remaining error", f"{self.step:.3g}, {self.step_error:.2g}"),
             ("seeds, spp, reference spp", f"{self.seeds}, {self.spp}, {self.fd_spp}"),
             ("z", f"{self.z:+.2f}"),
             ("verdict", f"{self.verdict.upper()}: {self.reason}"),
@@ -67,7 +68,7 @@ class GradientCheck(Judgement):
         return "\n".join([f"{self.key} ({self.direction})", *(f"  {name:<{width}}  {value}" for name, value in rows)])
 
 
-def check_gradient(  # noqa: PLR0913 (of which most are keywords)
+def check_gradient(  # noqa: PLR0913 (most are keyword-only)
     scene: mi.Scene,
     key: str,
     *,
@@ -88,33 +89,34 @@ def check_gradient(  # noqa: PLR0913 (of which most are keywords)
     """Compare dF/dt at t = 0 of the parameter value + t · direction with finite differences, over independent seeds.
 
     Args:
-        scene: a scene of an AD variant; it is left as it was, parameters and gradients, whatever happens.
+        scene: a scene of an AD variant; its parameters and gradients are restored in any case.
         key: a differentiable parameter of ``mi.traverse(scene)``.
-        integrator: what is tested: object, dictionary, plugin name, or None for the scene's own if it is made for
+        integrator: the one under test: object, dictionary, plugin name, or None for the scene's own if it is made for
             differentiation and ``pathreplay`` otherwise. Names get the path limits of the scene's integrator.
-        reference: what is differenced; None for Mitsuba's ``path`` (``volpath`` with media) with the same limits.
-        max_depth: path length, where ``integrator`` is None or a name.
-        sensor: index of the sensor; its film gives the resolution.
-        seeds: number n of independent seeds, for the gradient and, others, for the reference.
+        reference: the integrator whose images are differenced; None for Mitsuba's ``path`` (``volpath`` with media)
+            with the same limits.
+        max_depth: path length, if ``integrator`` is None or a name.
+        sensor: index of the sensor; its film determines the resolution.
+        seeds: number n of independent seeds for the gradient, and of n others for the reference.
         spp: samples per pixel of one gradient.
-        fd_spp: samples per pixel of one image of the reference (None: the same). Each reference seed costs four images,
+        fd_spp: samples per pixel of one image of the reference (None: the same). Each reference seed takes four images,
             at ±h and ±h/2 with common random numbers.
         step: h; None for a hundredth of max(1, largest absolute entry).
-        direction: array of the parameter's shape, taken as it is; None for 1 (scalars), a random translation
-            (``to_world``; a rotation for sun and sky), or random positive entries, the largest being 1.
+        direction: array of the parameter's shape, not normalised; None for 1 (scalars), a random translation
+            (``to_world``; a rotation for sun and sky), or random positive entries with maximum 1.
         mode: 'backward' (``dr.backward`` through ``mi.render``) or 'forward' (``dr.forward``).
-        loss: None for the mean of the image under smooth weights between 0.5 and 1.5 that differ by channel, so
+        loss: None for the mean of the image under smooth weights between 0.5 and 1.5 that differ between channels, so
             that errors of opposite sign in two places do not cancel. Otherwise a function from the image (TensorXf,
-            height x width x channels) to a scalar, which is linearised once at a rendered image: the check
-            is one of the renderer, and a nonlinear loss of a noisy image would be biased.
-        seed: chooses all random numbers, and the direction.
-        progress: called with (renderings done, renderings in all), first with 0 when all arguments are known to do.
+            height x width x channels) to a scalar, which is linearised once at a rendered image: the check concerns
+            the renderer, and a nonlinear loss of a noisy image would be biased.
+        seed: determines all random numbers and the direction.
+        progress: called with (finished renderings, total renderings), first with 0 after all arguments are validated.
 
     Returns:
         the estimates, their standard errors and the verdict (see :mod:`pathreplay.testing.verdict`).
 
-    Not checked: what no direction of ``key`` moves, the loss itself, and the alpha channel (no integrator
-    differentiates it).
+    Not checked: components of ``key`` orthogonal to the direction, the loss itself, and the alpha channel (no
+    integrator differentiates it).
 
     Raises:
         PathreplayError: a bad argument, a parameter without derivative, NaN in the scene, an integrator that cannot
@@ -134,7 +136,7 @@ def check_gradient(  # noqa: PLR0913 (of which most are keywords)
 
 @dataclass
 class _Plan:
-    """What is sampled, how often, and who is told of every rendering that is done."""
+    """The sampling plan of a check, with its progress callback."""
 
     mode: Mode
     seeds: int
@@ -149,8 +151,7 @@ class _Plan:
     ) -> GradientCheck:
         n, stencil = self.seeds, line.stencil
         self._tell()
-        # Distinct 32-bit words: seeds of the gradient's primal image, of its derivative, of the reference, of the
-        # weights.
+        # Distinct 32-bit seeds: of the gradient's primal image, its derivative, the reference, and the weights.
         words = [int(word) for word in np.random.SeedSequence(self.seed).generate_state(3 * n + 1)]
         objective.weigh_by(loss, plain, words[-1], self.fd_spp)
         self._tick()
@@ -191,7 +192,7 @@ class _Plan:
 def _line(
     params: mi.SceneParameters, key: str, by: mi.Integrator, step: float | None, direction: ArrayLike | None, seed: int
 ) -> Line:
-    """The line through the parameter that will be looked along; what cannot be differentiated or differenced raises."""
+    """The line to check along; raises PathreplayError if the parameter cannot be differentiated or differenced."""
     require_differentiable(params, key, by)
     require_finite(params)
     value, owner = get_array(params[key]), params.properties[key][2]
@@ -200,7 +201,7 @@ def _line(
             f"Parameter '{key}' is stored in half precision, too coarse for finite differences; give the texture the "
             "option format='variant'"
         )
-    # Infinitely far away only the orientation of a light counts.
+    # Only the orientation of an infinitely distant emitter matters.
     infinite = mi.EmitterFlags.Infinite | mi.EmitterFlags.DeltaDirection
     far = isinstance(owner, mi.Emitter) and bool(mi.has_flag(owner.flags(), infinite))
     spectra = coefficient_channels(params, key) > 0
@@ -209,7 +210,9 @@ def _line(
 
 def _require_types(key: object, loss: object, **numbers: object) -> None:
     if not isinstance(key, str):
-        raise PathreplayError(f"key is {shown(key)}; give the name of one parameter, as 'wall.reflectance.data'")
+        raise PathreplayError(
+            f"key is {shown(key)}; give the name of one parameter, for example 'wall.reflectance.data'"
+        )
     if loss is not None and not callable(loss):
         raise PathreplayError(f"loss is {shown(loss)}; give a function from the image to a number, or leave it out")
     for name, number in numbers.items():
@@ -224,7 +227,7 @@ def _require_arguments(scene: object, sensor: int, seeds: int, spp: int, fd_spp:
         )
     if type(scene).__name__ == "Scene" and isinstance(scene, mi.Object) and not isinstance(scene, mi.Scene):
         raise PathreplayError(
-            f"scene belongs to another variant than the active one, '{mi.variant()}': load it anew, or set its variant"
+            f"scene belongs to another variant than the active one, '{mi.variant()}': load it again, or set its variant"
         )
     if not isinstance(scene, mi.Scene):
         raise PathreplayError(
@@ -233,15 +236,15 @@ def _require_arguments(scene: object, sensor: int, seeds: int, spp: int, fd_spp:
     if not 0 <= sensor < len(scene.sensors()):
         raise PathreplayError(f"Sensor {sensor} does not exist; the scene has {len(scene.sensors())}, counted from 0")
     if seeds > _MOST_SEEDS:
-        raise PathreplayError(f"seeds is {shown(seeds)}; give up to {_MOST_SEEDS}, and take more samples instead")
+        raise PathreplayError(f"seeds is {shown(seeds)}; give at most {_MOST_SEEDS}, and more samples instead")
     if seeds < 2:
-        raise PathreplayError(f"seeds is {seeds}; a standard error needs at least 2, and 8 or more make sense")
+        raise PathreplayError(f"seeds is {seeds}; a standard error needs at least 2; use 8 or more")
     counts = {"spp": spp, "fd_spp": fd_spp}
     for name, count in counts.items():
         if count < 1:
             raise PathreplayError(f"{name} is {count}; give at least 1 sample per pixel")
     require_film(scene.sensors()[sensor], f"sensor {sensor}", counts)
     if seed < 0:
-        raise PathreplayError(f"seed is {seed}; give a whole number from 0 on")
+        raise PathreplayError(f"seed is {seed}; give a whole number of at least 0")
     if mode not in ("backward", "forward"):
         raise PathreplayError(f"mode is '{mode}'; choose 'backward' or 'forward'")

@@ -1,7 +1,7 @@
-"""The objective of a check, F(t): a weighted mean of the image, as a function of one parameter along one curve.
+"""The objective of a check, F(t): a weighted mean of the image, as a function of one parameter along a curve.
 
-F(π) = Σ_k w_k I_k(π) / n is linear in the image, so that the gradient of one noisy image is an unbiased sample of the
-gradient of F, and the difference of two noisy images one of its difference.
+F(π) = Σ_k w_k I_k(π) / n is linear in the image. The gradient of one noisy image is therefore an unbiased sample of the
+gradient of F, and the difference of two noisy images an unbiased sample of its difference.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ Loss = Callable[["mi.TensorXf"], "mi.Float"]
 
 @contextmanager
 def alone(params: mi.SceneParameters, key: str) -> Iterator[None]:
-    """Detach all parameters, so that only ``key`` will be attached; put everything back at the end."""
-    # Copies: the map hands out references to what the scene holds, and the scene is about to change.
+    """Detach all parameters, so that only ``key`` will be attached; restore everything at the end."""
+    # Copies, because the map returns references into the scene, which is about to change.
     held = {name: dr.copy(params[name]) for name in params.keys() if name == key or dr.grad_enabled(params[name])}
-    # Setting through the map, then update(): objects keep values derived from their parameters.
+    # Set through the map and call update(), because objects cache values derived from their parameters.
     for name, value in held.items():
         params[name] = dr.detach(value)
     params.update()
@@ -45,10 +45,10 @@ def alone(params: mi.SceneParameters, key: str) -> Iterator[None]:
 
 
 class Objective:
-    """The scene on the curve move(value, t) through the value of one parameter, seen by one sensor, under weights.
+    """The scene on the curve move(value, t) through the value of one parameter, seen by one sensor, with weights.
 
-    ``move(value, t)`` is the parameter at t, the value itself at t = 0. Unless it says otherwise, all of a method's
-    pictures have the same seed: common random numbers.
+    ``move(value, t)`` is the parameter at t, and the value itself at t = 0. Unless stated otherwise, all images of a
+    method use the same seed, i.e. common random numbers.
     """
 
     def __init__(self, scene: mi.Scene, params: mi.SceneParameters, key: str, move: Move, sensor: int = 0) -> None:
@@ -66,12 +66,12 @@ class Objective:
         self.params.update()
 
     def weigh(self, weights: np.ndarray) -> None:
-        """Set the weights w / n, of the shape of the picture."""
+        """Set the weights w / n, in the shape of the image."""
         self.adjoint = mi.TensorXf(weights)
         self.weights = np.array(self.adjoint, np.float64)
 
     def weigh_by(self, loss: Loss | None, plain: mi.Integrator, seed: int, spp: int) -> None:
-        """Set smooth weights, or the derivative of a loss at a picture; and the scale Σ |w_k I_k| / n of F."""
+        """Set smooth weights, or the derivative of a loss at an image; and the scale Σ |w_k I_k| / n of F."""
         image = self._render(plain, seed, spp)
         if loss is None:
             w = smooth_weights(image.shape, _has_alpha(self.sensor))
@@ -83,27 +83,29 @@ class Objective:
             dr.backward(value)
             w = np.array(dr.grad(image), np.float64)
             if not np.isfinite(w).all():
-                raise PathreplayError("loss has a derivative that is NaN or infinite; give a function without, or none")
+                raise PathreplayError(
+                    "loss has a derivative that is NaN or infinite; give another function, or leave it out"
+                )
             if _has_alpha(self.sensor):
                 w[..., -1] = 0
         self.weigh(w)
         self.scale = float(np.abs(w * np.array(image, np.float64)).sum())
 
     def dot(self, image: np.ndarray) -> float:
-        """The weighted sum; in double precision, since it must not round what a difference is made of."""
+        """The weighted sum, in double precision because differences of it are taken."""
         return float(np.vdot(self.weights, image))
 
     def image(self, integrator: mi.Integrator, seed: int, spp: int, t: float = 0.0) -> np.ndarray:
-        """The picture at t (height x width x channels)."""
+        """The image at t (height x width x channels)."""
         self.put(dr.opaque(mi.Float, t))
         return np.array(self._render(integrator, seed, spp), np.float64)
 
     def difference(self, integrator: mi.Integrator, stencil: Stencil, h: float, seed: int, spp: int) -> np.ndarray:
-        """Finite difference of the picture."""
+        """Finite difference of the image."""
         return stencil(lambda t: self.image(integrator, seed, spp, t), h)
 
     def derivative(self, integrator: mi.Integrator, mode: Mode, primal: int, seed: int, spp: int) -> float:
-        """dF/dt at 0, through ``mi.render`` and with seeds for picture and derivative, as users have it."""
+        """dF/dt at 0 through ``mi.render``, with separate seeds for image and derivative, as in user code."""
         name = integrator_name(integrator)
         with told(f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode", (RuntimeError, TypeError)):
             t = self._attached()
@@ -118,13 +120,13 @@ class Objective:
             return float(dr.grad(t)[0])
 
     def forward(self, integrator: mi.Integrator, seed: int, spp: int) -> np.ndarray:
-        """The derivative of the picture, by the integrator's forward pass alone."""
+        """Derivative of the image from the integrator's forward pass alone."""
         dr.forward(self._attached(), dr.ADFlag.ClearEdges)
         image = integrator.render_forward(self.scene, self.params, self.sensor, seed=seed, spp=spp)
         return np.array(image, np.float64)
 
     def backward(self, integrator: mi.Integrator, seed: int, spp: int) -> float:
-        """dF/dt, by the integrator's reverse pass alone."""
+        """dF/dt from the integrator's reverse pass alone."""
         t = self._attached()
         integrator.render_backward(self.scene, self.params, self.adjoint, self.sensor, seed=seed, spp=spp)
         return self.collect(t)
@@ -135,20 +137,20 @@ class Objective:
         return abs(self.dot(tangent) - self.backward(back, seed, spp)) / self.dot(np.abs(tangent))
 
     def collect(self, t: mi.Float) -> float:
-        """Bring what a reverse pass left at the parameter back to t."""
+        """Propagate gradients from the parameter, where a reverse pass accumulated them, back to t."""
         dr.enqueue(dr.ADMode.Backward, self.params[self.key])
         dr.traverse(dr.ADMode.Backward)
         return float(dr.grad(t)[0])
 
     def judge(self, line: Line, gradients: np.ndarray, full: np.ndarray, half: np.ndarray) -> Judgement:
-        """The verdict on gradients, from differences along the line with its stencil and with this halved."""
-        # A rounding error of one half unit in the last place of every image, all of one sign, at worst.
+        """The verdict on gradients, from differences along the line with its stencil and with half the step."""
+        # Worst case: rounding errors of half a unit in the last place of every image, all of the same sign.
         unit = np.finfo(get_array(self.value).dtype).eps / 2
         rounding = line.stencil.rounding() * unit * self.scale / line.step
         return judge(gradients, full, half, rounding=rounding, negligible=NEGLIGIBLE * self.scale / line.size)
 
     def _attached(self) -> mi.Float:
-        """t = 0 with gradients, which the parameter's value at t now passes on."""
+        """t = 0 with gradients enabled; the parameter is set to its value at t."""
         t = dr.opaque(mi.Float, 0)
         dr.enable_grad(t)
         self.put(t)
@@ -166,8 +168,9 @@ def _has_alpha(sensor: mi.Sensor) -> bool:
 def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
     """w / n with w = 1 + cos(2π (0.7 x + 0.4 y + c/3)) / 2 for pixel (x, y) in [0, 1]² and channel c.
 
-    Positive and smooth, since random signs would cost resolution as in a direction; a wave across the image
-    and out of phase between channels, of which no mirror symmetry of a scene makes a constant.
+    Positive and smooth, because random signs would reduce the signal, as for a direction. The wave runs obliquely
+    across the image and is out of phase between channels, so that a mirror symmetry of the scene does not make it
+    constant.
     """
     height, width, channels = shape
     y, x, c = np.ogrid[:height, :width, :channels]
@@ -178,8 +181,8 @@ def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
 
 
 def integrator_name(integrator: mi.Integrator) -> str:
-    """Name of the integrator as a user writes it, and its boundary terms; a PRBIntegrator is called 'prb'."""
-    # For Python plugins Mitsuba's class_name() is that of the C++ base.
+    """Name of the integrator as in a scene file, and its boundary terms; a PRBIntegrator is called 'prb'."""
+    # For Python plugins Mitsuba's class_name() returns the name of the C++ base class.
     name = type(integrator).__name__ if isinstance(integrator, mi.CppADIntegrator) else str(integrator.class_name())
     name = name.removesuffix("Integrator").replace("VolumetricPath", "Volpath").lower()
     edges = stateful(integrator).options().get("boundary", "auto")

@@ -1,7 +1,7 @@
-"""Which integrators a check compares: the one under test, and the plain path tracer that serves as its reference.
+"""The integrators that a check compares: the one under test, and the plain path tracer that serves as its reference.
 
-The reference must estimate the same image: same path length, same treatment of directly visible emitters. These are
-read off the integrator under test.
+The reference must estimate the same image: same path length, same treatment of directly visible emitters. These
+settings are read from the integrator under test.
 """
 
 from __future__ import annotations
@@ -18,26 +18,27 @@ from pathreplay.integrators.stateful import stateful
 from pathreplay.scenes.descriptions import load_integrator
 
 Spec: TypeAlias = "mi.Integrator | Mapping[str, Any] | str | None"
-"""An integrator: finished, described, by name, or left to us."""
+"""An integrator: an object, a dictionary, a plugin name, or None for the default."""
 
 NO_ROULETTE = 2**30
 """A ``rr_depth`` that no path reaches."""
 
 LONGEST_WITHOUT_ROULETTE = 64
-"""Above this length the reference keeps Russian roulette: without it, no path of a closed room ends before its time."""
+"""Above this length the reference keeps Russian roulette; without it, paths in a closed room end only at this length.
+"""
 
 
 def integrator_under_test(
     spec: Spec, scene: mi.Scene, max_depth: int | None = None, boundary: Mapping[str, Any] | None = None
 ) -> mi.Integrator:
-    """The integrator that ``spec`` means: an object (taken as it is), a dictionary, a plugin name, or None.
+    """The integrator that ``spec`` describes: an object (used unchanged), a dictionary, a plugin name, or None.
 
-    None is the scene's own integrator if that one is made for differentiation, else ``pathreplay``. A plugin given by
-    name, or chosen by None, gets the path limits of the scene's own integrator; ``max_depth`` overrides them, and
-    ``boundary`` holds properties of `pathreplay` to add (``boundary``, ``boundary_spp``).
+    None selects the scene's own integrator if it is made for differentiation, else ``pathreplay``. A plugin given by
+    name, or selected by None, gets the path limits of the scene's own integrator. ``max_depth`` overrides them, and
+    ``boundary`` holds additional properties of `pathreplay` (``boundary``, ``boundary_spp``).
 
-    Raises PathreplayError where Mitsuba cannot make it, ``max_depth`` is no depth or given with a finished one, or
-    boundary terms are asked of another integrator than `pathreplay`.
+    Raises PathreplayError if Mitsuba cannot create it, if ``max_depth`` is invalid or given with a finished integrator,
+    or if boundary terms are requested from another integrator than `pathreplay`.
     """
     if max_depth is not None and (type(max_depth) is not int or (max_depth < 1 and max_depth != -1)):
         raise PathreplayError(f"max_depth is {max_depth!r}; give a path length of at least 1, or -1 for no bound")
@@ -47,7 +48,7 @@ def integrator_under_test(
     if isinstance(spec, mi.Integrator):
         if max_depth is not None or boundary:
             what = "max_depth" if max_depth is not None else "boundary"
-            raise PathreplayError(f"{what} cannot be given along with a finished integrator; set it there")
+            raise PathreplayError(f"{what} cannot be given along with an integrator object; set it in the integrator")
         return spec
     if isinstance(spec, Mapping):
         description = dict(spec)
@@ -69,10 +70,11 @@ def integrator_under_test(
 def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> mi.Integrator:
     """The integrator whose images are differenced: ``spec`` if given, else ``path``, or ``volpath`` with media.
 
-    Its Russian roulette is switched off where paths are short enough. That leaves the expected image alone, keeps
-    decisions from flipping between +h and -h, and lets throughputs be negative, as they are beside a reflectance of 0.
+    Its Russian roulette is disabled if paths are short enough. This leaves the expected image unchanged, prevents
+    decisions from changing between +h and -h, and allows throughputs to be negative, as they are next to a reflectance
+    of 0.
 
-    Raises PathreplayError where the path length of the tested one cannot be read, or ``spec`` cannot be made.
+    Raises PathreplayError if the path length of the tested integrator cannot be read, or ``spec`` cannot be created.
     """
     if isinstance(spec, mi.Integrator):
         return spec
@@ -81,8 +83,8 @@ def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> 
     limits = read_limits(tested)
     if limits is None:
         raise PathreplayError(
-            f"Integrator {type(tested).__name__} does not say its max_depth; pass a reference integrator that computes "
-            "the same image, such as reference={'type': 'path', 'max_depth': 6}"
+            f"Integrator {type(tested).__name__} does not expose its max_depth; pass a reference integrator that "
+            "computes the same image, for example reference={'type': 'path', 'max_depth': 6}"
         )
     short = 0 <= limits.max_depth <= LONGEST_WITHOUT_ROULETTE
     name = spec or ("volpath" if facts_of(scene).has_media else "path")

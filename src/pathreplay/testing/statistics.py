@@ -1,8 +1,8 @@
-"""Statistics of few samples: means with their standard errors, and differences of means as normal deviates.
+"""Statistics of few samples: means with standard errors, and differences of means as normal deviates.
 
-Standard errors are estimated from the samples, so a difference over its error follows Student's distribution. ``z`` is
-that ratio turned into the normal deviate of the same probability, so that |z| < 4 means the same for 3 seeds and for
-300. All functions take numbers or arrays; samples run along the first axis.
+Standard errors are estimated from the samples, so that a difference divided by its error follows Student's
+distribution. ``z`` is the normal deviate with the same probability as that ratio: |z| < 4 means the same for 3 seeds as
+for 300. All functions take numbers or arrays; samples are along the first axis.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy import stats
 
 
 class Gap(NamedTuple):
-    """A difference of means, its standard error, and how improbable it is."""
+    """A difference of means, its standard error, and its normal deviate."""
 
     value: Any
     error: Any
@@ -29,7 +29,7 @@ def mean_and_error(samples: ArrayLike) -> tuple[Any, Any]:
 
 
 def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
-    """mean(a) - mean(b) of independent samples (n, ...) and (m, ...); ``b`` without a first axis is known exactly."""
+    """mean(a) - mean(b) of independent samples (n, ...) and (m, ...); ``b`` without a sample axis is exact."""
     a, b = np.asarray(a), np.asarray(b)
     known = b.ndim < a.ndim
     (mean_a, error_a), (mean_b, error_b) = mean_and_error(a), (b, 0) if known else mean_and_error(b)
@@ -38,9 +38,9 @@ def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
 
 
 def welch(difference: Any, σ: Any, *parts: tuple[Any, int]) -> Any:
-    """z of difference/σ, where σ holds ``parts`` (standard error, number of samples) that were estimated.
+    """z of difference/σ, where ``parts`` (standard error, number of samples) are the estimated contributions to σ.
 
-    What else σ holds is known, and adds no uncertainty to it (Welch-Satterthwaite).
+    The remaining contributions to σ are known and add no uncertainty to it (Welch-Satterthwaite).
     """
     difference, σ = np.asarray(difference, np.float64), np.asarray(σ, np.float64)
     noise = sum(np.asarray(error, np.float64) ** 4 / (n - 1) for error, n in parts)
@@ -51,5 +51,5 @@ def welch(difference: Any, σ: Any, *parts: tuple[Any, int]) -> Any:
 
 
 def normal(t: Any, freedom: Any) -> Any:
-    """The normal deviate that is as improbable as a ratio t under Student's distribution, for t >= 0."""
+    """The normal deviate with the same tail probability as a ratio t >= 0 under Student's distribution."""
     return stats.norm.isf(np.maximum(stats.t.sf(t, freedom), 1e-300))

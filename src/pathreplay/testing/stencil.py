@@ -1,4 +1,4 @@
-"""Finite differences: which points along a line are looked at, and how their values are weighed."""
+"""Finite-difference stencils: sample points along a line, and their weights."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Stencil:
     terms: tuple[tuple[float, float], ...]
 
     def __call__(self, f: Callable[[float], Any], h: float = 1.0) -> Any:
-        """D(h), of numbers or of arrays."""
+        """D(h), for numbers or arrays."""
         return sum(c * f(o * h) for o, c in self.terms) / h
 
     def halved(self) -> Stencil:
-        """D(h/2), as a stencil of step h."""
+        """D(h/2), as a stencil with step h."""
         return Stencil(self.name, tuple((o / 2, 2 * c) for o, c in self.terms))
 
     def points(self) -> tuple[float, ...]:
@@ -27,7 +27,7 @@ class Stencil:
         return tuple(sorted({o for o, _ in self.terms + self.halved().terms}))
 
     def rounding(self) -> float:
-        """How errors of f add up at worst, in units of h, in Richardson's combination (4 D(h/2) - D(h)) / 3."""
+        """Worst-case amplification of errors of f, in units of 1/h, in Richardson's (4 D(h/2) - D(h)) / 3."""
         full, half = dict(self.terms), dict(self.halved().terms)
         return sum(abs(4 * half.get(o, 0) - full.get(o, 0)) for o in self.points()) / 3
 
@@ -35,7 +35,7 @@ class Stencil:
 CENTRAL = Stencil("central", ((-1, -0.5), (1, 0.5)))
 FORWARD = Stencil("one-sided, up", ((0, -1.5), (1, 2), (2, -0.5)))
 BACKWARD = Stencil("one-sided, down", ((0, 1.5), (-1, -2), (-2, 0.5)))
-# Of fourth and third order. They let h be a large share of the parameter: delta tracking decides anew at every h, so
-# that its noise does not shrink with h as that of a smooth path does.
+# Fourth and third order. They permit a step of a large fraction of the parameter. Delta tracking makes new decisions at
+# every h, so that its noise does not decrease with h as that of a smooth path does.
 WIDE = Stencil("wide", ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12)))
 UPWARD = Stencil("wide, up", ((0, -11 / 6), (1, 3), (2, -1.5), (3, 1 / 3)))

@@ -1,12 +1,12 @@
-"""The verdict on a gradient: what two sets of independent samples allow to say, in pure arithmetic.
+"""The verdict on a gradient: the conclusion that two sets of independent samples permit, in pure arithmetic.
 
-Given are n samples of the gradient under test and n of its reference, all from independent seeds. The reference comes
-as two finite differences per seed, one with the step h and one with h/2, whose error is O(h²). Their Richardson
-combination (4 D(h/2) - D(h)) / 3 removes that term; what halving the step changed, beyond noise, bounds what is left.
+Given are n samples of the gradient under test and n of its reference, all from independent seeds. The reference
+consists of two finite differences per seed, with steps h and h/2, whose error is O(h²). Their Richardson combination (4
+D(h/2) - D(h)) / 3 removes this term. The change caused by halving the step, beyond noise, bounds the remaining error.
 
     σ² = se(gradient)² + se(reference)² + step_error²,      z = (mean gradient - mean reference) / σ
 
-and ``z`` is turned into a normal deviate, whatever the number of samples: see :mod:`pathreplay.testing.statistics`.
+``z`` is converted to a normal deviate, independent of the number of samples: see :mod:`pathreplay.testing.statistics`.
 """
 
 from __future__ import annotations
@@ -22,31 +22,35 @@ from pathreplay.testing.statistics import mean_and_error, welch
 Verdict = Literal["pass", "zero", "fail", "inconclusive"]
 
 Z_LIMIT = 4.0
-"""A right gradient exceeds it once in 16 000 checks: a battery of hundreds of cells stays quiet."""
+"""A correct gradient exceeds it once in 16 000 checks, so that hundreds of checks rarely produce a false alarm."""
 
 RESOLUTION = 0.1
-"""Largest σ, as a share of the larger of the two means, with which agreement says anything."""
+"""Largest σ, as a fraction of the larger of the two means, at which agreement is meaningful."""
 
 NEGLIGIBLE = 1e-3
-"""A gradient is called zero if moving the parameter by its own size changes the objective by less than this share."""
+"""A gradient counts as zero if moving the parameter by its own size changes the objective by less than this fraction.
+"""
 
 SUMMATION = 1e-4
-"""Relative error granted to a float32 gradient: sums of 10⁶ atomic additions round by about 10³ · 2⁻²⁴ = 6e-5."""
+"""Relative error allowed for a float32 gradient: sums of 10⁶ atomic additions round by about 10³ · 2⁻²⁴ = 6e-5."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What the samples say. All quantities are derivatives of the objective along the direction, but z and reason."""
+    """The result of a comparison.
+
+    All numbers except z and resolution are derivatives of the objective along the direction.
+    """
 
     gradient: float
     gradient_se: float
     reference: float
     reference_se: float
     step_error: float
-    """Bound on the systematic error of the reference: truncation that noise does not explain, and rounding."""
+    """Bound on the systematic error of the reference: truncation beyond noise, and rounding."""
     z: float
     resolution: float
-    """σ / max(|gradient|, |reference|); infinite where both are zero."""
+    """σ / max(|gradient|, |reference|); infinite if both are zero."""
     verdict: Verdict
     reason: str
 
@@ -56,16 +60,17 @@ def judge(
 ) -> Judgement:
     """Compare n gradient samples with n finite differences of step h and n of step h/2 (same seeds for these two).
 
-    ``rounding`` bounds the error that floating-point arithmetic leaves in the reference; ``negligible`` is the size
-    below which a derivative counts as zero. Shapes (n,), n >= 2.
+    ``rounding`` bounds the error of floating-point arithmetic in the reference; ``negligible`` is the size below which
+    a derivative counts as zero. Shapes (n,), n >= 2.
 
     Rule: |z| >= 4 or a gradient that is not finite *fails*. Otherwise, if σ is at most a tenth of the larger mean, it
-    *passes*; if not, it passes as *zero* where both means are within 4 σ of zero and 4 σ is negligible; if not, nothing
-    was resolved and it is *inconclusive*.
+    *passes*. If not, it passes as *zero* if both means are within 4 σ of zero and 4 σ is negligible. Otherwise nothing
+    is resolved and it is *inconclusive*.
     """
-    with np.errstate(invalid="ignore"):  # infinite samples are looked for below
+    with np.errstate(invalid="ignore"):  # infinite samples are handled below
         reference = (4 * half_step - full_step) / 3
-        # D(h/2) is off by a third of what halving changed; that it bounds the better combination keeps us safe.
+        # The error of D(h/2) is a third of the change caused by halving; using it for the better combination is
+        # conservative.
         change, change_se = mean_and_error((half_step - full_step) / 3)
         g, g_se, r, r_se = map(float, (*mean_and_error(gradient), *mean_and_error(reference)))
     truncation = math.sqrt(max(0.0, change**2 - change_se**2))
@@ -87,7 +92,7 @@ def judge(
     elif resolution <= RESOLUTION:
         verdict, reason = "pass", f"agrees; an error above {100 * Z_LIMIT * resolution:.2g} % would have shown"
     elif scale <= Z_LIMIT * σ <= negligible or scale == σ == 0:
-        verdict, reason = "zero", f"both are zero to within {Z_LIMIT * σ:.1g}, which is nothing against the image"
+        verdict, reason = "zero", f"both are zero to within {Z_LIMIT * σ:.1g}, which is negligible in the image"
     else:
         verdict, reason = "inconclusive", _unresolved(resolution, step_error, σ)
     return replace(known, z=z, resolution=resolution, verdict=verdict, reason=reason)
@@ -98,7 +103,7 @@ def _unresolved(resolution: float, step_error: float, σ: float) -> str:
         return "the finite differences depend on the step; change --step"
     if not math.isfinite(resolution):
         return "nothing was resolved; use more --spp or --seeds"
-    # Twice what the noise asks for: both the noise and the size of the gradient are themselves uncertain.
+    # Twice the required number, because the noise and the size of the gradient are themselves uncertain.
     factor = 2 * (resolution / RESOLUTION) ** 2
     if factor > 1000:
         return "the noise hides everything; use another direction or objective, or very many more samples"
