@@ -1,1 +1,1 @@
-"""Ways to differentiate a path: primal, forward, recorded paths with a reverse sweep, path replay."""
+"""Drivers, which differentiate light paths: primal, forward, recorded path with reverse sweep, and path replay."""

@@ -1,4 +1,4 @@
-"""Reverse and forward differentiation of a single step: the only place where automatic differentiation is called."""
+"""Reverse and forward differentiation of a single step: the only module that calls automatic differentiation."""
 
 from __future__ import annotations
 

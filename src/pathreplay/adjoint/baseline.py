@@ -1,9 +1,10 @@
-"""The learned baseline of volume gradients: a guess of the radiance that arrives at a point of a medium from beyond.
+"""The learned baseline of volume gradients: an estimate of the radiance that arrives at a point of a medium.
 
-Two averages over cells of position and direction: X of what real collisions scatter, and Y of what comes through where
-a ray goes on. With p the probability of a real collision there, b = (1 - p) X + p Y. Only earlier passes are asked, so
-that b is independent of the pass that it serves and its score has mean zero, whatever b is, since real and (if the walk
-branches) null collisions are asked everywhere: a bad guess is noise, not bias. Nothing here is differentiated.
+It consists of two averages over cells of position and direction: X of the radiance scattered at real collisions, and Y
+of the radiance transmitted where rays continue. With p the probability of a real collision, b = (1 - p) X + p Y. Only
+earlier passes contribute, so that b is independent of the current pass and its score has mean zero for any b. This
+requires that real collisions and, if they are kept, null collisions evaluate b everywhere. A poor estimate increases
+noise and causes no bias. Nothing here is differentiated.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a driver is: a way to differentiate the light paths of a start."""
+"""The driver interface: a driver differentiates the light paths that begin at a start."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""The emission-only driver: where only what lights emit has gradients, one walk is enough, and nothing is recorded.
+"""The emission-only driver: if only emitted radiance has gradients, a single pass without a record suffices.
 
-L = Σ β_i e_i is linear in what lights emit, and β knows nothing of it. So δL β_i de_i is back-propagated on the way.
+L = Σ β_i e_i is linear in emitted radiance, and β does not depend on it. δL β_i de_i is therefore back-propagated
+during sampling.
 """
 
 from __future__ import annotations

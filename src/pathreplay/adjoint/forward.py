@@ -1,4 +1,4 @@
-"""The forward driver: carry tangents along the path, δL = Σ (δβ_i e_i + β_i δe_i), in a single pass."""
+"""The forward driver: propagate tangents along the path, δL = Σ (δβ_i e_i + β_i δe_i), in a single pass."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The branch: one more path from a null collision, for derivatives where collisions are never real.
+"""Null branching: an extra path from a null collision, for derivatives where collisions are never real.
 
 The derivative of a collision is dσ_s L_s - dσ_t b, with L_s the radiance that it would scatter. Where σ_s is zero no
-path ever scatters, so that nobody knows L_s. One null collision of each path is kept, and an extra path from there
-estimates it; `branch_weight` shares the work with real collisions.
+path ever scatters, so that L_s has no estimate. One null collision per path is therefore kept, and an extra path from
+there estimates L_s; `branch_weight` distributes the derivative between real and null collisions.
 """
 
 from __future__ import annotations

@@ -1,16 +1,17 @@
-"""The pixel sweep: an image and the gradient of a quadratic loss, from one set of paths that are walked once.
+"""The pixel sweep: an image and the gradient of a quadratic loss from the same set of paths, each sampled once.
 
-What a loss wants of a path is known only when its pixel is. So a lane walks all N paths of a pixel and records them
-one behind the other, as `sweep` does for one path; then it goes back through all of them. With I the mean of their
-radiances L_s, a loss with derivative f'(I) must not judge a path by itself, or the gradient would be biased by the
-covariance of L_s and its derivative; nor by paths that know of it, as those do that fill the pixel evenly with it. So
-paths come in sets S whose random numbers know nothing of each other, and each is judged by those of the other sets:
+The adjoint of a path is known only after its pixel is complete. Each lane therefore samples all N paths of a pixel,
+records them one after the other as `sweep` does for one path, and then sweeps back through all of them. Let I be the
+mean of the radiances L_s. For a loss with derivative f'(I), the adjoint of a path must not depend on its own radiance:
+the covariance of L_s and its derivative would bias the gradient. Nor must it depend on correlated paths, as stratified
+samples of one pixel are. Paths are therefore drawn in mutually independent sets S, and the adjoint of each path uses
+the other sets only:
 
     δL_s = f'(I_{-S}) / N,    I_{-S} = (N I - Σ_S L) / (N - |S|),    f'(I) = offset + slope · I.
 
-The gradient's mean is that with an image of other paths. Its variance differs by the covariance of f'(I) dL_s and the
-change of f' with L_s: to the better where the loss asks for more light, to the worse where it asks for less; and, of
-second order in 1/N, by what the noise of the image and that of the derivative make together.
+The expected gradient is that with an independent image. The variance differs by the covariance of f'(I) dL_s and the
+change of f' with L_s. It is lower where the loss demands more light and higher where it demands less. It also differs,
+to second order in 1/N, by the product of the noise of the image and that of the derivative.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The primal driver: walk paths and add up radiance, L = Σ β_i e_i."""
+"""The primal driver: sample paths and accumulate radiance, L = Σ β_i e_i."""
 
 from __future__ import annotations
 

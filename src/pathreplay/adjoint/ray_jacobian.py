@@ -1,10 +1,10 @@
 """Rays in four local coordinates, and the 4x4 Jacobian by which a step maps one ray to the next.
 
-A ray has four degrees of freedom: its origin in the plane perpendicular to it, and its direction. Sliding the origin
-along the ray changes neither what is hit nor what follows, so in the six coordinates (o, d) the Jacobian is always
-singular. Two facts about an arrival go beyond the ray and matter at the next vertex alone, through the MIS weight of
-its emission: the density of the ray and the distance it came. They are differentiated there and then
-(`emission_slope`), so that they need no place in the matrix.
+A ray has four degrees of freedom: its origin in the plane perpendicular to it, and its direction. Moving the origin
+along the ray changes neither the hit point nor the rest of the path, so the Jacobian in the six coordinates (o, d) is
+always singular. Two quantities of an arrival are not functions of the ray: its density and the distance from the
+previous vertex. They affect only the next vertex, through the MIS weight of its emission, and are differentiated there
+(`emission_slope`). They therefore need no place in the matrix.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""One vertex of a path as the sweep drivers remember it: plain numbers, for thread-local memory.
+"""The record of one path vertex in the sweep drivers: plain numbers for thread-local memory.
 
-What is remembered stands in one table, from which the type of a record, its writing and its reading follow.
+One table lists the recorded fields; the record type and the functions that write and read it are derived from the
+table.
 """
 
 from __future__ import annotations

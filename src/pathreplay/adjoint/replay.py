@@ -1,8 +1,8 @@
-"""The replay driver: walk the path again with the same random numbers and peel its radiance, vertex by vertex.
+"""The replay driver: sample the path again with the same random numbers and peel its radiance, vertex by vertex.
 
-This is path replay backpropagation (Vicini, Speierer, Jakob 2021): the first pass keeps one number, L_0; the second
-recovers what lies beyond each vertex from what has been met so far. Memory does not depend on the depth at all.
-Where the path moves with the parameters, `replay_attached` peels the adjoint of the ray as well.
+This is path replay backpropagation (Vicini, Speierer, Jakob 2021). The first pass stores one number, L_0. The second
+pass recovers the radiance beyond each vertex by subtracting the contributions of the vertices before. Memory does not
+depend on depth. Where the path moves with the parameters, `replay_attached` peels the adjoint of the ray as well.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""Attached path replay: recover the adjoint of the ray, too, by inverting one 4x4 Jacobian per vertex.
+"""Attached path replay: also recover the adjoint of the ray, by inverting one 4x4 Jacobian per vertex.
 
-The first pass keeps L_0 and q_0 = δL·∂L_0/∂r_0. The second walks the path again and peels both,
+The first pass stores L_0 and q_0 = δL·∂L_0/∂r_0. The second samples the path again and peels both,
 
     β_{i+1} L_{i+1} = β_i L_i - β_i e_i,      (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i,      A_i = ∂r_{i+1}/∂r_i,
 
-where p_i = δL·∂(β_i e_i + β_i w_i L_{i+1})/∂r_i at fixed L_{i+1}. ε_i has mean zero and the first pass carries the
-same A_i + ε_i X_i along: the expectation of q_0 is what it would be without. This is the attached estimator of Vicini,
-Speierer and Jakob (2021). It is here to be compared with: the sweep driver needs no inverse.
+where p_i = δL·∂(β_i e_i + β_i w_i L_{i+1})/∂r_i at fixed L_{i+1}. The noise ε_i has mean zero, and the first pass uses
+the same A_i + ε_i X_i, so that the expectation of q_0 is unchanged. This is the attached estimator of Vicini, Speierer
+and Jakob (2021). It serves as a baseline for comparison: the sweep driver needs no inverse.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The sweep driver: record a path vertex by vertex, then back-propagate from its last vertex to the first.
 
-The record lives in thread-local memory: its size depends on ``max_depth`` and on the number of running threads, not
-on the number of paths. On the way back L_i = e_i + w_i L_{i+1} is rebuilt, so nothing is divided or subtracted.
+The record is in thread-local memory: its size depends on ``max_depth`` and on the number of running threads, not on the
+number of paths. On the way back L_i = e_i + w_i L_{i+1} is rebuilt, so nothing is divided or subtracted.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The two walks of the sweep drivers: one that records a path, and one from its last vertex back to the first."""
+"""The two passes of the sweep drivers: one that records a path, and one from its last vertex back to the first."""
 
 from __future__ import annotations
 

@@ -207,8 +207,8 @@ def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
             return channels > 1 and not mi.is_monochromatic, all_bounds(voxel_bounds(lattice, values[0]))
     if needs_grid:
         raise PathreplayError(
-            f"gridmedium: sigma_t ({volume.class_name()}) has no accessible voxels; give a gridvolume, or leave supergrid "
-            "at 'auto'"
+            f"gridmedium: sigma_t ({volume.class_name()}) has no accessible voxels; give a gridvolume, or leave "
+            "supergrid at 'auto'"
         )
     grey = all(dr.is_diff_v(value) and not dr.is_vector_v(value) and dr.width(value) == 1 for value in values)
     lowest, highest = 0.0, float(volume.max())
