@@ -1,4 +1,4 @@
-"""The boundary term: what edges do to an image when they move, as far as one asks for it."""
+"""The boundary term: derivative of an image by the motion of edges."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
 
 @dataclass(frozen=True)
 class Boundary:
-    """A term: edges that the camera sees, directly or by mirrors and glass, and those that surfaces and particles see.
+    """The boundary term of edges that the camera sees (also by mirrors and glass), and that surfaces and particles see.
 
     Not differentiated: hard shadows beyond the first vertex that scatters, with media; edges of textures and of masks;
     alpha.
@@ -87,14 +87,14 @@ class Boundary:
 
     @staticmethod
     def informed(view: Pass, trace: TraceConfig) -> TraceConfig:
-        """The walk, knowing which shapes may move. With media all may: paths pass boundaries that move unseen."""
+        """Add to ``trace`` which shapes may move. With media all may, because paths cross null boundaries that move."""
         if trace.media is not None or trace.traits.moving is not None:
             return trace
         return replace(trace, traits=replace(trace.traits, moving=moving_shapes(trace.scene, _still_cameras(view))))
 
     @staticmethod
     def obstacle(view: Pass) -> str:
-        """Why edges cannot be differentiated, with the way out; "" where they can."""
+        """Why boundary terms cannot be computed, with the remedy; "" if they can."""
         if view.sensor.class_name() == BATCH:
             return (
                 f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
@@ -108,7 +108,7 @@ class Boundary:
         return ""
 
     def _searches(self, view: Pass, trace: TraceConfig, places: FilmPlaces) -> Iterator[Edges]:
-        """The edges of each search."""
+        """Yield the edges that each search finds."""
         if why := self.obstacle(view):
             raise PathreplayError(f"{why}, or use boundary = 'none'")
         trace = self.informed(view, trace)
@@ -123,7 +123,7 @@ class Boundary:
 
 
 def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
-    """How many segments look for edges: ``spp`` per pixel in the whole pass, or as many as samples (0)."""
+    """Number of boundary segments of a pass: ``spp`` per pixel (0: as many as samples)."""
     pixels = int(places.size.x) * int(places.size.y)
     n = pixels * (math.ceil(spp * view.share) if spp else view.spp)
     if n > MOST_SAMPLES:
@@ -135,7 +135,7 @@ def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
 
 
 def _still_cameras(view: Pass) -> list[mi.Sensor]:
-    """Those whose gradients do not reach the rays of a pass, but for what the flow of its film knows."""
+    """Cameras whose motion the film's flow contains, or which have no gradients: their rays stay."""
     return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
 
 

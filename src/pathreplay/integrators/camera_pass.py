@@ -1,4 +1,4 @@
-"""A pass: scene, sensor, seed and samples per pixel. It gives the camera rays, and tells itself from other passes."""
+"""A pass: scene, sensor, seed and samples per pixel. Generates camera rays; its key identifies the pass."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class Rays:
 
 @dataclass(frozen=True)
 class _ForCamera:
-    """Numbers, as Mitsuba's integrators want them to draw camera rays."""
+    """Adapter of our sampler to what Mitsuba's `sample_rays` expects."""
 
     numbers: OwenSobolSampler
     count: int
 
     def sample_count(self) -> int:
-        """Paths of a pixel."""
+        """Number of paths per pixel."""
         return self.count
 
     def next_1d(self) -> mi.Float:
@@ -56,12 +56,12 @@ class _ForCamera:
 
 @dataclass(frozen=True)
 class _Seen:
-    """The sensor of a pass, as Mitsuba's integrators want it to draw camera rays."""
+    """Adapter of the sensor of a pass to what Mitsuba's `sample_rays` expects."""
 
     view: Pass
 
     def __getattr__(self, name: str) -> object:
-        """What a sensor has."""
+        """Forward to the sensor."""
         return getattr(self.view.sensor, name)
 
     def sample_ray_differential(
@@ -72,10 +72,10 @@ class _Seen:
 
 @dataclass(frozen=True)
 class Pass:
-    """Everything that decides which paths are walked, but for the integrator's options. Gives the same rays each time.
+    """What determines the paths, besides the integrator's options. Generates the same rays each time.
 
-    ``spp`` of 0 are the samples per pixel of the sensor's sampler. If that is an `independent` one, ``even`` numbers
-    can take its place; other samplers are taken as they are.
+    ``spp`` = 0 means the samples per pixel of the sensor's sampler. With ``even``, Owen-scrambled Sobol samples replace
+    an `independent` sampler; other samplers are kept.
     """
 
     scene: mi.Scene
@@ -88,19 +88,19 @@ class Pass:
 
     @staticmethod
     def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int, even: bool = False) -> Pass:
-        """A pass by the arguments of Mitsuba's integrators: the sensor may be an index."""
+        """Make a pass from the arguments of Mitsuba's integrators; the sensor may be an index."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         even = even and sensor.sampler().class_name() == "IndependentSampler"
         return Pass(scene, sensor, seed, spp or sensor.sampler().sample_count(), even=even)
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the picture, in pixels."""
+        """Width and height of the image in pixels."""
         width, height = self.sensor.film().crop_size()
         return int(width), int(height)
 
     def rays(self) -> Rays:
-        """The camera rays, as Mitsuba's integrators draw them; makes the film ready for their samples."""
+        """Sample camera rays as Mitsuba's integrators do, and prepare the film."""
         mitsuba = mitsuba_integrator()
         sampler, spp = mitsuba.prepare(None, self.sensor, self.seed, self.spp, [])
         if self.even:
@@ -116,7 +116,7 @@ class Pass:
     def camera_ray(
         self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """The sensor's ray and its weight (see Mitsuba's Sensor), attached to the camera as the pass has it."""
+        """The sensor's ray and its weight (see Mitsuba's Sensor), attached to the camera or to the film's flow."""
         if self.flow is not None:
             return self.flow.ray(Sample(time, wavelength, place, aperture))
         # Not `sample_ray`, which irradiance meters do not have.
@@ -125,7 +125,10 @@ class Pass:
     def numbers(
         self, pixel: mi.UInt32, width: int, path: mi.UInt32, paths: int, of: int | mi.UInt32 = 0
     ) -> OwenSobolSampler:
-        """Even numbers of a path in a pixel (row by row, of that width) that has so many; ``of`` keeps sets apart."""
+        """Sobol sampler of a path of a pixel with so many ``paths``; ``of`` selects an independent set.
+
+        ``pixel`` is a row-major index in a film of ``width``.
+        """
         bits = (paths - 1).bit_length()
         place = in_order(pixel % width, pixel // width)
         # What does not fit into 32 bits tells sets apart, too.
@@ -134,14 +137,14 @@ class Pass:
 
     @property
     def opaque_seed(self) -> mi.UInt32:
-        """The seed, as no constant of a kernel, which would be another one for each seed."""
+        """The seed as a variable: as a literal it would make another kernel for each seed."""
         seed = mi.UInt32(self.seed)
         if seed.state == dr.VarState.Literal:
             dr.make_opaque(seed)
         return seed
 
     def of_pixels(self, pixel: mi.UInt32) -> PixelSamples:
-        """Random numbers for a lane per pixel (row by row), which walks all paths of it."""
+        """Samples for one lane per pixel (row-major), which traces all paths of its pixel."""
         if self.even:
             width, _ = self.size
             return EvenSets(partial(self.numbers, pixel, width))
@@ -151,9 +154,9 @@ class Pass:
 
     @cached_property
     def keys(self) -> tuple[tuple[int, int, int], ...]:
-        """What tells the passes over one scene apart. Reads the seed, which takes time if it is an array.
+        """Identify the pass among those over one scene. Reads the seed, which synchronises if it is an array.
 
-        Nothing in a frozen function, which cannot read it.
+        Empty in a frozen function, which cannot read it.
         """
         if is_recording():
             return ()

@@ -1,4 +1,4 @@
-"""What is to be said of a pass: paths that lost a part of their gradient, and what would make a gradient wrong."""
+"""Messages about a pass: paths that lost a part of their gradient, and causes of wrong gradients."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ COST_OF_EDGES = (
 
 
 def lost_note(lost: int, paths: int) -> str:
-    """One line that tells of paths that lost a part of their gradient."""
+    """Message about paths that lost a part of their gradient."""
     why = "a ray adjoint was not finite, or media have more boundaries on the way than the record holds"
     return f"{lost / paths:.2%} of the paths lost a part of their gradient: {why}"
 
 
 def used_before_note(seed: int) -> str:
-    """One line that tells of a pass that was learned from already."""
+    """Message about a pass that has contributed to the control variate before."""
     return (
         f"seed {seed} was used before: a pass cannot serve as baseline for itself, so that this one goes without; "
         "give every pass a seed of its own"
@@ -33,9 +33,9 @@ def used_before_note(seed: int) -> str:
 
 
 def doubts(trace: TraceConfig) -> Iterator[str]:
-    """One line for each thing that makes the gradient of this scene wrong or incomplete, whatever moves.
+    """Messages about what makes the gradient of this scene wrong or incomplete, whatever moves.
 
-    Raises PathreplayError where it would be useless.
+    Raises PathreplayError if the gradient would be useless.
     """
     traits = trace.traits
     if traits.instances_move and trace.attach != "none":

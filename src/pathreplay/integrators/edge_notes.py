@@ -1,4 +1,4 @@
-"""What is said where a gradient is incomplete: the motion of edges is not differentiated, so it is missing there."""
+"""Messages about gradients without boundary terms."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _PLACES = {"vertex_positions", "to_world", "control_points"}
 
 
 def moves_edges(params: mi.SceneParameters, key: str) -> bool:
-    """Whether silhouettes or shadows move with a parameter of ``mi.traverse(scene)``.
+    """Whether a parameter of ``mi.traverse(scene)`` moves silhouettes or shadows.
 
-    They do with the shape of things and their place, with cameras, and with lights that cast hard shadows.
+    These are shapes and their transforms, cameras, and lights that cast hard shadows.
     """
     node, name = params.properties[key][2], key.rsplit(".", 1)[-1]
     if isinstance(node, mi.Shape):

@@ -184,7 +184,7 @@ class PathReplayIntegrator(PathIntegrator):
         return obstacle(view.sensor, self.max_depth, view.spp, some) or ("" if some else self._loss_of_sweep(view))
 
     def _loss_of_sweep(self, view: Pass) -> str:
-        """Why whole pictures are better rendered than swept: the film follows what moves, which no sweep of it does."""
+        """Why whole images should not use the pixel sweep: a film flow is needed, which the sweep does not support."""
         if self.boundary in ("none", "primary"):
             return ""
         with self._passing():

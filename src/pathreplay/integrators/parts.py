@@ -1,4 +1,4 @@
-"""A pass of many samples in parts: passes with seeds of their own, of which it is the mean, weighted by their samples.
+"""Split a pass of many samples into passes with their own seeds; the result is their mean, weighted by samples.
 
 Dr.Jit counts the samples of a kernel in 32 bits. Long before, single precision ends what sums can hold: one to which
 n equal numbers are added, one by one, is off by up to n 2^-25 of itself, and stands still at n = 2^24. Packets of 16
@@ -37,7 +37,7 @@ MOST_IN_ALL = 2**36
 
 
 def parts(view: Pass) -> list[Pass]:
-    """The pass, or those that it is the mean of, weighted by their ``share``; the first has its seed.
+    """Yield the pass, or the passes that it is split into with their ``share``; the first has its seed.
 
     Raises PathreplayError where one sample for each pixel is beyond what Dr.Jit can count, or all of them would take
     hours.
@@ -79,7 +79,7 @@ class Sums:
         self.take()
 
     def take(self) -> None:
-        """Add up what there is since the last time."""
+        """Add the gradients since the last call."""
         for n, value in enumerate(self._values):
             found = dr.grad(value)
             self._sums[n] = found if self._sums[n] is None else self._sums[n] + found
@@ -87,7 +87,7 @@ class Sums:
         dr.eval(self._sums)
 
     def give(self) -> None:
-        """Give the parameters what was added up."""
+        """Write the sums to the parameters."""
         for value, total in zip(self._values, self._sums, strict=True):
             dr.set_grad(value, total)
 
@@ -108,10 +108,10 @@ def _arrays(value: Any) -> list[Any]:
 
 
 def split(sampler: mi.Sampler, spp: int, most: int) -> list[int]:
-    """Samples per pixel of each part, about ``most``; together they are ``spp``, or more where the sampler rounds up.
+    """Samples per pixel of each part, about ``most``. They add up to ``spp``, or more if the sampler rounds up.
 
-    Samplers other than `independent` place the samples of a pixel by each other: they get parts of a power of four,
-    which all of them take.
+    Samplers other than `independent` stratify the samples of a pixel. Their parts are powers of four, which all of them
+    accept.
     """
     if spp <= most:
         return [spp]
@@ -123,7 +123,7 @@ def split(sampler: mi.Sampler, spp: int, most: int) -> list[int]:
 
 
 def rounded(sampler: mi.Sampler, count: int) -> int:
-    """The samples per pixel that a sampler takes where it is asked for so many."""
+    """Samples per pixel to which a sampler rounds a requested number."""
     copy = sampler.clone()  # integrators differ in whether they tell the sensor's own
     copy.set_sample_count(count)
     return int(copy.sample_count())

@@ -1,4 +1,4 @@
-"""What our integrators share: their common properties, Mitsuba's interface, and care around each pass."""
+"""Base of our integrators: common properties, Mitsuba's interface, and the rules of each pass."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ UNBOUNDED = 0xFFFFFFFF
 
 
 def _sum(total: Any, image: Any, share: float) -> Any:
-    """Images added up by the shares of their passes, each computed before the next begins; one alone as it is."""
+    """Weighted sum of the images of split passes, each evaluated before the next begins."""
     if share == 1:
         return image
     total = image * share if total is None else total + image * share
@@ -96,7 +96,7 @@ class PathIntegrator:
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """What the gradient is a sum of."""
+        """Terms that add up to the gradient."""
         return (self.interior,)
 
     def render(
@@ -205,7 +205,7 @@ class PathIntegrator:
         return view, self._walk(view.scene, view.sensor, state), self.terms
 
     def _learned(self, view: Pass, trace: TraceConfig, state: PassState) -> Baseline | None:
-        """What earlier passes found out that this one may use."""
+        """Control variate that this pass may use."""
         return None
 
     def _told(self, view: Pass, trace: TraceConfig, found: TermResult) -> None:
@@ -226,12 +226,12 @@ class PathIntegrator:
 
     @contextmanager
     def _passing(self) -> Iterator[None]:
-        """A pass is under way, in which nothing is differentiated but what asks for it: see `careful`, too."""
+        """Context of a pass, with gradients suspended by default: see `careful`."""
         with careful(), dr.suspend_grad():
             yield
 
     def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
-        """How the scene is walked through; the sensor may be in a medium. Without a ``state``, as the scene is now."""
+        """Options and facts of a trace; ``sensor`` may be inside a medium. Default ``state``: the scene's."""
         facts, state = facts_of(scene), PathIntegrator.begin(self, scene) if state is None else state
         return TraceConfig(
             scene=scene,

@@ -1,4 +1,4 @@
-"""What decides the image that an integrator estimates: how long paths are, and whether emitters are seen."""
+"""Limits that determine the image of an integrator: path length, and whether emitters are visible."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathreplay.integrators.path_integrator import UNBOUNDED
 
 @dataclass(frozen=True)
 class Limits:
-    """What decides the image that an integrator estimates. ``max_depth`` -1: no bound."""
+    """Limits of an integrator. ``max_depth`` -1 is unbounded."""
 
     max_depth: int
     rr_depth: int

@@ -1,4 +1,4 @@
-"""The properties of our plugins, read so that what cannot be is refused in one line with the way out."""
+"""Validation of plugin properties: an error of one line names the property, its value and the remedy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LARGEST = 2**31 - 1
 
 
 def choice(props: mi.Properties, plugin: str, name: str, default: Any, choices: tuple[Any, ...]) -> Any:
-    """A property of ``plugin`` that has to be one of the choices. Raises PathreplayError for another."""
+    """Read a property that must be one of ``choices``. Raises PathreplayError otherwise."""
     value = props.get(name, default)
     # By type, too: 1 == True.
     if not any(type(value) is type(allowed) and value == allowed for allowed in choices):
@@ -31,9 +31,9 @@ def whole_number(
     unbounded: bool = False,
     kind: str = "depth",
 ) -> int:
-    """A whole number from ``lowest`` to `LARGEST`, or -1 where it may be unbounded; ``kind`` says of what.
+    """Read an integer from ``lowest`` to `LARGEST`, or -1 if ``unbounded``; ``kind`` names it in errors.
 
-    Raises PathreplayError else.
+    Raises PathreplayError otherwise.
     """
     value = props.get(name, default)
     if type(value) is int and (lowest <= value <= LARGEST or (unbounded and value == -1)):
@@ -45,7 +45,7 @@ def whole_number(
 
 
 def deviation(props: mi.Properties, plugin: str, name: str, default: float) -> float:
-    """A finite standard deviation, at least 0. Raises PathreplayError for anything else."""
+    """Read a finite standard deviation of at least 0. Raises PathreplayError otherwise."""
     value = props.get(name, default)
     if type(value) not in (int, float) or not 0 <= value < float("inf"):
         raise PathreplayError(f"{plugin}: {name} = {shown(value)}: use a finite standard deviation >= 0 (0 = off)")
@@ -53,7 +53,7 @@ def deviation(props: mi.Properties, plugin: str, name: str, default: float) -> f
 
 
 def flag(props: mi.Properties, plugin: str, name: str, default: bool) -> bool:
-    """True or False. Raises PathreplayError for anything else."""
+    """Read a boolean. Raises PathreplayError otherwise."""
     value = props.get(name, default)
     if type(value) is not bool:
         raise PathreplayError(f"{plugin}: {name} = {shown(value)}: use true or false")

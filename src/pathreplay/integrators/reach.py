@@ -14,10 +14,10 @@ from pathreplay.transport.facts.nodes import nodes_of
 def reached_sensors(
     scene: mi.Scene, sensors: Sequence[mi.Sensor], params: mi.SceneParameters, keys: Iterable[str]
 ) -> list[bool]:
-    """Of each sensor, whether its picture can depend on one of the ``keys`` of ``params``.
+    """For each sensor, whether its image can depend on one of the ``keys`` of ``params``.
 
-    A parameter of a camera reaches the pictures of that camera alone. Any other parameter is taken to reach all
-    pictures, including one of a medium that a camera shares with a shape.
+    A parameter of a camera reaches the images of that camera alone. Any other parameter is assumed to reach all images,
+    including that of a medium which a camera shares with a shape.
     """
     owners = {params.properties[key][2] for key in keys}
     below = {sensor: nodes_of(sensor) | {sensor} for sensor in {*scene.sensors(), *sensors}}
@@ -34,9 +34,9 @@ def attached_keys(params: mi.SceneParameters) -> list[str]:
 
 
 def unreached_note(scene: mi.Scene, sensor: mi.Sensor) -> str:
-    """What to tell where no parameter with gradients reaches the paths of a sensor; "" where this is as it should be.
+    """Message if no parameter with gradients reaches the paths of a sensor; "" if that is right.
 
-    That is so where all parameters with gradients belong to other cameras: their gradient in this picture is zero.
+    It is right if all parameters with gradients belong to other cameras, whose gradient in this image is zero.
     """
     params = mi.traverse(scene)
     keys = attached_keys(params)

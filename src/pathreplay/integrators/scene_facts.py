@@ -1,4 +1,4 @@
-"""Facts about a scene: what it consists of is found once, and what of it has gradients is looked up in every pass."""
+"""Facts about a scene: its objects are collected once, and which of them have gradients is determined in every pass."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from pathreplay.transport.volume.media import Media, scene_media, wants_branch
 
 
 class SceneFacts:
-    """Of one scene: they hold objects of it, so that none can take their place in memory unseen (see `facts_of`)."""
+    """Facts about one scene. They keep its objects alive, so no other object can reuse their addresses (`facts_of`)."""
 
     def __init__(self, scene: mi.Scene) -> None:
         nodes = nodes_of(scene)
@@ -45,7 +45,7 @@ class SceneFacts:
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
 
     def are_about(self, scene: mi.Scene) -> bool:
-        """Whether the scene is the one that they were found of, with the same BSDFs on its shapes."""
+        """Whether they describe this scene with its current BSDFs."""
         parts = _parts(scene)
         return len(parts) == len(self._parts) and all(a is b for a, b in zip(parts, self._parts, strict=True))
 
@@ -55,13 +55,13 @@ class SceneFacts:
 
     @property
     def has_seams(self) -> bool:
-        """Whether a texture jumps within itself. A recording cannot look: there one may, unless it is known."""
+        """Whether a texture has discontinuities. Assumed in a recording unless it is known."""
         if self._seams is None and not is_recording():
             self._seams = has_seams(self._textures)
         return self._seams is not False
 
     def media(self, sensor: mi.Sensor | None, branches: bool | None = None) -> Media | None:
-        """What the walk wants to know of media now; ``sensor`` (or None) may be in one. For the rest: see there."""
+        """Media as they are now; ``sensor`` (or None) may be inside one."""
         return scene_media(self._media, self._traits.veils, sensor, branches)
 
     def constants(self) -> tuple[object, ...]:
@@ -73,7 +73,7 @@ class SceneFacts:
         return wants_branch(self._media)
 
     def traits(self, tables: Tables | None = None) -> Traits:
-        """What the drivers want to know now, with these ``tables``, or with `tables`."""
+        """Traits as they are now, with these ``tables`` (default: `tables`)."""
         return replace(
             self._traits,
             tables=self.tables() if tables is None else tables,
@@ -84,7 +84,7 @@ class SceneFacts:
         )
 
     def tables(self) -> Tables:
-        """Those of the scene as it is now, made anew as far as it has changed."""
+        """Tables of the scene as it is now; only changed parts are rebuilt."""
         boxes, sizes = [shape.bbox() for shape in self._shapes], _sizes(self._shapes)
         if self._tables is None:
             self._tables = tables_of(self._traits.attachables, self._shapes, self._lights)
@@ -116,11 +116,11 @@ def _sizes(shapes: list[mi.Shape]) -> list[tuple[int, int]]:
 
 
 def _parts(scene: mi.Scene) -> list[mi.Object]:
-    """Objects that no two scenes share all of, and all that can be exchanged."""
+    """Objects that identify a scene, and all objects that can be replaced in it."""
     shapes = scene.shapes()
     return [*scene.sensors(), *scene.emitters(), *shapes, *(shape.bsdf() for shape in shapes)]
 
 
 def facts_of(scene: mi.Scene) -> SceneFacts:
-    """The facts about a scene, found once; anew where the scene has become another."""
+    """Return the facts about a scene, collected once, and again if the scene has changed."""
     return SCENES.about(scene, lambda facts: facts.are_about(scene), lambda: SceneFacts(scene))

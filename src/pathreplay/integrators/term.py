@@ -1,4 +1,4 @@
-"""What a gradient is a sum of: terms, which are functions of a pass, and what they give back."""
+"""Terms of a gradient: functions of a pass, and their results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathreplay.transport.vertex import TraceConfig
 
 @dataclass(frozen=True)
 class TermResult:
-    """What terms give back of their passes, beside the gradients of parameters: it can be added up."""
+    """Result of a term, besides the gradients of parameters. Results add up."""
 
     image: mi.TensorXf | None = None  # tangent of the image (forward mode), or the image itself (pixel sweep)
     seen: BaselineStats | None = None  # of media, for later passes
@@ -34,15 +34,15 @@ def _sum(a: Any, b: Any) -> Any:
 class Term(Protocol):
     """A part of the derivative of an image by the parameters: interior, edges, particles.
 
-    It says in its docstring what it does not differentiate. Both functions are called under `dr.suspend_grad`, once in
-    a pass; ``learned`` is what earlier passes found out, or None.
+    Its docstring says what it does not differentiate. Both functions are called once per pass under
+    `dr.suspend_grad`; ``learned`` is the control variate of earlier passes, or None.
     """
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Its part of the tangent of the image. The parameters carry their tangents already."""
+        """Return its part of the tangent of the image. The parameters carry their tangents already."""
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
-        """Back-propagate the adjoint of the image into the parameters. Everything has been launched on return."""
+        """Back-propagate the adjoint of the image into the parameters. All kernels have been launched on return."""
 
     def note(self, trace: TraceConfig) -> str:
-        """What is to be said of how it goes about it; "" if it is nothing."""
+        """Message about how the term is computed; "" if there is none."""

@@ -1,6 +1,6 @@
-"""The tentative collisions of a first walk once more, each differentiated by itself, for the listing driver.
+"""Differentiate each tentative collision of a traced path by itself, for the listing driver.
 
-They are found by the numbers that had drawn them, so that nothing has to be kept of them.
+The same random numbers reproduce the collisions, so none are stored.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathreplay.transport.volume.shadow import Stretch
 
 @dr.syntax
 def differentiate_flight(at: Arrival, flight: Flight, past: mi.Sampler, active: mi.Bool, weight: mi.Spectrum) -> None:
-    """Differentiate the collisions of a flight; ``past`` is the sampler as it was when the flight drew from it."""
+    """Differentiate the collisions of a flight; ``past`` is the sampler state before the flight."""
     medium, ray = at.medium, at.ray
     flying = active & (medium != None)  # noqa: E711 (an array of pointers)
     a, b = span(medium, ray, dr.select(at.hit.is_valid(), at.hit.t, dr.inf), flying)
@@ -38,7 +38,7 @@ def differentiate_flight(at: Arrival, flight: Flight, past: mi.Sampler, active: 
 def differentiate_shadow(
     trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, past: mi.Sampler, active: mi.Bool, weight: mi.Spectrum
 ) -> None:
-    """Differentiate the tentative collisions of a shadow ray that arrived. In homogeneous media there are none."""
+    """Differentiate the tentative collisions of an unoccluded shadow ray. Homogeneous media have none."""
     stretch = Stretch.begin(ray, medium, active)
     while dr.hint(stretch.active, exclude=[trace], label="pathreplay: listing, shadow"):
         hit, a, b, inside = stretch.part(trace)
@@ -58,7 +58,7 @@ def differentiate_shadow(
 def _differentiate(
     medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float, σ_bar: mi.Float, null: mi.Bool, real: mi.Bool, weight: mi.Spectrum
 ) -> None:
-    """A collision at ``t``; ``weight`` is the radiance that has passed it, times its adjoint."""
+    """Differentiate a collision at ``t``; ``weight`` is the transmitted radiance times its adjoint."""
     with dr.resume_grad():
         σ_s, _, σ_t = medium.get_scattering_coefficients(interaction(medium, ray, t), null | real)
         log = dr.select(null, -σ_t * dr.detach(reciprocal(σ_bar - σ_t)), 0)

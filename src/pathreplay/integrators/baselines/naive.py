@@ -1,7 +1,8 @@
-"""The tape driver: plain automatic differentiation of a wavefront of paths, to compare the other drivers with.
+"""The naive driver: automatic differentiation of a wavefront of paths, for comparison.
 
 Every vertex of every path is evaluated in memory and stays there until the graph of the whole loop has been
-back-propagated: memory grows with the number of paths times their length. This is what reverse mode does by itself.
+back-propagated: memory grows with the number of paths times their length. Reverse-mode AD by itself
+does this.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def tape_backward(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost
 
 
 def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
-    """Tangent of the radiance along the rays of a ``start``, ``(δL, valid, moves)``: see `forward`.
+    """Return the tangent of the radiance along camera rays, ``(δL, valid, moves)``: see `forward`.
 
     The parameters must carry their tangents already. Not differentiated: see `tape`.
     """
@@ -43,9 +44,9 @@ def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter)
 
 
 def _cut(state: tuple[Any, ...]) -> Any:
-    """The same values; on the way back, all that comes from behind them is evaluated before it goes on.
+    """Return the same values, and evaluate their adjoints before the reverse pass continues.
 
-    Without it the way back is a single kernel, whose code grows with the depth: a minute to compile at 64 vertices.
+    Otherwise the reverse pass is a single kernel whose code grows with depth: a minute to compile at 64 vertices.
     """
 
     class Cut(dr.CustomOp):  # type: ignore[misc]
@@ -69,8 +70,8 @@ def _cut(state: tuple[Any, ...]) -> Any:
 def tape(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, bool]:
     """Radiance along the rays of a ``start`` as an AD variable, ``(L, valid, moves)``: L = Σ β_i e_i.
 
-    Every step is taken detached, to make its choices, and once more attached. Not differentiated: visibility, Russian
-    roulette and, with ``attach='none'``, everything that moves. Adjoints that are not finite are not looked for. Call
+    Every step is sampled detached and then evaluated attached. Not differentiated: visibility, Russian
+    roulette and, with ``attach='none'``, everything that moves. Adjoints that are not finite are not detected. Call
     it under `dr.resume_grad`.
     """
     sampler = start.sampler

@@ -25,9 +25,9 @@ ATTACH = ("delta", "none")
 
 @dataclass(frozen=True)
 class OtherInterior:
-    """The interior term in another way.
+    """The interior term by another driver.
 
-    Media are differentiated by the score, without a baseline, and where they are empty not at all.
+    Media are differentiated by the score, without control variate; empty voxels have no derivative.
     """
 
     backwards: Driver
@@ -47,7 +47,7 @@ class OtherInterior:
 
 
 class NaiveIntegrator(PathIntegrator):
-    """Plain AD of a wavefront path tracer: for comparison only, since memory grows with the depth (see `tape`).
+    """AD of a wavefront path tracer, for comparison only: memory grows with depth (see `tape`).
 
     Properties: those of `PathIntegrator` and ``attach`` (``delta``, ``none``), which means what it does for
     `pathreplay`.
@@ -62,7 +62,7 @@ class NaiveIntegrator(PathIntegrator):
 
 
 class RadiativeIntegrator(PathIntegrator):
-    """Radiative backpropagation: for comparison only, since time grows with the square of the depth.
+    """Radiative backpropagation, for comparison only: time grows with the square of the depth.
 
     Properties: those of `PathIntegrator` and ``linear`` (False: unbiased; True: the biased variant in linear
     time), see `radiative`. Nothing that moves is differentiated, and there is no forward mode.
@@ -77,10 +77,10 @@ class RadiativeIntegrator(PathIntegrator):
 
 
 class ListingIntegrator(PathIntegrator):
-    """Delta tracking as first published: for comparison only, since it misses derivatives (see `listing`).
+    """Delta tracking as first published, for comparison only: it misses derivatives (see `listing`).
 
-    Properties: those of `PathIntegrator`. For scenes with media; what moves raises in reverse mode. Tangents are
-    those of the forward driver, without baseline and branch.
+    Properties: those of `PathIntegrator`. For scenes with media; motion raises in reverse mode. Forward mode
+    uses the forward driver, without control variate and branch.
     """
 
     name = "prb_volume_listing"

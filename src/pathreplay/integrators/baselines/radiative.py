@@ -1,4 +1,4 @@
-"""Radiative backpropagation: adjoint radiance walks from the camera, to compare the other drivers with.
+"""Radiative backpropagation: adjoint radiance is traced from the camera, for comparison.
 
 At every vertex δL β_i is multiplied with the derivative of e_i + w_i L_{i+1}, and the radiance L_{i+1} that comes back
 along the continuation is estimated by a fresh path of all the remaining depth (Nimier-David, Speierer, Ruiz, Jakob:
@@ -22,7 +22,7 @@ from pathreplay.transport.vertex import TraceConfig
 
 
 def no_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
-    """There is none. Raises PathreplayError."""
+    """Raise PathreplayError: there is no forward mode."""
     raise PathreplayError("radiative_backprop has no forward mode: use the integrator 'pathreplay'")
 
 

@@ -1,4 +1,4 @@
-"""Film flow: the motion of a camera as motion of places on its film, which needs no edges.
+"""Film flow: the motion of a camera as motion of positions on its film, which needs no boundary term.
 
 A camera that turns sees the same radiance at other places. Let s be a place on the film, c(s, π) its camera ray, and
 T(s, π) where a chosen flow takes the place, with T(s, π₀) = s and the velocity v = ∂T/∂π. An integral over the film D
@@ -61,15 +61,15 @@ class Sample:
 
 
 class FilmFlow(Protocol):
-    """A flow of the places of a film."""
+    """A velocity field of positions on the film."""
 
     @property
     def is_all(self) -> bool:
-        """Whether nothing but the places of the film depends on parameters with gradients."""
+        """Whether the flow contains the whole derivative."""
 
     @property
     def samples(self) -> int:
-        """Samples of a pass for which there is one group of paths that tell what the flow does."""
+        """Number of samples of the pass per group of paths of the flow."""
 
     def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         """The sensor's ray and its weight.
@@ -84,10 +84,10 @@ class FilmFlow(Protocol):
         """∂v_x/∂x + ∂v_y/∂y: zero, attached to the parameters."""
 
     def moves_at(self, place: mi.Point2f) -> mi.Bool:
-        """Whether there may be a velocity at a place."""
+        """Whether the velocity at a film position may be non-zero."""
 
     def leaves_rest_at(self, place: mi.Point2f) -> mi.Bool:
-        """Whether the ray through a place may move beyond the flow."""
+        """Whether the ray through a film position may move beyond the flow."""
 
     def carry_tangents(self) -> None:
         """Carry tangents of the parameters as far as terms share what the flow knows, once for all of them."""
@@ -154,7 +154,7 @@ class CameraFlow:
 
 
 def followed(δp: mi.Vector3f, slopes: Slopes, t: mi.Float) -> mi.Vector2f:
-    """How places move if points at a distance t on their rays move by δp: by least squares, from the rays' slopes."""
+    """Velocity of film positions whose points at distance t move by δp: least squares with the rays' derivatives."""
     x, y = (o_k + t * d_k for o_k, d_k in zip(*slopes, strict=True))
     xx, xy, yy = dr.dot(x, x), dr.dot(x, y), dr.dot(y, y)
     a, b = dr.dot(x, δp), dr.dot(y, δp)
@@ -162,25 +162,25 @@ def followed(δp: mi.Vector3f, slopes: Slopes, t: mi.Float) -> mi.Vector2f:
 
 
 def move_with_place(ray: mi.Ray3f, slopes: Slopes, v: mi.Vector2f) -> None:
-    """Add to a ray's motion what comes of its place moving by v."""
+    """Add to a ray's motion the effect of its film position moving by v."""
     o, d = slopes
     ray.o += o[0] * v.x + o[1] * v.y
     ray.d += d[0] * v.x + d[1] * v.y
 
 
 def glances_of(sensor: mi.Sensor, n: int) -> Sample:
-    """What decides on n x n rays that are spread evenly over a film, row by row."""
+    """Samples of n x n camera rays in the cells of a grid over the film, row by row."""
     i = dr.arange(mi.UInt32, n * n)
     return Sample(sensor.shutter_open(), mi.Float(0.5), glanced_at(i, n), mi.Point2f(0.5))
 
 
 def glanced_at(i: mi.UInt32, n: int) -> mi.Point2f:
-    """The place of a ray by its number: see `glances_of`."""
+    """Film position of a ray by its index: see `glances_of`."""
     return (mi.Point2f(i % n, i // n) + 0.5) / n
 
 
 def slopes_of(sensor: mi.Sensor, sample: Sample) -> Slopes:
-    """How a ray changes with its place. Detached."""
+    """Derivative of a ray by its film position. Detached."""
     o, d = [], []
     with dr.suspend_grad():
         for step in (mi.Vector2f(STEP, 0), mi.Vector2f(0, STEP)):
@@ -191,7 +191,7 @@ def slopes_of(sensor: mi.Sensor, sample: Sample) -> Slopes:
 
 
 def _is_carried(sensor: mi.Sensor) -> bool:
-    """Whether its pose has gradients, and leaves a rest: a pinhole that only turns leaves none."""
+    """Whether the camera translates: the flow of a pinhole that only turns contains all of its motion."""
     poses = with_gradients(sensor, "to_world")
     if sensor.class_name() != PINHOLE:
         return bool(poses)

@@ -1,4 +1,4 @@
-"""Places on the film of a pass: their camera rays, what an adjoint image wants of them, and how they make an image."""
+"""Film positions of a pass: their camera rays, their importance under an adjoint image, and splatting."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class FilmPlaces:
         return (self.corner + s - mi.ScalarPoint2f(film.crop_offset())) / mi.ScalarVector2f(film.crop_size())
 
     def undeveloped(self, grad_in: mi.TensorXf) -> mi.TensorXf:
-        """The adjoint of a film block's pixels, from that of the image: g_j / ∫ h_j, with the filter h_j of pixel j."""
+        """Adjoint of a film block's pixels from that of the image: g_j / ∫ h_j, with the filter h_j of pixel j."""
         with dr.resume_grad():
             pixels = mi.TensorXf(self._block().tensor())
             dr.enable_grad(pixels)
@@ -87,7 +87,7 @@ class FilmPlaces:
         return self.developed(self._put(s, dr.select(inside, L, 0), wavelengths))
 
     def importance_of_pixels(self, wanted: mi.TensorXf, pixel: mi.UInt32, wavelengths: mi.Spectrum) -> mi.Spectrum:
-        """g_j / ∫ h_j of pixels by their number (row by row), what is wanted of radiance in them: see `importance`."""
+        """Importance g_j / ∫ h_j of pixels by row-major index: see `importance`."""
         return _adjoint(lambda L: self.pixels(pixel, L, wavelengths), dr.width(pixel), wanted)
 
     def pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
