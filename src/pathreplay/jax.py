@@ -72,8 +72,8 @@ def _function(render: RenderFunction, sensor: int, spp: int) -> Any:
         return np.array(render.picture(_to_drjit(values), View(sensor, int(seed), spp)), np.float32)
 
     def gradient(seed: np.ndarray, weights: np.ndarray, *values: np.ndarray) -> tuple[np.ndarray, ...]:
-        found = render.gradient(_to_drjit(values), View(sensor, int(seed), spp), mi.TensorXf(np.array(weights)))
-        return tuple(np.array(each, np.float32) for each in found)
+        gradients = render.gradient(_to_drjit(values), View(sensor, int(seed), spp), mi.TensorXf(np.array(weights)))
+        return tuple(np.array(value, np.float32) for value in gradients)
 
     call = partial(jax.pure_callback, vmap_method="sequential")
 

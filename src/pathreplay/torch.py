@@ -67,8 +67,8 @@ class _Rendering(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         weights = mi.TensorXf(grad.contiguous())
-        found = ctx.render.gradient(_to_drjit(ctx.saved_tensors), ctx.view, weights)
-        return None, None, *(_to_torch(value, ctx.render.device) for value in found)
+        gradients = ctx.render.gradient(_to_drjit(ctx.saved_tensors), ctx.view, weights)
+        return None, None, *(_to_torch(value, ctx.render.device) for value in gradients)
 
 
 def _to_drjit(tensors: tuple[torch.Tensor, ...]) -> list[mi.TensorXf]:
@@ -77,5 +77,5 @@ def _to_drjit(tensors: tuple[torch.Tensor, ...]) -> list[mi.TensorXf]:
 
 def _to_torch(tensor: Any, device: torch.device) -> torch.Tensor:
     """A copy in memory that PyTorch owns, so that Dr.Jit cannot reuse it."""
-    made: torch.Tensor = tensor.torch()
-    return made.to(device).clone()
+    result: torch.Tensor = tensor.torch()
+    return result.to(device).clone()

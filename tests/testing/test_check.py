@@ -464,7 +464,7 @@ def test_progress_counts_every_rendering(box: Any) -> None:
         ({"sensor": 1}, "Sensor 1 does not exist"),
         ({"max_depth": 0}, "max_depth is 0"),
         ({"integrator": "prx"}, "'prx' cannot be created"),
-        ({"integrator": {"type": "diffuse"}}, "is no integrator"),
+        ({"integrator": {"type": "diffuse"}}, "not an integrator"),
         ({"key": "red.reflectanse.value"}, "nearest: red.reflectance.value"),
         ({"key": "small-box.faces"}, "carries no derivative"),
     ],

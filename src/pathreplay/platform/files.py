@@ -27,17 +27,17 @@ def file_problem(path: str | Path, most_bytes: int | None = None) -> str:
     Follows symbolic links. ``most_bytes`` is the size above which the file cannot be of the expected kind.
     """
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except (FileNotFoundError, NotADirectoryError):
         return MISSING
     except (OSError, ValueError) as error:  # name too long, folder without search permission, or a NUL character
         return f"cannot be reached ({getattr(error, 'strerror', None) or error})"
-    if not stat.S_ISREG(found.st_mode):
-        return _KINDS.get(stat.S_IFMT(found.st_mode), "is not a regular file")
+    if not stat.S_ISREG(status.st_mode):
+        return _KINDS.get(stat.S_IFMT(status.st_mode), "is not a regular file")
     if not os.access(path, os.R_OK):
         return "cannot be read (its permissions)"
-    if most_bytes is not None and found.st_size > most_bytes:
-        return f"has {found.st_size} bytes, more than the limit of {most_bytes}"
+    if most_bytes is not None and status.st_size > most_bytes:
+        return f"has {status.st_size} bytes, more than the limit of {most_bytes}"
     return ""
 
 

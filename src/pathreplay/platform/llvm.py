@@ -65,8 +65,8 @@ def pip_library() -> str | None:
         return None
     # Use the file itself, not its symbolic links: these are created only at the first start of Python after
     # installation.
-    found = (Path(str(f.locate())).resolve() for f in files if re.fullmatch(r"libLLVM\.so\.[\d.]+", f.name))
-    return next((str(path) for path in found if path.is_file()), None)
+    paths = (Path(str(f.locate())).resolve() for f in files if re.fullmatch(r"libLLVM\.so\.[\d.]+", f.name))
+    return next((str(path) for path in paths if path.is_file()), None)
 
 
 _SYSTEM_PATTERNS = {
@@ -120,8 +120,8 @@ def _known_to_linker() -> list[str]:
 
 def system_libraries() -> list[str]:
     """The system's libLLVM files, from new to old, each file once."""
-    found = [path for pattern in _SYSTEM_PATTERNS.get(sys.platform, ()) for path in glob.glob(pattern)]
-    files = {os.path.realpath(path) for path in _known_to_linker() + found if os.path.isfile(path)}
+    paths = [path for pattern in _SYSTEM_PATTERNS.get(sys.platform, ()) for path in glob.glob(pattern)]
+    files = {os.path.realpath(path) for path in _known_to_linker() + paths if os.path.isfile(path)}
     return sorted(files, key=lambda path: (version_in_path(path), path), reverse=True)
 
 
@@ -184,8 +184,8 @@ def unlinked_siblings(path: str) -> list[str]:
 def _reason(returncode: int, stderr: str) -> str:
     """A one-line reason for the failure of a test, from the exit status and standard error of the subprocess."""
     # `probe` disables the kernel cache, which Dr.Jit reports.
-    told = [line.strip() for line in stderr.splitlines() if line.strip() and "kernel cache" not in line]
-    lines = [re.sub(r"^\w+\(\): ", "", line) for line in told] or [""]
+    messages = [line.strip() for line in stderr.splitlines() if line.strip() and "kernel cache" not in line]
+    lines = [re.sub(r"^\w+\(\): ", "", line) for line in messages] or [""]
     crash = returncode < 0 and returncode != -signal.SIGTERM
     usual = lines[-1] if "Traceback" in stderr else lines[0]
     detail = next((line for line in lines if crash and line.startswith("LLVM ERROR")), usual)

@@ -23,6 +23,6 @@ def traversed(thing: Any) -> Any:
 def known_values(params: Any) -> Iterator[tuple[str, Any]]:
     """Iterate over the parameters with their values, for reading only: `update` does not notice in-place changes."""
     for key, (value, kind, node, _) in params.properties.items():
-        found = value if kind is None else params.get_property(value, kind, node)
-        if found is not None:
-            yield key, found
+        current = value if kind is None else params.get_property(value, kind, node)
+        if current is not None:
+            yield key, current

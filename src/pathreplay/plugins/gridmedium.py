@@ -112,7 +112,7 @@ class GridMedium:
         """Values that kernels treat as constants: a recorded kernel is invalid if they change."""
         cells = self.flight_cells, self.shadow_cells
         box = *map(float, self.box.min), *map(float, self.box.max)
-        return self.is_chromatic, box, *((each.shape, tuple(each.to_cell.ravel().tolist())) for each in cells)
+        return self.is_chromatic, box, *((table.shape, tuple(table.to_cell.ravel().tolist())) for table in cells)
 
     def to_string(self) -> str:
         lines = [f"sigma_t = {self.sigma_t}", f"albedo = {self.albedo}", f"emission = {self.emission}"]

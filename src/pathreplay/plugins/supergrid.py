@@ -147,23 +147,23 @@ def coarser(bounds: Bounds) -> Bounds:
 
 def all_bounds(bounds: Bounds) -> list[Bounds]:
     """These bounds and successively coarser ones, down to a single cell."""
-    found = [bounds]
-    while not found[-1].is_single:
-        found.append(coarser(found[-1]))
-    dr.eval([(b.lowest, b.mean, b.highest) for b in found])
-    return found
+    levels = [bounds]
+    while not levels[-1].is_single:
+        levels.append(coarser(levels[-1]))
+    dr.eval([(b.lowest, b.mean, b.highest) for b in levels])
+    return levels
 
 
 def _channels(data: mi.TensorXf) -> Values:
     """Lowest, mean and highest value over the channels of every voxel."""
     if data.shape[3] == 1:
         return 3 * (mi.TensorXf(data.array, data.shape[:3]),)
-    each = [data[..., k] for k in range(data.shape[3])]
-    if len(each) == 4:
+    channels = [data[..., k] for k in range(data.shape[3])]
+    if len(channels) == 4:
         # Coefficients of a spectrum with values between 0 and 1, and its factor; the spectrum is bounded by 0 and 1
         # only.
-        return dr.fmin(each[3], 0), each[3] * 0, each[3]
-    return reduce(dr.fmin, each), reduce(operator.add, each) / len(each), reduce(dr.fmax, each)
+        return dr.fmin(channels[3], 0), channels[3] * 0, channels[3]
+    return reduce(dr.fmin, channels), reduce(operator.add, channels) / len(channels), reduce(dr.fmax, channels)
 
 
 def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np.int64]:

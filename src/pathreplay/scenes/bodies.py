@@ -43,9 +43,9 @@ def mesh(vertices: np.ndarray, faces: np.ndarray, bsdf: dict[str, object], flat:
     """A Mitsuba mesh, with vertex normals unless it is ``flat``."""
     props = mi.Properties()
     props["bsdf"], props["face_normals"] = mi.load_dict(bsdf), flat
-    made = mi.Mesh("mesh", len(vertices), len(faces), props, has_vertex_normals=not flat)
-    params = mi.traverse(made)
+    result = mi.Mesh("mesh", len(vertices), len(faces), props, has_vertex_normals=not flat)
+    params = mi.traverse(result)
     params["vertex_positions"] = np.ravel(vertices).astype(np.float32)
     params["faces"] = np.ravel(faces).astype(np.uint32)
     params.update()
-    return made
+    return result

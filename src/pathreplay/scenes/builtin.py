@@ -131,7 +131,7 @@ def glass_pane(resolution: int = 40, texture: int = 12) -> SceneDict:
 
 def _bumps(size: int) -> np.ndarray:
     """Normal map of h(x, y) = 0.03 w (sin 5x cos 4y + cos(3x + 5y)), w = (1 - x²)²(1 - y²)², flat at the border."""
-    y, x = (2 * each - 1 for each in _centres(size, size))
+    y, x = (2 * centres - 1 for centres in _centres(size, size))
 
     def height(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         window = np.square((1 - x * x) * (1 - y * y))
@@ -168,7 +168,7 @@ def mirror_camera(resolution: int = 48) -> SceneDict:
 
 def _blotches(size: int) -> np.ndarray:
     """Reflectance 0.7 + 0.15 (cos 9x sin 7y + sin(5x - 8y)), less in blue."""
-    y, x = (2 * each - 1 for each in _centres(size, size))
+    y, x = (2 * centres - 1 for centres in _centres(size, size))
     grey = 0.7 + 0.15 * (np.cos(9 * x) * np.sin(7 * y) + np.sin(5 * x - 8 * y))
     return (grey[:, :, None] * np.array([1, 0.97, 0.9])).astype(np.float32)
 
@@ -316,7 +316,7 @@ def _cumulus(size: int) -> np.ndarray:
     Six Gaussian blobs, cut off below by b to a flat base; the noise n is a sum of 12 plane waves of wavelengths 0.5 to
     1.2. The shape is (z, y, x, 1).
     """
-    z, y, x = (2 * each - 1 for each in _centres(size, size, size))
+    z, y, x = (2 * centres - 1 for centres in _centres(size, size, size))
     shape = np.zeros_like(x)
     for cx, cy, cz, radius in (
         (0.0, -0.05, 0.0, 0.46), (0.5, -0.2, 0.12, 0.36), (-0.5, -0.22, -0.1, 0.38),

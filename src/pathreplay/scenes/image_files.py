@@ -63,18 +63,18 @@ class RadianceHead:
 
 def pixmap_head(data: bytes) -> PixmapHead:
     """The header of a PGM or PPM, with comments. Raises ValueError."""
-    if not (found := _PIXMAP.match(data)) or not 0 < int(found[4]) < 2**16:
+    if not (match := _PIXMAP.match(data)) or not 0 < int(match[4]) < 2**16:
         raise ValueError("it has no PGM or PPM header")
-    width, height, highest = (int(found[n]) for n in (2, 3, 4))
-    return PixmapHead(1 if found[1] == b"5" else 3, width, height, highest, found.end())
+    width, height, highest = (int(match[n]) for n in (2, 3, 4))
+    return PixmapHead(1 if match[1] == b"5" else 3, width, height, highest, match.end())
 
 
 def radiance_head(data: bytes) -> RadianceHead:
     """The header of a Radiance image: lines, an empty line, and the resolution. Raises ValueError."""
     text, gap, rest = data.partition(b"\n\n")
     resolution, end, _ = rest.partition(b"\n")
-    found = _RESOLUTION.fullmatch(resolution.decode("latin-1"))
-    if not found or found[2] == found[5]:
+    match = _RESOLUTION.fullmatch(resolution.decode("latin-1"))
+    if not match or match[2] == match[5]:
         raise ValueError("it has no Radiance header")
     exposure, xyz = 1.0, False
     for line in text.decode("latin-1").split("\n")[1:]:
@@ -87,9 +87,9 @@ def radiance_head(data: bytes) -> RadianceHead:
                 raise ValueError(f"its FORMAT is {value.strip()}, neither 32-bit_rle_rgbe nor 32-bit_rle_xyze")
     if not (isfinite(exposure) and exposure > 0):
         raise ValueError(f"its EXPOSURE is {exposure:g}")
-    counts = int(found[3]), int(found[6])
+    counts = int(match[3]), int(match[6])
     return RadianceHead(
-        found[2] + found[5], found[1] + found[4], counts, exposure, xyz, len(text + gap + resolution + end)
+        match[2] + match[5], match[1] + match[4], counts, exposure, xyz, len(text + gap + resolution + end)
     )
 
 

@@ -140,8 +140,8 @@ def load_scene_with_floats(
 def coarse_pictures(params: Any, wanted: Iterable[str]) -> tuple[str, ...]:
     """Files of the 8-bit textures that keys and globs ending in ``data`` name."""
     owners = [params.properties[key][2] for key in _matching(params, wanted, "data")]
-    found = [re.search(r'name = "(.*)"', str(owner)) for owner in owners if owner.class_name() == _COARSE]
-    return tuple(dict.fromkeys(match[1] for match in found if match))
+    matches = [re.search(r'name = "(.*)"', str(owner)) for owner in owners if owner.class_name() == _COARSE]
+    return tuple(dict.fromkeys(match[1] for match in matches if match))
 
 
 def _matching(params: Any, wanted: Iterable[str], name: str) -> list[str]:

@@ -73,13 +73,13 @@ def _places(path: Path, content: mmap) -> list[_Place]:
         if not grids:
             raise _damaged(path, "it contains no grid")
         at += _SEGMENT.size
-        found = []
+        sizes = []
         for _ in range(grids):
             grid_size, file_size, _, _, kind, _, name = _GRID.unpack_from(content, at)
             content[at + _GRID.size : at + _GRID.size + name].rstrip(b"\0").decode()
             at += _GRID.size + name
-            found.append((grid_size, file_size, kind))
-        for grid_size, file_size, kind in found:
+            sizes.append((grid_size, file_size, kind))
+        for grid_size, file_size, kind in sizes:
             places.append(_Place(grid_size, file_size, kind, at, codec))
             at += file_size
         if at > len(content):

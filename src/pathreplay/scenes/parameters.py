@@ -52,15 +52,15 @@ def resolve_keys(params: Mapping[str, Any], patterns: str | Iterable[str]) -> li
     Raises PathreplayError, with the nearest keys, if a pattern matches nothing.
     """
     known = list(params.keys())
-    found: dict[str, None] = {}
+    selected: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         # '[[]' matches a literal '['.
         literal = pattern.replace("[", "[[]")
         matches = [pattern] if pattern in known else fnmatch.filter(known, pattern) or fnmatch.filter(known, literal)
         if not matches:
             raise PathreplayError(_no_match(known, pattern))
-        found.update(dict.fromkeys(matches))
-    return list(found)
+        selected.update(dict.fromkeys(matches))
+    return list(selected)
 
 
 def keep_only(params: Any, keys: Iterable[str]) -> None:
@@ -132,14 +132,14 @@ def resolve_differentiable(params: Any, patterns: str | Iterable[str], integrato
 
     Raises PathreplayError if a pattern matches nothing, or nothing that carries a derivative.
     """
-    found: dict[str, None] = {}
+    selected: dict[str, None] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         matches = resolve_keys(params, pattern)
         usable = [key for key in matches if carries_derivative(params, key, integrator)]
         if not usable:
             require_differentiable(params, matches[0], integrator)
-        found.update(dict.fromkeys(usable))
-    return list(found)
+        selected.update(dict.fromkeys(usable))
+    return list(selected)
 
 
 def carries_derivative(params: Any, key: str, integrator: Any = None) -> bool:

@@ -108,10 +108,10 @@ class SceneFunction:
                 seed_grad=other,
             )
             dr.backward_from(dr.sum(image * weights, axis=None))
-            found = [dr.grad(value) for value in seen]
-            dr.eval(found)
+            gradients = [dr.grad(value) for value in seen]
+            dr.eval(gradients)
             self._put(values, grad=False)  # releases the AD graph held by the scene
-        return found
+        return gradients
 
     def _put(self, values: Sequence[mi.TensorXf], grad: bool) -> list[mi.TensorXf]:
         """Set the parameters of the scene; return the values, attached if ``grad``."""

@@ -33,9 +33,9 @@ def tga_size(data: bytes) -> tuple[int, int]:
 
 
 def require_sound_tga(path: Path) -> None:
-    """Raise PathreplayError for a TGA that is too wide or too high, and for one of runs that do not fill the picture.
+    """Raise PathreplayError for a TGA that is too wide or too high, or whose runs do not add up to the image.
 
-    Other files are left alone, and what else can be wrong with a TGA is left to Mitsuba, which sees it.
+    Other files are ignored. Mitsuba itself detects other damage.
     """
     with path.open("rb") as file:
         if not is_tga(file):
@@ -52,9 +52,9 @@ def require_sound_tga(path: Path) -> None:
             return
         file.seek(skipped, os.SEEK_CUR)
         pixels, pixel = width * height, bits // 8
-        found = _filled(file.read(pixels * (1 + pixel)), pixels, pixel)
-    if found != pixels:
-        what = f"its packets hold {found} pixels and its header claims {pixels}"
+        filled = _filled(file.read(pixels * (1 + pixel)), pixels, pixel)
+    if filled != pixels:
+        what = f"its packets hold {filled} pixels and its header claims {pixels}"
         raise PathreplayError(f"Image {path} is a damaged TGA: {what}; replace the file")
 
 
@@ -64,11 +64,11 @@ def _filled(data: bytes, pixels: int, pixel: int) -> int:
     A packet is a byte with the number of its pixels minus one, followed by these pixels of ``pixel`` bytes each, or by
     a single pixel for all if the highest bit of the byte is set. Truncated packets do not count.
     """
-    at = found = 0
-    while found < pixels and at < len(data):
+    at = filled = 0
+    while filled < pixels and at < len(data):
         count = (data[at] & 127) + 1
         at += 1 + pixel * (1 if data[at] & 128 else count)
         if at > len(data):
             break
-        found += count
-    return found
+        filled += count
+    return filled

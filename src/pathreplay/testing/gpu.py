@@ -77,10 +77,10 @@ def examine(variant: str | None, output: Path, names: Sequence[str] = (), tell: 
     device = device_of(chosen)
     if variant is None and not device.is_gpu:
         raise PathreplayError(f"{chosen} does not run on a GPU; leave --gpu out")
-    found = []
+    results = []
     for name in names or (*(f"truth: {n}" for n in TRUTHS), *(f"time: {n}" for n in TIMINGS)):
-        found.append(_in_process(chosen, name))
-        tell(f"{name}: {found[-1].error or _told(found[-1].facts)}")
+        results.append(_in_process(chosen, name))
+        tell(f"{name}: {results[-1].error or _told(results[-1].facts)}")
     report = {
         "pathreplay": __version__,
         "mitsuba": version("mitsuba"),
@@ -90,11 +90,11 @@ def examine(variant: str | None, output: Path, names: Sequence[str] = (), tell: 
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "variant": chosen,
         "device": asdict(device),
-        "items": [asdict(item) for item in found],
+        "items": [asdict(item) for item in results],
     }
     write_whole(output, json.dumps(report, indent=1).encode() + b"\n", "--output")
-    wrong = [item.name for item in found if item.error or item.facts.get("verdict") == "fail"]
-    return f"{output}: {len(found)} items, {len(wrong)} failed" + (f" ({'; '.join(wrong)})" if wrong else "")
+    wrong = [item.name for item in results if item.error or item.facts.get("verdict") == "fail"]
+    return f"{output}: {len(results)} items, {len(wrong)} failed" + (f" ({'; '.join(wrong)})" if wrong else "")
 
 
 def _told(facts: dict[str, Any]) -> str:
@@ -123,9 +123,9 @@ def truth(name: str) -> dict[str, Any]:
 
     scene, arguments, key, options = TRUTHS[name]
     loaded, _ = load_scene_for(scene, [key], **arguments)
-    found = check_gradient(loaded, key, **{"seeds": 8, "spp": 64, "fd_spp": 256, **options})
-    facts = {key: getattr(found, key) for key in ("verdict", "gradient", "gradient_se", "reference", "reference_se")}
-    return facts | {"z": found.z if math.isfinite(found.z) else 0.0}
+    check = check_gradient(loaded, key, **{"seeds": 8, "spp": 64, "fd_spp": 256, **options})
+    facts = {key: getattr(check, key) for key in ("verdict", "gradient", "gradient_se", "reference", "reference_se")}
+    return facts | {"z": check.z if math.isfinite(check.z) else 0.0}
 
 
 def timing(name: str) -> dict[str, Any]:

@@ -161,7 +161,7 @@ class _Plan:
         for o in stencil.points():
             images = (objective.image(plain, seed, self.fd_spp, o * line.step) for seed in others)
             values[o] = np.array([self._tick(objective.dot(image)) for image in images])
-        full, half = (each(values.__getitem__) / line.step for each in (stencil, stencil.halved()))
+        full, half = (differences(values.__getitem__) / line.step for differences in (stencil, stencil.halved()))
         return GradientCheck(
             key=objective.key,
             direction=line.description,

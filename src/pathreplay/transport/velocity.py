@@ -51,11 +51,11 @@ def moved_direction(
     ``origin`` along ``d``. Rays that leave the scene keep their direction. Differentiable in ``origin`` and in the
     shape that was hit.
     """
-    found = active & hit.is_valid()
-    y = held_point(hit, dr.detach(origin.spawn_ray(d)), found)
+    valid = active & hit.is_valid()
+    y = held_point(hit, dr.detach(origin.spawn_ray(d)), valid)
     towards = y.p - origin.spawn_ray(dr.detach(d)).o
     facing = dr.abs(dr.dot(y.A, towards))
-    ok = found & (facing > 0)
+    ok = valid & (facing > 0)
     dist2 = dr.select(ok, dr.squared_norm(towards), 1)
     d_H = towards * dr.rsqrt(dist2)
     # Distances in corners are tiny: the derivative of the logarithm stays finite where powers would overflow.

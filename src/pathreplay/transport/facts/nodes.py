@@ -58,7 +58,7 @@ def with_gradients(root: mi.Object, *names: str) -> list[dr.ArrayBase]:
     If ``names`` are given, only parameters under one of them count: a parameter ``a.b`` is under ``a.b`` and under
     ``a``.
     """
-    found: list[dr.ArrayBase] = []
+    parameters: list[dr.ArrayBase] = []
     seen, waiting = {root}, [("", root)]
     while waiting:
         prefix, node = waiting.pop()
@@ -67,10 +67,10 @@ def with_gradients(root: mi.Object, *names: str) -> list[dr.ArrayBase]:
             if not names or any(f"{prefix}{name}.".startswith(f"{n}.") for n in names):
                 value = value if cpptype is None else mi.get_property(value, cpptype, node)
                 if value is not None:  # None for ``sigma_a`` of hair with ``eumelanin``
-                    found.append(value)
+                    parameters.append(value)
         for name, child in children:
             if child not in seen:
                 seen.add(child)
                 waiting.append((f"{prefix}{name}.", child))
     with dr.resume_grad():
-        return [value for value in found if dr.grad_enabled(value)]
+        return [value for value in parameters if dr.grad_enabled(value)]

@@ -165,7 +165,7 @@ def blend_lengths(shapes: list[mi.Shape]) -> mi.Float:
 
 def smoothing_groups_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
     """The tables of smoothing groups: the offset of each shape, and the group of each triangle."""
-    found: list[np.ndarray] = [np.zeros(1, np.uint32)]
+    blocks: list[np.ndarray] = [np.zeros(1, np.uint32)]
 
     def begin(shape: mi.Shape) -> int:
         if not shape.is_mesh():
@@ -175,11 +175,11 @@ def smoothing_groups_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
         groups = mesh_smoothing_groups(shape)
         if not groups.any():
             return WHOLE
-        found.append(groups)
-        return sum(map(len, found[:-1]))
+        blocks.append(groups)
+        return sum(map(len, blocks[:-1]))
 
     begins = _by_index(mi.ShapePtr, shapes, begin, WHOLE)
-    return _array(mi.UInt32, begins), _array(mi.UInt32, np.concatenate(found).astype(np.uint32))
+    return _array(mi.UInt32, begins), _array(mi.UInt32, np.concatenate(blocks).astype(np.uint32))
 
 
 def is_coarse(mesh: mi.Mesh) -> bool:
@@ -229,8 +229,8 @@ def _ball(mesh: mi.Mesh) -> np.ndarray:
 
 def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], otherwise: V) -> list[V]:
     """A list of the objects' values, ordered by Dr.Jit's registry index."""
-    found = {dr.reinterpret_array(mi.UInt32, pointer(x))[0]: value(x) for x in objects}
-    return [found.get(i, otherwise) for i in range(max(found, default=0) + 1)]
+    by_index = {dr.reinterpret_array(mi.UInt32, pointer(x))[0]: value(x) for x in objects}
+    return [by_index.get(i, otherwise) for i in range(max(by_index, default=0) + 1)]
 
 
 def is_null(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:
