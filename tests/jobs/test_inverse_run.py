@@ -19,7 +19,7 @@ from pathreplay.inverse.loop import loop
 from pathreplay.jobs import optimize
 from pathreplay.platform.atomic_files import Content, chunks
 from pathreplay.runs import run_folder as folders
-from room_job import TEXTURE, interrupt_at, run
+from room_job import TEXTURE, interrupt_at, room, run  # noqa: F401 (room: its folder, for every test)
 
 
 @pytest.mark.parametrize("integrator", [pytest.param("prb", marks=pytest.mark.slow), "pathreplay"])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exposed_job import JOB, KEY, scene
+from exposed_job import JOB, KEY, folder, scene  # noqa: F401 (folder: for every test)
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.images.io import exr_bytes
 from pathreplay.inverse.objective.evaluate import Evaluator, Shard
