@@ -30,7 +30,7 @@ def casters(trace: TraceConfig) -> list[mi.Shape]:
 def cast_shadows(
     trace: TraceConfig, shapes: list[mi.Shape], places: FilmDomain, seed: mi.UInt32
 ) -> tuple[mi.Point2f, mi.Bool]:
-    """Places of the film, and whether a shadow of one of the shapes may fall there."""
+    """Film positions, and whether a shadow of one of the shapes may fall there."""
     numbers = CounterSampler.of(key_of(dr.arange(mi.UInt32, RAYS), seed))
     number, u = dr.minimum(mi.UInt32(numbers.next_1d() * len(shapes)), len(shapes) - 1), numbers.next_2d()
     which = numbers.next_1d()

@@ -160,7 +160,7 @@ class SegmentDensity:
 
     @staticmethod
     def even(size: mi.ScalarVector2f, l: float) -> SegmentDensity:
-        """All places alike, of a film of so many pixels and segments of length l."""
+        """Uniform density over a film of this size in pixels, for segments of length l."""
         return SegmentDensity(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
 
     def refined(self, s: mi.Point2f, found: mi.Float, evenly: float = EVENLY) -> SegmentDensity:

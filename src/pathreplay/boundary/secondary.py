@@ -56,7 +56,7 @@ class SecondarySearch(EdgeSearch[CameraPath]):
     """
 
     lengths: tuple[float, float]
-    radiance: mi.Float | None = None  # how bright is what arcs see, by the first look
+    radiance: mi.Float | None = None  # brightness seen by arcs, estimated by the first probe
 
     bisection = Stream.BISECT_SECONDARY
 

@@ -33,7 +33,7 @@ class Worth:
 
     found: mi.Float  # see `Survey`
     edges: mi.Float  # what they may be worth
-    light: mi.Float  # what is scattered there, of emitters or of light from all around
+    light: mi.Float  # scattered radiance, of emitters or of indirect light
 
     @staticmethod
     def of(seen: Survey, light: mi.Float, scale: mi.Float) -> Worth:

@@ -25,7 +25,7 @@ Which: TypeAlias = "int | mi.Sensor"
 class Rays:
     """The camera rays of a pass, one for every sample of every pixel."""
 
-    sampler: mi.Sampler  # goes on where the rays' own random numbers end
+    sampler: mi.Sampler  # positioned after the dimensions of the camera ray
     ray: mi.RayDifferential3f  # attached to the camera, if that has gradients
     weight: mi.Spectrum
     position: mi.Vector2f  # on the film, in pixels: where the sample is splatted

@@ -41,7 +41,7 @@ class _Kept(Generic[T]):
 
     scene: mi.Scene
     about: T
-    held_once: object = field(default_factory=object)  # how Python counts what only this record holds
+    held_once: object = field(default_factory=object)  # its reference count is that of an unshared scene
 
     @property
     def is_dropped(self) -> bool:

@@ -69,7 +69,7 @@ class SceneFacts:
         return tuple(medium.constants for medium in self._media if hasattr(medium, "constants"))
 
     def branches(self) -> bool:
-        """That of `Media`, now."""
+        """`Media.branches` of the scene as it is now."""
         return wants_branch(self._media)
 
     def traits(self, tables: Tables | None = None) -> Traits:

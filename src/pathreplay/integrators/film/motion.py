@@ -60,7 +60,7 @@ class Flowing:
     sample: Sample  # of their camera rays
     axis: mi.UInt32  # along which places of pairs count
     single: mi.Bool  # a path for the divergence
-    offset: mi.Float  # of pairs, from the middle of the pixel along their axis
+    offset: mi.Float  # of paired paths: distance from the pixel's centre along their axis
     slope: FilterSamples  # which these are drawn from
     L: mi.Spectrum  # times its weight; what the velocity of places is multiplied with
     wavelengths: mi.Spectrum
