@@ -74,6 +74,7 @@ class PathIntegrator:
     attach = "none"
     even = False  # whether even numbers take the place of independent ones
     boundary = "none"  # which boundary terms are estimated
+    baseline: Any = None  # what was learned
     interior: Term
     max_depth: int  # these are Mitsuba's
     rr_depth: int

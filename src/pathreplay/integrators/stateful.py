@@ -57,6 +57,10 @@ class StatefulIntegrator(Protocol):
         self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
     ) -> tuple[mi.TensorXf, PassState]: ...
 
+    @property
+    def baseline(self) -> object:
+        """Learned state, another object after each change; None if there is none."""
+
     def state_dict(self) -> dict[str, np.ndarray]: ...
 
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None: ...
@@ -121,6 +125,10 @@ class Stateless:
     ) -> tuple[mi.TensorXf, PassState]:
         """Not available. Raises PathreplayError."""
         raise PathreplayError(whole_pictures(self.name))
+
+    @property
+    def baseline(self) -> None:
+        return None
 
     def state_dict(self) -> dict[str, np.ndarray]:
         return {}

@@ -220,11 +220,11 @@ class Evaluator:
 
     def _know(self, learned: Arrays) -> None:
         """Go on with what an evaluation has learned. Raises PathreplayError if it is none of this integrator's."""
-        held = getattr(self.integrator, "baseline", None)
+        held = self.integrator.baseline
         if (learned is self._learned and held is self._at) or (held is None and not learned):
             return
         self.integrator.load_state_dict(self.problem.scene, learned)
-        self._learned, self._at = learned, getattr(self.integrator, "baseline", None)
+        self._learned, self._at = learned, self.integrator.baseline
 
     def _view(self, values: Arrays, view: int, seed: int, spp: int, pixels: int | None) -> Evaluation:
         about = self.problem.views[view]
@@ -253,7 +253,7 @@ class Evaluator:
         dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
         for key in broken:
             gradients[key] = np.where(np.isfinite(gradients[key]), gradients[key], 0)
-        self._learned, self._at = self.integrator.state_dict(), getattr(self.integrator, "baseline", None)
+        self._learned, self._at = self.integrator.state_dict(), self.integrator.baseline
         return Evaluation(loss, gradients, dropped, self._learned)
 
     def _differentiated(

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pathreplay.integrators.stateful import stateful
 from pathreplay.inverse.objective.evaluate import Evaluate, Evaluation, Shard
 from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.inverse.problem.joint import JointProblem
@@ -22,9 +23,9 @@ class JointEvaluator:
         self._problem, self._parts = problem, parts
         self._fresh: dict[str, np.ndarray] = {}
         for n, part in enumerate(problem.parts):
-            if hasattr(part.integrator, "load_state_dict"):
-                part.integrator.load_state_dict(part.scene, {})
-                self._fresh |= {f"{n}:{name}": array for name, array in part.integrator.state_dict().items()}
+            integrator = stateful(part.integrator)
+            integrator.load_state_dict(part.scene, {})
+            self._fresh |= {f"{n}:{name}": array for name, array in integrator.state_dict().items()}
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`. Loss and gradients are divided by the number of scenes."""
