@@ -51,7 +51,7 @@ def emission_only(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost
     scene, which each path meets once. Returns that paths do not move.
     Not differentiated: all but what lights emit. Raises PathreplayError when no parameter reaches the paths.
     """
-    trace = replace(trace, leaves=True)
+    trace = replace(trace, background_apart=True)
     sampler, path = start.sampler, PathState.begin(trace, start)
     path, left = path.leave()
 

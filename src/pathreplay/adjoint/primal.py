@@ -30,10 +30,10 @@ def walk_on(trace: TraceConfig, sampler: mi.Sampler, path: PathState) -> tuple[m
 
     Relative to its throughput, which has to be one.
     """
-    trace = replace(trace, leaves=trace.media is None)
+    trace = replace(trace, background_apart=trace.media is None)
     L = mi.Spectrum(0)  # radiance so far
     valid, left = mi.Bool(False), mi.Bool(False)
-    if dr.hint(trace.leaves, mode="scalar"):
+    if dr.hint(trace.background_apart, mode="scalar"):
         path, left = path.leave()
 
     while dr.hint(path.active, exclude=[trace], label="pathreplay: primal"):
@@ -41,10 +41,10 @@ def walk_on(trace: TraceConfig, sampler: mi.Sampler, path: PathState) -> tuple[m
         L += path.β * step.e
         valid |= path.active & step.seen
         path = path.advance(trace, u, step)[0]
-        if dr.hint(trace.leaves, mode="scalar"):
+        if dr.hint(trace.background_apart, mode="scalar"):
             path, gone = path.leave()
             left |= gone
 
-    if dr.hint(trace.leaves, mode="scalar"):
+    if dr.hint(trace.background_apart, mode="scalar"):
         L += path.β * background(trace, path.at, left)
     return L, valid

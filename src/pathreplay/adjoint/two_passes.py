@@ -34,11 +34,11 @@ def first_walk(
 
     All lanes of a packet write to the same place: elsewhere writes to local memory get lost (Dr.Jit 1.5).
     """
-    trace = replace(trace, leaves=layout.fixed)
+    trace = replace(trace, background_apart=layout.fixed)
     L, beyond = mi.Spectrum(0), mi.Spectrum(0)  # radiance so far
     count = mi.UInt32(0)  # vertices, and null boundaries
     branch, left = Branch.none(), mi.Bool(False)
-    if dr.hint(trace.leaves, mode="scalar"):
+    if dr.hint(trace.background_apart, mode="scalar"):
         path, left = path.leave()
 
     while dr.hint(path.active, exclude=[trace, layout, lost], label="pathreplay: record"):
@@ -54,11 +54,11 @@ def first_walk(
             full = path.active & (count >= room_for(trace))
             lost.add(full)
             path.active &= ~full
-        if dr.hint(trace.leaves, mode="scalar"):
+        if dr.hint(trace.background_apart, mode="scalar"):
             path, gone = path.leave()
             left |= gone
 
-    if dr.hint(trace.leaves, mode="scalar"):
+    if dr.hint(trace.background_apart, mode="scalar"):
         beyond = background(trace, path.at, left)
         L += path.β * beyond
     return records, count, L, beyond, branch

@@ -37,7 +37,7 @@ def chain_config(trace: TraceConfig) -> TraceConfig:
     Nor are there media or null boundaries, which chains pass with the transmittance as their weight.
     """
     chain = replace(trace, rr_depth=NEVER, max_depth=min(trace.max_depth, MAX_CHAIN))
-    return chain if trace.media is None else replace(chain, media=None, clear=True)  # type: ignore[arg-type]
+    return chain if trace.media is None else replace(chain, media=None, skips_null=True)  # type: ignore[arg-type]
 
 
 @dr.syntax

@@ -47,7 +47,7 @@ class ShadowTest:
         found = active & (light.pdf != 0)
         lit, ray = found & light.delta, x.spawn_ray_to(light.p)
         hit = meet(trace, ray, lit)
-        if trace.clear or trace.media is not None:
+        if trace.skips_null or trace.media is not None:
             hit = skip_null(trace, ray, hit, lit)
         outside = mi.Bool(False)
         if trace.media is None:

@@ -115,7 +115,7 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         """f_a - f_b, with the same random numbers on both sides. ``ray`` is the camera's."""
         trace = self.trace
         # Coarse meshes cut lobes off at creases, and nothing else is to jump beyond an edge.
-        onward = replace(trace, steady=trace.traits.coarse_meshes and not trace.traits.brushed_meshes)
+        onward = replace(trace, steady_frames=trace.traits.coarse_meshes and not trace.traits.brushed_meshes)
         sides, T = off_contact(self.chain, split.a, split.b, active), mi.Spectrum(1)
         if trace.media is not None:
             t = SHORT_OF * dr.minimum(split.a.hit.t, split.b.hit.t)

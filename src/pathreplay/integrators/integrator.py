@@ -149,7 +149,7 @@ class PathReplayIntegrator(PathIntegrator):
         if not state.is_complete:
             tables = facts_of(view.scene).recorded_tables(state.tables, edges=True)
             trace = replace(trace, traits=replace(trace.traits, tables=tables))
-        return view, replace(trace, edges=self.boundary != "primary" and trace.media is None), (*terms, *motion)
+        return view, replace(trace, may_slide=self.boundary != "primary" and trace.media is None), (*terms, *motion)
 
     def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:
         """Whether the film may follow what it sees: all edges are found of what then slides under it."""

@@ -53,7 +53,7 @@ def choose(
     probability that a collision is real, see `fly`.
     """
     si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
-    if trace.steady:
+    if trace.steady_frames:
         si = steady(si, at.ray, active)
     if trace.media is None:
         return _on_surface(trace, at, si, False, active)

@@ -32,7 +32,7 @@ def vertex_glow(
     trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool
 ) -> mi.Spectrum:
     """The `emission` at a vertex; zero where the background is added separately and no surface of the scene emits."""
-    if trace.leaves and not trace.traits.area_lights:
+    if trace.background_apart and not trace.traits.area_lights:
         return mi.Spectrum(0)
     return emission(trace.scene, at, si, attached, active)
 

@@ -112,7 +112,7 @@ def next_arrival(trace: TraceConfig, at: Arrival, step: SampledStep, active: mi.
     """
     kept, null, ray = step.kept, step.null, step.ray_next
     hit = meet(trace, ray, active)
-    if trace.clear:
+    if trace.skips_null:
         hit = skip_null(trace, ray, hit, active)
     if trace.media is None:
         return Arrival(ray=ray, hit=hit, pdf=kept.pdf, delta=kept.delta, camera=mi.Bool(False))

@@ -169,7 +169,7 @@ def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.
     because a fixed direction slides over edges. The decision depends on the vertex and the incident ray only, so that
     all directions sampled at the vertex move alike.
     """
-    if not (trace.edges and trace.traits.glossy):
+    if not (trace.may_slide and trace.traits.glossy):
         return mi.Bool(False)
     centre, _ = si.bsdf().sample(mi.BSDFContext(), dr.detach(si), 0.5, mi.Point2f(0.5), active)
     return active & ~mi.has_flag(centre.sampled_type, mi.BSDFFlags.Delta) & (dr.detach(centre.pdf) > NARROW)
@@ -181,7 +181,7 @@ def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi
     A continuation that followed a moving transparent sheet would slide over the surfaces behind it and over their
     edges. Applies only if boundary terms are estimated, which include the outline of the sheet.
     """
-    if not (trace.edges and trace.traits.veils):
+    if not (trace.may_slide and trace.traits.veils):
         return mi.Bool(False)
     return mi.has_flag(hit.shape.bsdf().flags(), mi.BSDFFlags.Null)
 

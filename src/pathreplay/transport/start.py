@@ -24,7 +24,7 @@ class CameraStart:
         """The first arrival along the rays, detached; ``hide_emitters`` makes area emitters transparent."""
         ray = mi.Ray3f(dr.detach(self.ray))
         hit = meet(trace, ray, active, coherent=True)
-        if trace.clear:
+        if trace.skips_null:
             hit = skip_null(trace, ray, hit, active)
         if trace.hide_emitters:
             hit = behind_emitters(trace, ray, hit, active)

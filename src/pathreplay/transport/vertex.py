@@ -12,39 +12,47 @@ from pathreplay.transport.facts.traits import Traits
 from pathreplay.transport.volume.media import Media
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TraceConfig:
-    """The scene and the options of a trace: Python values, constant in a recorded kernel.
+    """The scene and the options of a trace: Python values, constant in a recorded kernel."""
 
-    ``attach`` selects what follows the parameters when they move things: ``none`` nothing, ``delta`` hit points and the
-    directions of delta lobes, ``all`` also the directions of the BSDFs in ``traits.attachables``. ``hide_emitters``
-    hides directly visible emitters. ``max_depth`` and ``rr_depth`` are Mitsuba's; unbounded depth is 2^32 - 1.
-    ``media`` is None in a scene without media, where paths follow the conventions of Mitsuba's `path`. With media they
-    follow `volpath`: null boundaries do not count as vertices. ``baseline`` maps (MediumInteraction3f, extinction,
-    majorant, Bool) to a Spectrum, an estimate of the radiance that arrives at a point of a medium from the rest of the
-    ray (None: zero). Its quality affects noise only, not the mean. ``edges`` says that boundary terms are
-    estimated, for which smooth continuations move differently (see `scatter`).
-    """
-
+    # The scene.
     scene: mi.Scene
     traits: Traits
+    media: Media = None  # type: ignore[assignment]
+    """None in a scene without media, where paths follow the conventions of Mitsuba's `path`. With media they follow
+    `volpath`: null boundaries do not count as vertices."""
+
+    # Properties of the integrator.
     attach: str
+    """Selects what follows the parameters when they move things: ``none`` nothing, ``delta`` hit points and the
+    directions of delta lobes, ``all`` also the directions of the BSDFs in ``traits.attachables``."""
     hide_emitters: bool
+    """Hides directly visible emitters."""
     max_depth: int
+    """As in Mitsuba; unbounded depth is 2^32 - 1."""
     rr_depth: int
-    skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]  # a method of Mitsuba's integrators
-    media: Media = None  # type: ignore[assignment]  # None in scenes without media
+    """As in Mitsuba."""
+    skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
+    """A method of Mitsuba's integrators."""
+
+    # Inputs of gradient estimators.
     baseline: Callable[..., mi.Spectrum] | None = None
-    # Relative weight of null collisions (Float, see `branch_weight`) if one null collision per path is kept, for
-    # derivatives where collisions are never real; else None.
+    """Maps (MediumInteraction3f, extinction, majorant, Bool) to a Spectrum, an estimate of the radiance that arrives at
+    a point of a medium from the rest of the ray (None: zero). Its quality affects noise only, not the mean."""
     branching: mi.Float = None
-    edges: bool = False
-    # Rays skip null boundaries, and ``media`` is None: the configuration of the search for edges.
-    clear: bool = False
-    # Shading frames of meshes come from `steady`.
-    steady: bool = False
-    # A ray that leaves the scene arrives at no vertex: the caller adds the `background` after all paths have ended.
-    leaves: bool = False
+    """Relative weight of null collisions (Float, see `branch_weight`) if one null collision per path is kept, for
+    derivatives where collisions are never real; else None."""
+    may_slide: bool = False
+    """Boundary terms are estimated, for which smooth continuations move differently (see `scatter`)."""
+
+    # Choices of the caller.
+    skips_null: bool = False
+    """Rays skip null boundaries, and ``media`` is None: the configuration of the search for edges."""
+    steady_frames: bool = False
+    """Shading frames of meshes come from `steady`."""
+    background_apart: bool = False
+    """A ray that leaves the scene arrives at no vertex: the caller adds the `background` after all paths have ended."""
 
     @property
     def resamples(self) -> bool:
