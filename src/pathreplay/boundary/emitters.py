@@ -38,7 +38,7 @@ BORDER = 1e-4
 """Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
 INSIDE = 1 - 2 * BORDER
 JUMP = 4.0
-"""So many times as far from an edge as its slope says is the other end of a piece where emitter samples jump."""
+"""Emitter samples jump where a bisected piece ends this many times as far from the edge as its slope predicts."""
 
 
 @dataclass

@@ -28,7 +28,7 @@ from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
 
 FILM_CLOSER, INNER_CLOSER = 5, 16
-"""For so many segments one is resolved, of those with an edge."""
+"""Ratio of probed segments to segments that are resampled and resolved, on the film and in secondary searches."""
 GRID = "SDFGrid"
 """By class: its surface is neither met nor held where its outline would have to be."""
 BATCH = "BatchSensor"
