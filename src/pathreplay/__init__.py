@@ -83,7 +83,7 @@ def _set_up() -> None:
         with interrupts.undisturbed():  # Ctrl-C in the middle of this brings the process down
             import mitsuba  # noqa: F401
     except Exception:
-        return  # missing or broken: set_variant and the doctor say so, with the way out
+        return  # missing or broken: set_variant and the doctor say so, with the remedy
     registration.install()
 
 

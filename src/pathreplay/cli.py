@@ -364,7 +364,7 @@ def _run() -> NoReturn:
     except PathreplayError as error:
         _fail(str(error))
     except ImportError as error:
-        if not (line := address_space.told(error)):
+        if not (line := address_space.describe_failure(error)):
             raise
         _fail(line)
     except MemoryError:

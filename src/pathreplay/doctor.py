@@ -33,7 +33,7 @@ class VariantVerdict:
 class DoctorReport:
     """What was found.
 
-    `mitsuba` and `drjit` are version numbers, or the reason why they cannot be imported. `ways_out` has one line for
+    `mitsuba` and `drjit` are version numbers, or the reason why they cannot be imported. `remedies` has one line for
     each failure that can be mended.
     """
 
@@ -41,7 +41,7 @@ class DoctorReport:
     drjit: str
     libraries: tuple[LlvmLibrary, ...]
     variants: tuple[VariantVerdict, ...]
-    ways_out: tuple[str, ...]
+    remedies: tuple[str, ...]
 
     @property
     def works(self) -> bool:
@@ -71,8 +71,8 @@ class DoctorReport:
             line(verdict(variant.works), variant.name, f": {variant.message}" if variant.message else "")
         if not self.variants:
             line("  none tried")
-        if self.ways_out:
-            line(("Ways out", "bold"), *("\n  - " + way_out for way_out in self.ways_out))
+        if self.remedies:
+            line(("Ways out", "bold"), *("\n  - " + remedy for remedy in self.remedies))
         usable = ", ".join(variant.name for variant in self.variants if variant.works)
         line(("Verdict", "bold"), f": pathreplay runs here ({usable})" if usable else ": pathreplay does not run here")
 
@@ -122,7 +122,7 @@ def _try_variants(names: list[str], library: LlvmLibrary | None) -> list[Variant
 
 def examine() -> DoctorReport:
     """Try every libLLVM and every variant on this machine (a few seconds). Raises nothing."""
-    ways_out: list[str] = []
+    remedies: list[str] = []
     try:
         import drjit as dr
         import mitsuba as mi
@@ -130,7 +130,7 @@ def examine() -> DoctorReport:
         versions, known = (str(mi.__version__), str(dr.__version__)), list(mi.variants())
     except Exception as error:
         versions, known = (f"cannot be imported ({plain_line(str(error))})", "unknown"), []
-        ways_out.append("install Mitsuba: pip install 'mitsuba>=3.9.1,<3.10'")
+        remedies.append("install Mitsuba: pip install 'mitsuba>=3.9.1,<3.10'")
     libraries = tuple(llvm.probe(path, origin) for path, origin in llvm.candidates()) if known else ()
     library = next((library for library in libraries if library.works), None)
     names = sorted(filter(is_usable_variant, known), key=lambda name: (name.split("_")[0] != "llvm", known.index(name)))
@@ -138,14 +138,14 @@ def examine() -> DoctorReport:
 
     broken = {variant.name.split("_")[0] for variant in variants if not variant.works}
     if "llvm" in broken and library is None:
-        ways_out.append(f"libLLVM: {llvm.WAY_OUT}")
+        remedies.append(f"libLLVM: {llvm.WAY_OUT}")
     if library is not None and any(each.path == llvm.ASKED_FOR and not each.works for each in libraries):
-        ways_out.append(f"{ENVIRONMENT_VARIABLE} names a libLLVM that fails: unset it, or let it name {library.path}")
+        remedies.append(f"{ENVIRONMENT_VARIABLE} names a libLLVM that fails: unset it, or let it name {library.path}")
     if "cuda" in broken:
-        ways_out.append(
+        remedies.append(
             "CUDA: needs an NVIDIA GPU and its driver (`nvidia-smi` has to list the GPU); "
             "without one, LLVM does the work on the CPU"
         )
     if "metal" in broken:
-        ways_out.append("Metal: needs a Mac with Apple silicon; without one, LLVM does the work on the CPU")
-    return DoctorReport(*versions, libraries, tuple(variants), tuple(ways_out))
+        remedies.append("Metal: needs a Mac with Apple silicon; without one, LLVM does the work on the CPU")
+    return DoctorReport(*versions, libraries, tuple(variants), tuple(remedies))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-# Beyond, a message is no line that anyone reads; its two ends name the thing and the way out.
+# Beyond, a message is no line that anyone reads; its two ends name the thing and the remedy.
 _LONGEST = 1000
 
 
 class PathreplayError(Exception):
     """A mistake that the user can mend.
 
-    The message is a single line that names the thing, its value and the way out (`plain_line`). The command line prints
+    The message is a single line that names the thing, its value and the remedy (`plain_line`). The command line prints
     it without a traceback and ends with exit status 2.
     """
 

@@ -11,7 +11,7 @@ import pytest
 
 from edge_ordinary import T, film, sensor
 from pathreplay.boundary.cast_shadows import cast_shadows, casters
-from pathreplay.boundary.emitters import BORDER, EmitterSegment, Lamp
+from pathreplay.boundary.emitters import BORDER, EmitterSegment, SampledEmitter
 from pathreplay.integrators.boundary_term import Boundary
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.integrators.film.domain import FilmPlaces
@@ -88,7 +88,7 @@ def test_lines_are_reflected_at_the_border_of_the_square() -> None:
     n, l = 2000, 0.25
     turn = mi.Float(rng.uniform(0, 2 * np.pi, n))
     c, w = mi.Point2f(rng.uniform(0, 1, (2, n))), mi.Vector2f(dr.cos(turn), dr.sin(turn))
-    none = Lamp(dr.zeros(mi.EmitterPtr, n), mi.Point3f(0), mi.Float(0), mi.Bool(False))
+    none = SampledEmitter(dr.zeros(mi.EmitterPtr, n), mi.Point3f(0), mi.Float(0), mi.Bool(False))
     nobody: Any = None
     segment = EmitterSegment(c, w, mi.Float(l), nobody, mi.UInt32(0), none, mi.Float(1))
     t, step = mi.Float(rng.uniform(-0.5 * l, 0.5 * l, n)), 1e-3

@@ -266,7 +266,7 @@ def test_the_cone_around_a_mesh_lamp_follows_it() -> None:
     scene = mi.load_dict(scenes.scene(wall=scenes.shape(scenes.BACK, scenes.BLACK), lamp=scenes.ball_of_triangles()))
     facts, params = SceneFacts(scene), mi.traverse(scene)
     key = next(key for key in params.keys() if key.endswith("vertex_positions"))
-    before = np.array(facts.tables().lamp_balls).reshape(-1, 4)
+    before = np.array(facts.tables().emitter_bounds).reshape(-1, 4)
     assert before[0, 3] == pytest.approx(0.4, rel=0.05)
     vertices = np.array(params[key]).reshape(-1, 3)
     box = vertices.min(axis=0), vertices.max(axis=0)
@@ -274,10 +274,10 @@ def test_the_cone_around_a_mesh_lamp_follows_it() -> None:
     params[key] = mi.Float(vertices.ravel())
     params.update()
     centre, radius = np.mean(box, axis=0), np.linalg.norm(box[1] - box[0]) / 2
-    assert np.array(facts.tables().lamp_balls) == pytest.approx([*centre, radius], rel=1e-4)
+    assert np.array(facts.tables().emitter_bounds) == pytest.approx([*centre, radius], rel=1e-4)
     params[key] = mi.Float((vertices + 1).ravel())
     params.update()
-    assert np.array(facts.tables().lamp_balls) == pytest.approx([*(centre + 1), radius], rel=1e-4)
+    assert np.array(facts.tables().emitter_bounds) == pytest.approx([*(centre + 1), radius], rel=1e-4)
 
 
 def test_passes_share_no_random_numbers() -> None:

@@ -15,7 +15,7 @@ import safetensors.numpy
 
 from pathreplay import PathreplayError
 from pathreplay.inverse.config.optimizer_options import Optimizer
-from pathreplay.inverse.images.disk_store import Album
+from pathreplay.inverse.images.disk_store import DiskStore
 from pathreplay.inverse.objective.evaluate import Evaluation, Local, Shard, total
 from pathreplay.inverse.optim import adaptive as optimisers
 from pathreplay.inverse.optim.adaptive import DrJitOptimiser, WhenAsked
@@ -110,11 +110,11 @@ def test_pieces_step_as_the_whole_does(kind: str, monkeypatch: pytest.MonkeyPatc
 
 def test_an_album_keeps_what_it_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
-    album = Album(room=2**20)
+    disk_store = DiskStore(room=2**20)
     pictures = [array(300, 200, 3) for _ in range(4)]
-    kept = [album.keep(picture) for picture in pictures]
+    kept = [disk_store.keep(picture) for picture in pictures]
     assert kept[0] is pictures[0] and kept[2] is not pictures[2] and not kept[2].flags.writeable
-    album.rest()
+    disk_store.rest()
     for picture, other in zip(pictures, kept, strict=True):
         np.testing.assert_array_equal(picture, other)
         assert other.dtype == np.float32 and other.shape == picture.shape
@@ -127,7 +127,7 @@ def test_an_album_tells_of_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("tempfile.TemporaryFile", full)
     with pytest.raises(PathreplayError, match=r"No space left in .* set TMPDIR to a folder on another disk"):
-        Album(room=0).keep(array(300, 200, 3))
+        DiskStore(room=0).keep(array(300, 200, 3))
 
 
 def test_tensor_files_are_those_of_the_library() -> None:

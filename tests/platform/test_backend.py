@@ -284,9 +284,9 @@ def test_the_doctor_finds_that_this_machine_works(report: doctor.DoctorReport) -
 
 
 def test_every_back_end_that_fails_has_a_way_out(report: doctor.DoctorReport) -> None:
-    ways_out = "\n".join(report.ways_out).lower()
+    remedies = "\n".join(report.remedies).lower()
     for name in {variant.name.split("_")[0] for variant in report.variants if not variant.works}:
-        assert name in ways_out
+        assert name in remedies
 
 
 def test_the_doctor_without_any_libllvm_says_how_to_get_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,7 +294,7 @@ def test_the_doctor_without_any_libllvm_says_how_to_get_one(monkeypatch: pytest.
     monkeypatch.setattr(llvm, "run_trial", lambda *_: ("", "no GPU"))
     report = doctor.examine()
     assert not report.works
-    assert any("pip install karellen-llvm-core" in way_out for way_out in report.ways_out)
+    assert any("pip install karellen-llvm-core" in remedy for remedy in report.remedies)
 
 
 def test_the_report_never_wraps_a_path(report: doctor.DoctorReport, capsys: pytest.CaptureFixture[str]) -> None:

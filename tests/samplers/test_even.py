@@ -13,7 +13,7 @@ import pytest
 
 from pathreplay.integrators.camera_pass import Pass
 from pathreplay.jobs import make_config, optimize
-from pathreplay.samplers.owen_sobol import OwenSobolSampler, in_order, key_of
+from pathreplay.samplers.owen_sobol import OwenSobolSampler, key_of, morton_index
 from pathreplay.samplers.pixel_samples import SETS
 
 METHODS: dict[str, dict[str, Any]] = {
@@ -77,7 +77,7 @@ def test_clones_repeat() -> None:
 
 def test_mortons_order() -> None:
     x, y = (mi.UInt32(np.array(values, np.uint32)) for values in ((0, 1, 0, 1, 2, 65535), (0, 0, 1, 1, 0, 65535)))
-    assert np.array(in_order(x, y)).tolist() == [0, 1, 2, 3, 4, 2**32 - 1]
+    assert np.array(morton_index(x, y)).tolist() == [0, 1, 2, 3, 4, 2**32 - 1]
 
 
 def scene(spp: int, sampler: str = "independent", side: int = 16) -> mi.Scene:

@@ -104,10 +104,10 @@ def test_a_glob_keeps_what_has_a_derivative_and_an_exact_key_must(params: Any) -
         ("lamp.intensity.valve", "nearest: lamp.intensity.value"),
     ],
 )
-def test_a_missing_derivative_is_explained(params: Any, key: str, way_out: str) -> None:
+def test_a_missing_derivative_is_explained(params: Any, key: str, remedy: str) -> None:
     with pytest.raises(PathreplayError) as error:
         require_differentiable(params, key)
-    assert key in str(error.value) and way_out in str(error.value) and "\n" not in str(error.value)
+    assert key in str(error.value) and remedy in str(error.value) and "\n" not in str(error.value)
 
 
 DIFFERENTIABLE = {

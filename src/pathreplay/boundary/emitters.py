@@ -31,7 +31,7 @@ from pathreplay.boundary.worth import STEEP, Worth, closeness, own_plane
 from pathreplay.samplers.counter_sampler import CounterSampler
 from pathreplay.transport.motion import may_move
 from pathreplay.transport.signature import edge_normal, outline_gap
-from pathreplay.transport.surface import held_point
+from pathreplay.transport.surface import surface_point
 from pathreplay.transport.vertex import TraceConfig, mis_weight
 
 BORDER = 1e-4
@@ -42,7 +42,7 @@ JUMP = 4.0
 
 
 @dataclass
-class Lamp:
+class SampledEmitter:
     """An emitter, and a ball around it: its radius is 0 where it is no mesh."""
 
     emitter: mi.EmitterPtr
@@ -51,16 +51,16 @@ class Lamp:
     around: mi.Bool  # its samples go around: see `sample_at`
 
     @staticmethod
-    def of(trace: TraceConfig, index: mi.UInt32, active: mi.Bool) -> Lamp:
+    def of(trace: TraceConfig, index: mi.UInt32, active: mi.Bool) -> SampledEmitter:
         """The emitter of an index."""
         emitter = dr.gather(mi.EmitterPtr, trace.scene.emitters_dr(), index, active)
         around = mi.Bool(False)
         if trace.traits.ball_lights:
             around = emitter.get_shape().shape_type() == int(mi.ShapeType.Sphere)
         if not trace.traits.mesh_lights:
-            return Lamp(emitter, mi.Point3f(0), mi.Float(0), around)
-        ball = dr.gather(mi.Vector4f, trace.traits.tables.lamp_balls, index, active)
-        return Lamp(emitter, mi.Point3f(ball.x, ball.y, ball.z), ball.w, around)
+            return SampledEmitter(emitter, mi.Point3f(0), mi.Float(0), around)
+        ball = dr.gather(mi.Vector4f, trace.traits.tables.emitter_bounds, index, active)
+        return SampledEmitter(emitter, mi.Point3f(ball.x, ball.y, ball.z), ball.w, around)
 
     def may_move(self, trace: TraceConfig) -> mi.Bool:
         """Whether it is known not to stand still."""
@@ -89,7 +89,7 @@ def _hides(hit: mi.PreliminaryIntersection3f, emitter: mi.EmitterPtr, active: mi
     return active & hit.is_valid() & (hit.shape.emitter() != emitter)
 
 
-def sample_at(trace: TraceConfig, lamp: Lamp, u: mi.Point2f) -> mi.Point2f:
+def sample_at(trace: TraceConfig, lamp: SampledEmitter, u: mi.Point2f) -> mi.Point2f:
     """The sample of an emitter at a place; of a ball that at the place's distance and angle on the disk, as evenly."""
     if not trace.traits.ball_lights:
         return u
@@ -98,7 +98,7 @@ def sample_at(trace: TraceConfig, lamp: Lamp, u: mi.Point2f) -> mi.Point2f:
     return dr.select(lamp.around, mi.Point2f(dr.squared_norm(p), turn - dr.floor(turn)), u)
 
 
-def direction(lamp: Lamp, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
+def direction(lamp: SampledEmitter, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
     """A direction in the cone from o around the ball, and the solid angle of that; differentiable in u.
 
     All directions where o is in the ball.
@@ -120,7 +120,7 @@ class EmitterSegment(PlaneSegment):
 
     observer: ObserverVertex
     key: mi.UInt32
-    lamp: Lamp
+    lamp: SampledEmitter
     share: mi.Float  # 1 / probability of the emitter
 
     @staticmethod
@@ -129,7 +129,7 @@ class EmitterSegment(PlaneSegment):
         which, turn = numbers.next_2d()
         index, share, _ = scene.sample_emitter(which)
         c = BORDER + INSIDE * numbers.next_2d()
-        lamp = Lamp.of(observer.trace, index, observer.active)
+        lamp = SampledEmitter.of(observer.trace, index, observer.active)
         return EmitterSegment(mi.Point2f(c), heading(turn), mi.Float(l), observer, key, lamp, share)
 
     def at(self, t: mi.Float) -> mi.Point2f:
@@ -183,7 +183,7 @@ class EmitterSegment(PlaneSegment):
         if not trace.traits.mesh_lights:
             return light.d
         d, _ = direction(lamp, origin.p, u)
-        y = held_point(glue.hit, dr.detach(glue.ray), in_cone & glue.hit.is_valid()).p
+        y = surface_point(glue.hit, dr.detach(glue.ray), in_cone & glue.hit.is_valid()).p
         to_y = dr.normalize(dr.select(in_cone, y - origin.p, mi.Vector3f(0, 0, 1)))
         return dr.select(in_cone, d + (to_y - dr.detach(to_y)), light.d)
 

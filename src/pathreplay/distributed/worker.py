@@ -22,7 +22,7 @@ from pathreplay.inverse.parameters.values import Arrays
 from pathreplay.inverse.problem.problem import Problem, build_problem
 from pathreplay.platform import backend
 from pathreplay.platform.threads import one_thread
-from pathreplay.scenes.descriptions import told
+from pathreplay.scenes.descriptions import errors_as
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class RayActor:
         plugin = config.baseline if baseline and config.baseline is not None else config.integrator
         self.log.lines.clear()
         begin = time.perf_counter()
-        with one_thread(config.deterministic), told(f"Integrator '{plugin.type}' cannot do this job"):
+        with one_thread(config.deterministic), errors_as(f"Integrator '{plugin.type}' cannot do this job"):
             evaluation = self._evaluator(baseline)(values, shard, learned)
         return Answer(evaluation, time.perf_counter() - begin, tuple(self.log.lines))
 

@@ -12,8 +12,8 @@ import mitsuba as mi
 from pathreplay.integrators.film.camera_flow import FilmFlow, Sample
 from pathreplay.integrators.lifetimes import is_recording
 from pathreplay.platform.registration import mitsuba_integrator
-from pathreplay.samplers.owen_sobol import OwenSobolSampler, in_order, key_of
-from pathreplay.samplers.pixel_samples import Alone, EvenSets, PixelSamples
+from pathreplay.samplers.owen_sobol import OwenSobolSampler, key_of, morton_index
+from pathreplay.samplers.pixel_samples import IndependentSets, PixelSamples, SobolSets
 from pathreplay.transport.start import CameraStart
 
 Seed: TypeAlias = "int | mi.UInt32"
@@ -130,7 +130,7 @@ class Pass:
         ``pixel`` is a row-major index in a film of ``width``.
         """
         bits = (paths - 1).bit_length()
-        place = in_order(pixel % width, pixel // width)
+        place = morton_index(pixel % width, pixel // width)
         # What does not fit into 32 bits tells sets apart, too.
         beyond = place >> (32 - bits) if bits else mi.UInt32(0)
         return OwenSobolSampler.of((place << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), beyond))
@@ -147,10 +147,10 @@ class Pass:
         """Samples for one lane per pixel (row-major), which traces all paths of its pixel."""
         if self.even:
             width, _ = self.size
-            return EvenSets(partial(self.numbers, pixel, width))
+            return SobolSets(partial(self.numbers, pixel, width))
         sampler = self.sensor.sampler().clone()
         sampler.seed(self.seed, dr.width(pixel))
-        return Alone(sampler)
+        return IndependentSets(sampler)
 
     @cached_property
     def keys(self) -> tuple[tuple[int, int, int], ...]:

@@ -175,7 +175,7 @@ class PathReplayIntegrator(PathIntegrator):
         return not self.why_no_pixel_sweep(scene, sensor, spp, some)
 
     def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
-        """Why it cannot be used, with the way out: see `obstacle`. It needs the sweep driver, too, and no media."""
+        """Why it cannot be used, with the remedy: see `obstacle`. It needs the sweep driver, too, and no media."""
         view = Pass.of(scene, sensor, 0, spp)
         if self.adjoint != "recorded":
             return f"adjoint = '{self.adjoint}' records no paths; use 'recorded'"

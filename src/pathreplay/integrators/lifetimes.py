@@ -143,7 +143,7 @@ def _entered() -> bool:
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Within this block a PathreplayError that Dr.Jit wrapped in others, on the way out of a loop, is itself again."""
+    """Within this block a PathreplayError that Dr.Jit wrapped in others, while a loop ends, is itself again."""
     try:
         yield
     except RuntimeError as error:

@@ -16,8 +16,8 @@ from pathreplay.transport.facts.traits import (
     Tables,
     Traits,
     blend_lengths,
+    emitter_bounds,
     fixed_traits,
-    lamp_balls,
     smoothing_groups_of,
     tables_of,
 )
@@ -91,9 +91,9 @@ class SceneFacts:
         elif boxes != self._boxes:
             self._tables = replace(self._tables, blend_lengths=blend_lengths(self._shapes))
         if self._traits.mesh_lights:  # whose vertices may move within a box
-            balls = lamp_balls(self._lights, self._shapes)
-            if not np.array_equal(np.array(balls), np.array(self._tables.lamp_balls)):
-                self._tables = replace(self._tables, lamp_balls=balls)
+            balls = emitter_bounds(self._lights, self._shapes)
+            if not np.array_equal(np.array(balls), np.array(self._tables.emitter_bounds)):
+                self._tables = replace(self._tables, emitter_bounds=balls)
         if sizes != self._sizes:
             begins, groups = smoothing_groups_of(self._shapes)
             self._tables = replace(self._tables, groups_at=begins, groups=groups)

@@ -96,7 +96,7 @@ def _iterations(
         run = run_of(problem, pool)
         kept = FolderRun(replace(job, config=problem.config), problem, run, stop, output, home, resumed)
         stack.callback(kept.folder.lock.close)
-        stack.enter_context(stopping(bar.say, kept.way_out, stop))
+        stack.enter_context(stopping(bar.say, kept.remedy, stop))
         if isinstance(bar, NotebookPanel):
             bar.follow(kept.previews.pictures, str(kept.folder.name))
         yield from iterations(problem, run, stop, (bar.observe, kept.observe), kept)

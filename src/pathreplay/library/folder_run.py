@@ -54,7 +54,7 @@ class FolderRun:
         self.previews = Previews(self.folder, problem.config, problem, run, self._before, stop)
 
     @property
-    def way_out(self) -> str:
+    def remedy(self) -> str:
         """Return the message for an aborted run."""
         return f"aborted; go on from the last checkpoint with: {self.folder.resume_command()}"
 
@@ -79,8 +79,8 @@ class FolderRun:
             if self._is_new and not self._run.history and not self._stop.aborted:
                 self.folder.remove()
             elif self._saving.rescued() and not self._stop.aborted:
-                way_out = f"what was done is saved, go on with: {self.folder.resume_command()}"
-                raise PathreplayError(f"{error}; {way_out}") from error
+                remedy = f"what was done is saved, go on with: {self.folder.resume_command()}"
+                raise PathreplayError(f"{error}; {remedy}") from error
             raise
 
     def finish(self) -> RunResult:
@@ -93,7 +93,7 @@ class FolderRun:
             theirs = render_views(problem, config, run.baseline.values) if run.baseline else {}
         outcome = outcome_of(self._job, self.folder.name, problem, run, self._before, after, theirs, verdict)
         files = result_files(outcome, self.previews.finished(after))
-        problem.album.rest()
+        problem.disk.rest()
         self.folder.write(files)
         return result_of(outcome, self._stop.by)
 
@@ -130,9 +130,9 @@ def _went_on(folder: RunFolder, problem: Problem, run: Run) -> dict[str, Image]:
         return before
     name = f"Run {folder.name}"
     if run.optimiser.finished:
-        way_out = "lower the optimizer's tolerance" if folder.in_python else "lower 'tolerance' in its config"
-        raise PathreplayError(f"{name} has ended by itself ({run.optimiser.finished}); {way_out}")
+        remedy = "lower the optimizer's tolerance" if folder.in_python else "lower 'tolerance' in its config"
+        raise PathreplayError(f"{name} has ended by itself ({run.optimiser.finished}); {remedy}")
     if len(run.history) >= config.iterations:
-        way_out = "raise 'steps'" if folder.in_python else "raise 'iterations' in its config"
-        raise PathreplayError(f"{name} has all its {len(run.history)} iterations; {way_out}")
+        remedy = "raise 'steps'" if folder.in_python else "raise 'iterations' in its config"
+        raise PathreplayError(f"{name} has all its {len(run.history)} iterations; {remedy}")
     return before

@@ -146,6 +146,6 @@ def iterations(
         for event in computed(problem, problem.config, run, stop):
             for observe in observers:
                 observe(event)
-            problem.album.rest()
+            problem.disk.rest()
             if isinstance(event, Stepped):
                 yield Iteration(event.entry, best_values(problem, run), names, folder, problem)

@@ -157,7 +157,7 @@ def _minimized(
             kept = _folder_run(job, built, run, stop, output, resume, stack)
         elif resume:
             raise PathreplayError("resume = True needs a folder; give 'output'")
-        stack.enter_context(stopping(bar.say, "aborted" if kept is None else kept.way_out, stop))
+        stack.enter_context(stopping(bar.say, "aborted" if kept is None else kept.remedy, stop))
         observers = [bar.observe, *_observers(bar, built, run, stop, kept)]
         for about in stack.enter_context(closing(iterations(built, run, stop, observers, kept))):
             if any([callback(about) is True for callback in callbacks]):

@@ -30,7 +30,7 @@ from pathreplay.platform.files import file_names
 from pathreplay.platform.traversal import traversed
 from pathreplay.runs.run_folder import IN_MEMORY, Job, read_job, require_writable_name
 from pathreplay.scenes.builtin import BUILTINS
-from pathreplay.scenes.descriptions import told
+from pathreplay.scenes.descriptions import errors_as
 from pathreplay.scenes.loading import as_xml_has_them, builtin_dict, coarse_pictures
 from pathreplay.scenes.parameters import get_array
 
@@ -132,7 +132,7 @@ def _floats(source: Source, values: Arrays) -> tuple[str, ...]:
     keys = [key for key in values if key.endswith(".data")]
     if not keys:
         return ()
-    with told("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
+    with errors_as("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
         pictures = coarse_pictures(traversed(source.load()), keys)
     gc.collect()  # Dr.Jit traces virtual calls through every instance alive
     return pictures

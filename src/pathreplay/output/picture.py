@@ -19,7 +19,7 @@ from pathreplay.integrators.film.image import MOST_SAMPLES, require_film
 from pathreplay.integrators.parts import rounded, split
 from pathreplay.inverse.images.io import Image, png_bytes
 from pathreplay.platform import memory
-from pathreplay.scenes.descriptions import told
+from pathreplay.scenes.descriptions import errors_as
 
 # Samples per pass with independent samples: a few seconds, so that the bar moves and Ctrl-C takes effect.
 _A_PASS = 2**24
@@ -119,7 +119,7 @@ def render(
     done = 0
     for i, count in enumerate(counts):
         number = seed if i == 0 else int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
-        with dr.suspend_grad(), told("The scene cannot be rendered"):
+        with dr.suspend_grad(), errors_as("The scene cannot be rendered"):
             image = mi.render(scene, sensor=sensor, integrator=integrator, spp=count, seed=number)
             taken = rounded(sensor.sampler(), count)
             total = total + np.array(image, np.float64) * taken

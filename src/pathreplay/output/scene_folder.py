@@ -23,7 +23,7 @@ from pathreplay.platform.files import file_names
 from pathreplay.platform.registration import PLUGINS
 from pathreplay.platform.threads import spare_thread
 from pathreplay.platform.traversal import traversed
-from pathreplay.scenes.descriptions import told
+from pathreplay.scenes.descriptions import errors_as
 from pathreplay.scenes.parameters import get_array, is_empty, to_value
 from pathreplay.scenes.stored import form_of
 from pathreplay.scenes.substitute import load_dict_with, load_file_with
@@ -93,7 +93,7 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, Any] | Non
     Raises:
         PathreplayError: the scene has something that no scene file of Mitsuba can hold.
     """
-    with told("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
+    with errors_as("The scene cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene = source.load()
         params = _set(scene, values)
         described, owners = describe(source.scene, source.arguments, source.plugins, source.cameras, source.floats)
@@ -117,7 +117,7 @@ def exported(source: Source, values: Arrays, integrator: Mapping[str, Any] | Non
 def require_same(original: mi.Scene, folder: Path) -> None:
     """Raise PathreplayError unless the exported scene has the parameters of the original, up to rounding."""
     gc.collect()
-    with told(f"The exported scene {folder / SCENE} cannot be loaded"), spare_thread():
+    with errors_as(f"The exported scene {folder / SCENE} cannot be loaded"), spare_thread():
         copy = mi.load_file(str(folder / SCENE), optimize=False)
     ours, theirs = traversed(original), traversed(copy)
     # Objects without id are in the same order in both scenes.

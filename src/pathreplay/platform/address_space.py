@@ -29,7 +29,7 @@ def require() -> None:
         raise PathreplayError(_line())
 
 
-def told(error: ImportError) -> str:
+def describe_failure(error: ImportError) -> str:
     """A one-line message if a library failed to load for lack of address space; "" for any other reason."""
     return f"{_line()} ({error})" if any(sign in str(error).lower() for sign in _SIGNS) else ""
 

@@ -108,11 +108,11 @@ class Stop:
 
 
 @contextmanager
-def stopping(say: Callable[[str], None], way_out: str, stop: Stop | None = None) -> Iterator[Stop]:
+def stopping(say: Callable[[str], None], remedy: str, stop: Stop | None = None) -> Iterator[Stop]:
     """Within this block the first signal requests a stop, and a second one that is Ctrl-C raises KeyboardInterrupt.
 
     SIGTERM and SIGHUP only request a stop, however often they arrive: schedulers and terminals send them repeatedly.
-    ``say`` receives status messages; ``way_out`` is the message of the KeyboardInterrupt; ``stop`` is the request to
+    ``say`` receives status messages; ``remedy`` is the message of the KeyboardInterrupt; ``stop`` is the request to
     set, if the caller has one already.
     """
     stop = Stop() if stop is None else stop
@@ -123,12 +123,12 @@ def stopping(say: Callable[[str], None], way_out: str, stop: Stop | None = None)
             say(f"{stop.by}: stopping after this iteration (Ctrl-C aborts)")
         elif number == signal.SIGINT:
             stop.aborted = True
-            raise_once(KeyboardInterrupt(way_out))
+            raise_once(KeyboardInterrupt(remedy))
 
     with handled(handle):
         try:
             yield stop
         except (RuntimeError, PathreplayError):
             if stop.aborted:  # Dr.Jit converts exceptions raised during tracing
-                raise KeyboardInterrupt(way_out) from None
+                raise KeyboardInterrupt(remedy) from None
             raise

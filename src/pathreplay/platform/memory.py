@@ -72,11 +72,11 @@ def require_kept() -> None:
         )
 
 
-def require(needed: int, thing: str, way_out: str) -> None:
-    """Raise PathreplayError unless ``needed`` bytes are available; it names ``thing`` and the remedy ``way_out``."""
+def require(needed: int, thing: str, remedy: str) -> None:
+    """Raise PathreplayError unless ``needed`` bytes are available; it names ``thing`` and the remedy ``remedy``."""
     if needed > (left := available()):
         asked = f"needs about {_readable(needed)} of memory"
-        raise PathreplayError(f"{thing} {asked}, {_readable(left)} is available; {way_out}")
+        raise PathreplayError(f"{thing} {asked}, {_readable(left)} is available; {remedy}")
 
 
 def _readable(count: int) -> str:

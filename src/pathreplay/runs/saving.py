@@ -96,7 +96,7 @@ def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) 
     Raises PathreplayError if an image or a checkpoint is missing, damaged, or does not fit this run.
     """
     _require_capture(folder / CAPTURE, problem)
-    keep, sums = problem.album.keep, Sums(folder)
+    keep, sums = problem.disk.keep, Sums(folder)
     before = {view.name: keep(_read(folder / _picture("start", view.name), sums)) for view in problem.views}
     for view in problem.views:
         home, there = problem.home(view)

@@ -60,7 +60,7 @@ def key_of(seed: mi.UInt32, *more: mi.UInt32) -> mi.UInt32:
     return key
 
 
-def in_order(x: mi.UInt32, y: mi.UInt32) -> mi.UInt32:
+def morton_index(x: mi.UInt32, y: mi.UInt32) -> mi.UInt32:
     """Morton index of a pixel, for images of up to 2^16 x 2^16."""
     return _spread(x) | (_spread(y) << 1)
 

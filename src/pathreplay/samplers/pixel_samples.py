@@ -30,7 +30,7 @@ class PixelSamples(Protocol):
 
 
 @dataclass(frozen=True)
-class Alone:
+class IndependentSets:
     """Samples of a sampler with independent samples: each path is its own set."""
 
     sampler: mi.Sampler
@@ -49,7 +49,7 @@ class Alone:
 
 
 @dataclass(frozen=True)
-class EvenSets:
+class SobolSets:
     """Low-discrepancy samples, in up to `SETS` sets."""
 
     numbers: Callable[[mi.UInt32, int, mi.UInt32], Any]

@@ -27,7 +27,9 @@ def load_integrator(description: Mapping[str, Any]) -> mi.Integrator:
     """Load the integrator that a dictionary describes. Raises PathreplayError if Mitsuba cannot create it."""
     require_values(description)
     name = description.get("type")
-    with told(f"Integrator '{name}' cannot be created", (Exception,)):  # plugins in Python raise exceptions of any type
+    with errors_as(
+        f"Integrator '{name}' cannot be created", (Exception,)
+    ):  # plugins in Python raise exceptions of any type
         integrator = mi.load_dict(dict(description))
     if not isinstance(integrator, mi.Integrator):
         raise PathreplayError(
@@ -38,7 +40,7 @@ def load_integrator(description: Mapping[str, Any]) -> mi.Integrator:
 
 
 @contextmanager
-def told(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -> Iterator[None]:
+def errors_as(what: str, kinds: tuple[type[Exception], ...] = (RuntimeError,)) -> Iterator[None]:
     """Convert exceptions of these kinds into a PathreplayError whose message begins with ``what``.
 
     The message is that of the first exception in the chain, because those that Dr.Jit's calls and loops raise

@@ -20,7 +20,7 @@ from pathreplay.platform.files import MISSING, file_problem
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes import parameters as scene_parameters
 from pathreplay.scenes.builtin import BUILTINS, COSTS, SceneDict
-from pathreplay.scenes.descriptions import told
+from pathreplay.scenes.descriptions import errors_as
 from pathreplay.scenes.substitute import Cameras, load_dict_with, load_file_with
 
 # Class name of a `bitmap` stored in 8 bits.
@@ -56,13 +56,13 @@ def load_scene_with(
     if mi.variant() is None:
         raise PathreplayError("No Mitsuba variant is active; call mitsuba.set_variant('llvm_ad_rgb') first")
     if isinstance(spec, Mapping):
-        with told("The scene's dictionary cannot be loaded", (RuntimeError, ValueError, TypeError)):
+        with errors_as("The scene's dictionary cannot be loaded", (RuntimeError, ValueError, TypeError)):
             scene, exchanged = load_dict_with(_copied(spec), plugins, cameras, floats)
         if not isinstance(scene, mi.Scene):
             raise PathreplayError(f"The dictionary describes a {type(scene).__name__}, not a scene; give a 'scene'")
         return scene, exchanged
     if str(spec) in BUILTINS:
-        with told(f"Built-in scene '{spec}' cannot be created with {parameters}"):
+        with errors_as(f"Built-in scene '{spec}' cannot be created with {parameters}"):
             return load_dict_with(builtin_dict(str(spec), parameters), plugins, cameras, floats)
     path = Path(spec) if base is None else Path(base) / spec
     if (problem := file_problem(path)) == MISSING:
@@ -70,7 +70,7 @@ def load_scene_with(
     if problem:
         raise PathreplayError(f"Scene {path} {problem}; give the path of a Mitsuba XML file")
     arguments = as_xml_has_them(parameters)
-    with told(f"Scene {path} cannot be loaded", (RuntimeError, ValueError, TypeError)):
+    with errors_as(f"Scene {path} cannot be loaded", (RuntimeError, ValueError, TypeError)):
         scene, exchanged = load_file_with(path, plugins, arguments, cameras, floats)
     if not isinstance(scene, mi.Scene):
         raise PathreplayError(f"{path} describes a {type(scene).__name__}, not a <scene>; wrap it in <scene>")

@@ -18,7 +18,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.platform.traversal import traversed
-from pathreplay.scenes.descriptions import load_integrator, told
+from pathreplay.scenes.descriptions import errors_as, load_integrator
 from pathreplay.scenes.loading import load_scene_for
 from pathreplay.scenes.parameters import get_array, is_transform, resolve_differentiable
 from pathreplay.scenes.stored import form_of
@@ -85,7 +85,7 @@ class SceneFunction:
 
     def picture(self, values: Sequence[mi.TensorXf], view: View) -> mi.TensorXf:
         """Render the image of a sensor (height, width, channels; linear)."""
-        with dr.suspend_grad(), told("The scene cannot be rendered"):
+        with dr.suspend_grad(), errors_as("The scene cannot be rendered"):
             self._put(values, grad=False)
             sensor, seed, spp = view
             image = mi.render(self.scene, sensor=sensor, integrator=self.integrator, spp=spp, seed=seed)
@@ -96,7 +96,7 @@ class SceneFunction:
         """Gradient of the weighted sum of the image, from separate samples whose seed is derived from the view's."""
         sensor, seed, spp = view
         other = int(np.random.SeedSequence([seed, 1]).generate_state(1)[0])
-        with dr.resume_grad(), told("The gradient cannot be computed"):
+        with dr.resume_grad(), errors_as("The gradient cannot be computed"):
             seen = self._put(values, grad=True)
             image = mi.render(
                 self.scene,

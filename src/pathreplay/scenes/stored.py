@@ -125,7 +125,7 @@ class Spectra(Form):
         return (seen * factor[:, None]).reshape(colours.shape).astype(np.float32)
 
 
-class Lamp(Spectra):
+class EmitterColour(Spectra):
     """The radiance of an emitter, whose brightness is not part of its coefficients."""
 
     def of_colours(self, key: str, colours: Array) -> Array:
@@ -144,7 +144,7 @@ def form_of(params: Any, key: str) -> Form:
         form = Sky(mono=mi.is_monochromatic)
     if not (channels := coefficient_channels(params, key)):
         return form
-    return Lamp() if kind == "D65Spectrum" else Spectra(scaled=channels == 4, inner=form)
+    return EmitterColour() if kind == "D65Spectrum" else Spectra(scaled=channels == 4, inner=form)
 
 
 def _entries(value: Any, channels: int) -> Any:

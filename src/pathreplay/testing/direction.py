@@ -97,11 +97,11 @@ _LONGEST_STEP = 1e6
 
 def _require_seen(key: str, value: np.ndarray, direction: np.ndarray, step: float, size: float) -> None:
     """Raise PathreplayError for a step far larger than the parameter, or lost in single precision."""
-    way_out = f"leave it out, or give one near {RELATIVE_STEP * size:g}"
+    remedy = f"leave it out, or give one near {RELATIVE_STEP * size:g}"
     if step * float(np.abs(direction).max()) > _LONGEST_STEP * size:
-        raise PathreplayError(f"Step {step} for '{key}' is too long for values up to {size:g}; {way_out}")
+        raise PathreplayError(f"Step {step} for '{key}' is too long for values up to {size:g}; {remedy}")
     if (np.float32(value + step / 2 * direction) == np.float32(value)).all():
-        raise PathreplayError(f"Step {step} for '{key}' is lost in the rounding of single precision; {way_out}")
+        raise PathreplayError(f"Step {step} for '{key}' is lost in the rounding of single precision; {remedy}")
 
 
 def _random_direction(

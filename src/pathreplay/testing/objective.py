@@ -16,7 +16,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.stateful import stateful
-from pathreplay.scenes.descriptions import told
+from pathreplay.scenes.descriptions import errors_as
 from pathreplay.scenes.parameters import get_array
 from pathreplay.testing.direction import Line
 from pathreplay.testing.stencil import Stencil
@@ -107,7 +107,9 @@ class Objective:
     def derivative(self, integrator: mi.Integrator, mode: Mode, primal: int, seed: int, spp: int) -> float:
         """dF/dt at 0 through ``mi.render``, with separate seeds for image and derivative, as in user code."""
         name = integrator_name(integrator)
-        with told(f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode", (RuntimeError, TypeError)):
+        with errors_as(
+            f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode", (RuntimeError, TypeError)
+        ):
             t = self._attached()
             image = mi.render(
                 self.scene, self.params, sensor=self.sensor, integrator=integrator,
@@ -157,7 +159,7 @@ class Objective:
         return t
 
     def _render(self, integrator: mi.Integrator, seed: int, spp: int) -> mi.TensorXf:
-        with told(f"Integrator '{integrator_name(integrator)}' cannot render the scene"):
+        with errors_as(f"Integrator '{integrator_name(integrator)}' cannot render the scene"):
             return mi.TensorXf(integrator.render(self.scene, self.sensor, seed=mi.UInt32(seed), spp=spp))
 
 

@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from pathreplay.transport.facts.traits import is_painted
 from pathreplay.transport.meet import meet
-from pathreplay.transport.surface import held_point
+from pathreplay.transport.surface import surface_point
 from pathreplay.transport.vertex import Arrival, Lighting, TraceConfig, mis_weight, reciprocal
 from pathreplay.transport.volume.passage import skip_null
 
@@ -100,7 +100,7 @@ def _glued(
     hit = meet(trace, ray, active)
     if trace.media is not None:
         hit = skip_null(trace, ray, hit, active)
-    y = held_point(hit, ray, active)
+    y = surface_point(hit, ray, active)
     towards = y.p - origin.p
     facing = dr.abs(dr.dot(y.A, towards))
     ok = active & hit.is_valid() & (hit.shape.emitter() == still.emitter) & (facing > 0)
@@ -125,5 +125,5 @@ def _mesh_growth(scene: mi.Scene, origin: mi.Interaction3f, light: mi.DirectionS
     ray.maxt = dr.largest(mi.Float)
     hit = scene.ray_intersect_preliminary(ray, active=lit)
     on_mesh = lit & hit.is_valid() & hit.shape.is_mesh() & (hit.shape.emitter() == light.emitter)
-    area = dr.norm(held_point(hit, ray, on_mesh).A)
+    area = dr.norm(surface_point(hit, ray, on_mesh).A)
     return dr.select(on_mesh & (area > 0), dr.replace_grad(mi.Float(1), area * dr.detach(reciprocal(area))), 1)

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.transport.facts.traits import FACETS, WHOLE, Tables
-from pathreplay.transport.surface import held_point
+from pathreplay.transport.surface import surface_point
 from pathreplay.transport.vertex import TraceConfig
 
 TUBES = mi.ShapeType.Cylinder, mi.ShapeType.BSplineCurve, mi.ShapeType.LinearCurve
@@ -101,7 +101,7 @@ def outline_gap(
 
     z has fixed surface coordinates on its shape. Differentiable in o, d and the shape; zero where not ``active``.
     """
-    z = held_point(hit, dr.detach(ray), active).p
+    z = surface_point(hit, dr.detach(ray), active).p
     return dr.select(active, dr.dot(n, o + dr.select(active, hit.t, 0) * d - z), 0)
 
 

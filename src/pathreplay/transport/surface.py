@@ -59,7 +59,7 @@ def steady(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Su
 
 
 @dataclass
-class HeldPoint:
+class SurfacePoint:
     """A point with fixed surface coordinates, which moves with its surface."""
 
     p: mi.Point3f
@@ -68,7 +68,7 @@ class HeldPoint:
     κ: mi.Float  # curvature of a sphere (> 0: convex), 0 for a plane, infinite for other surfaces; detached
 
 
-def held_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> HeldPoint:
+def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> SurfacePoint:
     """The point that ``ray`` hit, with fixed surface coordinates.
 
     On meshes A is computed from the triangle itself. Derivatives with respect to texture coordinates would vanish where
@@ -79,7 +79,7 @@ def held_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
     y = hit.compute_surface_interaction(ray, mi.RayFlags.All | mi.RayFlags.dNGdUV | flags, active)
     triangle = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal | flags, on_mesh)
     A = dr.select(on_mesh, dr.cross(triangle.dp_du, triangle.dp_dv), dr.cross(y.dp_du, y.dp_dv))
-    return HeldPoint(y.p, A, dr.detach(y.n), dr.select(on_mesh, 0, _curvature(dr.detach(y))))
+    return SurfacePoint(y.p, A, dr.detach(y.n), dr.select(on_mesh, 0, _curvature(dr.detach(y))))
 
 
 def _curvature(y: mi.SurfaceInteraction3f) -> mi.Float:

@@ -27,7 +27,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.transport.surface import HeldPoint, held_point
+from pathreplay.transport.surface import SurfacePoint, surface_point
 
 # h0 over the size of the shape that was hit. A larger value gives less noise and loses more of the motion of nearby
 # edges; docs/gradients.md has measurements for 0.003 to 0.03.
@@ -52,7 +52,7 @@ def moved_direction(
     shape that was hit.
     """
     valid = active & hit.is_valid()
-    y = held_point(hit, dr.detach(origin.spawn_ray(d)), valid)
+    y = surface_point(hit, dr.detach(origin.spawn_ray(d)), valid)
     towards = y.p - origin.spawn_ray(dr.detach(d)).o
     facing = dr.abs(dr.dot(y.A, towards))
     ok = valid & (facing > 0)
@@ -87,13 +87,13 @@ def held_direction(
 
     Differentiable in ``origin`` and in the shape that was hit.
     """
-    y = held_point(hit, dr.detach(origin.spawn_ray(d)), active)
+    y = surface_point(hit, dr.detach(origin.spawn_ray(d)), active)
     towards = y.p - origin.spawn_ray(dr.detach(d)).o
     ok = active & (dr.squared_norm(towards) > 0)
     return dr.select(ok, dr.replace_grad(d, dr.normalize(towards)), d)
 
 
-def _share(h0: mi.Float, y: HeldPoint, towards: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Vector3f]:
+def _share(h0: mi.Float, y: SurfacePoint, towards: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Vector3f]:
     """The blend factor φ, and the vector ``slope`` with ∇φ·V_H = slope·d_H'. Detached."""
     r = dr.norm(towards)
     n = dr.normalize(y.A)

@@ -79,10 +79,10 @@ def require_film(sensor: mi.Sensor, name: str, spp: Mapping[str, int], also: int
     pixels = width * height
     for key, count in spp.items():
         if pixels * count > MOST_SAMPLES:
-            way_out = f"'{key}' up to {MOST_SAMPLES // pixels}" if pixels <= MOST_SAMPLES else "a smaller film"
+            remedy = f"'{key}' up to {MOST_SAMPLES // pixels}" if pixels <= MOST_SAMPLES else "a smaller film"
             raise PathreplayError(
                 f"'{key}' is {count}: with {name} of {width} x {height} pixels that is {pixels * count} samples, "
-                f"beyond the {MOST_SAMPLES} that Dr.Jit takes at once; take {way_out}"
+                f"beyond the {MOST_SAMPLES} that Dr.Jit takes at once; take {remedy}"
             )
     thing = f"Rendering {name} of {width} x {height} pixels"
     memory.require(pixels * _A_PIXEL + also, thing, "take a smaller film or fewer sensors")

@@ -24,7 +24,7 @@ def _most(max_depth: int) -> int:
 
 
 def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) -> str:
-    """Why pixels of a sensor cannot be swept, as the end of a sentence, with the way out; "" where they can.
+    """Why pixels of a sensor cannot be swept, as the end of a sentence, with the remedy; "" where they can.
 
     That takes a box filter, so that each path belongs to one pixel, or if only ``some`` are swept, any filter that is a
     density (see `FilterSamples`); colours (rgb) and no alpha; an independent sampler; a camera that stands still and

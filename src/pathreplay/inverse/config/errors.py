@@ -103,7 +103,7 @@ def _renamed(key: str, table: type[BaseModel]) -> str | None:
     return next((name for name in RENAMED.get(key, "").split() if name in table.model_fields), None)
 
 
-_ALTERNATIVES = ("int", "float", "bool", "str", "count", "Picture", "Value", "Displacement")
+_ALTERNATIVES = ("int", "float", "bool", "str", "count", "ImageValue", "Value", "Displacement")
 
 
 def _path(loc: tuple[int | str, ...]) -> list[str]:

@@ -11,7 +11,7 @@ from pathreplay.errors import shown
 from pathreplay.inverse.config.tables import Count, Finite, Positive, Switch, Table
 
 
-class Picture(Table):
+class ImageValue(Table):
     """An image file as the value of a texture."""
 
     image: str
@@ -22,7 +22,7 @@ class Picture(Table):
     """Use the stored values without decoding them from sRGB."""
 
 
-Value = Finite | list[Finite] | str | Picture
+Value = Finite | list[Finite] | str | ImageValue
 """Value of a parameter: one number for all entries, a list of numbers (a colour), or the name of a file."""
 
 

@@ -16,7 +16,7 @@ All keys of a config file. This page is the output of `pathreplay schema --markd
 _TITLES = {
     "Parameter": "[[parameters]]",
     "Displacement": "initial = { ... } for a pose",
-    "Picture": "{ image = ... }",
+    "ImageValue": "{ image = ... }",
     "Derivation": "[[derived]]",
     "Target": "[target]",
     "Capture": "[capture]",

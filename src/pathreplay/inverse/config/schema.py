@@ -18,7 +18,7 @@ from pathreplay.inverse.config.executor_options import ExecutorName, RayOptions
 from pathreplay.inverse.config.memory_options import Memory, bytes_of
 from pathreplay.inverse.config.noise_options import AUTO, AdaptiveSpp, Spp
 from pathreplay.inverse.config.optimizer_options import Optimizer
-from pathreplay.inverse.config.parameter_options import Derivation, Displacement, Parameter, Picture
+from pathreplay.inverse.config.parameter_options import Derivation, Displacement, ImageValue, Parameter
 from pathreplay.inverse.config.parsing import YAML, most_bytes, parsed
 from pathreplay.inverse.config.preview_options import Preview
 from pathreplay.inverse.config.schedules import Schedule
@@ -290,7 +290,7 @@ _TABLES: dict[str, type[BaseModel]] = {
     "parameters": Parameter,
     "derived": Derivation,
     "target": Target,
-    "Picture": Picture,
+    "ImageValue": ImageValue,
     "Displacement": Displacement,
     "optimizer": Optimizer,
     "preview": Preview,

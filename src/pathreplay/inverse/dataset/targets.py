@@ -18,7 +18,7 @@ from pathreplay.inverse.dataset.globbing import matching
 from pathreplay.inverse.dataset.undistortion import Lens
 from pathreplay.inverse.dataset.views import View
 from pathreplay.inverse.images.background import background
-from pathreplay.inverse.images.disk_store import ROOM, Album
+from pathreplay.inverse.images.disk_store import ROOM, DiskStore
 from pathreplay.inverse.images.io import (
     Image,
     find_image,
@@ -35,7 +35,7 @@ from pathreplay.inverse.parameters.grids import comparable
 from pathreplay.inverse.parameters.values import Array, adapted_image, make_value, require_finite_array, seen
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes import parameters
-from pathreplay.scenes.descriptions import load_integrator, told
+from pathreplay.scenes.descriptions import errors_as, load_integrator
 from pathreplay.scenes.image_files import MOST_PIXELS
 from pathreplay.scenes.loading import load_scene_with_floats
 from pathreplay.scenes.stored import form_of
@@ -94,7 +94,7 @@ def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> d
     return {k: value for k, value in true.items() if comparable(value.shape, parameters.get_array(seen(own, k)).shape)}
 
 
-def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], album: Album) -> dict[str, Image]:
+def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], disk: DiskStore) -> dict[str, Image]:
     """Render the targets of all views. Raises PathreplayError if the target scene lacks a sensor."""
     plugin = config.target.integrator
     assert plugin is not None  # set by `completed`
@@ -108,12 +108,12 @@ def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], a
     targets: dict[str, Image] = {}
     for name, index in sensors.items():
         seed, _ = config.seeds(TARGET, index)
-        with told(f"Integrator '{plugin.type}' cannot render the target of sensor '{name}'"):
+        with errors_as(f"Integrator '{plugin.type}' cannot render the target of sensor '{name}'"):
             image = mi.render(scene, sensor=index, integrator=integrator, spp=config.target.spp, seed=mi.UInt32(seed))
             targets[name] = np.array(image, dtype=np.float32)
             del image
         require_finite_array(f"Target image of sensor '{name}'", targets[name])
-        targets[name] = album.keep(targets[name])
+        targets[name] = disk.keep(targets[name])
     return targets
 
 
@@ -132,7 +132,7 @@ class Reading:
 
 
 def read_targets(
-    files: Mapping[str, str], how: Reading, scene: mi.Scene, sensors: dict[str, int], base: Path, album: Album
+    files: Mapping[str, str], how: Reading, scene: mi.Scene, sensors: dict[str, int], base: Path, disk: DiskStore
 ) -> tuple[Targets, tuple[str, ...]]:
     """Read target images from files.
 
@@ -142,7 +142,7 @@ def read_targets(
         scene: scene of the job.
         sensors: index of the sensor of each view.
         base: folder that relative paths start from.
-        album: store of the images.
+        disk: store of the images.
 
     Returns:
         The targets, with weights for alpha = 'mask' and for undistorted images, and notes for the user.
@@ -176,9 +176,9 @@ def read_targets(
             image = unpremultiplied(image)
         elif alpha == "scene" and not how.hidden:
             image = over(image, background(scene, sensors[name]))
-        targets[name] = album.keep(adapted_image(what, image, f"sensor '{name}' renders", shape[2]))
+        targets[name] = disk.keep(adapted_image(what, image, f"sensor '{name}' renders", shape[2]))
         if name in weights:
-            weights[name] = album.keep(weights[name])
+            weights[name] = disk.keep(weights[name])
         fraction = transparent_share(image)
         if fraction and shape[2] in (1, 3) and alpha == "black":
             notes.append(
@@ -195,7 +195,7 @@ def read_targets(
 
 
 def _kinds(lenses: Mapping[str, Lens]) -> str:
-    return ", ".join(sorted({lens.told() for lens in lenses.values()}))
+    return ", ".join(sorted({lens.describe() for lens in lenses.values()}))
 
 
 def _require_alpha(what: str, image: Image, alpha: str, name: str, shape: tuple[int, int, int]) -> None:

@@ -47,7 +47,7 @@ class Lens:
         bends = self.fisheye or any(self.radial) or any(self.tangential)
         return not bends and abs(self.fy / self.fx - 1) * self.h / 2 <= OFF
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """Describe the lens in words."""
         if self.fisheye:
             return "a fisheye lens"

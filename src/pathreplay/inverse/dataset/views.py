@@ -71,7 +71,7 @@ def _place(item: int | str, ids: list[str], names: list[str]) -> int:
     return index
 
 
-def held_out_of(scene: mi.Scene, sensors: dict[str, int], config: Config, shots: list[str]) -> set[str]:
+def test_views_of(scene: mi.Scene, sensors: dict[str, int], config: Config, shots: list[str]) -> set[str]:
     """Return the names of the test views: those that the job names, and every n-th shot of a capture."""
     available = sensors_of(scene, None)
     ids = [sensor.id() for sensor in scene.sensors()]

@@ -25,7 +25,7 @@ SMALL = 2**16
 Array = NDArray[np.float32]
 
 
-class Album:
+class DiskStore:
     """Keeps up to ``room`` bytes of arrays in memory and the others in a file in TMPDIR (default: /var/tmp)."""
 
     def __init__(self, room: int = ROOM) -> None:
@@ -35,9 +35,9 @@ class Album:
         self._maps: list[mmap.mmap] = []
 
     @staticmethod
-    def of(budget: int | None) -> Album:
+    def of(budget: int | None) -> DiskStore:
         """Make a store for a run with a memory limit of ``budget`` bytes, of which it uses at most an eighth."""
-        return Album(ROOM if budget is None else min(ROOM, budget // 8))
+        return DiskStore(ROOM if budget is None else min(ROOM, budget // 8))
 
     def keep(self, array: Array) -> Array:
         """Return the array itself or a read-only copy on disk. Raises PathreplayError if the disk is full."""

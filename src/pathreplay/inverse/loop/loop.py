@@ -329,7 +329,7 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
 
 def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:
     """Render all views with the job's integrator at these values; all calls use the same random numbers."""
-    return {view.name: problem.album.keep(picture_of(problem, config, values, view)) for view in problem.views}
+    return {view.name: problem.disk.keep(picture_of(problem, config, values, view)) for view in problem.views}
 
 
 def picture_of(problem: Problem, config: Config, values: Arrays, view: View, spp: int | None = None) -> Image:

@@ -34,7 +34,7 @@ from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem, scene_values, sensor_of
 from pathreplay.platform import memory
 from pathreplay.platform.threads import one_thread
-from pathreplay.scenes.descriptions import told
+from pathreplay.scenes.descriptions import errors_as
 from pathreplay.scenes.parameters import get_array
 
 LARGE = 2**22
@@ -229,7 +229,7 @@ class Evaluator:
     def _view(self, values: Arrays, view: int, seed: int, spp: int, pixels: int | None) -> Evaluation:
         about = self.problem.views[view]
         sensor_of(self.problem, about)
-        variables = self.problem.held.variables(self.problem, values)
+        variables = self.problem.cache.variables(self.problem, values)
         moving = {key: value for key, value in variables.items() if key in self._moving}
         if view in self._reached:
             dr.enable_grad(moving)
@@ -277,7 +277,7 @@ class Evaluator:
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         request = RenderRequest(sensor, number, spp, batch)
         loss = ViewLoss(problem.loss, about.share / len(problem.trained()), self._sweeps[which])
-        problem.album.rest()
+        problem.disk.rest()
         with plain_errors():
             step = self._recordings[spp].differentiate if records else differentiate
             found = step(problem.params, problem.scene, self.integrator, request, target, loss)
@@ -291,5 +291,5 @@ def computing(config: Config) -> Iterator[None]:
     names = (
         config.integrator.type if config.baseline is None else f"{config.integrator.type}' or '{config.baseline.type}"
     )
-    with one_thread(config.deterministic), told(f"Integrator '{names}' cannot do this job"):
+    with one_thread(config.deterministic), errors_as(f"Integrator '{names}' cannot do this job"):
         yield

@@ -139,10 +139,10 @@ def _require_divisible(sensor: mi.Sensor, name: str, downscale: int) -> None:
     if width % downscale or height % downscale:
         most = np.gcd(width, height)
         fit = [n for n in range(2, min(int(most), 64) + 1) if most % n == 0]
-        way_out = f"take one of {', '.join(map(str, fit))}" if fit else "leave it out"
+        remedy = f"take one of {', '.join(map(str, fit))}" if fit else "leave it out"
         raise PathreplayError(
             f"stages: downscale = {downscale} does not divide the {width} x {height} pixels of sensor '{name}'; "
-            f"{way_out}"
+            f"{remedy}"
         )
 
 

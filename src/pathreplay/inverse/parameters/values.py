@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError
-from pathreplay.inverse.config.parameter_options import Picture, Value
+from pathreplay.inverse.config.parameter_options import ImageValue, Value
 from pathreplay.inverse.images.io import Image, find_image, read_image, resized, with_channels
 from pathreplay.inverse.parameters.grids import Array, resampled
 from pathreplay.scenes.parameters import get_array, is_transform
@@ -58,7 +58,7 @@ def make_value(key: str, like: Any, value: Value, base: Path) -> Array:
             channels = f"{data.shape[3]} channels, but '{key}' has {current.shape[3]}"
             raise PathreplayError(f"Volume {path} has {channels}; convert the volume")
         return resampled(data, current.shape)
-    picture = value if isinstance(value, Picture) else Picture(image=value)
+    picture = value if isinstance(value, ImageValue) else ImageValue(image=value)
     if current.ndim != 3:
         raise PathreplayError(
             f"Value of '{key}' is the image '{picture.image}', but the parameter is not a texture "

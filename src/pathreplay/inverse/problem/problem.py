@@ -37,9 +37,9 @@ from pathreplay.inverse.dataset.targets import (
     target_scene,
     truth_of,
 )
-from pathreplay.inverse.dataset.views import View, held_out_of, named_views, sensors_of, shares_of
+from pathreplay.inverse.dataset.views import View, named_views, sensors_of, shares_of, test_views_of
 from pathreplay.inverse.images.background import require_known
-from pathreplay.inverse.images.disk_store import Album
+from pathreplay.inverse.images.disk_store import DiskStore
 from pathreplay.inverse.images.io import picture_size
 from pathreplay.inverse.losses.pixelwise import Loss, find_loss
 from pathreplay.inverse.parameters import limits as parameter_limits
@@ -59,7 +59,7 @@ from pathreplay.scenes.descriptions import load_integrator
 from pathreplay.scenes.loading import load_scene_for
 
 
-class Held:
+class VariableCache:
     """Cache of the last values that were converted to Dr.Jit, so that only one copy exists."""
 
     def __init__(self) -> None:
@@ -100,9 +100,9 @@ class Problem:
     derived: tuple[Derived, ...] = ()
     capture: str | None = None
     """Hash of the capture (see `fingerprint`)."""
-    album: Album = field(default_factory=Album)
+    disk: DiskStore = field(default_factory=DiskStore)
     """Store of images, initial values and true values."""
-    held: Held = field(default_factory=Held)
+    cache: VariableCache = field(default_factory=VariableCache)
     """Cache of converted values."""
 
     def moves(self, moving: frozenset[str]) -> set[str]:
@@ -167,7 +167,7 @@ def sensor_of(problem: Problem, view: View) -> mi.Sensor:
 def put_values(problem: Problem, values: Arrays) -> None:
     """Set the parameters of the scene, or of all scenes, to the values of the variables, without gradients."""
     for each in problem.scenes():
-        each.params.update(scene_values(each, each.held.variables(each, values)))
+        each.params.update(scene_values(each, each.cache.variables(each, values)))
 
 
 def errors_of(problem: Problem, values: Arrays) -> dict[str, float]:
@@ -185,7 +185,7 @@ def errors_of(problem: Problem, values: Arrays) -> dict[str, float]:
     """
     errors = {v.key: rmse(values[v.key], v.truth) for v in problem.variables if v.truth is not None}
     poses = [pose for pose in problem.poses if pose.truth is not None]
-    variables = problem.held.variables(problem, values) if problem.derived or poses else {}
+    variables = problem.cache.variables(problem, values) if problem.derived or poses else {}
     for entry in problem.derived:
         value = entry.require_finite(variables)
         if entry.truth is not None:
@@ -222,7 +222,7 @@ def build_problem(
     Raises:
         PathreplayError: a part of the job is invalid or inconsistent.
     """
-    album = Album.of(config.budget)
+    disk = DiskStore.of(config.budget)
     given = memory or InMemory()
     modules = Modules(base, given.functions)
     loss = find_loss(config.loss, modules)
@@ -248,7 +248,7 @@ def build_problem(
     # Cheap checks come before the rendering of targets.
     sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
     used = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
-    test_views = held_out_of(scene, sensors, config, list(shots))
+    test_views = test_views_of(scene, sensors, config, list(shots))
     feasibility.require_visible(scene, params, keys)
     if config.target.alpha == "scene":
         require_known(scene, params, keys)
@@ -257,7 +257,7 @@ def build_problem(
     derived = make_derived(params, derivations, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
-    targets, truth, messages = _seen(config, targets, used, _Opened(scene, params, keys, sensors), base, album)
+    targets, truth, messages = _seen(config, targets, used, _Opened(scene, params, keys, sensors), base, disk)
     notes += messages
     if missing := set(sensors) - set(targets.images):
         raise PathreplayError(f"The run folder has no target image of sensor '{missing.pop()}'; start a new run")
@@ -272,8 +272,8 @@ def build_problem(
     unsolved += _exposures(scene, config, views)
     for view in views:
         feasibility.require_finite_loss(loss, view.name, view.target, view.weight)
-        album.rest()
-    variables = tuple(_kept(album, replace(variable, truth=truth.get(variable.key))) for variable in unsolved)
+        disk.rest()
+    variables = tuple(_kept(disk, replace(variable, truth=truth.get(variable.key))) for variable in unsolved)
     poses = tuple(replace(pose, truth=truth.get(pose.key)) for pose in unsolved_poses)
     derived = tuple(replace(entry, truth=truth.get(entry.key)) for entry in derived)
     # Traversed again: SceneParameters from which values were read expect all of their keys at the next update().
@@ -281,7 +281,7 @@ def build_problem(
     parameters.keep_only(params, keys)
     digest = fingerprint(used.values()) if used else None
     return Problem(
-        config, scene, params, integrator, baseline, judge, variables, poses, views, loss, notes, derived, digest, album
+        config, scene, params, integrator, baseline, judge, variables, poses, views, loss, notes, derived, digest, disk
     )
 
 
@@ -311,7 +311,7 @@ class _Opened:
 
 
 def _seen(
-    config: Config, targets: Targets | None, shots: Mapping[str, Shot], opened: _Opened, base: Path, album: Album
+    config: Config, targets: Targets | None, shots: Mapping[str, Shot], opened: _Opened, base: Path, disk: DiskStore
 ) -> tuple[Targets, dict[str, Array], tuple[str, ...]]:
     """Read or render the targets unless they are given; returns them, true values by key, and notes for the user."""
     truth: dict[str, Array] = {}
@@ -322,21 +322,21 @@ def _seen(
         truth = truth_of(other, opened.params, opened.keys)
         if targets is None:
             with one_thread(config.deterministic):
-                targets = Targets(rendered_targets(config, other, opened.sensors, album), {})
+                targets = Targets(rendered_targets(config, other, opened.sensors, disk), {})
         # Dr.Jit traces virtual calls through all live instances, so a live target scene would enlarge every kernel.
         del other
         gc.collect()
     elif targets is None:
-        targets, notes = _pictures(config, shots, opened.scene, opened.sensors, base, album)
+        targets, notes = _pictures(config, shots, opened.scene, opened.sensors, base, disk)
     if first and config.target.masks is not None:
         masks = by_view("masks", config.target.masks, opened.sensors, base)
         targets = masked(targets, read_masks(masks, opened.scene, opened.sensors, base))
     return targets, truth, notes
 
 
-def _kept(album: Album, variable: Variable) -> Variable:
-    truth = None if variable.truth is None else album.keep(variable.truth)
-    return replace(variable, start=album.keep(variable.start), truth=truth)
+def _kept(disk: DiskStore, variable: Variable) -> Variable:
+    truth = None if variable.truth is None else disk.keep(variable.truth)
+    return replace(variable, start=disk.keep(variable.start), truth=truth)
 
 
 def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list[Variable]:
@@ -361,13 +361,13 @@ def _exposures(scene: mi.Scene, config: Config, views: tuple[View, ...]) -> list
 
 
 def _pictures(
-    config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path, album: Album
+    config: Config, shots: Mapping[str, Shot], scene: mi.Scene, sensors: dict[str, int], base: Path, disk: DiskStore
 ) -> tuple[Targets, tuple[str, ...]]:
     """Read the targets from the files of a capture, or from files that the job names; returns notes, too."""
     how = Reading(config.target.alpha, hidden=bool((config.integrator.model_extra or {}).get("hide_emitters")))
     if config.capture is None:
         files = by_view("target images", config.target.images or [], sensors, base)
-        return read_targets(files, how, scene, sensors, base, album)
+        return read_targets(files, how, scene, sensors, base, disk)
     if other := set(sensors) - set(shots):
         raise PathreplayError(f"sensors: '{min(other)}' is not a camera of the capture and has no image; remove it")
     pictures = {name: str(shot.image.resolve()) for name, shot in shots.items()}
@@ -376,7 +376,7 @@ def _pictures(
         raise PathreplayError("target: the capture has masks, which exclude alpha = 'mask'; remove one of them")
     lenses = {name: shot.lens for name, shot in shots.items() if shot.lens is not None}
     how = replace(how, resize=True, lenses=lenses)
-    targets, notes = read_targets(pictures, how, scene, sensors, base, album)
+    targets, notes = read_targets(pictures, how, scene, sensors, base, disk)
     return masked(targets, read_masks(masks, scene, sensors, base, resize=True, lenses=lenses)), notes
 
 

@@ -49,7 +49,7 @@ class Tables:
     blend_lengths: mi.Float  # `velocity.blend_length` by shape
     groups_at: mi.UInt32  # by shape: offset of its triangles in `groups`, or `WHOLE` or `FACETS`
     groups: mi.UInt32  # concatenated `smoothing_groups` of these meshes; entry 0 is unused
-    lamp_balls: mi.Float  # bounding spheres of mesh emitters: see `lamp_balls`
+    emitter_bounds: mi.Float  # bounding spheres of mesh emitters: see `emitter_bounds`
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def tables_of(
         _array(mi.Bool, attachable) if attachables else None,
         blend_lengths(shapes),
         *(smoothing_groups_of(shapes) if edges else (mi.UInt32(WHOLE), mi.UInt32(0))),
-        lamp_balls(emitters, shapes),
+        emitter_bounds(emitters, shapes),
     )
 
 
@@ -206,7 +206,7 @@ def is_brushed(bsdf: mi.BSDF) -> bool:
     return any(isinstance(node, mi.BSDF) and node.class_name() in RELIEFS for node in {bsdf, *nodes_of(bsdf)})
 
 
-def lamp_balls(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:
+def emitter_bounds(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:
     """Bounding sphere of each mesh emitter, in the order of the scene's emitters: centre, and radius (0 for others)."""
     lamps = {lamp.emitter(): lamp for lamp in _mesh_lamps(shapes)}
     balls = [_ball(lamps[emitter]) if emitter in lamps else np.zeros(4) for emitter in emitters]
