@@ -5,14 +5,16 @@ And that neither could be missing or counted twice.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from edge_scenes import BY_NAME, INDIRECT, SHADOWS, VEILED
 from edge_truth import backwards, hold_forward, hold_gradients, hold_need, loaded, reference, some
-from pathreplay.boundary import observer
-from pathreplay.boundary import secondary as secondary_boundary
+from pathreplay.boundary import observer, occlusion
+from pathreplay.boundary.emitters import ShadowCrossing
 from pathreplay.integrators import boundary_term as boundary
 from pathreplay.integrators import integrator as integrators
 from pathreplay.testing.statistics import gap
@@ -61,9 +63,9 @@ def test_nor_do_they_where_edges_ignore_what_the_interior_follows(name: str, mon
     """
     monkeypatch.setattr(integrators, "can_follow", lambda trace, sensor: False)
     arrival, kept = observer.Arrival, (mi.Bool(True), mi.Bool(False))
-    monkeypatch.setattr(secondary_boundary, "moved_direction", lambda lengths, origin, d, hit, active: (d, mi.Float(1)))
+    monkeypatch.setattr(occlusion, "moved_direction", lambda lengths, origin, d, hit, active: (d, mi.Float(1)))
     monkeypatch.setattr(observer, "Arrival", lambda ray, hit, pdf, *_: arrival(ray, hit, pdf, *kept))
-    monkeypatch.setattr(secondary_boundary, "shadow_weight", lambda x, shaded: mi.Spectrum(0))
+    monkeypatch.setattr(ShadowCrossing, "weighted", lambda self, *_: replace(self, weight=mi.Spectrum(0)))
     differences = reference(name)
     with loaded(BY_NAME[name]) as bench:
         found = gap(backwards(bench, COUNTED_TWICE[name]), differences)
