@@ -73,7 +73,7 @@ BAD = {
     ),
     "attached": (
         {"type": "pathreplay", "boundary": "all", "attach": "all"},
-        "edges know what moves with attach = 'delta'",
+        "boundary terms need attach = 'delta'",
     ),
 }
 

@@ -102,8 +102,8 @@ def test_auto_walks_twice_where_records_would_take_too_much_and_says_so_once(
     np.testing.assert_allclose(gradient(ours), recorded, rtol=1e-4)
     np.testing.assert_allclose(gradient(ours), recorded, rtol=1e-4)
     told = capfd.readouterr().out
-    assert told.count("paths are walked twice instead") == 1
-    assert "records of 1500 vertices are more than NVIDIA H100" in told
+    assert told.count("paths are replayed instead") == 1
+    assert "records of 1500 vertices per thread do not fit into the memory of NVIDIA H100" in told
     most = deepest(walk_of(room()), H100)
     assert f"up to max_depth = {most} they are recorded" in told
     assert ours.interior._sweeps(walk_of(room(), most)) and not ours.interior._sweeps(walk_of(room(), most + 1))

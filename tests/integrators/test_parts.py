@@ -164,7 +164,9 @@ def test_what_cannot_be_counted_is_told_before_anything_is_launched() -> None:
     params = mi.traverse(scene)
     params["sensor.film.size"] = mi.ScalarVector2u(2**16, 2**16)
     params.update()
-    with pytest.raises(PathreplayError, match=r"65536 x 65536 pixels, beyond the 4294967295 samples.*make it smaller"):
+    with pytest.raises(
+        PathreplayError, match=r"65536 x 65536 pixels, more than the 4294967295 samples.*make it smaller"
+    ):
         integrator().render(scene, seed=1, spp=1)
     scene = mi.load_dict(room(moves=True) | {"light": {"type": "point", "position": [0, 0, 6], "intensity": 9.0}})
     with pytest.raises(PathreplayError, match=r"boundary_spp = 300000000 .* take boundary_spp up to 268435455, or 0"):

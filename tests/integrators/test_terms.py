@@ -72,7 +72,7 @@ def test_a_term_has_the_methods_of_the_protocol_and_gives_what_it_says(plugin: s
             assert all(p.default is not p.empty for p in given[len(promised) :])
         with dr.suspend_grad(), dr.isolate_grad():
             found = term.backward(view, trace, adjoint, None)
-        assert isinstance(found, TermResult) and found.image is None and found.seen is None
+        assert isinstance(found, TermResult) and found.image is None and found.stats is None
         assert np.abs(np.array(dr.grad(params[DENSITY]))).max() > 0
         dr.set_grad(params[DENSITY], 1)
         with dr.suspend_grad():
@@ -148,7 +148,7 @@ def test_what_shards_have_seen_can_be_added(load) -> None:
     def seen(seed: int) -> BaselineStats:
         with dr.suspend_grad(), dr.isolate_grad():
             term, view = integrator.interior, Pass.of(scene, 0, seed, SPP)
-            return term.backward(view, trace, dr.ones(mi.TensorXf, (16, 16, 3)), nothing.guess).seen
+            return term.backward(view, trace, dr.ones(mi.TensorXf, (16, 16, 3)), nothing.guess).stats
 
     one, other = seen(1), seen(2)
     both = one + other

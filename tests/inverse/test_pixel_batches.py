@@ -106,7 +106,7 @@ def test_places_are_drawn_by_the_filter(filter: str) -> None:
     until /= until[-1]
     u = (dr.arange(mi.Float, n) + 0.5) / n
     for begin, end in ((-samples.radius, samples.radius), (-0.5, samples.radius), (-0.3, 0.5)):
-        low, high = (samples.share(mi.Float(place)) for place in (begin, end))
+        low, high = (samples.cdf_at(mi.Float(place)) for place in (begin, end))
         drawn = np.array(samples.draw(u, low, high))
         assert begin - 1e-3 <= drawn.min() and drawn.max() <= end + 1e-3
         a, b = np.interp([begin, end], x, until)
@@ -248,7 +248,7 @@ def test_pixels_that_are_none_are_refused(opened) -> None:
     bench = opened(Case("gaussian", lambda: room(**FILMS["gaussian"]), FLOOR, random(1.0)))
     rows = mi.TensorXf(np.ones((2, 1, 3), np.float32))
     for pixels in ([3, 3], [3, RES**2]):
-        with pytest.raises(PathreplayError, match=f"one twice, or one beyond the {RES} x {RES}"):
+        with pytest.raises(PathreplayError, match=f"a repeated index, or one outside the film of {RES} x {RES}"):
             bench.integrator().render_value_and_grad(bench.scene, rows, rows, spp=4, pixels=mi.UInt32(pixels))
     with pytest.raises(PathreplayError, match=r"shape \(2, 1, 3\): use \(3, 1, 3\)"):
         bench.integrator().render_value_and_grad(bench.scene, rows, rows, spp=4, pixels=mi.UInt32([1, 2, 3]))
@@ -267,12 +267,18 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "exposure": ({"exposure": {"fix_scale": False}}, "'exposure' needs whole images; remove one of them"),
     "auto": ({"spp": "auto"}, "spp = 'auto' cannot reduce"),
-    "integrator": ({"integrator": PRB}, "PRBIntegrator renders whole pictures; take the integrator 'pathreplay'"),
-    "baseline": ({"baseline": PRB}, "PRBIntegrator renders whole pictures"),
+    "integrator": ({"integrator": PRB}, "PRBIntegrator renders whole images only; take the integrator 'pathreplay'"),
+    "baseline": ({"baseline": PRB}, "PRBIntegrator renders whole images only"),
     "replay": ({"integrator": {"type": "pathreplay", "adjoint": "replay"}}, "adjoint = 'replay' .*; use 'recorded'"),
-    "one sample": ({"spp": 1}, "1 samples a pixel cannot judge each other; take 2 or more"),
-    "one sample of a half": ({"spp": 2, "measure_snr": True}, "1 samples a pixel"),
-    "too many": ({"spp": 1024}, "1024 samples a pixel of 3 vertices are more than the 682 that are held; take fewer"),
+    "one sample": (
+        {"spp": 1},
+        "1 samples per pixel cannot provide independent loss derivatives for each other; take 2 or more",
+    ),
+    "one sample of a half": ({"spp": 2, "measure_snr": True}, "1 samples per pixel"),
+    "too many": (
+        {"spp": 1024},
+        "1024 samples per pixel of 3 vertices are more than the 682 that a record holds; take fewer",
+    ),
     "late": ({"stages": [{"iterations": 2}, {"iterations": 1, "max_depth": 1500}]}, "of 1500 vertices"),
     "camera": (MOVED, "its camera moves; hold 'sensor.to_world', or leave 'pixel_batch_size' out"),
 }

@@ -103,7 +103,7 @@ def scene(spp: int, sampler: str = "independent", side: int = 16) -> mi.Scene:
 def test_squares_of_pixels_share_a_net(spp: int) -> None:
     view = Pass.of(scene(spp), 0, 3, spp)
     i = dr.arange(mi.UInt32, 16 * 16 * spp)
-    pairs = points(view.numbers(i // spp, 16, i % spp, spp))
+    pairs = points(view.sobol_sampler(i // spp, 16, i % spp, spp))
     pixel = np.arange(16 * 16 * spp) // spp
     row, column = pixel // 16, pixel % 16
     for size in (1, 2, 4, 8, 16):
@@ -114,7 +114,7 @@ def test_squares_of_pixels_share_a_net(spp: int) -> None:
 
 def test_more_than_32_bits_are_sets_of_their_own() -> None:
     view = Pass.of(scene(4), 0, 3, 2**24)
-    drawn = view.numbers(mi.UInt32([0, 256]), 16, mi.UInt32(5), 2**24).next_2d()
+    drawn = view.sobol_sampler(mi.UInt32([0, 256]), 16, mi.UInt32(5), 2**24).next_2d()
     assert float(np.ptp(np.array(drawn.x))) > 0
 
 
@@ -149,7 +149,9 @@ def test_paths_of_one_set_know_of_each_other_and_of_no_other_set() -> None:
     pixel = dr.arange(mi.UInt32, n)
 
     def drawn(place: int, number: int) -> np.ndarray:
-        return np.array(view.numbers(pixel, 256, mi.UInt32(place), size, number).next_2d(), dtype=np.float64) - 0.5
+        return (
+            np.array(view.sobol_sampler(pixel, 256, mi.UInt32(place), size, number).next_2d(), dtype=np.float64) - 0.5
+        )
 
     one, other = drawn(0, 0), drawn(0, 1)
     same = sum(np.mean(one * drawn(k, 0)) for k in range(1, size)) * 12

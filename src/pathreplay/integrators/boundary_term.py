@@ -1,4 +1,4 @@
-"""The boundary term: derivative of an image by the motion of edges."""
+"""The boundary term: derivative of an image due to moving edges."""
 
 from __future__ import annotations
 
@@ -30,27 +30,26 @@ from pathreplay.transport.vertex import TraceConfig
 FILM_CLOSER, INNER_CLOSER = 5, 16
 """Ratio of probed segments to segments that are resampled and resolved, on the film and in secondary searches."""
 GRID = "SDFGrid"
-"""By class: its surface is neither met nor held where its outline would have to be."""
+"""Class of shapes whose silhouettes cannot be sampled: points near the outline are neither hit nor kept fixed."""
 BATCH = "BatchSensor"
-"""By class: Dr.Jit ends the process where its rays are differentiated by their place."""
-FILM_LENGTH = 0.5  # pixels
-INNER_LENGTHS = 0.25, 0.1  # in the square of emitter samples; radians
+"""Class of sensors whose rays cannot be differentiated by film position: Dr.Jit terminates the process."""
+FILM_LENGTH = 0.5  # length of segments on the film, in pixels
+INNER_LENGTHS = 0.25, 0.1  # of segments in the unit square of emitter samples, and of arcs in radians
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """The boundary term of edges that the camera sees (also by mirrors and glass), and that surfaces and particles see.
+    """The boundary term of edges seen by the camera (also through mirrors and glass) or by surfaces and particles.
 
-    Not differentiated: hard shadows beyond the first vertex that scatters, with media; edges of textures and of masks;
-    alpha.
+    Not differentiated: with media, hard shadows after the first scattering vertex; edges in textures and masks; alpha.
     """
 
-    film: bool = True  # edges that the camera sees
-    inner: bool = True  # those that surfaces see
-    spp: int = 0  # segments per pixel, of each kind; 0: samples of the pass
+    film: bool = True  # edges seen by the camera
+    inner: bool = True  # edges seen by surfaces and particles
+    spp: int = 0  # segments per pixel, for each of the two; 0: as many as the samples of the pass
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Tangent of the image: see `Term`."""
+        """Compute the tangent of the image: see `Term`."""
         places = FilmPlaces.of(view)
         if not _move(trace, places):
             return TermResult()
@@ -66,35 +65,35 @@ class Boundary:
         places = FilmPlaces.of(view)
         if not _move(trace, places):
             return TermResult()
-        wanted = places.undeveloped(grad_in)
+        block_grad = places.undeveloped(grad_in)
 
         lost, paths = NonFiniteCounter(), 0
         for edges in self._searches(view, trace, places):
-            W = places.importance(wanted, edges.path.s, edges.path.ray.wavelengths)
+            W = places.importance(block_grad, edges.path.s, edges.path.ray.wavelengths)
             edges_backward(trace, places, edges, W, lost)
             paths += dr.width(edges.path.s)
         dr.eval()
         return TermResult(lost=lost.count, paths=paths, moves=True)
 
     def note(self, trace: TraceConfig) -> str:
-        """Nothing: see `Term`."""
+        """See `Term`: none."""
         return ""
 
     @staticmethod
     def move(view: Pass, trace: TraceConfig) -> bool:
-        """Whether edges move with the parameters that have gradients. Nothing is evaluated."""
+        """Return whether edges depend on parameters with gradients. Traces without evaluating anything."""
         return _move(trace, FilmPlaces.of(view))
 
     @staticmethod
     def informed(view: Pass, trace: TraceConfig) -> TraceConfig:
-        """Add to ``trace`` which shapes may move. With media all may, because paths cross null boundaries that move."""
+        """Add the moving shapes to ``trace``. With media all may move, since paths cross moving null boundaries."""
         if trace.media is not None or trace.traits.moving is not None:
             return trace
         return replace(trace, traits=replace(trace.traits, moving=moving_shapes(trace.scene, _still_cameras(view))))
 
     @staticmethod
     def obstacle(view: Pass) -> str:
-        """Why boundary terms cannot be computed, with the remedy; "" if they can."""
+        """Return why boundary terms cannot be computed, with the remedy; "" if they can."""
         if view.sensor.class_name() == BATCH:
             return (
                 f"edges of sensor '{view.sensor.id()}' of type 'batch' cannot be differentiated: "
@@ -108,7 +107,7 @@ class Boundary:
         return ""
 
     def _searches(self, view: Pass, trace: TraceConfig, places: FilmPlaces) -> Iterator[Edges]:
-        """Yield the edges that each search finds."""
+        """Run the searches that apply, and yield the edges of each."""
         if why := self.obstacle(view):
             raise PathreplayError(f"{why}, or use boundary = 'none'")
         trace = self.informed(view, trace)
@@ -123,24 +122,24 @@ class Boundary:
 
 
 def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
-    """Number of boundary segments of a pass: ``spp`` per pixel (0: as many as samples)."""
+    """Return the number of boundary segments of a pass: ``spp`` per pixel (0: as many as samples)."""
     pixels = int(places.size.x) * int(places.size.y)
     n = pixels * (math.ceil(spp * view.share) if spp else view.spp)
     if n > MOST_SAMPLES:
         raise PathreplayError(
-            f"boundary_spp = {spp} with a film of {pixels} pixels are {n} segments, beyond the {MOST_SAMPLES} that "
+            f"boundary_spp = {spp} with a film of {pixels} pixels are {n} segments, more than the {MOST_SAMPLES} that "
             f"Dr.Jit takes at once; take boundary_spp up to {MOST_SAMPLES // pixels}, or 0"
         )
     return max(n, 1)
 
 
 def _still_cameras(view: Pass) -> list[mi.Sensor]:
-    """Cameras whose motion the film's flow contains, or which have no gradients: their rays stay."""
+    """Return the sensors that count as still: the others, and this one if the film flow handles its motion."""
     return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
 
 
 def _move(trace: TraceConfig, places: FilmPlaces) -> bool:
-    """Whether edges move with the parameters: see `edges_move`."""
+    """Return whether edges move with the parameters: see `edges_move`."""
     key = mi.UInt32(0)
     with dr.resume_grad():
         ray, _ = places.ray(mi.Point2f(0.5), key)

@@ -23,13 +23,13 @@ Which: TypeAlias = "int | mi.Sensor"
 
 @dataclass(frozen=True)
 class Rays:
-    """The camera rays of a pass, one for every sample of every pixel."""
+    """The camera rays of a pass, one per sample of each pixel."""
 
     sampler: mi.Sampler  # positioned after the dimensions of the camera ray
     ray: mi.RayDifferential3f  # attached to the camera, if that has gradients
     weight: mi.Spectrum
-    position: mi.Vector2f  # on the film, in pixels: where the sample is splatted
-    spp: int  # samples per pixel: those of the pass, rounded as the sampler needs them
+    position: mi.Vector2f  # film position in pixels, where the sample is splatted
+    spp: int  # samples per pixel: that of the pass, as rounded by the sampler
 
     @property
     def start(self) -> CameraStart:
@@ -37,10 +37,10 @@ class Rays:
 
 
 @dataclass(frozen=True)
-class _ForCamera:
-    """Adapter of our sampler to what Mitsuba's `sample_rays` expects."""
+class _CameraSampler:
+    """Adapter of a Sobol sampler to the interface that Mitsuba's `sample_rays` expects."""
 
-    numbers: OwenSobolSampler
+    sampler: OwenSobolSampler
     count: int
 
     def sample_count(self) -> int:
@@ -48,15 +48,15 @@ class _ForCamera:
         return self.count
 
     def next_1d(self) -> mi.Float:
-        return self.numbers.next_1d()
+        return self.sampler.next_1d()
 
     def next_2d(self) -> mi.Point2f:
-        return self.numbers.next_2d()
+        return self.sampler.next_2d()
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """Adapter of the sensor of a pass to what Mitsuba's `sample_rays` expects."""
+class _PassSensor:
+    """Adapter of the sensor of a pass to the interface that Mitsuba's `sample_rays` expects."""
 
     view: Pass
 
@@ -72,26 +72,26 @@ class _Seen:
 
 @dataclass(frozen=True)
 class Pass:
-    """What determines the paths, besides the integrator's options. Generates the same rays each time.
+    """The inputs that determine the paths, besides the integrator's options. Generates the same rays in every call.
 
-    ``spp`` = 0 means the samples per pixel of the sensor's sampler. With ``even``, Owen-scrambled Sobol samples replace
-    an `independent` sampler; other samplers are kept.
+    ``spp`` = 0 means the samples per pixel of the sensor's sampler. With ``uses_sobol``, Owen-scrambled Sobol samples
+    replace an `independent` sampler; other samplers are kept.
     """
 
     scene: mi.Scene
     sensor: mi.Sensor
     seed: Seed
     spp: int = 0
-    share: float = 1.0  # of a larger pass, whose part this is: see `parts`
-    even: bool = False
-    flow: FilmFlow | None = None  # of the film, if rays move by the rest only
+    share: float = 1.0  # weight in the mean over the parts of a split pass: see `parts`
+    uses_sobol: bool = False
+    flow: FilmFlow | None = None  # motion of film positions; rays then carry only the rest of the motion
 
     @staticmethod
-    def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int, even: bool = False) -> Pass:
-        """Make a pass from the arguments of Mitsuba's integrators; the sensor may be an index."""
+    def of(scene: mi.Scene, sensor: Which, seed: Seed, spp: int, uses_sobol: bool = False) -> Pass:
+        """Create a pass from the arguments of Mitsuba's integrators; the sensor may be an index."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        even = even and sensor.sampler().class_name() == "IndependentSampler"
-        return Pass(scene, sensor, seed, spp or sensor.sampler().sample_count(), even=even)
+        uses_sobol = uses_sobol and sensor.sampler().class_name() == "IndependentSampler"
+        return Pass(scene, sensor, seed, spp or sensor.sampler().sample_count(), uses_sobol=uses_sobol)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -103,60 +103,60 @@ class Pass:
         """Sample camera rays as Mitsuba's integrators do, and prepare the film."""
         mitsuba = mitsuba_integrator()
         sampler, spp = mitsuba.prepare(None, self.sensor, self.seed, self.spp, [])
-        if self.even:
+        if self.uses_sobol:
             film = self.sensor.film()
             border = 2 * film.rfilter().border_size() if film.sample_border() else 0
             width, height = (n + border for n in self.size)
             i = dr.arange(mi.UInt32, width * height * spp)
-            sampler = self.numbers(i // spp, width, i % spp, spp)
-        camera = _ForCamera(sampler, spp) if self.even else sampler
-        ray, weight, position = mitsuba.sample_rays(None, self.scene, _Seen(self), camera)
+            sampler = self.sobol_sampler(i // spp, width, i % spp, spp)
+        camera = _CameraSampler(sampler, spp) if self.uses_sobol else sampler
+        ray, weight, position = mitsuba.sample_rays(None, self.scene, _PassSensor(self), camera)
         return Rays(sampler, ray, weight, position, spp)
 
     def camera_ray(
-        self, time: mi.Float, wavelength: mi.Float, place: mi.Point2f, aperture: mi.Point2f
+        self, time: mi.Float, wavelength: mi.Float, position: mi.Point2f, aperture: mi.Point2f
     ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
-        """The sensor's ray and its weight (see Mitsuba's Sensor), attached to the camera or to the film's flow."""
+        """Sample the sensor's ray and its weight (see Mitsuba's Sensor), attached to the camera or to the film flow."""
         if self.flow is not None:
-            return self.flow.ray(Sample(time, wavelength, place, aperture))
-        # Not `sample_ray`, which irradiance meters do not have.
-        return self.sensor.sample_ray_differential(time, wavelength, place, aperture)
+            return self.flow.ray(Sample(time, wavelength, position, aperture))
+        # Irradiance meters do not implement `sample_ray`.
+        return self.sensor.sample_ray_differential(time, wavelength, position, aperture)
 
-    def numbers(
+    def sobol_sampler(
         self, pixel: mi.UInt32, width: int, path: mi.UInt32, paths: int, of: int | mi.UInt32 = 0
     ) -> OwenSobolSampler:
-        """Sobol sampler of a path of a pixel with so many ``paths``; ``of`` selects an independent set.
+        """Create the Sobol sampler of path number ``path`` of a pixel that has ``paths`` paths.
 
-        ``pixel`` is a row-major index in a film of ``width``.
+        ``pixel`` is a row-major index in a film of ``width`` pixels. Each value of ``of`` selects an independent set.
         """
         bits = (paths - 1).bit_length()
-        place = morton_index(pixel % width, pixel // width)
-        # What does not fit into 32 bits tells sets apart, too.
-        beyond = place >> (32 - bits) if bits else mi.UInt32(0)
-        return OwenSobolSampler.of((place << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), beyond))
+        morton = morton_index(pixel % width, pixel // width)
+        # Bits of the path index beyond 32 select the set as well.
+        overflow = morton >> (32 - bits) if bits else mi.UInt32(0)
+        return OwenSobolSampler.of((morton << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), overflow))
 
     @property
     def opaque_seed(self) -> mi.UInt32:
-        """The seed as a variable: as a literal it would make another kernel for each seed."""
+        """The seed as an opaque variable. A literal seed would compile a new kernel for each value."""
         seed = mi.UInt32(self.seed)
         if seed.state == dr.VarState.Literal:
             dr.make_opaque(seed)
         return seed
 
-    def of_pixels(self, pixel: mi.UInt32) -> PixelSamples:
-        """Samples for one lane per pixel (row-major), which traces all paths of its pixel."""
-        if self.even:
+    def pixel_samples(self, pixel: mi.UInt32) -> PixelSamples:
+        """Create the samples of lanes that each trace all paths of one pixel (row-major index)."""
+        if self.uses_sobol:
             width, _ = self.size
-            return SobolSets(partial(self.numbers, pixel, width))
+            return SobolSets(partial(self.sobol_sampler, pixel, width))
         sampler = self.sensor.sampler().clone()
         sampler.seed(self.seed, dr.width(pixel))
         return IndependentSets(sampler)
 
     @cached_property
     def keys(self) -> tuple[tuple[int, int, int], ...]:
-        """Identify the pass among those over one scene. Reads the seed, which synchronises if it is an array.
+        """Keys that identify this pass among passes over the same scene: seed, samples per pixel and sensor.
 
-        Empty in a frozen function, which cannot read it.
+        Reads the seed, which synchronises if it is an array. Empty in a frozen function, which cannot read it.
         """
         if is_recording():
             return ()

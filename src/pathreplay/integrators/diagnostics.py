@@ -13,27 +13,27 @@ from pathreplay.transport.vertex import TraceConfig
 COST_OF_EDGES = (
     "edges move with the parameters (silhouettes, shadows, borders of lights) and are differentiated in a pass of "
     "their own, which may take several times as long as the rest: boundary = 'none' of the integrator leaves them out, "
-    "boundary = 'primary' those that only surfaces see; see docs/boundary.md"
+    "boundary = 'primary' only edges that the camera does not see; see docs/boundary.md"
 )
-"""One line that tells what edges cost, where nobody asked for them."""
+"""Message about the cost of boundary terms, if they were enabled by default."""
 
 
 def lost_note(lost: int, paths: int) -> str:
-    """Message about paths that lost a part of their gradient."""
-    why = "a ray adjoint was not finite, or media have more boundaries on the way than the record holds"
+    """Format the message about paths that lost a part of their gradient."""
+    why = "a ray adjoint was not finite, or a ray crosses more boundaries of media than the record holds"
     return f"{lost / paths:.2%} of the paths lost a part of their gradient: {why}"
 
 
 def used_before_note(seed: int) -> str:
-    """Message about a pass that has contributed to the control variate before."""
+    """Format the message about a pass that has already contributed to the control variate."""
     return (
-        f"seed {seed} was used before: a pass cannot serve as baseline for itself, so that this one goes without; "
+        f"seed {seed} was used before: a pass must not use a baseline that it contributed to, so it uses none; "
         "give every pass a seed of its own"
     )
 
 
 def doubts(trace: TraceConfig) -> Iterator[str]:
-    """Messages about what makes the gradient of this scene wrong or incomplete, whatever moves.
+    """Yield messages about properties of the scene that make the gradient wrong or incomplete.
 
     Raises PathreplayError if the gradient would be useless.
     """
@@ -45,13 +45,13 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
         )
     if traits.masks_mirrors:
         yield (
-            "a mask lies over delta lobes, which Mitsuba cannot sample one by one there: derivatives by what "
-            "decides among them (an index, or a reflectance of plastic) are wrong"
+            "a mask covers delta lobes, which Mitsuba then cannot sample one by one: derivatives with respect to "
+            "parameters of their probabilities (an index, or a reflectance of plastic) are wrong"
         )
     if trace.media is not None and trace.media.passes and traits.opacity_moves:
         yield (
-            "the opacity of a mask has gradients in a scene with media: what it does to the light of emitters "
-            "that shadow rays see through it is missing from the gradient"
+            "the opacity of a mask has gradients in a scene with media: its effect on emitter samples whose "
+            "shadow rays cross the mask is missing from the gradient"
         )
     if trace.attach != "all":
         return
@@ -65,16 +65,16 @@ def doubts(trace: TraceConfig) -> Iterator[str]:
 
 
 def missing_edges(trace: TraceConfig, sensor: mi.Sensor, edges: str) -> tuple[str, bool]:
-    """One line that tells of the motion of edges where something moves (empty: none), and whether it names what.
+    """Format the message about moving edges whose boundary term is left out ("" if there is none to report).
 
-    ``edges`` are looked at.
+    ``edges`` are the estimated boundary terms. Also returns whether the message names the parameter that moves.
     """
     moving = keys_that_move_edges(mi.traverse(trace.scene)) or keys_that_move_edges(mi.traverse(sensor))
     if moving:
         return edges_note(moving, edges), True
     if edges == "none" and trace.traits.lobes and trace.traits.area_lights:
         return (
-            "something moves in a scene with delta lobes and area lights: where the edge of a light or a "
-            "silhouette is seen through glass or mirrors, its motion is missing from the gradient"
+            "something moves in a scene with delta lobes and area lights: the motion of silhouettes and of borders of "
+            "lights that are seen through glass or mirrors is missing from the gradient"
         ), False
     return "", False

@@ -9,41 +9,41 @@ import mitsuba as mi
 
 from pathreplay.scenes.parameters import needs_ray_adjoint
 
-# Of shapes: what moves a point of the surface. Others, such as B-spline controls, Mitsuba marks as discontinuous.
-_PLACES = {"vertex_positions", "to_world", "control_points"}
+# Parameters that move points of a surface. Mitsuba marks the others, for example B-spline controls, as discontinuous.
+_POSITIONS = {"vertex_positions", "to_world", "control_points"}
 
 
 def moves_edges(params: mi.SceneParameters, key: str) -> bool:
-    """Whether a parameter of ``mi.traverse(scene)`` moves silhouettes or shadows.
+    """Return whether a parameter of ``mi.traverse(scene)`` moves silhouettes or shadows.
 
-    These are shapes and their transforms, cameras, and lights that cast hard shadows.
+    Parameters of shapes, of cameras, and of emitters that cast hard shadows can do so.
     """
     node, name = params.properties[key][2], key.rsplit(".", 1)[-1]
     if isinstance(node, mi.Shape):
         marked = bool(params.flags(key) & mi.ParamFlags.Discontinuous) and name != "vertex_normals"
-        return name in _PLACES or marked
+        return name in _POSITIONS or marked
     if isinstance(node, mi.Emitter) and not mi.has_flag(node.flags(), mi.EmitterFlags.Delta):
-        return False  # of the sky
+        return False  # an environment emitter
     return needs_ray_adjoint(params, key)
 
 
 def keys_that_move_edges(params: mi.SceneParameters) -> list[str]:
-    """The parameters with gradients that `moves_edges`."""
+    """Return the keys of parameters that have gradients and move edges."""
     with dr.resume_grad():
         return [key for key in params.keys() if moves_edges(params, key) and dr.grad_enabled(params[key])]
 
 
 def edges_note(keys: Iterable[str], edges: str = "none") -> str:
-    """One line that tells of parameters with which edges move, and what can be done; ``edges`` are looked at."""
+    """Format the message about parameters that move edges, with the remedy; ``edges`` are the estimated terms."""
     first, *others = keys
     more = f" (and {len(others)} more)" if others else ""
     if edges == "primary":
         return (
-            f"'{first}'{more} moves, and boundary = 'primary' leaves out what surfaces see of moving edges (soft "
+            f"'{first}'{more} moves, and boundary = 'primary' leaves out edges that only surfaces see (soft "
             "shadows, indirect light): use boundary = 'all' where that matters; see docs/boundary.md"
         )
     return (
-        f"'{first}'{more} moves, and the gradient leaves out what moving edges do (silhouettes, shadows, borders of "
-        "lights): use boundary = 'all' of the integrator 'pathreplay', or let paint or shading show the motion rather "
-        "than outlines, and measure what is missing with 'pathreplay check'; see docs/boundary.md"
+        f"'{first}'{more} moves, and the gradient leaves out moving edges (silhouettes, shadows, borders of lights): "
+        "use boundary = 'all' of the integrator 'pathreplay', or let textures or shading show the motion rather than "
+        "outlines, and measure the error with 'pathreplay check'; see docs/boundary.md"
     )

@@ -1,19 +1,20 @@
-"""What may be alive, registered and collected while a pass is traced, recorded or frozen.
+"""Lifetimes of scene objects: rules about objects, garbage collection and threads while a pass is traced or recorded.
 
-Mitsuba registers every scene object with Dr.Jit, which traces a virtual call through all that are registered, those of
-other scenes included. Four rules follow. They hold for all passes and stand here alone:
+Mitsuba registers every scene object with Dr.Jit. Dr.Jit traces a virtual function call through all registered objects,
+including the objects of other scenes. Four rules follow, which this module enforces for all passes:
 
-1. No part outlives its scene. An area light has a bare pointer to its shape: traced after the shape is gone, it ends
-   the process. So what we remember about a scene is kept here together with the scene, and is released once nobody else
-   holds the scene. (`nodes` has the other half: traversals leave no cycles.)
-2. No instance comes or goes between two virtual calls of one kernel, or one function is written twice ("invalid
-   redefinition"). So the cyclic garbage collector is off during a pass, and scenes are released before it.
-3. No scene is freed while `dr.freeze` records: that launches a function on the host, which cannot be recorded, and the
-   process ends. So nothing is released then, and what could be garbage by then is kept from the collector until the
-   recording is over.
-4. One Python thread at a time. Dr.Jit's registry and its memory are shared by all threads of a process; two that trace
-   or launch kernels side by side get wrong numbers, or end the process. So a pass that finds another one under way is
-   refused, and `exclusive` lets threads take turns.
+1. No object outlives its scene. An area light has a raw pointer to its shape, and tracing the light after the shape is
+   freed crashes the process. Facts about a scene are therefore stored here together with the scene, and both are
+   released once nothing else references the scene. (`nodes` ensures that traversals leave no reference cycles.)
+2. No object is created or freed between two virtual function calls of one kernel. Otherwise Dr.Jit emits the same
+   function twice ("invalid redefinition"). The cyclic garbage collector is therefore off during a pass, and scenes are
+   released before it.
+3. No scene is freed while `dr.freeze` records. Freeing a scene launches a host function, which cannot be recorded and
+   crashes the process. Nothing is therefore released then, and objects that may have become garbage are hidden from the
+   collector until the recording has ended.
+4. Only one Python thread renders at a time. All threads of a process share Dr.Jit's registry and memory. Threads that
+   trace or launch kernels concurrently get wrong results or crash the process. A pass therefore raises an error if
+   another thread has one in progress; `exclusive` lets threads take turns.
 """
 
 from __future__ import annotations
@@ -36,62 +37,65 @@ T = TypeVar("T")
 
 
 @dataclass
-class _Kept(Generic[T]):
-    """A scene and what is remembered about it."""
+class _Entry(Generic[T]):
+    """A scene and the facts stored about it."""
 
     scene: mi.Scene
     about: T
-    held_once: object = field(default_factory=object)  # its reference count is that of an unshared scene
+    held_once: object = field(
+        default_factory=object
+    )  # has the reference count of a scene that only this entry references
 
     @property
-    def is_dropped(self) -> bool:
-        """Whether nobody else holds the scene. Mitsuba's own references to an object count as Python's do."""
+    def is_unreferenced(self) -> bool:
+        """Whether nothing else references the scene. The count includes Mitsuba's own references to an object."""
         return sys.getrefcount(self.scene) <= sys.getrefcount(self.held_once)
 
 
 class SceneMemory(Generic[T]):
-    """Remembers one thing about each scene that somebody holds."""
+    """Cache of facts about each scene that is still referenced elsewhere."""
 
     def __init__(self) -> None:
-        self._kept: dict[int, _Kept[T]] = {}
+        self._entries: dict[int, _Entry[T]] = {}
 
     def about(self, scene: mi.Scene, is_right: Callable[[T], bool], find: Callable[[], T]) -> T:
-        """What is remembered about a scene, found anew where it is not ``is_right`` any more."""
-        kept = self._kept.get(id(scene))
-        if kept is None or not is_right(kept.about):
-            kept = self._kept[id(scene)] = _Kept(scene, find())
-        return kept.about
+        """Return the facts about a scene; ``find`` computes them if there are none or ``is_right`` rejects them."""
+        entry = self._entries.get(id(scene))
+        if entry is None or not is_right(entry.about):
+            entry = self._entries[id(scene)] = _Entry(scene, find())
+        return entry.about
 
     def release(self) -> None:
-        """Forget the scenes that nobody else holds, which frees them."""
-        for key in [key for key, kept in self._kept.items() if kept.is_dropped]:
-            self._kept.pop(key, None)
+        """Remove, and thereby free, the scenes that nothing else references."""
+        for key in [key for key, entry in self._entries.items() if entry.is_unreferenced]:
+            self._entries.pop(key, None)
 
     def clear(self) -> None:
-        """Forget all scenes."""
-        self._kept.clear()
+        """Remove all scenes."""
+        self._entries.clear()
 
 
 SCENES: SceneMemory = SceneMemory()
-"""What is known of the scenes of this process, released as the rules above say."""
+"""Facts about the scenes of this process, released according to the rules above."""
 _ONE_THREAD = threading.RLock()
 _AT_COLLECTION = threading.Lock()
-"""Held by `_collected`, which has the other one for a moment, in whatever thread Python collects."""
-_passes = 0  # under way, one within the other
-_put_aside = False  # objects are kept from the collector
+"""Held by `_on_collection` while it briefly holds `_ONE_THREAD`, in any thread that triggers a collection."""
+_passes = 0  # number of nested passes in progress
+_hidden = False  # whether objects are hidden from the collector
 
 
 def is_recording() -> bool:
-    """Whether `dr.freeze` records what is done now."""
+    """Return whether `dr.freeze` is recording."""
     return bool(dr.flag(dr.JitFlag.FreezingScope))
 
 
 @contextmanager
 def exclusive() -> Iterator[None]:
-    """Within this block no other thread is in such a block, and none may render with an integrator of ours.
+    """Context that gives one Python thread exclusive use of the integrators of this package.
 
-    Use it in each of several Python threads, around all that they do with Mitsuba and Dr.Jit: loading a scene,
-    rendering, `dr.backward`, the step of an optimiser, reading results. All kernels have ended when the block ends.
+    If several threads render, each must enclose all its use of Mitsuba and Dr.Jit: loading a scene, rendering,
+    `dr.backward`, optimiser steps, reading results. Other threads wait at their own `exclusive` blocks; without one,
+    their passes raise an error. All kernels have finished when the block ends.
     """
     with _ONE_THREAD:
         try:
@@ -102,14 +106,14 @@ def exclusive() -> Iterator[None]:
 
 @contextmanager
 def careful() -> Iterator[None]:
-    """Within this block, a pass, the rules above hold, and errors are plain (see `plain_errors`).
+    """Context of a pass, in which the rules above hold and errors are unwrapped (see `plain_errors`).
 
-    Raises PathreplayError if another thread has one, or is `exclusive`.
+    Raises PathreplayError if another thread is in a pass or in an `exclusive` block.
     """
     global _passes
-    if not _entered():
+    if not _acquire():
         raise PathreplayError(
-            "pathreplay: another Python thread is rendering, and Dr.Jit computes wrong numbers if two use it at once: "
+            "pathreplay: another Python thread is rendering, and Dr.Jit computes wrong results if two use it at once: "
             "put all that each thread does with Mitsuba into 'with pathreplay.exclusive():', or use processes"
         )
     collecting = gc.isenabled()
@@ -124,26 +128,26 @@ def careful() -> Iterator[None]:
         finally:
             _passes -= 1
             if is_recording():
-                _put_garbage_aside()
+                _hide_garbage()
     finally:
         if collecting:
             gc.enable()
         _ONE_THREAD.release()
 
 
-def _entered() -> bool:
-    """Take the lock, unless another thread has it that does more than collect garbage."""
+def _acquire() -> bool:
+    """Acquire the lock without blocking, except for a garbage collection in another thread; return success."""
     while not _ONE_THREAD.acquire(blocking=False):
         if not _AT_COLLECTION.locked():
             return _ONE_THREAD.acquire(blocking=False)
-        with _AT_COLLECTION:  # until that is over
+        with _AT_COLLECTION:  # wait for the end of the collection
             pass
     return True
 
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Within this block a PathreplayError that Dr.Jit wrapped in others, while a loop ends, is itself again."""
+    """Context that unwraps a PathreplayError which Dr.Jit, at the end of a loop, has wrapped in other exceptions."""
     try:
         yield
     except RuntimeError as error:
@@ -155,17 +159,17 @@ def plain_errors() -> Iterator[None]:
         raise cause from None
 
 
-def _put_garbage_aside() -> None:
-    """Keep all objects from the collector, unless somebody else does; takes no time. See `_collected`."""
-    global _put_aside
-    if _put_aside or gc.get_freeze_count() == 0:
+def _hide_garbage() -> None:
+    """Hide all objects from the collector in constant time, unless other code has done so. See `_on_collection`."""
+    global _hidden
+    if _hidden or gc.get_freeze_count() == 0:
         gc.freeze()
-        _put_aside = True
+        _hidden = True
 
 
-def _collected(phase: str, info: dict[str, int]) -> None:
-    """Called by the collector: before it runs, give back what was put aside; after it ran, release scenes."""
-    global _put_aside
+def _on_collection(phase: str, info: dict[str, int]) -> None:
+    """Handle a garbage collection: before it, make hidden objects visible again; after it, release scenes."""
+    global _hidden
     if is_recording() or not _AT_COLLECTION.acquire(blocking=False):
         return
     try:
@@ -174,9 +178,9 @@ def _collected(phase: str, info: dict[str, int]) -> None:
         try:
             if _passes:
                 return
-            if phase == "start" and _put_aside:
+            if phase == "start" and _hidden:
                 gc.unfreeze()
-                _put_aside = False
+                _hidden = False
             elif phase == "stop":
                 SCENES.release()
         finally:
@@ -185,12 +189,12 @@ def _collected(phase: str, info: dict[str, int]) -> None:
         _AT_COLLECTION.release()
 
 
-def _end() -> None:
-    """Free what is left while Dr.Jit is still there to be told."""
-    if _collected in gc.callbacks:
-        gc.callbacks.remove(_collected)
+def _at_exit() -> None:
+    """Free the remaining scenes at exit, while Dr.Jit is still loaded."""
+    if _on_collection in gc.callbacks:
+        gc.callbacks.remove(_on_collection)
     SCENES.clear()
 
 
-gc.callbacks.append(_collected)
-atexit.register(_end)
+gc.callbacks.append(_on_collection)
+atexit.register(_at_exit)

@@ -1,8 +1,8 @@
 """Split a pass of many samples into passes with their own seeds; the result is their mean, weighted by samples.
 
-Dr.Jit counts the samples of a kernel in 32 bits. Long before, single precision ends what sums can hold: one to which
-n equal numbers are added, one by one, is off by up to n 2^-25 of itself, and stands still at n = 2^24. Packets of 16
-samples are added up before that, and no more: neither the sum of a pixel nor the gradient of a number is.
+Dr.Jit counts the samples of a kernel in 32 bits, but single precision limits sums much earlier. A sum of n equal
+numbers, added one by one, has a relative error of up to n 2^-25, and stops growing at n = 2^24. Dr.Jit adds packets of
+16 samples first. Apart from that, samples are added one by one, both to a pixel and to the gradient of a scalar.
 """
 
 from __future__ import annotations
@@ -22,37 +22,37 @@ from pathreplay.integrators.film.image import MOST_SAMPLES, film_size
 from pathreplay.platform.traversal import known_values
 from pathreplay.scenes.parameters import is_transform
 
-# Up to so many samples a pass is one. The gradient of a number is then off by less than 1e-2 of itself, where all
-# samples add the same to it, and by far less than its noise, where they do not.
+# Largest number of samples of a pass that is not split. The relative error of a scalar's gradient is then below 1e-2 if
+# all samples contribute equally, and far below its noise otherwise.
 MOST_AT_ONCE = 2**24
-# Samples of a part of a larger one: off by 1.3e-3, and some tenths of a second of work, beside which tracing it once
-# more does not count.
+# Samples of a part of a split pass: the relative error is 1.3e-3, and a part takes a few tenths of a second, so that
+# the cost of tracing its kernel again is negligible.
 A_PART = 2**22
-# Samples of a pixel, of a pass and of a part: a pixel of one colour is off by 7e-4 of it.
+# Largest number of samples per pixel in one pass or part: a pixel of constant colour has a relative error of 7e-4.
 MOST_A_PIXEL = 2**16
-# Of a part of many pixels: beside fewer, the work on the film would count.
+# Smallest number of samples per pixel in a part with many pixels: with fewer, the work on the film would be noticeable.
 LEAST_A_PIXEL = 4
-# Samples of one call, which cannot be stopped or seen: minutes on the machines of today.
+# Largest number of samples of one call, which shows no progress and cannot be interrupted: minutes on current machines.
 MOST_IN_ALL = 2**36
 
 
 def parts(view: Pass) -> list[Pass]:
-    """Yield the pass, or the passes that it is split into with their ``share``; the first has its seed.
+    """Split a pass of many samples into parts with weights ``share``; the first part keeps the seed.
 
-    Raises PathreplayError where one sample for each pixel is beyond what Dr.Jit can count, or all of them would take
-    hours.
+    Returns the pass itself if it needs no split.
+    Raises PathreplayError if Dr.Jit cannot count one sample per pixel, or if all samples would take hours.
     """
     width, height = film_size(view.sensor)
     pixels = width * height
     if pixels > MOST_SAMPLES:
         raise PathreplayError(
-            f"The film of sensor '{view.sensor.id()}' has {width} x {height} pixels, beyond the {MOST_SAMPLES} samples "
-            "that Dr.Jit takes at once; make it smaller, or give it a crop window"
+            f"The film of sensor '{view.sensor.id()}' has {width} x {height} pixels, more than the {MOST_SAMPLES} "
+            "samples that Dr.Jit takes at once; make it smaller, or give it a crop window"
         )
     if pixels * view.spp > MOST_IN_ALL:
         raise PathreplayError(
-            f"spp = {view.spp} with a film of {width} x {height} pixels are more samples than one call takes, "
-            f"{MOST_IN_ALL}; take spp up to {MOST_IN_ALL // pixels}, and the mean of calls with other seeds"
+            f"spp = {view.spp} with a film of {width} x {height} pixels are more samples than the limit of one "
+            f"call, {MOST_IN_ALL}; take spp up to {MOST_IN_ALL // pixels}, and average calls with different seeds"
         )
     if pixels * view.spp <= MOST_AT_ONCE and view.spp <= MOST_A_PIXEL:
         return [view]
@@ -67,7 +67,7 @@ def parts(view: Pass) -> list[Pass]:
 
 
 class Sums:
-    """Gradients of a scene's parameters over parts: each begins at zero, or kernels would add to what there is."""
+    """Sums of parameter gradients over parts. Gradients are reset after each part to limit rounding errors."""
 
     def __init__(self, scene: mi.Scene) -> None:
         params = mi.traverse(scene)
@@ -79,10 +79,10 @@ class Sums:
         self.take()
 
     def take(self) -> None:
-        """Add the gradients since the last call."""
+        """Add the gradients accumulated since the last call, and reset them."""
         for n, value in enumerate(self._values):
-            found = dr.grad(value)
-            self._sums[n] = found if self._sums[n] is None else self._sums[n] + found
+            gradient = dr.grad(value)
+            self._sums[n] = gradient if self._sums[n] is None else self._sums[n] + gradient
             dr.set_grad(value, 0)
         dr.eval(self._sums)
 
@@ -93,13 +93,13 @@ class Sums:
 
 
 @contextmanager
-def summed(scene: mi.Scene, of_parts: Sequence[Pass]) -> Iterator[Callable[[], None]]:
-    """Add up the gradients of parts that are back-propagated one by one; yields a function to call after each."""
-    sums = Sums(scene) if len(of_parts) > 1 else None
+def summed(scene: mi.Scene, passes: Sequence[Pass]) -> Iterator[Callable[[], None]]:
+    """Context that sums the gradients of back-propagated parts; yields a function to call after each part."""
+    sums = Sums(scene) if len(passes) > 1 else None
     try:
         yield (lambda: None) if sums is None else sums.take
     finally:
-        if sums is not None:  # also if no parameter reaches this view: gradients of others stay
+        if sums is not None:  # also after an error, so that gradients of other views are kept
             sums.give()
 
 
@@ -108,23 +108,23 @@ def _arrays(value: Any) -> list[Any]:
 
 
 def split(sampler: mi.Sampler, spp: int, most: int) -> list[int]:
-    """Samples per pixel of each part, about ``most``. They add up to ``spp``, or more if the sampler rounds up.
+    """Return the samples per pixel of each part, about ``most``. Their sum is ``spp``, or more if the sampler rounds.
 
-    Samplers other than `independent` stratify the samples of a pixel. Their parts are powers of four, which all of them
-    accept.
+    Samplers other than `independent` stratify the samples of a pixel. For these, the size of a part is a power of four,
+    which every sampler accepts.
     """
     if spp <= most:
         return [spp]
     if sampler.class_name() == "IndependentSampler":
         count = math.ceil(spp / most)
         return [spp // count + (i < spp % count) for i in range(count)]
-    each = 4 ** int(math.log(most, 4))
-    return [each] * math.ceil(spp / each)
+    size = 4 ** int(math.log(most, 4))
+    return [size] * math.ceil(spp / size)
 
 
 def rounded(sampler: mi.Sampler, count: int) -> int:
-    """Samples per pixel to which a sampler rounds a requested number."""
-    copy = sampler.clone()  # integrators differ in whether they tell the sensor's own
+    """Return the number of samples per pixel to which a sampler rounds ``count``."""
+    copy = sampler.clone()  # integrators differ in whether they change the count of the sensor's own sampler
     copy.set_sample_count(count)
     return int(copy.sample_count())
 

@@ -12,32 +12,32 @@ from pathreplay.transport.facts.traits import Tables
 
 @dataclass(frozen=True)
 class PassState:
-    """Passed to a pass, and returned by it with the results added.
+    """State that a pass takes as input and returns with its results added.
 
-    `PathIntegrator.begin` makes one, `PathIntegrator.keep` reports the results and learns from them. A function that is
-    recorded by `dr.freeze` takes the state as an argument, since it cannot inspect the scene on the host.
+    `PathIntegrator.begin` creates a state; `PathIntegrator.keep` reports the results and learns from them. A function
+    that `dr.freeze` records takes the state as an argument, since it cannot inspect the scene on the host.
     """
 
     tables: Tables | None = None
     """Lookup tables of the scene."""
     branches: bool | None = None
-    """`Media.branches`; None: determined by the pass."""
+    """`Media.branches`; None if the pass determines it."""
     guess: Baseline | None = None
     """Control variate for the radiance in media."""
     passes: frozenset[Hashable] = frozenset()
     """Keys of the passes that ``guess`` was learned from."""
-    found: TermResult = field(default_factory=TermResult)
-    """Sum of the results of the passes since `begin`, without images."""
+    result: TermResult = field(default_factory=TermResult)
+    """Sum of the results of all passes since `begin`, without images."""
 
     @property
     def is_complete(self) -> bool:
-        """Whether the scene was inspected outside of a recording."""
+        """Whether `begin` ran outside of a recording, where it can inspect the scene."""
         return self.branches is not None
 
-    def after(self, found: TermResult) -> PassState:
+    def after(self, result: TermResult) -> PassState:
         """Return the state with the result of a pass added."""
-        return replace(self, found=self.found + replace(found, image=None))
+        return replace(self, result=self.result + replace(result, image=None))
 
     def to_record(self) -> PassState:
-        """Return the input of a recorded pass, which cannot read its own key and compare it with ``passes``."""
+        """Return the state without ``passes``, for a recorded pass, which cannot compare its own key with them."""
         return replace(self, passes=frozenset())

@@ -1,4 +1,4 @@
-"""Base of our integrators: common properties, Mitsuba's interface, and the rules of each pass."""
+"""Base class of the integrators: common properties, Mitsuba's interface, and the steps of a pass."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pathreplay.integrators.pass_state import PassState
 from pathreplay.integrators.properties import flag, whole_number
 from pathreplay.integrators.reach import unreached_note
 from pathreplay.integrators.scene_facts import facts_of
-from pathreplay.integrators.stateful import Learned, require_nothing_learned, whole_pictures
+from pathreplay.integrators.stateful import Learned, no_pixel_sweep, require_nothing_learned
 from pathreplay.integrators.term import Term, TermResult
 from pathreplay.platform.registration import mitsuba_integrator
 from pathreplay.transport.facts.traits import Tables
@@ -37,7 +37,7 @@ UNBOUNDED = 0xFFFFFFFF
 
 
 def _sum(total: Any, image: Any, share: float) -> Any:
-    """Weighted sum of the images of split passes, each evaluated before the next begins."""
+    """Add a weighted image of a split pass to the sum, evaluated before the next pass begins."""
     if share == 1:
         return image
     total = image * share if total is None else total + image * share
@@ -46,37 +46,38 @@ def _sum(total: Any, image: Any, share: float) -> Any:
 
 
 @contextmanager
-def reached(scene: mi.Scene, sensor: Which, zero_is_told: bool = False) -> Iterator[None]:
-    """Within this block, which differentiates, a gradient that is plainly zero is no error: see `unreached_note`.
+def reached(scene: mi.Scene, sensor: Which, zero_is_error: bool = False) -> Iterator[None]:
+    """Context of a gradient pass: explain `Unreached` errors, and suppress them if the gradient is zero by design.
 
-    Unless ``zero_is_told``: then it is one, too.
+    The gradient is zero by design if only other cameras have gradients (see `unreached_note`). With ``zero_is_error``
+    that case raises as well.
     """
     try:
         yield
     except Unreached as error:
         note = unreached_note(scene, Pass.of(scene, sensor, 0, 1).sensor)
-        if note or zero_is_told:
+        if note or zero_is_error:
             raise Unreached(note or str(error)) from error
 
 
 class PathIntegrator:
-    """A template of an integrator (see `on_base`), for those of ours.
+    """Template of an integrator (see `on_base`), the base of all integrators of this package.
 
-    Properties ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5) and ``hide_emitters`` (False).
-    Classes below have a ``name`` (the plugin's), ``attach`` (as `TraceConfig` has it) and the term ``interior``. Raises
+    Properties: ``max_depth`` (6; -1 = unbounded), ``rr_depth`` (5) and ``hide_emitters`` (False).
+    Subclasses define ``name`` (of the plugin), ``attach`` (see `TraceConfig`) and the term ``interior``. Raises
     PathreplayError for unusable properties and in polarised variants.
 
-    Methods whose names end in ``_pass`` take a `PassState`. Mitsuba's methods, which have no such parameter, `begin` a
-    state for each pass and `keep` its results.
+    Methods whose names end in ``_pass`` take a `PassState`. Mitsuba's methods have no such parameter; they call `begin`
+    before each pass and `keep` after it.
     """
 
     name = ""
     attach = "none"
-    even = False  # whether even numbers take the place of independent ones
-    boundary = "none"  # which boundary terms are estimated
-    baseline: Any = None  # what was learned
+    uses_sobol = False  # Owen-scrambled Sobol samples replace independent ones
+    boundary = "none"  # the estimated boundary terms
+    baseline: Any = None  # learned state
     interior: Term
-    max_depth: int  # these are Mitsuba's
+    max_depth: int  # this and the following are members of Mitsuba's integrator
     rr_depth: int
     skip_area_emitters: Callable[..., mi.PreliminaryIntersection3f]
 
@@ -86,14 +87,14 @@ class PathIntegrator:
                 f"{self.name}: variant {mi.variant()!r} tracks polarisation, which is not supported: "
                 f"use {mi.variant().replace('_polarized', '')!r}"
             )
-        # All three are Mitsuba's, too, which takes what it is given or says less.
+        # Mitsuba reads all three as well, but validates less.
         whole_number(props, self.name, "max_depth", 6, lowest=0, unbounded=True)
         whole_number(props, self.name, "rr_depth", 5, lowest=1)
         hide_emitters = flag(props, self.name, "hide_emitters", False)
         mitsuba_integrator().__init__(self, props)
         self.hide_emitters = hide_emitters
         self.warned: set[str] = set()  # notes that were logged or silenced
-        self.tables: Tables | None = None  # of the scene that was rendered last: there a user's `dr.freeze` finds them
+        self.tables: Tables | None = None  # of the last rendered scene; a recording by a user's `dr.freeze` uses them
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -109,7 +110,7 @@ class PathIntegrator:
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        """Render an image: see Mitsuba's ADIntegrator. Nothing is differentiated: use `mi.render` for that."""
+        """Render an image, without derivatives: see Mitsuba's ADIntegrator. `mi.render` is differentiable."""
         if not develop:
             raise PathreplayError(f"{self.name}: develop = False is not supported: leave it out")
         return self.image_pass(self.pass_of(scene, sensor, seed, spp), PathIntegrator.begin(self, scene))
@@ -117,23 +118,24 @@ class PathIntegrator:
     def render_forward(
         self, scene: mi.Scene, params: object, sensor: Which = 0, seed: Seed = 0, spp: int = 0
     ) -> mi.TensorXf:
-        """Tangent of the image along those of the parameters: see Mitsuba's ADIntegrator.
+        """Compute the tangent of the image from the tangents of the parameters: see Mitsuba's ADIntegrator.
 
-        The parameters must carry their tangents already: after ``dr.set_grad`` on something that they are computed
-        from, propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)``. Warns as `render_backward` does.
+        The parameters must carry their tangents already. If they are computed from another variable ``x``, call
+        ``dr.set_grad`` on ``x`` and propagate with ``dr.forward(x, dr.ADFlag.ClearEdges)`` first. Warns like
+        `render_backward`.
         """
         tangent = None
         for part in parts(self.pass_of(scene, sensor, seed, spp)):
             state = self.begin(scene)
-            with self._passing():
+            with self._pass_context():
                 part, trace, terms = self._planned(part, state)
                 learned = self._learned(part, trace, state)
                 if part.flow is not None:
                     part.flow.carry_tangents()
-                found = reduce(add, [term.forward(part, trace, learned) for term in terms])
-                tangent = _sum(tangent, found.image, part.share)
-            self._told(part, trace, found)
-            self.keep(scene, state.after(found))
+                result = reduce(add, [term.forward(part, trace, learned) for term in terms])
+                tangent = _sum(tangent, result.image, part.share)
+            self._log_notes(part, trace, result)
+            self.keep(scene, state.after(result))
         return tangent
 
     def render_backward(
@@ -141,55 +143,58 @@ class PathIntegrator:
     ) -> None:
         """Back-propagate an image gradient into the parameters: see Mitsuba's ADIntegrator.
 
-        Warns of what terms tell: a part of the gradient was not finite and had to be left out, edges move. Raises
-        PathreplayError where no parameter with gradients reaches the paths, unless all are those of other cameras.
+        Warns if a part of the gradient was not finite and was left out, or if moving edges are not differentiated.
+        Raises PathreplayError if no parameter with gradients reaches the paths, unless all belong to other cameras.
         """
-        of_parts = parts(self.pass_of(scene, sensor, seed, spp))
-        with summed(scene, of_parts) as add_up:
-            for part in of_parts:
+        passes = parts(self.pass_of(scene, sensor, seed, spp))
+        with summed(scene, passes) as add_up:
+            for part in passes:
                 self.keep(scene, self.gradient_pass(part, grad_in, self.begin(scene)))
                 add_up()
 
     def image_pass(self, view: Pass, state: PassState) -> mi.TensorXf:
         """Render the image of a pass, detached."""
-        made = None
+        total = None
         for part in parts(view):
-            with self._passing():
-                made = _sum(made, image(part, self._walk(part.scene, part.sensor, state)), part.share)
-        return made
+            with self._pass_context():
+                total = _sum(total, image(part, self._walk(part.scene, part.sensor, state)), part.share)
+        return total
 
     def gradient_pass(self, view: Pass, grad_in: mi.TensorXf, state: PassState) -> PassState:
         """Back-propagate an image gradient into the parameters: see `render_backward`."""
-        of_parts = parts(view)
-        with reached(view.scene, view.sensor), summed(view.scene, of_parts) as add_up:
-            for part in of_parts:
-                # Isolated, so that what the scene computes from its parameters can be differentiated in the next pass.
-                with self._passing(), dr.isolate_grad():
+        passes = parts(view)
+        with reached(view.scene, view.sensor), summed(view.scene, passes) as add_up:
+            for part in passes:
+                # Isolated, so that the AD graph from the parameters to derived scene values survives for the next pass.
+                with self._pass_context(), dr.isolate_grad():
                     part, trace, terms = self._planned(part, state)
                     learned = self._learned(part, trace, state)
-                    wanted = grad_in if part.share == 1 else grad_in * part.share
-                    with dr.isolate_grad():  # of terms, one by one, from the flow that they share
-                        found = reduce(add, [term.backward(part, trace, wanted, learned) for term in terms])
-                self._told(part, trace, found)
-                state = state.after(found)
+                    weighted = grad_in if part.share == 1 else grad_in * part.share
+                    with (
+                        dr.isolate_grad()
+                    ):  # the graph of the film flow, which terms share, is traversed once at the end
+                        result = reduce(add, [term.backward(part, trace, weighted, learned) for term in terms])
+                self._log_notes(part, trace, result)
+                state = state.after(result)
                 add_up()
         return state
 
     def sample(
         self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool = True, **_: Any
     ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float], Any]:
-        """Radiance along rays, for those who have rays and no sensor, such as Mitsuba's `aov`: they start in no medium.
+        """Estimate radiance along rays that start outside of media, for callers without a sensor (Mitsuba's `aov`).
 
-        Derivatives are those of passes: see `render_forward` and `render_backward`. Raises PathreplayError for them.
+        Only the primal mode is supported; `render_forward` and `render_backward` differentiate. Raises PathreplayError
+        for the other modes.
         """
         if mode != dr.ADMode.Primal:
             raise PathreplayError(f"{self.name}: sample() is not differentiated: use mi.render, or render_backward")
         return *primal(self._walk(scene, None), CameraStart(ray, sampler, mi.Bool(active))), [], None
 
     def begin(self, scene: mi.Scene) -> PassState:
-        """Make the state of a pass over a scene.
+        """Create the state of a pass over a scene.
 
-        In a recording by a user's `dr.freeze` it holds what a recording can find out.
+        In a recording by a user's `dr.freeze` it contains only tables: media cannot be inspected there.
         """
         with careful():
             facts = facts_of(scene)
@@ -199,26 +204,26 @@ class PathIntegrator:
             return PassState(self.tables, facts.branches())
 
     def keep(self, scene: mi.Scene, state: PassState) -> None:
-        """Report the results of passes whose state came from `begin`, and learn from them."""
+        """Log warnings about the passes since `begin`, and update the learned state from their results."""
 
     def _planned(self, view: Pass, state: PassState) -> tuple[Pass, TraceConfig, tuple[Term, ...]]:
-        """A gradient pass as terms see it, how it walks, and the terms that it adds up."""
+        """Return the gradient pass with its film flow, its trace configuration, and the terms to add."""
         return view, self._walk(view.scene, view.sensor, state), self.terms
 
     def _learned(self, view: Pass, trace: TraceConfig, state: PassState) -> Baseline | None:
-        """Control variate that this pass may use."""
+        """Return the control variate that this pass may use, or None."""
         return None
 
-    def _told(self, view: Pass, trace: TraceConfig, found: TermResult) -> None:
-        """Log notes about a pass, after its kernels were launched."""
+    def _log_notes(self, view: Pass, trace: TraceConfig, result: TermResult) -> None:
+        """Log notes about a pass after its kernels have been launched."""
 
     def pass_of(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Pass:
-        """Make a pass from the arguments of Mitsuba's methods."""
+        """Create a pass from the arguments of Mitsuba's methods."""
         self._require_active(scene)
-        return Pass.of(scene, sensor, seed, spp, self.even)
+        return Pass.of(scene, sensor, seed, spp, self.uses_sobol)
 
     def _require_active(self, scene: mi.Scene) -> None:
-        """Raise PathreplayError if scene or integrator are none of the active variant."""
+        """Raise PathreplayError if the scene or this integrator belongs to another variant than the active one."""
         if not isinstance(scene, mi.Scene) or not isinstance(self, mi.Integrator):
             raise PathreplayError(
                 f"{self.name}: scene or integrator belongs to another variant than the active one, "
@@ -226,13 +231,13 @@ class PathIntegrator:
             )
 
     @contextmanager
-    def _passing(self) -> Iterator[None]:
-        """Context of a pass, with gradients suspended by default: see `careful`."""
+    def _pass_context(self) -> Iterator[None]:
+        """Enter the context of a pass (see `careful`), with gradients suspended."""
         with careful(), dr.suspend_grad():
             yield
 
     def _walk(self, scene: mi.Scene, sensor: mi.Sensor | None, state: PassState | None = None) -> TraceConfig:
-        """Options and facts of a trace; ``sensor`` may be inside a medium. Default ``state``: the scene's."""
+        """Build the trace configuration; ``sensor`` may be inside a medium. Default ``state``: a new one."""
         facts, state = facts_of(scene), PathIntegrator.begin(self, scene) if state is None else state
         return TraceConfig(
             scene=scene,
@@ -246,12 +251,12 @@ class PathIntegrator:
         )
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:
-        """Whether a parameter with gradients reaches the paths of a sensor; where there are media, this is assumed.
+        """Return whether a parameter with gradients reaches the paths of a sensor; with media, this is assumed.
 
         Traces one step and evaluates nothing.
         """
         view = Pass.of(scene, sensor, 0, 1)
-        with self._passing():
+        with self._pass_context():
             trace, start = self._walk(scene, view.sensor), view.rays().start
             if trace.media is not None or trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
                 return True
@@ -264,16 +269,16 @@ class PathIntegrator:
 
     def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
         """Return why `pixel_pass` cannot be used, with the remedy; "" if it can."""
-        return whole_pictures(type(self).__name__)
+        return no_pixel_sweep(type(self).__name__)
 
     def pixel_pass(
         self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
     ) -> tuple[mi.TensorXf, PassState]:
-        """Not available. Raises PathreplayError."""
+        """Raise PathreplayError: not available."""
         raise PathreplayError(self.why_no_pixel_sweep(view.scene))
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """Return what gradient passes have learned: nothing."""
+        """Return the learned state: none."""
         return {}
 
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None:
@@ -285,7 +290,7 @@ class PathIntegrator:
         return {}
 
     def silence(self, notes: Iterable[str]) -> None:
-        """Do not log these notes."""
+        """Suppress these notes."""
         self.warned.update(notes)
 
     def _described(self, **more: Any) -> str:

@@ -1,4 +1,4 @@
-"""Limits that determine the image of an integrator: path length, and whether emitters are visible."""
+"""Path limits of an integrator, on which its image depends: path length, and visibility of emitters to the camera."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class Limits:
 
 
 def read_limits(integrator: mi.Integrator) -> Limits | None:
-    """The limits of an integrator of Mitsuba's or ours, or None where it has no path length to read."""
-    # Python integrators have attributes; C++ ones only print them.
+    """Read the limits of any integrator; None if its path length cannot be read."""
+    # Python integrators have attributes; C++ integrators only print the values.
     printed = dict(re.findall(r"(max_depth|rr_depth) = (-?\d+)", str(integrator)))
     max_depth = getattr(integrator, "max_depth", printed.get("max_depth"))
     rr_depth: Any = getattr(integrator, "rr_depth", printed.get("rr_depth", 5))
     if max_depth is None:
         return None
-    depth = int(max_depth)  # Mitsuba's Python integrators keep -1 as UNBOUNDED
+    depth = int(max_depth)  # Mitsuba's Python integrators store -1 as UNBOUNDED
     return Limits(-1 if depth >= UNBOUNDED else depth, int(rr_depth), bool(getattr(integrator, "hide_emitters", False)))

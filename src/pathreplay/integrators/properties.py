@@ -1,4 +1,4 @@
-"""Validation of plugin properties: an error of one line names the property, its value and the remedy."""
+"""Validation of plugin properties: one-line errors name the property, its value and the remedy."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import mitsuba as mi
 
 from pathreplay.errors import PathreplayError, shown
 
-#: What Mitsuba's own integrators can hold.
+#: Largest integer that Mitsuba's integrators can store.
 LARGEST = 2**31 - 1
 
 
 def choice(props: mi.Properties, plugin: str, name: str, default: Any, choices: tuple[Any, ...]) -> Any:
     """Read a property that must be one of ``choices``. Raises PathreplayError otherwise."""
     value = props.get(name, default)
-    # By type, too: 1 == True.
+    # Compare types as well, since 1 == True.
     if not any(type(value) is type(allowed) and value == allowed for allowed in choices):
-        known = ", ".join(map(repr, choices))
-        raise PathreplayError(f"{plugin}: {name} = {shown(value)} is unknown: use one of {known}")
+        listed = ", ".join(map(repr, choices))
+        raise PathreplayError(f"{plugin}: {name} = {shown(value)} is unknown: use one of {listed}")
     return value
 
 

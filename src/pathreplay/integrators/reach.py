@@ -1,4 +1,4 @@
-"""Which sensors a parameter can reach: all of them, unless it belongs to some of them alone."""
+"""Sensors whose images depend on a parameter: all, unless the parameter belongs to certain sensors only."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from pathreplay.transport.facts.nodes import nodes_of
 def reached_sensors(
     scene: mi.Scene, sensors: Sequence[mi.Sensor], params: mi.SceneParameters, keys: Iterable[str]
 ) -> list[bool]:
-    """For each sensor, whether its image can depend on one of the ``keys`` of ``params``.
+    """Return for each sensor whether its image can depend on one of the ``keys`` of ``params``.
 
-    A parameter of a camera reaches the images of that camera alone. Any other parameter is assumed to reach all images,
-    including that of a medium which a camera shares with a shape.
+    A parameter of a camera affects only the images of that camera. Any other parameter is assumed to affect all images.
+    So is a parameter of a medium that a camera shares with a shape.
     """
     owners = {params.properties[key][2] for key in keys}
     below = {sensor: nodes_of(sensor) | {sensor} for sensor in {*scene.sensors(), *sensors}}
-    things = (*scene.shapes(), *scene.emitters())
-    if owners.difference(*below.values()) or any(not owners.isdisjoint(nodes_of(thing)) for thing in things):
+    others = (*scene.shapes(), *scene.emitters())
+    if owners.difference(*below.values()) or any(not owners.isdisjoint(nodes_of(other)) for other in others):
         return [True] * len(sensors)
     return [not owners.isdisjoint(below[sensor]) for sensor in sensors]
 
 
 def attached_keys(params: mi.SceneParameters) -> list[str]:
-    """The keys whose values have gradients."""
+    """Return the keys whose values have gradients."""
     with dr.resume_grad():
         return [key for key, value in known_values(params) if dr.grad_enabled(value)]
 
 
 def unreached_note(scene: mi.Scene, sensor: mi.Sensor) -> str:
-    """Message if no parameter with gradients reaches the paths of a sensor; "" if that is right.
+    """Format the message that no parameter with gradients reaches the paths of a sensor; "" if that is expected.
 
-    It is right if all parameters with gradients belong to other cameras, whose gradient in this image is zero.
+    It is expected if all parameters with gradients belong to other cameras: their gradient in this image is zero.
     """
     params = mi.traverse(scene)
     keys = attached_keys(params)
@@ -47,5 +47,5 @@ def unreached_note(scene: mi.Scene, sensor: mi.Sensor) -> str:
     return (
         f"no parameter with gradients reaches the light paths of sensor '{sensor.id()}', {have}: check that the key is "
         "differentiable (mi.traverse(scene)), that params.update() was called after dr.enable_grad, and that attach is "
-        "not 'none' if it moves something"
+        "not 'none' if the parameter moves something"
     )

@@ -25,11 +25,11 @@ from pathreplay.transport.volume.media import Media, scene_media, wants_branch
 
 
 class SceneFacts:
-    """Facts about one scene. They keep its objects alive, so no other object can reuse their addresses (`facts_of`)."""
+    """Facts about one scene. They keep its objects alive, so that no other object can reuse their addresses."""
 
     def __init__(self, scene: mi.Scene) -> None:
         nodes = nodes_of(scene)
-        self._parts = _parts(scene)
+        self._replaceable = _replaceable(scene)
         self._traits = fixed_traits(nodes, scene)
         self._tables: Tables | None = None
         self._shapes = [node for node in nodes if isinstance(node, mi.Shape)]
@@ -37,7 +37,7 @@ class SceneFacts:
         self._sizes = _sizes(self._shapes)
         self._lights = scene.emitters()
         self._emitters = [*scene.emitters(), *(shape for shape in self._shapes if shape.is_emitter())]
-        self._lamps = [shape for shape in self._shapes if shape.is_mesh() and shape.is_emitter()]
+        self._mesh_emitters = [shape for shape in self._shapes if shape.is_mesh() and shape.is_emitter()]
         self._instances = [shape for shape in self._shapes if shape.class_name() == INSTANCE]
         self._masks = [node for node in nodes if isinstance(node, mi.BSDF) and node.class_name() == MASK]
         self._textures = [node for node in nodes if isinstance(node, mi.Texture)]
@@ -45,9 +45,11 @@ class SceneFacts:
         self._media = [node for node in nodes if isinstance(node, mi.Medium)]
 
     def are_about(self, scene: mi.Scene) -> bool:
-        """Whether they describe this scene with its current BSDFs."""
-        parts = _parts(scene)
-        return len(parts) == len(self._parts) and all(a is b for a, b in zip(parts, self._parts, strict=True))
+        """Return whether the facts describe this scene with its current sensors, emitters, shapes and BSDFs."""
+        parts = _replaceable(scene)
+        return len(parts) == len(self._replaceable) and all(
+            a is b for a, b in zip(parts, self._replaceable, strict=True)
+        )
 
     @property
     def has_media(self) -> bool:
@@ -55,45 +57,45 @@ class SceneFacts:
 
     @property
     def has_seams(self) -> bool:
-        """Whether a texture has discontinuities. Assumed in a recording unless it is known."""
+        """Whether a texture has discontinuities. A recording assumes so unless it was determined before."""
         if self._seams is None and not is_recording():
             self._seams = has_seams(self._textures)
         return self._seams is not False
 
     def media(self, sensor: mi.Sensor | None, branches: bool | None = None) -> Media | None:
-        """Media as they are now; ``sensor`` (or None) may be inside one."""
+        """Return the current media of the scene; ``sensor`` (or None) may be inside one."""
         return scene_media(self._media, self._traits.veils, sensor, branches)
 
     def constants(self) -> tuple[object, ...]:
-        """All of media that kernels take for constants, now: see `GridMedium`. Those of Mitsuba have none."""
+        """Return the current values of media that are constants in kernels: see `GridMedium.constants`."""
         return tuple(medium.constants for medium in self._media if hasattr(medium, "constants"))
 
     def branches(self) -> bool:
-        """`Media.branches` of the scene as it is now."""
+        """Return the current value of `Media.branches`."""
         return wants_branch(self._media)
 
     def traits(self, tables: Tables | None = None) -> Traits:
-        """Traits as they are now, with these ``tables`` (default: `tables`)."""
+        """Return the current traits, with these ``tables`` (default: `tables`)."""
         return replace(
             self._traits,
             tables=self.tables() if tables is None else tables,
-            lights_deform=any(with_gradients(lamp, "vertex_positions") for lamp in self._lamps),
+            lights_deform=any(with_gradients(mesh, "vertex_positions") for mesh in self._mesh_emitters),
             instances_move=any(with_gradients(instance, "to_world") for instance in self._instances),
             opacity_moves=any(with_gradients(mask, "opacity") for mask in self._masks),
             lights_vary=any(map(with_gradients, self._emitters)),
         )
 
     def tables(self) -> Tables:
-        """Tables of the scene as it is now; only changed parts are rebuilt."""
+        """Return the current tables; only changed parts are rebuilt."""
         boxes, sizes = [shape.bbox() for shape in self._shapes], _sizes(self._shapes)
         if self._tables is None:
             self._tables = tables_of(self._traits.attachables, self._shapes, self._lights)
         elif boxes != self._boxes:
             self._tables = replace(self._tables, blend_lengths=blend_lengths(self._shapes))
-        if self._traits.mesh_lights:  # whose vertices may move within a box
-            balls = emitter_bounds(self._lights, self._shapes)
-            if not np.array_equal(np.array(balls), np.array(self._tables.emitter_bounds)):
-                self._tables = replace(self._tables, emitter_bounds=balls)
+        if self._traits.mesh_lights:  # vertices may move without a change of the bounding box
+            spheres = emitter_bounds(self._lights, self._shapes)
+            if not np.array_equal(np.array(spheres), np.array(self._tables.emitter_bounds)):
+                self._tables = replace(self._tables, emitter_bounds=spheres)
         if sizes != self._sizes:
             begins, groups = smoothing_groups_of(self._shapes)
             self._tables = replace(self._tables, groups_at=begins, groups=groups)
@@ -101,10 +103,10 @@ class SceneFacts:
         return self._tables
 
     def recorded_tables(self, known: Tables | None, edges: bool) -> Tables:
-        """The tables of a pass that `dr.freeze` records.
+        """Return the tables of a pass that `dr.freeze` records.
 
-        The ``known`` tables are taken as they are if they belong to this scene. Otherwise the recording writes the
-        tables of the scene as it is now, and smoothing groups only if it looks for ``edges``.
+        Uses the ``known`` tables if they belong to this scene. Otherwise the recording computes the current tables,
+        including smoothing groups only if it searches for ``edges``.
         """
         if known is not None and known is self._tables:
             return known
@@ -115,12 +117,12 @@ def _sizes(shapes: list[mi.Shape]) -> list[tuple[int, int]]:
     return [(shape.vertex_count(), shape.face_count()) for shape in shapes if shape.is_mesh()]
 
 
-def _parts(scene: mi.Scene) -> list[mi.Object]:
-    """Objects that identify a scene, and all objects that can be replaced in it."""
+def _replaceable(scene: mi.Scene) -> list[mi.Object]:
+    """Return the objects that identify a scene, and all objects that can be replaced in it."""
     shapes = scene.shapes()
     return [*scene.sensors(), *scene.emitters(), *shapes, *(shape.bsdf() for shape in shapes)]
 
 
 def facts_of(scene: mi.Scene) -> SceneFacts:
-    """Return the facts about a scene, collected once, and again if the scene has changed."""
+    """Return the facts about a scene. They are collected once, and again if objects of the scene were replaced."""
     return SCENES.about(scene, lambda facts: facts.are_about(scene), lambda: SceneFacts(scene))

@@ -23,21 +23,21 @@ _PROJECTIVE = "Projective"
 
 @runtime_checkable
 class StatefulIntegrator(Protocol):
-    """An integrator whose passes take and return a `PassState`; `PathIntegrator` documents the other methods."""
+    """An integrator whose passes take and return a `PassState`. See `PathIntegrator` for undocumented methods."""
 
     @property
     def boundary(self) -> str:
-        """Estimated boundary terms, as in the property ``boundary`` of `pathreplay`."""
+        """The estimated boundary terms, as in the property ``boundary`` of `pathreplay`."""
 
     @property
     def warned(self) -> Collection[str]:
         """Notes that were logged or silenced."""
 
     def silence(self, notes: Iterable[str]) -> None:
-        """Do not log these notes."""
+        """Suppress these notes."""
 
     def is_recordable(self, has_media: bool) -> bool:
-        """Return whether `dr.freeze` can record its passes, as far as is known beforehand."""
+        """Return whether `dr.freeze` is expected to record its passes."""
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool: ...
 
@@ -59,25 +59,25 @@ class StatefulIntegrator(Protocol):
 
     @property
     def baseline(self) -> object:
-        """Learned state, another object after each change; None if there is none."""
+        """Learned state, replaced by a new object at each change; None if there is none."""
 
     def state_dict(self) -> dict[str, np.ndarray]: ...
 
     def load_state_dict(self, scene: mi.Scene, learned: Learned) -> None: ...
 
     def options(self) -> dict[str, Any]:
-        """Return the properties of a `pathreplay` that estimates the same, beyond those of all path integrators."""
+        """Return the properties for an equivalent `pathreplay`, except the ones that all path integrators share."""
 
 
 @dataclass(frozen=True)
 class Stateless:
-    """Adapter of an integrator of Mitsuba's: its passes return the state as it is, and learn nothing."""
+    """Adapter for an integrator of Mitsuba: its passes return the state unchanged and learn nothing."""
 
     integrator: mi.Integrator
 
     @property
     def name(self) -> str:
-        """Name of its class."""
+        """Class name of the integrator."""
         return type(self.integrator).__name__
 
     @property
@@ -89,17 +89,17 @@ class Stateless:
         return frozenset()
 
     def silence(self, notes: Iterable[str]) -> None:
-        """Nothing is logged."""
+        """Do nothing, since no notes are logged."""
 
     def is_recordable(self, has_media: bool) -> bool:
         return self.name in _RECORDABLE and not has_media
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:
-        """Unknown, hence assumed."""
+        """Return True: unknown, hence assumed."""
         return True
 
     def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
-        return whole_pictures(self.name)
+        return no_pixel_sweep(self.name)
 
     def pass_of(self, scene: mi.Scene, sensor: Which, seed: Seed, spp: int) -> Pass:
         return Pass.of(scene, sensor, seed, spp)
@@ -108,14 +108,14 @@ class Stateless:
         return PassState()
 
     def keep(self, scene: mi.Scene, state: PassState) -> None:
-        """Nothing is reported."""
+        """Do nothing, since there are no results to report."""
 
     def image_pass(self, view: Pass, state: PassState) -> mi.TensorXf:
         with dr.suspend_grad():
             return mi.render(view.scene, sensor=view.sensor, integrator=self.integrator, spp=view.spp, seed=view.seed)
 
     def gradient_pass(self, view: Pass, grad_in: mi.TensorXf, state: PassState) -> PassState:
-        with dr.isolate_grad():  # as in `PathIntegrator`
+        with dr.isolate_grad():  # as in `PathIntegrator.gradient_pass`
             params = mi.traverse(view.scene)
             self.integrator.render_backward(view.scene, params, grad_in, view.sensor, view.seed, view.spp)
         return state
@@ -123,8 +123,8 @@ class Stateless:
     def pixel_pass(
         self, view: Pass, derivative: tuple[mi.TensorXf, mi.TensorXf], pixels: mi.UInt32 | None, state: PassState
     ) -> tuple[mi.TensorXf, PassState]:
-        """Not available. Raises PathreplayError."""
-        raise PathreplayError(whole_pictures(self.name))
+        """Raise PathreplayError: not available."""
+        raise PathreplayError(no_pixel_sweep(self.name))
 
     @property
     def baseline(self) -> None:
@@ -141,19 +141,19 @@ class Stateless:
 
 
 def stateful(integrator: mi.Integrator) -> StatefulIntegrator:
-    """Return the integrator itself if it has the interface, otherwise with an adapter."""
+    """Return the integrator itself if it implements the interface, otherwise wrapped in an adapter."""
     return integrator if isinstance(integrator, StatefulIntegrator) else Stateless(integrator)
 
 
-def whole_pictures(name: str) -> str:
+def no_pixel_sweep(name: str) -> str:
     """Return why an integrator of this class has no pixel sweep, with the remedy."""
-    return f"{name} renders whole pictures; take the integrator 'pathreplay'"
+    return f"{name} renders whole images only; take the integrator 'pathreplay'"
 
 
 def require_nothing_learned(learned: Learned) -> None:
     """Raise PathreplayError if an integrator without learned state is given one."""
     if learned:
         raise PathreplayError(
-            "The checkpoint holds what another integrator has learned of media; set the config's 'integrator' "
+            "The checkpoint contains state that another integrator learned from media; set the config's 'integrator' "
             "back, or start a new run"
         )

@@ -14,17 +14,17 @@ from pathreplay.transport.vertex import TraceConfig
 
 @dataclass(frozen=True)
 class TermResult:
-    """Result of a term, besides the gradients of parameters. Results add up."""
+    """Results of a term besides the gradients of parameters. Results of several terms or passes can be added."""
 
     image: mi.TensorXf | None = None  # tangent of the image (forward mode), or the image itself (pixel sweep)
-    seen: BaselineStats | None = None  # of media, for later passes
-    lost: mi.UInt32 | None = None  # how many paths lost a part of their gradient, if they were counted
-    paths: int = 0  # how many they were counted out of
+    stats: BaselineStats | None = None  # statistics of media, from which later passes learn
+    lost: mi.UInt32 | None = None  # number of paths that lost a part of their gradient, if counted
+    paths: int = 0  # number of all paths in that count
     moves: bool = False  # hit points, directions or emitter samples depend on parameters with gradients
 
     def __add__(self, other: TermResult) -> TermResult:
-        image, seen, lost = (_sum(getattr(self, name), getattr(other, name)) for name in ("image", "seen", "lost"))
-        return TermResult(image, seen, lost, self.paths + other.paths, self.moves or other.moves)
+        image, stats, lost = (_sum(getattr(self, name), getattr(other, name)) for name in ("image", "stats", "lost"))
+        return TermResult(image, stats, lost, self.paths + other.paths, self.moves or other.moves)
 
 
 def _sum(a: Any, b: Any) -> Any:
@@ -32,17 +32,17 @@ def _sum(a: Any, b: Any) -> Any:
 
 
 class Term(Protocol):
-    """A part of the derivative of an image by the parameters: interior, edges, particles.
+    """A term in the derivative of an image with respect to the parameters: interior, boundary, film motion.
 
-    Its docstring says what it does not differentiate. Both functions are called once per pass under
-    `dr.suspend_grad`; ``learned`` is the control variate of earlier passes, or None.
+    The docstring of a term states what it does not differentiate. Either `forward` or `backward` is called once per
+    pass, under `dr.suspend_grad`; ``learned`` is the control variate from earlier passes, or None.
     """
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Return its part of the tangent of the image. The parameters carry their tangents already."""
+        """Return the contribution to the tangent of the image. The parameters carry their tangents already."""
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
-        """Back-propagate the adjoint of the image into the parameters. All kernels have been launched on return."""
+        """Back-propagate the adjoint of the image into the parameters. On return, all kernels have been launched."""
 
     def note(self, trace: TraceConfig) -> str:
-        """Message about how the term is computed; "" if there is none."""
+        """Return a message about how the term is computed; "" if there is none."""

@@ -9,21 +9,21 @@ from typing import Any, Protocol
 import mitsuba as mi
 
 SETS = 4
-"""Number of low-discrepancy sets per pixel, if it has that many paths. With fewer sets, each is weighted by fewer other
-paths; with more, each is less evenly distributed."""
+"""Number of low-discrepancy sets per pixel, if it has that many paths. With fewer sets, fewer other paths weight
+each set; with more, each set is less evenly distributed."""
 
 
 class PixelSamples(Protocol):
     """Samples of all paths of each lane's pixel."""
 
     def together(self, paths: int) -> int:
-        """Number of paths per set, of ``paths`` in total."""
+        """Return the number of paths per set, for ``paths`` paths in total."""
 
     def first(self) -> Any:
-        """Sampler of the first path."""
+        """Return the sampler of the first path."""
 
     def of(self, before: Any, place: mi.UInt32, size: int, number: mi.UInt32) -> Any:
-        """Sampler of the path at index ``place`` in set ``number`` of ``size`` paths.
+        """Return the sampler of the path at index ``place`` in set ``number``, which has ``size`` paths.
 
         ``before`` is the sampler of the previous path.
         """
@@ -52,7 +52,8 @@ class IndependentSets:
 class SobolSets:
     """Low-discrepancy samples, in up to `SETS` sets."""
 
-    numbers: Callable[[mi.UInt32, int, mi.UInt32], Any]
+    sampler: Callable[[mi.UInt32, int, mi.UInt32], Any]
+    """Maps index in the set, size of the set and index of the set to a sampler."""
 
     def together(self, paths: int) -> int:
         """See `PixelSamples`."""
@@ -60,8 +61,8 @@ class SobolSets:
 
     def first(self) -> Any:
         """See `PixelSamples`."""
-        return self.numbers(mi.UInt32(0), 1, mi.UInt32(0))
+        return self.sampler(mi.UInt32(0), 1, mi.UInt32(0))
 
     def of(self, before: Any, place: mi.UInt32, size: int, number: mi.UInt32) -> Any:
         """See `PixelSamples`."""
-        return self.numbers(place, size, number)
+        return self.sampler(place, size, number)

@@ -1,8 +1,9 @@
 """Streams: named, disjoint sequences of the counter-based samplers, one per purpose.
 
-A stream is separated from the others in one of three ways. Its value is the first index that it uses in a key
-(`CounterSampler.stream`), it is combined with a seed or key by exclusive or, or it is added to the state of a
-generator. Index 0 of a key belongs to the path itself, with six samples per vertex (see `CounterSampler.at_vertex`).
+The value of a stream is used in one of four ways. It is the first index of the stream in a key
+(`CounterSampler.stream`), it is combined with a seed or key by exclusive or, it is added to the state of a generator,
+or it is hashed into the key of a Sobol sampler. Index 0 of a key belongs to the path itself, with six samples per
+vertex (see `CounterSampler.at_vertex`).
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ import mitsuba as mi
 
 
 class Stream(IntEnum):
-    """The purposes of random streams."""
+    """Purposes of random number streams."""
 
     # Combined with the seed of a pass.
     BOUNDARY = 0x5EED  # the boundary term, beside the interior
-    FIRST_LOOK = 0x7F4A7C15  # segments whose results determine where later segments are sampled
+    FIRST_LOOK = 0x7F4A7C15  # pilot segments, whose results determine where later segments are sampled
     CAST_SHADOWS = 0x2C1B3C6D
     PRIMARY_KEYS = 0x51ED270B
     SECONDARY_KEYS = 0x2545F491
@@ -40,9 +41,13 @@ class Stream(IntEnum):
     BISECT_PRIMARY = 0
     BISECT_SECONDARY = 1
     BISECT_VOLUMETRIC = 2
+    # Index of an independent sample set of a pixel (`Pass.sobol_sampler`). The interior uses set 0, and a pixel sweep
+    # the first `pixel_samples.SETS` sets.
+    FLOW = 0x10  # paths of the film flow
+    FLOW_MEAN = 0x11  # paths that estimate the mean radiance for the film flow
     # Combined with the seed of an image.
     SECOND_IMAGE = 0x2B5AD2C7  # a second, independent image of one view
 
     def of(self, seed: mi.UInt32) -> mi.UInt32:
-        """The seed or key of this stream, derived from a shared one."""
+        """Derive the seed or key of this stream from a shared one."""
         return seed ^ int(self)

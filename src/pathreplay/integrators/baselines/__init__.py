@@ -1,1 +1,1 @@
-"""Other ways to differentiate a path tracer, for comparison only: nothing else depends on them."""
+"""Other differentiation methods for path tracers, for comparison only. No other part of the package depends on them."""

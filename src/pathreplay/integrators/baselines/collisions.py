@@ -1,6 +1,6 @@
-"""Differentiate each tentative collision of a traced path by itself, for the listing driver.
+"""Derivatives of individual tentative collisions along a path, for the listing driver.
 
-The same random numbers reproduce the collisions, so none are stored.
+The collisions are reproduced from the same random numbers instead of being stored.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def differentiate_flight(at: Arrival, flight: Flight, past: mi.Sampler, active: 
         u = past.next_1d(flying)
         t += dr.select(σ_bar > 0, -dr.log(1 - u) * dr.rcp(σ_bar), dr.inf)
         inside = flying & (t < b)
-        past.next_1d(inside)  # had decided whether it is real
+        past.next_1d(inside)  # the number that decided between a real and a null collision
         real = inside & flight.event & (t >= flight.t)
         flying = inside & ~real
         _differentiate(medium, ray, t, σ_bar, flying, real, weight)
@@ -38,14 +38,14 @@ def differentiate_flight(at: Arrival, flight: Flight, past: mi.Sampler, active: 
 def differentiate_shadow(
     trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, past: mi.Sampler, active: mi.Bool, weight: mi.Spectrum
 ) -> None:
-    """Differentiate the tentative collisions of an unoccluded shadow ray. Homogeneous media have none."""
+    """Differentiate the tentative collisions of an unoccluded shadow ray. Homogeneous media have no collisions."""
     stretch = Stretch.begin(ray, medium, active)
     while dr.hint(stretch.active, exclude=[trace], label="pathreplay: listing, shadow"):
         hit, a, b, inside = stretch.part(trace)
         σ_bar = majorant(stretch.medium, stretch.ray, inside)
         tracked = inside & (σ_bar > 0)
         if dr.hint(trace.media.homogeneous, mode="scalar"):
-            tracked &= ~stretch.medium.is_homogeneous()  # known without tracking
+            tracked &= ~stretch.medium.is_homogeneous()  # closed form, without tracking
         t = mi.Float(a)
         while dr.hint(tracked, label="pathreplay: listing, ratio tracking"):
             t -= dr.log(1 - past.next_1d(tracked)) / σ_bar
@@ -58,7 +58,7 @@ def differentiate_shadow(
 def _differentiate(
     medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float, σ_bar: mi.Float, null: mi.Bool, real: mi.Bool, weight: mi.Spectrum
 ) -> None:
-    """Differentiate a collision at ``t``; ``weight`` is the transmitted radiance times its adjoint."""
+    """Differentiate a null or real collision at ``t``; ``weight`` is the transmitted radiance times its adjoint."""
     with dr.resume_grad():
         σ_s, _, σ_t = medium.get_scattering_coefficients(interaction(medium, ray, t), null | real)
         log = dr.select(null, -σ_t * dr.detach(reciprocal(σ_bar - σ_t)), 0)

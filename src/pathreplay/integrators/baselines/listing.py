@@ -1,9 +1,9 @@
-"""Differentiable delta tracking as first published: path replay nested in the transmittance estimate.
+"""Differentiable delta tracking as first published: path replay with differentiated tentative collisions.
 
-Every tentative collision is differentiated by itself, in a second walk with the same random numbers: null ones as
-dσ_n/σ_n, real ones as dσ_s/σ_s (supplement of Vicini, Speierer, Jakob 2021, listings 1 and 2). Where σ_n or σ_s is zero
-such a collision is never drawn and its derivative is missing: on a constant grid all of that of the transmittance.
-`pathreplay` has no such holes; this driver is here to compare with.
+A second pass with the same random numbers differentiates each tentative collision: null collisions as dσ_n/σ_n and real
+collisions as dσ_s/σ_s (supplement of Vicini, Speierer, Jakob 2021, listings 1 and 2). Where σ_n or σ_s is zero, such a
+collision is never sampled, and its derivative is missing. On a constant grid this is the whole derivative of the
+transmittance. `pathreplay` does not have this limitation; this driver exists for comparison.
 """
 
 from __future__ import annotations
@@ -30,18 +30,20 @@ from pathreplay.transport.vertex import TraceConfig, VertexSamples, reciprocal
 def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters.
 
-    Uses one majorant for each medium. Not differentiated: what the listings miss (above), visibility, emission of
-    media, and everything that moves: a path that moves with the parameters raises PathreplayError, and so does a scene
-    without media.
+    Uses a global majorant for each medium. Not differentiated: derivatives that the listings miss (see the module),
+    visibility, and emission of media. Raises PathreplayError if paths move with the parameters, and for scenes without
+    media.
     """
     if dr.hint(trace.media is None, mode="scalar"):
         raise PathreplayError("prb_volume_listing differentiates media, and the scene has none: use 'pathreplay'")
-    # Nobody else's tracking is used, so that every collision is one that can be differentiated.
+    # Uses Mitsuba's interface for all media, so that every tracked collision can be differentiated.
     trace = replace(trace, media=replace(trace.media, grids=(), plain=True))
     sampler, path = start.sampler, PathState.begin(trace, start)
     if dr.hint(path_moves(trace, start, path.at), mode="scalar"):
-        raise PathreplayError("prb_volume_listing cannot follow what moves: use 'pathreplay'")
-    L = walk_on(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, peeled on the way
+        raise PathreplayError("prb_volume_listing does not differentiate motion: use 'pathreplay'")
+    L = walk_on(trace, sampler.clone(), dr.copy(path))[
+        0
+    ]  # β_i L_i, from which the loop subtracts β_i e_i at each vertex
     ctx = mi.BSDFContext()
 
     while dr.hint(path.active, exclude=[trace, ctx], label="pathreplay: listing"):
@@ -50,24 +52,24 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
         u, step = path.choose(trace, sampler)
         kept = step.kept
 
-        # All that comes along the ray has passed the null collisions of its flight, or was scattered at the real one.
+        # All radiance along the ray passed the null collisions of the flight, or was scattered at its real collision.
         differentiate_flight(path.at, kept.media.flight, past, path.active, δL * L)
         L -= path.β * step.e
 
-        onward, again = path.advance(trace, u, step)
+        onward, repeated = path.advance(trace, u, step)
         with dr.resume_grad():
             v = arrive.choose(trace, path.at, past, path.β, path.active, kept.media.flight)
             light, Le = redraw_emitter(trace, v.origin, u.light, kept.light, False, kept.lit)
             f, pdf = scatter.towards(v, ctx, light.d, kept.lit)
             reached = Connection(light, Le * kept.media.shadow.T, kept.lit).reaches(pdf, False)
             lighting = v.inside.w * dr.select(kept.lit, f * reached, 0)
-            w = scatter.repeat(trace, v, again, ctx, False)[0]
+            w = scatter.repeat(trace, v, repeated, ctx, False)[0]
             w *= v.inside.w
             Lo = path.β * (v.inside.e + v.inside.w * v.glow + lighting) + L * w * dr.detach(reciprocal(w))
             if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
                 backward(dr.sum(δL * Lo))
 
-        # The same for the light of the emitter sample, along its shadow ray.
+        # The collisions along the shadow ray transmit the radiance of the emitter sample.
         ray, begins = v.origin.spawn_ray_to(light.p), shadow_start(v, light, path.at.medium)
         differentiate_shadow(trace, ray, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
         path = onward

@@ -1,8 +1,7 @@
 """The naive driver: automatic differentiation of a wavefront of paths, for comparison.
 
-Every vertex of every path is evaluated in memory and stays there until the graph of the whole loop has been
-back-propagated: memory grows with the number of paths times their length. Reverse-mode AD by itself
-does this.
+Every vertex of every path is evaluated in memory, and stays there until the graph of the whole loop has been
+back-propagated. Memory therefore grows with the number of paths times their length, as in plain reverse-mode AD.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from pathreplay.transport.vertex import TraceConfig
 
 
 def tape_backward(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
-    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
+    """Back-propagate the adjoint radiance ``δL`` into the parameters and the ``start``; return whether paths move.
 
-    The estimator is that of the sweep driver, and with the same random numbers so is the gradient. Not differentiated:
-    see `tape`. Raises PathreplayError when no parameter reaches the paths.
+    The estimator is that of `sweep`: equal random numbers give equal gradients. Not differentiated: see `tape`. Raises
+    PathreplayError if no parameter reaches the paths.
     """
     with dr.resume_grad(), dr.isolate_grad():
         L, _, moves = tape(trace, start)
@@ -34,7 +33,7 @@ def tape_backward(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost
 
 
 def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
-    """Return the tangent of the radiance along camera rays, ``(δL, valid, moves)``: see `forward`.
+    """Compute the tangent of the radiance along camera rays, ``(δL, valid, moves)``: see `forward`.
 
     The parameters must carry their tangents already. Not differentiated: see `tape`.
     """
@@ -44,9 +43,9 @@ def tape_forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter)
 
 
 def _cut(state: tuple[Any, ...]) -> Any:
-    """Return the same values, and evaluate their adjoints before the reverse pass continues.
+    """Return the same values, and make AD passes evaluate their derivatives at this point.
 
-    Otherwise the reverse pass is a single kernel whose code grows with depth: a minute to compile at 64 vertices.
+    Otherwise the reverse pass is a single kernel whose size grows with depth: at 64 vertices it compiles for a minute.
     """
 
     class Cut(dr.CustomOp):  # type: ignore[misc]
@@ -68,11 +67,10 @@ def _cut(state: tuple[Any, ...]) -> Any:
 
 @dr.syntax
 def tape(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, bool]:
-    """Radiance along the rays of a ``start`` as an AD variable, ``(L, valid, moves)``: L = Σ β_i e_i.
+    """Compute the radiance L = Σ β_i e_i along the rays of a ``start`` as an AD variable: ``(L, valid, moves)``.
 
-    Every step is sampled detached and then evaluated attached. Not differentiated: visibility, Russian
-    roulette and, with ``attach='none'``, everything that moves. Adjoints that are not finite are not detected. Call
-    it under `dr.resume_grad`.
+    Every step is sampled detached and then evaluated attached. Not differentiated: visibility, Russian roulette and,
+    with ``attach='none'``, all motion. Non-finite adjoints are not detected. Call it under `dr.resume_grad`.
     """
     sampler = start.sampler
     with dr.suspend_grad():
@@ -80,8 +78,8 @@ def tape(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, 
         at = path.at
         valid = mi.Bool(trace.background_is_opaque) & path.active
     moves = path_moves(trace, start, at)
-    L = mi.Spectrum(0)  # radiance so far
-    β = mi.Spectrum(1)  # throughput, differentiable, and so the arrival: where, whence, density
+    L = mi.Spectrum(0)  # accumulated radiance
+    β = mi.Spectrum(1)  # attached throughput; origin, direction and density of the arrival below are attached as well
     first = start.ray if moves else at.ray
     o, d, pdf = mi.Point3f(first.o), mi.Vector3f(first.d), mi.Float(at.pdf)
 
@@ -95,10 +93,10 @@ def tape(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool, 
         ray = mi.Ray3f(path.at.ray)
         ray.o, ray.d = o, d
         at = replace(path.at, ray=ray, pdf=pdf)
-        again = repeat_step(trace, replace(v, at=at), moves, path.active)
-        L += β * again.e
-        β *= again.w * v.rr_weight
-        ray, pdf = (again.ray_next, again.pdf) if moves else (onward.at.ray, onward.at.pdf)
+        repeated = repeat_step(trace, replace(v, at=at), moves, path.active)
+        L += β * repeated.e
+        β *= repeated.w * v.rr_weight
+        ray, pdf = (repeated.ray_next, repeated.pdf) if moves else (onward.at.ray, onward.at.pdf)
         o, d, pdf = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(pdf)
         path = onward
 

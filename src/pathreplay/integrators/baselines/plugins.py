@@ -1,4 +1,4 @@
-"""The plugin classes of `pathreplay.baselines`, on the same light-transport step as `pathreplay`."""
+"""The plugin classes of `pathreplay.baselines`; they use the same light-transport step as `pathreplay`."""
 
 from __future__ import annotations
 
@@ -27,30 +27,29 @@ ATTACH = ("delta", "none")
 class OtherInterior:
     """The interior term by another driver.
 
-    Media are differentiated by the score, without control variate; empty voxels have no derivative.
+    Media are differentiated with the score-function estimator, without control variate. Empty voxels get no derivative.
     """
 
-    backwards: Driver
-    forwards: ForwardDriver
+    reverse_driver: Driver
+    forward_driver: ForwardDriver
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Tangent of the image: see `Term`."""
-        return tangent(view, trace, self.forwards)
+        """Compute the tangent of the image: see `Term`."""
+        return tangent(view, trace, self.forward_driver)
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         """Back-propagate the adjoint of the image: see `Term`."""
-        return back_propagate(view, trace, grad_in, self.backwards)
+        return back_propagate(view, trace, grad_in, self.reverse_driver)
 
     def note(self, trace: TraceConfig) -> str:
-        """Nothing: see `Term`."""
+        """See `Term`: none."""
         return ""
 
 
 class NaiveIntegrator(PathIntegrator):
     """AD of a wavefront path tracer, for comparison only: memory grows with depth (see `tape`).
 
-    Properties: those of `PathIntegrator` and ``attach`` (``delta``, ``none``), which means what it does for
-    `pathreplay`.
+    Properties: as in `PathIntegrator`, and ``attach`` (``delta``, ``none``) as in `pathreplay`.
     """
 
     name = "naive_ad"
@@ -64,8 +63,8 @@ class NaiveIntegrator(PathIntegrator):
 class RadiativeIntegrator(PathIntegrator):
     """Radiative backpropagation, for comparison only: time grows with the square of the depth.
 
-    Properties: those of `PathIntegrator` and ``linear`` (False: unbiased; True: the biased variant in linear
-    time), see `radiative`. Nothing that moves is differentiated, and there is no forward mode.
+    Properties: as in `PathIntegrator`, and ``linear`` (False: unbiased; True: the biased variant in linear time), see
+    `radiative`. Motion is not differentiated, and there is no forward mode.
     """
 
     name = "radiative_backprop"
@@ -79,10 +78,10 @@ class RadiativeIntegrator(PathIntegrator):
 class ListingIntegrator(PathIntegrator):
     """Delta tracking as first published, for comparison only: it misses derivatives (see `listing`).
 
-    Properties: those of `PathIntegrator`. For scenes with media; motion raises in reverse mode. Forward mode
-    uses the forward driver, without control variate and branch.
+    Properties: as in `PathIntegrator`. Reverse mode raises PathreplayError without media or with motion. Forward mode
+    uses `forward`, without control variate and null branching.
     """
 
     name = "prb_volume_listing"
-    attach = "delta"  # so that it is noticed
+    attach = "delta"  # makes motion detectable, which raises an error
     interior = OtherInterior(listing, forward)

@@ -1,8 +1,8 @@
 """Radiative backpropagation: adjoint radiance is traced from the camera, for comparison.
 
-At every vertex δL β_i is multiplied with the derivative of e_i + w_i L_{i+1}, and the radiance L_{i+1} that comes back
-along the continuation is estimated by a fresh path of all the remaining depth (Nimier-David, Speierer, Ruiz, Jakob:
-Radiative Backpropagation, 2020). Memory is constant; time grows with the square of the depth.
+At every vertex, δL β_i multiplies the derivative of e_i + w_i L_{i+1}. An independent path of the full remaining depth
+estimates L_{i+1}, the incident radiance along the continuation (Nimier-David, Speierer, Ruiz, Jakob: Radiative
+Backpropagation, 2020). Memory is constant; time grows with the square of the depth.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ def radiative(
 ) -> bool:
     """Back-propagate the adjoint radiance ``δL`` into the parameters.
 
-    ``linear`` is a biased variant in linear time, after those of the paper, which leave the incident radiance out: no
-    fresh paths, and L_{i+1} is taken to be one in all channels wherever a path goes on, while emission and next-event
-    estimation (e_i) are as they are. The size of a gradient is wrong, and where media are also dark its sign may be.
-    Nothing is lost. Not differentiated: everything that moves (as with ``attach='none'``), and visibility. Raises
-    PathreplayError when no parameter reaches the paths.
+    ``linear`` selects a biased variant in linear time that leaves out the incident radiance, like the variants in the
+    paper: L_{i+1} is replaced by one in all channels wherever a path continues, while emission and next-event
+    estimation (e_i) are unchanged. The magnitude of the gradient is then wrong, and where media are also dark, its sign
+    may be wrong. No paths are ``lost``. Not differentiated: all motion (as with ``attach='none'``), and visibility.
+    Raises PathreplayError if no parameter reaches the paths.
     """
     sampler, path = start.sampler, PathState.begin(trace, start)
 
@@ -50,7 +50,7 @@ def radiative(
             L, _ = walk_on(trace, sampler, PathState(at, mi.Spectrum(1), None, η, depth, step.active))
         onward, v = path.advance(trace, u, step, at)
         with dr.resume_grad():
-            again = repeat_step(trace, replace(v, go_on=step.active), False, path.active)
-            backward(dr.sum(δL * path.β * (again.e + again.w * L)))
+            repeated = repeat_step(trace, replace(v, go_on=step.active), False, path.active)
+            backward(dr.sum(δL * path.β * (repeated.e + repeated.w * L)))
         path = onward
     return False

@@ -1,1 +1,1 @@
-"""The film: samples, images and their adjoints, and how places on it move."""
+"""The film: samples, images and their adjoints, and the motion of film positions."""

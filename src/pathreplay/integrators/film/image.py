@@ -1,4 +1,4 @@
-"""The film: how samples become an image, how an adjoint image becomes one per ray, and how large pictures are."""
+"""Images of a film: splatting of samples, its adjoint, and checks of film sizes."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from pathreplay.platform.registration import mitsuba_integrator
 
 # Dr.Jit counts the samples of one kernel in 32 bits.
 MOST_SAMPLES = 2**32 - 1
-# Bytes, measured (peak of the process over 2048 x 2048 pixels, LLVM): a rendering, its derivative and their files take
-# 127 a pixel. Samples take next to none.
+# Bytes per pixel. A rendering, its derivative and their files take 127, measured as the peak of the process for 2048 x
+# 2048 pixels on LLVM. The memory of samples is negligible.
 _A_PIXEL = 128
 
 
 def splat(view: Pass, rays: Rays, L: mi.Spectrum, valid: mi.Bool) -> mi.TensorXf:
-    """The image that radiances ``L`` (and ``valid``, for alpha: one each per ray) give under the film's filter.
+    """Splat the radiance ``L`` and the alpha mask ``valid`` of each ray with the film's filter; return the image.
 
-    Differentiable in ``L``. Also takes tangents for radiances, and gives that of the image.
+    Differentiable in ``L``. Since the image is linear in ``L``, tangents of radiance give the tangent of the image.
     """
     film = view.sensor.film()
     block = film.create_block()
-    # Dr.Jit adds up the samples of a pixel before they are written, which pays only where there are some.
+    # Summing the samples of a pixel before the write pays off only for several samples.
     block.set_coalesce(block.coalesce() and rays.spp >= 4)
     mitsuba_integrator()._splat_to_block(
         block,
@@ -43,21 +43,21 @@ def splat(view: Pass, rays: Rays, L: mi.Spectrum, valid: mi.Bool) -> mi.TensorXf
 
 
 def adjoint(view: Pass, rays: Rays, grad_in: mi.TensorXf) -> mi.Spectrum:
-    """δL of each ray: ``grad_in`` (the adjoint of the image), taken back through filter, weights and their division."""
+    """Return δL of each ray: the adjoint ``grad_in`` of the image, propagated back through filter and normalisation."""
     with dr.resume_grad():
-        L = dr.full(mi.Spectrum, 1.0, dr.width(rays.position))  # rays may all be the same
+        L = dr.full(mi.Spectrum, 1.0, dr.width(rays.position))  # full width, even if all rays are equal
         dr.enable_grad(L)
         image = splat(view, rays, L, mi.Bool(True))
         dr.set_grad(image, grad_in)
         dr.enqueue(dr.ADMode.Backward, image)
         dr.traverse(dr.ADMode.Backward)
         δL = dr.grad(L)
-    view.sensor.film().clear()  # of the ones that were splatted
+    view.sensor.film().clear()  # discard the splatted ones
     return δL
 
 
 def film_size(sensor: mi.Sensor) -> tuple[int, int]:
-    """Width and height of what is rendered: the crop window, and the film's border where it samples one.
+    """Return width and height of the rendered area: the crop window, with the border if the film samples it.
 
     Raises PathreplayError if the film has no pixel.
     """
@@ -70,10 +70,10 @@ def film_size(sensor: mi.Sensor) -> tuple[int, int]:
 
 
 def require_film(sensor: mi.Sensor, name: str, spp: Mapping[str, int], also: int = 0) -> None:
-    """Return quietly if Dr.Jit takes the samples of a sensor's film at once, and memory what is rendered of it.
+    """Check that Dr.Jit can process the samples of a sensor's film at once, and that memory suffices for its images.
 
-    ``spp`` (samples per pixel, by the key that asks for them); ``also`` are bytes for other things. Raises
-    PathreplayError that names the sensor as ``name`` and, of samples, the key and the largest number that would do.
+    ``spp`` maps configuration keys to their samples per pixel; ``also`` is the number of bytes needed for other things.
+    Raises PathreplayError otherwise; the message calls the sensor ``name`` and states the largest possible value.
     """
     width, height = film_size(sensor)
     pixels = width * height
@@ -82,14 +82,14 @@ def require_film(sensor: mi.Sensor, name: str, spp: Mapping[str, int], also: int
             remedy = f"'{key}' up to {MOST_SAMPLES // pixels}" if pixels <= MOST_SAMPLES else "a smaller film"
             raise PathreplayError(
                 f"'{key}' is {count}: with {name} of {width} x {height} pixels that is {pixels * count} samples, "
-                f"beyond the {MOST_SAMPLES} that Dr.Jit takes at once; take {remedy}"
+                f"more than the {MOST_SAMPLES} that Dr.Jit takes at once; take {remedy}"
             )
     thing = f"Rendering {name} of {width} x {height} pixels"
     memory.require(pixels * _A_PIXEL + also, thing, "take a smaller film or fewer sensors")
 
 
 def fit_film(sensor: mi.Sensor, shape: Sequence[int]) -> None:
-    """Give the film of a sensor the size of a picture (height, width, ...), if it has another and no crop window."""
+    """Resize the film of a sensor to an image of shape (height, width, ...), unless it or its crop window fits."""
     size = mi.ScalarVector2u(int(shape[1]), int(shape[0]))
     if tuple(sensor.film().crop_size()) != tuple(size):
         params = mi.traverse(sensor)
@@ -98,17 +98,17 @@ def fit_film(sensor: mi.Sensor, shape: Sequence[int]) -> None:
 
 
 def make_ready(sensor: mi.Sensor) -> None:
-    """Give a sensor now what it is given when it is first rendered: storage of its film, and a state of its sampler.
+    """Initialise the film storage and the sampler state of a sensor, as its first rendering would.
 
-    Recorded passes hold all sensors of a scene, and have to be recorded again when one of them changes.
+    A recorded pass depends on all sensors of a scene and must be recorded again when one of them changes.
     """
     sensor.film().prepare([])
     sensor.sampler().seed(0, 1)  # as `mi.render` leaves it
 
 
 def picture_shape(sensor: mi.Sensor) -> tuple[int, int, int]:
-    """Height, width and channels of the pictures that a sensor's film develops."""
+    """Return height, width and number of channels of the images of a sensor."""
     film = sensor.film()
-    film.prepare([])  # without storage a film does not tell its channels
+    film.prepare([])  # the number of channels is known only after this
     width, height = (int(n) for n in film.crop_size())
     return height, width, film.bitmap().channel_count()

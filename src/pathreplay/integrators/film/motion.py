@@ -1,25 +1,25 @@
-"""The term of a film whose places move: what their flow does to the weights of what is seen.
+"""The term of moving film positions: derivative of the filter weights under a film flow.
 
-With the filter h_j of pixel j, of which only the part on the film D counts, and the velocity v of the film's places
+With the filter h_j of pixel j, restricted to the film D, and the velocity v of film positions (see `camera_flow`),
 
-    dI_j/dπ = 1/∫_D h_j · ( ∫_D div(h_j v) L ds - ∮_∂D h_j L v·n dl )                         (see `FilmFlow`).
+    dI_j/dπ = 1/∫_D h_j · ( ∫_D div(h_j v) L ds - ∮_∂D h_j L v·n dl ).
 
-Filters are products, h_j = f(x) f(y), and the border of the film is the place where f(x) falls to zero at once. So both
-parts with ∂f/∂x are one integral over a measure, df(x), in which the mass beyond the border lies at the border:
+Filters are products h_j = f(x) f(y), and at the border of the film f(x) jumps to zero. Both parts with ∂f/∂x therefore
+form one integral over a measure df(x), whose mass outside the film is concentrated at the border:
 
     ∫ f(y) dy ∫ v_x L df(x),        ∫ f(x) dx ∫ v_y L df(y),        ∫_D h_j (∂v_x/∂x + ∂v_y/∂y) L ds.
 
-df is odd: places x away from the middle of a pixel, to its right and to its left, count against each other. Their
-paths have the same random numbers, so that what they have in common cancels, as it does in a difference of two
-pictures. Paths only tell L: nothing of them is differentiated, and no edge has to be found.
+The measure df is odd: two positions at the same distance to the right and to the left of a pixel centre have opposite
+signs. Paths are sampled in such pairs with the same random numbers, so that common parts of their radiance cancel, as
+in a finite difference of two images. Paths only estimate L: they are not differentiated, and no edges are sampled.
 
-On a film of many pixels the two places are close to each other, and most that is left is noise. So the adjoint W_j of
-pixels is taken apart. Its mean over some pixels around, W̄_j, is smooth, and with it neighbours cancel better than pairs
-do: a path at x counts for all pixels of its row at once,
+On a film of many pixels, the two positions are close to each other and their difference is mostly noise. The adjoint
+W_j of the pixels is therefore split. Its local mean W̄_j is smooth, so that contributions of adjacent pixels cancel
+better than pairs do. A path at x contributes to all pixels of its row at once, with the weight
 
     (W_j - W̄_j) sgn df(x - x_j) + Σ_i W̄_i df(x - x_i) / Σ_i |df(x - x_i)|,
 
-where the sum in the denominator is the density of all places of the row. Forward mode is the transpose.
+where the denominator is the density of all sampled positions of the row. Forward mode is the transpose.
 """
 
 from __future__ import annotations
@@ -39,157 +39,167 @@ from pathreplay.integrators.film.domain import FilmPlaces
 from pathreplay.integrators.film.filter_samples import FilterSamples
 from pathreplay.integrators.term import TermResult
 from pathreplay.samplers.owen_sobol import OwenSobolSampler
+from pathreplay.samplers.streams import Stream
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
 
 GROUP = 5
-"""Paths with the same random numbers: to the right and to the left, above and below, and one for the divergence."""
+"""Number of paths with the same random numbers: right and left, above and below, and one for the divergence."""
 BLUR, MOST = 16, 16
-"""The adjoint of pixels is averaged over a BLUR-th of the film's shorter side to each side, and at most MOST pixels.
+"""The local mean of the adjoint extends to each side over 1 / BLUR of the film's shorter side, at most MOST pixels.
 
-The noise of the smooth part falls with the third power of that length, as long as the adjoint is smooth over it."""
-NUMBERS = 1
-"""Number of the set of random numbers; the interior uses 0."""
+The noise of the smooth part falls with the third power of that length, if the adjoint is smooth over it."""
 
 
 @dataclass
-class Flowing:
-    """Paths, and how the flow of their places weighs what they bring."""
+class FlowPaths:
+    """Paths of the term, and the weights of their radiance under the flow."""
 
-    pixel: mi.UInt32  # row by row
-    sample: Sample  # of their camera rays
-    axis: mi.UInt32  # along which places of pairs count
-    single: mi.Bool  # a path for the divergence
-    offset: mi.Float  # of paired paths: distance from the pixel's centre along their axis
-    slope: FilterSamples  # which these are drawn from
-    L: mi.Spectrum  # times its weight; what the velocity of places is multiplied with
+    pixel: mi.UInt32  # row-major index
+    sample: Sample  # sample of the camera ray
+    axis: mi.UInt32  # axis along which the two positions of a pair differ
+    single: mi.Bool  # whether the path is the one for the divergence
+    offset: mi.Float  # of a pair: distance from the pixel centre along the axis
+    derivative: FilterSamples  # sampler of the offsets: the derivative of the filter
+    L: mi.Spectrum  # weighted radiance, the factor of the velocity or divergence
     wavelengths: mi.Spectrum
 
 
 @dataclass(frozen=True)
 class FilmMotion:
-    """A term: what the flow of a film does to the picture; the rest of the motion is left to other terms."""
+    """The term of the film flow (see `Term`). Not differentiated: the rest of the motion, which other terms contain."""
 
     flow: FilmFlow
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
-        """Tangent of the image: see `Term`."""
-        places, f = FilmPlaces.of(view), self._walked(view, trace)
+        """Compute the tangent of the image: see `Term`."""
+        places, f = FilmPlaces.of(view), self._trace(view, trace)
         with dr.resume_grad():
-            (δ,) = tangents(self._moved(view, f))
+            (δ,) = tangents(self._flow_factor(view, f))
         pixels = places.pixels(f.pixel, f.L * δ, f.wavelengths)
-        pixels += blurred(sum(places.pixels(i, f.L * δ * share, f.wavelengths) for i, share in self._shared(view, f)))
+        pixels += blurred(
+            sum(places.pixels(i, f.L * δ * factor, f.wavelengths) for i, factor in self._smooth_factors(view, f))
+        )
         return TermResult(places.developed(pixels))
 
     def backward(self, view: Pass, trace: TraceConfig, grad_in: mi.TensorXf, learned: Baseline | None) -> TermResult:
         """Back-propagate the adjoint of the image: see `Term`."""
-        places, f = FilmPlaces.of(view), self._walked(view, trace)
-        wanted = places.undeveloped(grad_in)
-        smooth = blurred(wanted)
-        W = places.importance_of_pixels(wanted, f.pixel, f.wavelengths)
-        W += sum(share * places.importance_of_pixels(smooth, i, f.wavelengths) for i, share in self._shared(view, f))
+        places, f = FilmPlaces.of(view), self._trace(view, trace)
+        block_grad = places.undeveloped(grad_in)
+        smooth = blurred(block_grad)
+        W = places.importance_of_pixels(block_grad, f.pixel, f.wavelengths)
+        W += sum(
+            factor * places.importance_of_pixels(smooth, i, f.wavelengths)
+            for i, factor in self._smooth_factors(view, f)
+        )
         δ = dr.sum(W * f.L)
-        # Every parameter of the camera sums over these apart, which would walk the paths as often.
-        dr.eval(δ, f.sample.place)
+        # Gradients of camera parameters are separate sums; without this evaluation, each would trace the paths again.
+        dr.eval(δ, f.sample.position)
         with dr.resume_grad():
-            backward(δ * self._moved(view, f))
+            backward(δ * self._flow_factor(view, f))
         dr.eval()
         return TermResult()
 
     def note(self, trace: TraceConfig) -> str:
-        """Nothing: see `Term`."""
+        """See `Term`: none."""
         return ""
 
-    def _moved(self, view: Pass, f: Flowing) -> mi.Float:
-        """Of pairs the velocity of their place along their axis, in pixels; of single paths its divergence."""
+    def _flow_factor(self, view: Pass, f: FlowPaths) -> mi.Float:
+        """Return the velocity of pairs along their axis, in pixels, and the divergence for single paths."""
         v = self.flow.velocity(f.sample) * mi.Vector2f(*view.size)
         return dr.select(f.single, self.flow.divergence(f.sample), dr.select(f.axis == 0, v.x, v.y))
 
-    def _shared(self, view: Pass, f: Flowing) -> list[tuple[mi.UInt32, mi.Float]]:
-        """How much of the smooth weight of which pixels a path of a pair has, as shares of the weight of its own.
+    def _smooth_factors(self, view: Pass, f: FlowPaths) -> list[tuple[mi.UInt32, mi.Float]]:
+        """Return pixels and factors by which each path of a pair weighs the smooth part W̄ of the adjoint.
 
-        Less all of its own, which has that already.
+        The factors are relative to the weight of the path's own pixel. The first entry subtracts W̄ of that pixel, which
+        the full adjoint W contains.
         """
         width, height = view.size
-        slope, along_x = f.slope, f.axis == 0
-        place, most = dr.select(along_x, f.pixel % width, f.pixel // width), dr.select(along_x, mi.Int32(width), height)
-        first, total = mi.Int32(dr.ceil(f.offset - slope.radius)), mi.Float(0)
+        derivative, along_x = f.derivative, f.axis == 0
+        position, most = (
+            dr.select(along_x, f.pixel % width, f.pixel // width),
+            dr.select(along_x, mi.Int32(width), height),
+        )
+        first, total = mi.Int32(dr.ceil(f.offset - derivative.radius)), mi.Float(0)
         masses = []
-        for k in range(math.ceil(2 * slope.radius)):
+        for k in range(math.ceil(2 * derivative.radius)):
             i = first + k
-            inside = ~f.single & (mi.Int32(place) + i >= 0) & (mi.Int32(place) + i < most)
-            mass = dr.select(inside, slope.mass(f.offset - mi.Float(i)), 0)
+            inside = ~f.single & (mi.Int32(position) + i >= 0) & (mi.Int32(position) + i < most)
+            mass = dr.select(inside, derivative.mass(f.offset - mi.Float(i)), 0)
             pixel = mi.UInt32(mi.Int32(f.pixel) + i * dr.select(along_x, mi.Int32(1), width))
             masses.append((dr.select(inside, pixel, f.pixel), mass))
             total += dr.abs(mass)
-        scale = dr.select(total > 0, slope.sign(f.offset) / total, 0)
+        scale = dr.select(total > 0, derivative.sign(f.offset) / total, 0)
         return [(f.pixel, dr.select(f.single, 0, mi.Float(-1))), *((pixel, mass * scale) for pixel, mass in masses)]
 
-    def _usual(self, view: Pass, trace: TraceConfig) -> mi.Float:
-        """What is usually seen, as one number, by paths of its own.
+    def _mean_radiance(self, view: Pass, trace: TraceConfig) -> mi.Float:
+        """Estimate the mean radiance of positions with flow, from independent paths.
 
-        A picture that is the same everywhere does not change while its places move, so that radiance counts less that.
+        Its subtraction from all radiance reduces noise and adds no bias: motion does not change a constant image.
         """
         width, height = view.size
         pixel = dr.arange(mi.UInt32, width * height)
-        numbers = view.numbers(pixel, width, mi.UInt32(0), 1, NUMBERS + 1)
-        place = (mi.Point2f(pixel % width, pixel // width) + numbers.next_2d()) / mi.Point2f(width, height)
-        sample = Sample(view.sensor.shutter_open(), numbers.next_1d(), place, numbers.next_2d())
-        there = dr.full(mi.Bool, True, width * height) & self.flow.moves_at(place)
-        L, _ = _seen(view, trace, sample, numbers, there)
-        return dr.sum(dr.mean(L)) / dr.maximum(mi.Float(dr.count(there)), 1)
+        sampler = view.sobol_sampler(pixel, width, mi.UInt32(0), 1, Stream.FLOW_MEAN)
+        position = (mi.Point2f(pixel % width, pixel // width) + sampler.next_2d()) / mi.Point2f(width, height)
+        sample = Sample(view.sensor.shutter_open(), sampler.next_1d(), position, sampler.next_2d())
+        moving = dr.full(mi.Bool, True, width * height) & self.flow.moves_at(position)
+        L, _ = _radiance(view, trace, sample, sampler, moving)
+        return dr.sum(dr.mean(L)) / dr.maximum(mi.Float(dr.count(moving)), 1)
 
-    def _walked(self, view: Pass, trace: TraceConfig) -> Flowing:
-        """Walk the paths of a pass."""
+    def _trace(self, view: Pass, trace: TraceConfig) -> FlowPaths:
+        """Trace the paths of a pass."""
         width, height = view.size
         groups = -(-view.spp // self.flow.samples)
         i = dr.arange(mi.UInt32, width * height * groups * GROUP)
         member, group = i % GROUP, i // GROUP
         pixel, single, axis = group // groups, member == GROUP - 1, member // 2
-        numbers = view.numbers(pixel, width, group % groups, groups, NUMBERS)
+        sampler = view.sobol_sampler(pixel, width, group % groups, groups, Stream.FLOW)
 
-        sensor, film, u = view.sensor, view.sensor.film(), numbers.next_2d()
-        places, filter, slope = FilmPlaces.of(view), FilterSamples.of(film), FilterSamples.of_slope(film)
+        sensor, film, u = view.sensor, view.sensor.film(), sampler.next_2d()
+        places, filter, derivative = FilmPlaces.of(view), FilterSamples.of(film), FilterSamples.of_derivative(film)
         middle = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)) + 0.5
         middle += mi.Point2f(mi.ScalarPoint2f(film.crop_offset()) - places.corner)
         s, weight, offset = mi.Point2f(0), mi.Float(1 / groups), mi.Float(0)
         for k in range(2):
-            low, high = filter.share(-middle[k]), filter.share(places.size[k] - middle[k])
-            x, away = filter.draw(u[k], low, high), slope.draw(u[k], mi.Float(0.5), mi.Float(1))
+            low, high = filter.cdf_at(-middle[k]), filter.cdf_at(places.size[k] - middle[k])
+            x, away = filter.draw(u[k], low, high), derivative.draw(u[k], mi.Float(0.5), mi.Float(1))
             pairs = ~single & (axis == k)
             x = dr.select(pairs, dr.select(member % 2 == 0, away, -away), x)
             offset = dr.select(pairs, x, offset)
             s[k] = dr.clip(middle[k] + x, 0, places.size[k])
-            mass = dr.select(pairs, 0.5 * slope.total * slope.sign(x), filter.total * (high - low) * filter.sign(x))
+            mass = dr.select(
+                pairs, 0.5 * derivative.total * derivative.sign(x), filter.total * (high - low) * filter.sign(x)
+            )
             weight *= mass
-        place = places.in_sensor(s)
+        position = places.in_sensor(s)
 
-        time = sensor.shutter_open() + numbers.next_1d() * sensor.shutter_open_time()
-        sample = Sample(time, numbers.next_1d(), place, numbers.next_2d())
-        L, wavelengths = _seen(view, trace, sample, numbers, self.flow.moves_at(place))
-        L = (L - self._usual(view, trace)) * weight
-        return Flowing(pixel, sample, axis, single, offset, slope, L, wavelengths)
+        time = sensor.shutter_open() + sampler.next_1d() * sensor.shutter_open_time()
+        sample = Sample(time, sampler.next_1d(), position, sampler.next_2d())
+        L, wavelengths = _radiance(view, trace, sample, sampler, self.flow.moves_at(position))
+        L = (L - self._mean_radiance(view, trace)) * weight
+        return FlowPaths(pixel, sample, axis, single, offset, derivative, L, wavelengths)
 
 
-def _seen(
-    view: Pass, trace: TraceConfig, sample: Sample, numbers: OwenSobolSampler, active: mi.Bool
+def _radiance(
+    view: Pass, trace: TraceConfig, sample: Sample, sampler: OwenSobolSampler, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """What a path brings that begins with the camera ray of a sample, times the ray's weight; and its wavelengths."""
+    """Return the weighted radiance along the camera ray of a sample, and the wavelengths of the ray."""
     ray, weight = dr.detach(sample.ray(view.sensor))
-    L, _ = primal(trace, CameraStart(mi.Ray3f(ray), numbers, active))
+    L, _ = primal(trace, CameraStart(mi.Ray3f(ray), sampler, active))
     return L * weight, ray.wavelengths
 
 
 def blurred(pixels: mi.TensorXf) -> mi.TensorXf:
-    """The mean of pixels over a square around each, with zero beyond the border: its own transpose."""
+    """Average pixels over squares, with zeros outside the image. This linear map is its own transpose."""
     height, width, channels = pixels.shape
     reach = min(max(min(height, width) // BLUR, 1), MOST)
     index, values = dr.arange(mi.UInt32, height * width * channels), pixels.array
     for stride, most in ((channels, width), (channels * width, height)):
-        place, total = mi.Int32(index // stride % most), mi.Float(0)
+        position, total = mi.Int32(index // stride % most), mi.Float(0)
         for k in range(-reach, reach + 1):
-            inside = (place + k >= 0) & (place + k < most)
+            inside = (position + k >= 0) & (position + k < most)
             total += dr.gather(mi.Float, values, mi.UInt32(mi.Int32(index) + k * stride), inside)
         values = total / (2 * reach + 1)
-        dr.eval(values)  # before it is read at other places
+        dr.eval(values)  # gathered at other indices next
     return mi.TensorXf(values, pixels.shape)

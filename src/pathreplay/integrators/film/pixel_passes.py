@@ -1,4 +1,4 @@
-"""Pixels that are swept: whether they can be, their cameras, and what a loss wants of each."""
+"""Inputs of a pixel sweep: its preconditions, the camera rays of each pixel, and the loss derivative of each pixel."""
 
 from __future__ import annotations
 
@@ -17,66 +17,70 @@ from pathreplay.integrators.lifetimes import is_recording
 from pathreplay.platform.device import device_of
 
 
-def _most(max_depth: int) -> int:
-    """Of how many paths the record of a lane can hold the vertices."""
+def _largest_spp(max_depth: int) -> int:
+    """Return the largest number of paths whose vertices fit into the record of a lane."""
     device = device_of(mi.variant())
     return device.most_records(LARGEST_RECORD, MAX_DEPTH) // device.room(max(max_depth, 1))
 
 
 def obstacle(sensor: mi.Sensor, max_depth: int, spp: int, some: bool = False) -> str:
-    """Why pixels of a sensor cannot be swept, as the end of a sentence, with the remedy; "" where they can.
+    """Return why a pixel sweep is impossible for a sensor, as the end of a sentence, with the remedy; "" if possible.
 
-    That takes a box filter, so that each path belongs to one pixel, or if only ``some`` are swept, any filter that is a
-    density (see `FilterSamples`); colours (rgb) and no alpha; an independent sampler; a camera that stands still and
-    takes no time; two paths or more (``spp``), all of which fit into the record of a lane.
+    Requirements: a box filter, so that each path belongs to one pixel, or, if only ``some`` pixels are swept, any
+    non-negative filter (see `FilterSamples`); an rgb image without alpha; an independent sampler; a camera without
+    motion and with an instantaneous shutter; at least two paths per pixel (``spp``), which fit into the record of a
+    lane.
     """
     film, sampler = sensor.film(), sensor.sampler()
     film.prepare([])
     with dr.resume_grad():
         ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
-    format, most = film.bitmap().pixel_format(), _most(max_depth)
+    format, most = film.bitmap().pixel_format(), _largest_spp(max_depth)
     box = film.rfilter().is_box_filter()
     if not mi.is_rgb:
-        return f"variant {mi.variant()!r} has other colours than rgb; take an rgb variant"
+        return f"variant {mi.variant()!r} does not use rgb colours; take an rgb variant"
     if not box and not some:
         return "its filter couples pixels; give its film the filter 'box'"
     if not box and not is_drawable(film):
         return "its filter is negative in places; give its film 'box', 'tent' or 'gaussian'"
     if mi.has_flag(film.flags(), mi.FilmFlags.Special) or format != mi.Bitmap.PixelFormat.RGB:
-        return "its film is none of plain colours; give it an hdrfilm with pixel_format 'rgb'"
+        return "its film does not store plain rgb; give it an hdrfilm with pixel_format 'rgb'"
     if sampler.class_name() != "IndependentSampler":
         return f"its sampler is of class {sampler.class_name()}; make it 'independent'"
     if sensor.shutter_open_time() > 0:
-        return "its shutter is open for a while; close it at once"
+        return "its shutter stays open for a time; set shutter_close to shutter_open"
     if dr.grad_enabled(ray.o, ray.d):
-        return "it moves; hold it"
+        return "it moves; freeze it"
     if spp < 2:
-        return f"{spp} samples a pixel cannot judge each other; take 2 or more"
+        return f"{spp} samples per pixel cannot provide independent loss derivatives for each other; take 2 or more"
     if spp > most:
-        return f"{spp} samples a pixel of {max_depth} vertices are more than the {most} that are held; take fewer"
+        return (
+            f"{spp} samples per pixel of {max_depth} vertices are more than the {most} that a record holds; take fewer"
+        )
     return ""
 
 
 def pixel_camera(sensor: mi.Sensor, pixel: mi.UInt32) -> Callable[..., tuple[mi.Ray3f, mi.Spectrum]]:
-    """Rays through random places of pixels (UInt32, row by row): (sampler, active) -> Ray3f and weight (Spectrum).
+    """Return a function that samples rays through pixels (UInt32, row-major): (sampler, active) -> Ray3f and Spectrum.
 
-    As in Mitsuba's RBIntegrator; places are drawn by the film's filter. Detached.
+    The Spectrum is the weight of the ray. Rays are those of Mitsuba's RBIntegrator, except that the film's filter is
+    importance sampled. Detached.
     """
     width, height = sensor.film().crop_size()
-    place_of = _placing(sensor.film(), mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)))
+    sample_position = _position_sampler(sensor.film(), mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width)))
 
     def camera(sampler: mi.Sampler, active: mi.Bool) -> tuple[mi.Ray3f, mi.Spectrum]:
-        place = place_of(sampler.next_2d(active)) / mi.Point2f(width, height)
+        position = sample_position(sampler.next_2d(active)) / mi.Point2f(width, height)
         aperture = sampler.next_2d(active) if sensor.needs_aperture_sample() else mi.Point2f(0)
-        return sensor.sample_ray(sensor.shutter_open(), 0.0, place, aperture, active)
+        return sensor.sample_ray(sensor.shutter_open(), 0.0, position, aperture, active)
 
     return camera
 
 
-def _placing(film: mi.Film, corner: mi.Point2f) -> Callable[[mi.Point2f], mi.Point2f]:
-    """A place by two random numbers, in the pixel with that corner or, with a filter that is wider, around it.
+def _position_sampler(film: mi.Film, corner: mi.Point2f) -> Callable[[mi.Point2f], mi.Point2f]:
+    """Return a function that maps two random numbers to a film position in the filter support of a pixel.
 
-    Films that do not sample their border filter what is within them, so that places beyond are not drawn.
+    ``corner`` is the lower corner of the pixel. Unless the film samples its border, positions stay inside the film.
     """
     if film.rfilter().is_box_filter():
         return lambda u: corner + u
@@ -84,21 +88,21 @@ def _placing(film: mi.Film, corner: mi.Point2f) -> Callable[[mi.Point2f], mi.Poi
     low, high = mi.Point2f(0), mi.Point2f(1)
     if not film.sample_border():
         for axis in range(2):
-            low[axis], high[axis] = samples.share(-middle[axis]), samples.share(size[axis] - middle[axis])
+            low[axis], high[axis] = samples.cdf_at(-middle[axis]), samples.cdf_at(size[axis] - middle[axis])
     return lambda u: middle + mi.Point2f(*(samples.draw(u[axis], low[axis], high[axis]) for axis in range(2)))
 
 
 def pixel_loss(
     view: Pass, max_depth: int, offset: mi.TensorXf, slope: mi.TensorXf, pixels: mi.UInt32 | None
 ) -> PixelLoss:
-    """The loss by each lane's pixel: all of them, or ``pixels``, for each of which the tensors have a row.
+    """Gather the loss derivative of each lane's pixel, for all pixels or for ``pixels`` (one row of the tensors each).
 
-    Raises PathreplayError where the pass, the tensors or the pixels do not allow it.
+    Raises PathreplayError for an unsuitable number of samples, a wrong shape, or repeated or invalid pixels.
     """
-    if not 1 < view.spp <= _most(max_depth):
+    if not 1 < view.spp <= _largest_spp(max_depth):
         raise PathreplayError(
-            f"pathreplay: {view.spp} samples per pixel, of {max_depth} vertices, cannot be swept: use "
-            f"2 or more, and at most {MAX_DEPTH} vertices in all, or mi.render"
+            f"pathreplay: {view.spp} samples per pixel of {max_depth} vertices do not suit a pixel sweep: "
+            f"use 2 or more, with at most {MAX_DEPTH} vertices in total, or mi.render"
         )
     width, height = view.size
     shape = (height, width, 3) if pixels is None else (dr.width(pixels), 1, 3)
@@ -106,18 +110,18 @@ def pixel_loss(
         if tensor.shape != shape:
             raise PathreplayError(f"pathreplay: derivative of the loss has shape {tensor.shape}: use {shape}")
     if pixels is not None and not is_recording():
-        numbers = np.unique(np.array(pixels))
-        if len(numbers) < dr.width(pixels) or numbers[-1] >= width * height:
+        indices = np.unique(np.array(pixels))
+        if len(indices) < dr.width(pixels) or indices[-1] >= width * height:
             raise PathreplayError(
-                f"pathreplay: 'pixels' has one twice, or one beyond the {width} x {height} of the film"
+                f"pathreplay: 'pixels' contains a repeated index, or one outside the film of {width} x {height} pixels"
             )
     row = dr.arange(mi.UInt32, shape[0] * shape[1])
     return PixelLoss(*(dr.gather(mi.Color3f, tensor.array, row) for tensor in (offset, slope)))
 
 
-def among(pixels: mi.UInt32, rows: mi.TensorXf, size: tuple[int, int]) -> mi.TensorXf:
-    """The picture of so many pixels across and up that has these rows at its ``pixels``, and is zero elsewhere."""
+def scatter_rows(pixels: mi.UInt32, rows: mi.TensorXf, size: tuple[int, int]) -> mi.TensorXf:
+    """Scatter one row per pixel into an image of ``size`` (width, height) that is zero elsewhere."""
     width, height = size
-    picture = dr.zeros(mi.TensorXf, (height, width, 3))
-    dr.scatter(picture.array, dr.gather(mi.Color3f, rows.array, dr.arange(mi.UInt32, dr.width(pixels))), pixels)
-    return picture
+    image = dr.zeros(mi.TensorXf, (height, width, 3))
+    dr.scatter(image.array, dr.gather(mi.Color3f, rows.array, dr.arange(mi.UInt32, dr.width(pixels))), pixels)
+    return image

@@ -1,19 +1,19 @@
-"""Seen flow: places of the film follow what is seen there, so that little slides under a pixel.
+"""Flow of a static camera: film positions follow the visible surfaces, so that surfaces move little under a pixel.
 
-A few rays glance at the scene. A point p that one of them hits, glued to its surface, moves over the film by
+A few probe rays sample the scene. A point p that a probe ray hits moves with its surface, and crosses the film with
 
     u = (∂(o + t d)/∂s)⁺ ∂p/∂π,
 
-where o + t d is the point at its distance t on the ray through the place s. If places stand still, surfaces slide
-under them by u / cos, with the angle between normal and ray, which has no bounds at an outline. So points that are seen
-aslant count most: the velocity at a node of a grid is the mean of those around it,
+where o + t d is the point at the same distance t on the ray through the film position s. If film positions are fixed,
+the surface slides under them by u / cos, with the angle between normal and ray, which is unbounded at silhouettes.
+Points at grazing angles therefore have the largest weights. The velocity at a node of a grid is the mean
 
-    v = Σ K W u / (K_0 + Σ K (W + S)),     W = 1 / (cos² + GRAZING²),     K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²,
+    v = Σ K W u / (K_0 + Σ K (W + S)),     W = 1 / (cos² + GRAZING²),     K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²
 
-with r their distance on the film; between nodes it is interpolated. Points that stand still have u = 0 and count, too.
-On a film that sees a narrow part of the world, u is large, and following it costs more noise than sliding: there S
-holds places where they are. Any v gives the same derivative (see `FilmFlow`). This one leaves little to the interior
-and to edges.
+over nearby points, where r is their distance from the node on the film; between nodes it is interpolated. Static points
+contribute with u = 0. For a narrow field of view u is large, and following it causes more noise than sliding; the term
+S then reduces v. Every v gives the same derivative (see `FilmFlow`). This one leaves little motion to the interior and
+boundary terms.
 """
 
 from __future__ import annotations
@@ -28,61 +28,63 @@ from pathreplay.adjoint.autodiff import tangents
 from pathreplay.integrators.film.camera_flow import (
     CAMERAS,
     Sample,
-    followed,
-    glanced_at,
-    glances_of,
-    move_with_place,
-    slopes_of,
+    film_velocity,
+    move_with_position,
+    probe_position,
+    probes_of,
+    ray_derivatives,
 )
 from pathreplay.transport.facts.nodes import with_gradients
 from pathreplay.transport.meet import meet
 from pathreplay.transport.motion import may_move
 from pathreplay.transport.vertex import TraceConfig
 
-GLANCES, CELLS = 32, 16
-"""Rays in a row and a column, and cells of the grid."""
+PROBES, CELLS = 32, 16
+"""Number of probe rays and number of grid cells per row and column of the film."""
 MARGIN = 2
-"""Nodes beyond the border of the film: filters reach there."""
+"""Number of nodes outside each border of the film, where filters still have support."""
 NODES = CELLS + 1 + 2 * MARGIN
 REACH, NEAR, K_0 = 0.25, 0.03, 1e3
-"""In widths of the film; and how much it counts that a place would rather stand still."""
+"""REACH and NEAR in film widths; K_0 is a weight that favours fixed film positions."""
 GRAZING, NARROW = 0.1, 0.004
-"""Least slope that counts; and S, over the square of the film's width in radians: see there."""
+"""Cosine below which W levels off; and S times the square of the film's width in radians."""
 
 
 @dataclass(frozen=True)
-class SeenFlow:
-    """The flow of a sensor that stands still: see `FilmFlow`."""
+class SurfaceFlow:
+    """The flow of a static sensor: see `FilmFlow`."""
 
     sensor: mi.Sensor
-    nodes: mi.Vector2f  # velocities: zeros, attached to what moves
-    flows: mi.Bool  # by node: whether something that moves is seen around its cell, or one beside that
+    nodes: mi.Vector2f  # velocities at grid nodes: their values are zero, and they are attached to moving surfaces
+    flows: (
+        mi.Bool
+    )  # for each cell, by its first node: whether the velocity may be non-zero there or in an adjacent cell
     is_all: bool = False
     samples: int = 5
 
     @staticmethod
-    def of(sensor: mi.Sensor, trace: TraceConfig) -> SeenFlow | None:
-        """The flow of a sensor, in a ``trace`` that knows what moves; None where nothing that it might see does."""
-        sample = glances_of(sensor, GLANCES)
+    def of(sensor: mi.Sensor, trace: TraceConfig) -> SurfaceFlow | None:
+        """Create the flow of a sensor; None if no visible surface moves. ``trace`` contains the moving shapes."""
+        sample = probes_of(sensor, PROBES)
         ray = mi.Ray3f(sample.ray(sensor)[0])
         hit = meet(trace, ray, mi.Bool(True), coherent=True)
-        seen, t = hit.is_valid(), dr.select(hit.is_valid(), hit.t, 1)
+        visible, t = hit.is_valid(), dr.select(hit.is_valid(), hit.t, 1)
         with dr.resume_grad():
             flags = mi.RayFlags.Minimal | mi.RayFlags.FollowShape
-            si = hit.compute_surface_interaction(ray, flags, seen)
+            si = hit.compute_surface_interaction(ray, flags, visible)
             if not dr.grad_enabled(si.p):
                 return None
-            slopes = slopes_of(sensor, sample)
-            cos, wide = dr.dot(dr.detach(si.n), ray.d), dr.squared_norm(slopes[0][0] + t * slopes[1][0])
-            aslant, S = dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / wide
-            W = dr.select(seen, aslant + S, 0)
-            u = followed(si.p - dr.detach(si.p), slopes, t) * aslant / (aslant + S)
-            moves = seen & may_move(trace, hit)
-            dr.eval(u, W, moves)  # before all nodes read them
+            derivatives = ray_derivatives(sensor, sample)
+            cos, wide = dr.dot(dr.detach(si.n), ray.d), dr.squared_norm(derivatives[0][0] + t * derivatives[1][0])
+            grazing, S = dr.rcp(cos * cos + GRAZING * GRAZING), NARROW * t * t / wide
+            W = dr.select(visible, grazing + S, 0)
+            u = film_velocity(si.p - dr.detach(si.p), derivatives, t) * grazing / (grazing + S)
+            moves = visible & may_move(trace, hit)
+            dr.eval(u, W, moves)  # gathered by all nodes below
 
-            pair = dr.arange(mi.UInt32, NODES * NODES * GLANCES * GLANCES)
-            node, i = pair // (GLANCES * GLANCES), pair % (GLANCES * GLANCES)
-            r2 = dr.squared_norm(mi.Point2f(_cell_of(node)) / CELLS - glanced_at(i, GLANCES))
+            index = dr.arange(mi.UInt32, NODES * NODES * PROBES * PROBES)
+            node, i = index // (PROBES * PROBES), index % (PROBES * PROBES)
+            r2 = dr.squared_norm(mi.Point2f(_cell_of(node)) / CELLS - probe_position(i, PROBES))
             K = dr.square(dr.maximum(1 - r2 / REACH**2, 0) / (r2 + NEAR**2)) * dr.gather(mi.Float, W, i)
             total = K_0 + _sums(K)
             nodes = mi.Vector2f(*(_sums(dr.select(K > 0, K * dr.gather(mi.Float, u[k], i), 0)) / total for k in (0, 1)))
@@ -92,49 +94,50 @@ class SeenFlow:
         for x, y in product(range(-1, 3), repeat=2):
             flows |= dr.gather(mi.Float, moved, _node(cell, x, y)) > 0
         dr.eval(flows)
-        return SeenFlow(sensor, nodes, flows)
+        return SurfaceFlow(sensor, nodes, flows)
 
     def ray(self, sample: Sample) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
         """See `FilmFlow`."""
         ray, weight = sample.ray(self.sensor)
-        if not dr.grad_enabled(sample.place) and dr.grad_enabled(self.nodes):
-            move_with_place(ray, slopes_of(self.sensor, sample), self.velocity(sample))
+        if not dr.grad_enabled(sample.position) and dr.grad_enabled(self.nodes):
+            move_with_position(ray, ray_derivatives(self.sensor, sample), self.velocity(sample))
         return ray, weight
 
     def velocity(self, sample: Sample) -> mi.Vector2f:
         """See `FilmFlow`."""
-        (a, b, c, d), f = self._corners(sample.place)
+        (a, b, c, d), f = self._corners(sample.position)
         return dr.lerp(dr.lerp(a, b, f.x), dr.lerp(c, d, f.x), f.y)
 
     def divergence(self, sample: Sample) -> mi.Float:
         """See `FilmFlow`."""
-        (a, b, c, d), f = self._corners(sample.place)
+        (a, b, c, d), f = self._corners(sample.position)
         return CELLS * (dr.lerp(b.x - a.x, d.x - c.x, f.y) + dr.lerp(c.y - a.y, d.y - b.y, f.x))
 
-    def moves_at(self, place: mi.Point2f) -> mi.Bool:
-        """Where something that moves is seen not far away."""
-        return dr.gather(mi.Bool, self.flows, _node(_cell_at(place)[0], 0, 0))
+    def moves_at(self, position: mi.Point2f) -> mi.Bool:
+        """Return whether a moving surface is visible near a film position."""
+        return dr.gather(mi.Bool, self.flows, _node(_cell_at(position)[0], 0, 0))
 
-    def leaves_rest_at(self, place: mi.Point2f) -> mi.Bool:
-        """Where places move."""
-        return self.moves_at(place)
+    def leaves_rest_at(self, position: mi.Point2f) -> mi.Bool:
+        """Return whether the film position moves."""
+        return self.moves_at(position)
 
     def carry_tangents(self) -> None:
-        """To the nodes."""
+        """Propagate tangents to the nodes."""
         with dr.resume_grad():
             tangents(self.nodes)
 
-    def _corners(self, place: mi.Point2f) -> tuple[list[mi.Vector2f], mi.Point2f]:
-        """The velocities at the corners of a place's cell, row by row, and where it is in there."""
-        cell, f = _cell_at(place)
+    def _corners(self, position: mi.Point2f) -> tuple[list[mi.Vector2f], mi.Point2f]:
+        """Return the velocities at the corners of a position's cell, row by row, and its coordinates in the cell."""
+        cell, f = _cell_at(position)
         return [dr.gather(mi.Vector2f, self.nodes, _node(cell, x, y)) for y in (0, 1) for x in (0, 1)], f
 
 
 def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
-    """Whether places may follow what is seen: then all else slides under them, and all of its edges have to be found.
+    """Return whether film positions may follow visible surfaces.
 
-    Those behind mirrors, glass and sheets and on bent curves are not, and media are not asked. (Nor are those in
-    textures: see `has_seams`.)
+    Everything else then slides under the film positions, so that all edges must be sampled. This is impossible for
+    edges behind mirrors, glass and thin sheets and on B-spline curves. Media are not supported. (Seams of textures are
+    not sampled either: see `has_seams`.)
     """
     traits = trace.traits
     hidden = traits.mirrors or traits.veils or traits.splines
@@ -142,23 +145,23 @@ def can_follow(trace: TraceConfig, sensor: mi.Sensor) -> bool:
 
 
 def _sums(values: mi.Float) -> mi.Float:
-    """Of each node, over all glances."""
-    return dr.block_sum(values, GLANCES * GLANCES)
+    """Sum over all probe rays, for each node."""
+    return dr.block_sum(values, PROBES * PROBES)
 
 
-def _cell_at(place: mi.Point2f) -> tuple[mi.Point2i, mi.Point2f]:
-    """The cell that a place is in, and where in there; beyond the grid, at its border."""
-    at = dr.clip(dr.detach(place) * CELLS, -MARGIN, CELLS + MARGIN)
+def _cell_at(position: mi.Point2f) -> tuple[mi.Point2i, mi.Point2f]:
+    """Return the cell of a film position and the coordinates in the cell, clamped to the grid."""
+    at = dr.clip(dr.detach(position) * CELLS, -MARGIN, CELLS + MARGIN)
     cell = dr.minimum(mi.Point2i(dr.floor(at)), CELLS + MARGIN - 1)
     return cell, at - mi.Point2f(cell)
 
 
 def _cell_of(node: mi.UInt32) -> mi.Point2i:
-    """The cell that begins at a node."""
+    """Return the cell whose first corner is a node."""
     return mi.Point2i(node % NODES, node // NODES) - MARGIN
 
 
 def _node(cell: mi.Point2i, x: int, y: int) -> mi.UInt32:
-    """The node that is x columns and y rows after the first node of a cell, or the nearest one of the grid."""
+    """Return the node x columns and y rows after the first node of a cell, clamped to the grid."""
     at = dr.clip(cell + mi.Point2i(x + MARGIN, y + MARGIN), 0, NODES - 1)
     return mi.UInt32(at.x + at.y * NODES)
