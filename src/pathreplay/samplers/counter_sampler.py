@@ -10,7 +10,7 @@ import mitsuba as mi
 from pathreplay.samplers.streams import Stream
 
 STEPS = tuple(round(2**32 * (root % 1)) for root in ((1 + 5**0.5) / 2, 2**0.5))
-"""Steps of Kronecker lattices. No rational combination of the two is rational, so that they also fill a square evenly.
+"""Steps of Kronecker lattices. They and 1 are linearly independent over the rationals: pairs also fill a square evenly.
 """
 ROUNDS = 8
 """Rounds of the TEA cipher. With Mitsuba's default of 4, samples of neighbouring keys are correlated: shadows in
@@ -26,17 +26,17 @@ class CounterSampler:
 
     @staticmethod
     def of(key: mi.UInt32) -> CounterSampler:
-        """Sampler at index 0 of a key."""
+        """Create a sampler at index 0 of a key."""
         return CounterSampler(mi.UInt32(key), mi.UInt32(0))
 
     @staticmethod
     def stream(key: mi.UInt32, stream: Stream) -> CounterSampler:
-        """Sampler at the first index that a stream owns in a key."""
+        """Create a sampler at the first index of a stream in a key."""
         return CounterSampler(mi.UInt32(key), mi.UInt32(int(stream)))
 
     @staticmethod
     def at_vertex(key: mi.UInt32, k: mi.UInt32) -> CounterSampler:
-        """Sampler at vertex k of a path whose key this is (six dimensions per vertex, see `VertexSamples.draw`)."""
+        """Create a sampler at vertex k of the path with this key (six dimensions each, see `VertexSamples.draw`)."""
         return CounterSampler(mi.UInt32(key), mi.UInt32(6 * k))
 
     def next_1d(self, active: bool | mi.Bool = True) -> mi.Float:
@@ -46,12 +46,12 @@ class CounterSampler:
 
     def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f:
         x, y = mi.sample_tea_32(self.key, self.index, ROUNDS)  # the two halves of one block of the cipher
-        self.index += 2  # the same as two 1D samples: see `at_vertex`
+        self.index += 2  # as many as two 1D samples: see `at_vertex`
         return mi.Point2f(_in_unit(x), _in_unit(y))
 
 
 def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-    """The key of the i-th segment of a pass.
+    """Return the key of the i-th segment of a pass.
 
     It must not be a function of i ^ seed. Otherwise passes would assign the same set of keys to different segments, and
     their mean would keep the error of a single pass.
@@ -60,7 +60,7 @@ def key_of(i: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
 
 
 def quasi_random(i: mi.UInt32, n: int, seed: mi.UInt32, dimensions: int = 2) -> list[mi.Float]:
-    """The i-th of n points of a randomly shifted Kronecker lattice in the unit square or cube, from left to right."""
+    """Return the i-th of n points of a randomly shifted Kronecker lattice, ordered by the first coordinate."""
     steps = [dr.opaque(mi.UInt32, 2**32 // n % 2**32), *map(mi.UInt32, STEPS)][:dimensions]
     shifts = [mi.sample_tea_32(seed, mi.UInt32(k + 1), ROUNDS)[0] for k in range(dimensions)]
     return [_in_unit(i * step + shift) for step, shift in zip(steps, shifts, strict=True)]
