@@ -32,7 +32,7 @@ TINTS = ("specular_reflectance", "specular_transmittance")
 
 
 def _index(props: Any, name: str, default: str) -> float:
-    """Index of refraction, given as a number or as the name of a material in Mitsuba's table."""
+    """Read an index of refraction: a number, or the name of a material in Mitsuba's table."""
     if name in props and props.type(name) == mi.Properties.Type.Integer:
         ior = float(props[name])
     else:
@@ -102,8 +102,8 @@ class DielectricAD:
 
         # Fresnel reflectance, and relative index along (it) and against (ti) the direction of travel
         F, cos_t, η_it, η_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.eta)
-        # Under total internal reflection F is 1 at any angle, but mi.fresnel's derivative is rounding error over cos
-        # θ_i.
+        # Under total internal reflection F is 1 at any angle, but the derivative of mi.fresnel is rounding error
+        # divided by cos θ_i.
         F = dr.select(cos_t == 0, dr.detach(F), F)
 
         # Choose the lobe with a detached probability

@@ -50,13 +50,13 @@ class Cells:
         return self.shape == (3, 3, 3)
 
     def lookup(self, kind: Any, cell: mi.Vector3f, active: mi.Bool) -> Any:
-        """The values of a cell (Vector3f of integers), as a Float or a vector."""
+        """Return the values of a cell (Vector3f of integers) as a Float or a vector."""
         index = mi.UInt32(dr.fma(dr.fma(cell.z, self.shape[1], cell.y), self.shape[0], cell.x))
         return dr.gather(kind, self.table, index, active)
 
 
 def make_cells(bounds: Bounds, values: Sequence[mi.Float]) -> Cells:
-    """Cells with these values (each an array with one entry per cell of ``bounds``)."""
+    """Create cells with these values (each an array with one entry per cell of ``bounds``)."""
     shape = tuple(n + 2 for n in bounds.shape)
     count = int(np.prod(bounds.shape))
     i = dr.arange(mi.UInt32, count)
@@ -76,7 +76,7 @@ def make_cells(bounds: Bounds, values: Sequence[mi.Float]) -> Cells:
 
 
 def through(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
-    """Distances at which the line of a ray enters and leaves a box; the first is larger on a miss. Attached.
+    """Return the distances at which the line of a ray enters and leaves a box; the first is larger on a miss. Attached.
 
     Mitsuba's `BoundingBox.ray_intersect` does the same, but accepts only rays of the first variant set in the process.
     """
@@ -94,7 +94,7 @@ def through(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
 
 
 def clip(box: mi.BoundingBox3f, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float]:
-    """The part [a, b] of the ray inside a box (a = 0, b = -1 if there is none). Never NaN for a finite ray."""
+    """Return the part [a, b] of a ray inside a box, or a = 0, b = -1 on a miss. Never NaN for a finite ray."""
     near, far = through(box, ray)
     a, b = dr.fmax(near, 0), dr.fmin(far, ray.maxt)
     met = a < b
@@ -112,11 +112,11 @@ class CellWalk:
     end: mi.Float  # the distance at which the traversal ends
 
     def crossing(self, cell: mi.Vector3f) -> mi.Vector3f:
-        """Distances at which the three axes are crossed next."""
+        """Return the distances at which the ray crosses the next cell face of each axis."""
         return dr.fma(cell, self.inverse, self.offset)
 
     def onward(self, cell: mi.Vector3f, crossings: mi.Vector3f, t: mi.Float) -> mi.Vector3f:
-        """The cell after the distance ``t``, which is at most the smallest crossing of this cell."""
+        """Return the cell after the distance ``t``, which is at most the smallest crossing of this cell."""
         return dr.select(crossings <= t, cell + self.stride, cell)
 
 
@@ -135,7 +135,7 @@ def begin(cells: Cells, ray: mi.Ray3f, a: mi.Float, b: mi.Float) -> CellWalk:
 
 
 def _transformed(m: NDArray[np.float64], ray: mi.Ray3f) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Origin and direction of a ray under an affine map; zero matrix entries cost nothing."""
+    """Transform origin and direction of a ray by an affine map; zero matrix entries cost nothing."""
 
     def linear(row: NDArray[np.float64], v: mi.Vector3f) -> mi.Float:
         terms = [float(row[k]) * v[k] for k in range(3) if row[k] != 0]
@@ -151,7 +151,7 @@ def _transformed(m: NDArray[np.float64], ray: mi.Ray3f) -> tuple[mi.Vector3f, mi
 def free_flight(
     cells: Cells, box: mi.BoundingBox3f, ray: mi.Ray3f, u: mi.Float, active: mi.Bool
 ) -> tuple[mi.Float, mi.Float]:
-    """Distance of the next tentative collision, and the majorant there; infinity and 0 if there is none.
+    """Sample the distance of the next tentative collision; return it and its majorant, or infinity and 0 without one.
 
     The distance t solves ∫_0^t m ds = -log(1 - u), with m the value of the cell (1 / unit length), and 0 outside
     ``box``.
@@ -189,7 +189,7 @@ def free_flight(
 
 
 def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """Control density c and rate m of residual collisions per cell, for the density ``scale`` times the volume.
+    """Compute control density c and residual collision rate m per cell, for the density ``scale`` times the volume.
 
     The relative variance of the estimate is exp(∫ (σ - c)²/m ds) - 1. The mean density is the best control on average,
     but in the empty part of a dense cell a ray sees (σ - c)²/m = c²/m. c therefore exceeds the lowest density only as
@@ -203,7 +203,7 @@ def control(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
 
 
 def majorants(bounds: Bounds, scale: mi.Float) -> mi.Float:
-    """Upper bound of the density per cell, 0 where it is negative (an optimiser may overshoot)."""
+    """Return an upper bound of the density per cell, or 0 where it is negative (an optimiser may overshoot)."""
     return dr.fmax(_scaled(bounds, scale)[1], 0)
 
 
@@ -214,7 +214,7 @@ def _scaled(bounds: Bounds, scale: mi.Float) -> tuple[mi.Float, mi.Float]:
 
 @dr.syntax
 def transmittance(cells: Cells, box: Any, ray: Any, density: Callable[..., Any], sampler: Any, active: Any) -> Any:
-    """Unbiased estimate of exp(-∫ σ ds) along the ray per channel (UnpolarizedSpectrum): residual ratio tracking.
+    """Estimate exp(-∫ σ ds) along the ray per channel (UnpolarizedSpectrum) without bias: residual ratio tracking.
 
     With control density c and rate m per cell (Novák et al. 2014), T = exp(-∫ c ds) Π (1 - (σ - c)/m), the product over
     residual collisions with rate m. ``density(t, active)`` evaluates σ.

@@ -81,7 +81,7 @@ class GridMedium:
             self._choose_cells()
 
     def _choose_cells(self) -> None:
-        """Build tables of majorants and control densities for the present scale, each with the cheapest cell size."""
+        """Build tables of majorants and control densities for the current scale, each with the cheapest cell size."""
         scale = dr.detach(self.scale)
         # With emission or gradients, empty cells need (null) collisions as well: one per crossing of the volume.
         with dr.resume_grad():
@@ -96,7 +96,7 @@ class GridMedium:
         dr.make_opaque(self.majorant)
 
     def _cheapest_cells(self, values: list[tuple[Any, ...]]) -> grid_traversal.Cells:
-        """Cells of the cheapest level; ``values`` has a tuple per level, whose last entry is the collision rate."""
+        """Return cells of the cheapest level; ``values`` has one tuple per level, with the collision rate last."""
         rates = [dr.mean(numbers[-1]) for numbers in values]
         dr.eval(values, rates)
         last = len(values) - 1
@@ -136,7 +136,7 @@ class GridMedium:
     # ------------------------------------------ interface of pathreplay ------------------------------------------
 
     def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool = True) -> tuple[mi.Float, mi.Float]:
-        """Distance to the next tentative collision and the local majorant there. Detached.
+        """Sample the distance to the next tentative collision, and return it with the local majorant. Detached.
 
         The distance t solves ∫_0^t m ds = -log(1 - u). The local majorant m is at least σ_t in all channels, and 0
         outside the medium's bounding box. If no t below ray.maxt solves this, the distance is infinite and the majorant
@@ -146,7 +146,7 @@ class GridMedium:
             return grid_traversal.free_flight(self.flight_cells, self.box, dr.detach(ray), dr.detach(u), active)
 
     def transmittance(self, ray: mi.Ray3f, sampler: mi.Sampler, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
-        """Unbiased estimate of exp(-∫_0^{ray.maxt} σ_t ds) per channel. Detached."""
+        """Estimate exp(-∫_0^{ray.maxt} σ_t ds) per channel without bias. Detached."""
         with dr.suspend_grad():
             ray, scale = dr.detach(ray), dr.detach(self.scale)
 
@@ -158,7 +158,7 @@ class GridMedium:
             return grid_traversal.transmittance(self.shadow_cells, self.box, ray, density, sampler, active)
 
     def emission_at(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
-        """Radiance emitted per unit length at an interaction; 0 without emission."""
+        """Return the radiance emitted per unit length at an interaction; 0 without emission."""
         return mi.UnpolarizedSpectrum(0) if self.emission is None else self.emission.eval(mei, active)
 
 
@@ -166,7 +166,7 @@ class GridMedium:
 
 
 def _volume(props: Any, name: str, default: float | None) -> Any:
-    """The volume of that name, or None; textures, colours and numbers become a very large `constvolume`."""
+    """Read the volume of that name, or None. Textures, colours and numbers become a very large `constvolume`."""
     value = props[name] if name in props else default
     if value is None or isinstance(value, mi.Volume):
         return value
@@ -196,7 +196,7 @@ def _choice(props: Any) -> bool | str:
 
 
 def _look(volume: mi.Volume, needs_grid: bool) -> tuple[bool, list[Bounds]]:
-    """Whether the volume differs between channels, and its bounds per cell, from finest to a single cell."""
+    """Return whether the volume differs between channels, and its bounds per cell, from finest to a single cell."""
     params = mi.traverse(volume)
     values = [dr.detach(params[key]) for key in params.keys()]
     if volume.class_name() == "GridVolume":

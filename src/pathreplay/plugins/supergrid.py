@@ -75,7 +75,7 @@ class Bounds:
 
 
 def find_lattice(volume: mi.Volume, shape: tuple[int, ...]) -> Lattice | None:
-    """The lattice of a `gridvolume` with data of shape (z, y, x, channels); None if it cannot be determined.
+    """Determine the lattice of a `gridvolume` with data of shape (z, y, x, channels); None if that fails.
 
     Mitsuba does not expose the volume's `to_world`. Its linear part is parsed from the volume's string representation,
     and the translation comes from the bounding box, which has full precision.
@@ -114,7 +114,7 @@ def _corners(volume: mi.Volume) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def constant_bounds(volume: mi.Volume, lowest: float, mean: float, highest: float) -> Bounds:
-    """A single cell for a volume of which only extreme values are known."""
+    """Return a single cell for a volume with known extreme values."""
     low, high = _corners(volume)
     scale = 1 / np.maximum(high - low, 1e-30)
     to_cell = np.concatenate([np.diag(scale), (-low * scale)[:, None]], axis=1)
@@ -122,7 +122,7 @@ def constant_bounds(volume: mi.Volume, lowest: float, mean: float, highest: floa
 
 
 def voxel_bounds(lattice: Lattice, data: mi.TensorXf) -> Bounds:
-    """Bounds of the values ``data`` (z y x channels) in cells of BASE³ voxels."""
+    """Compute bounds of the values ``data`` (z y x channels) in cells of BASE³ voxels."""
     values = _channels(dr.detach(data))
     for axis, span in enumerate(zip(lattice.low, lattice.high, lattice.size, strict=True)):
         values = _merged(values, axis, _support(*span), _support(*span, neighbours=False))
@@ -137,7 +137,7 @@ def _bounds(to_cell: NDArray[np.float64], values: Values) -> Bounds:
 
 
 def coarser(bounds: Bounds) -> Bounds:
-    """The same bounds for cells twice as large along every axis."""
+    """Merge the bounds into cells that are twice as large along every axis."""
     values: Any = [mi.TensorXf(v, bounds.shape[::-1]) for v in (bounds.lowest, bounds.mean, bounds.highest)]
     for axis, n in enumerate(bounds.shape):
         pairs = np.minimum(np.arange(0, n, 2)[:, None] + [0, 1], n - 1)
@@ -146,7 +146,7 @@ def coarser(bounds: Bounds) -> Bounds:
 
 
 def all_bounds(bounds: Bounds) -> list[Bounds]:
-    """These bounds and successively coarser ones, down to a single cell."""
+    """Return these bounds and successively coarser ones, down to a single cell."""
     levels = [bounds]
     while not levels[-1].is_single:
         levels.append(coarser(levels[-1]))
@@ -155,7 +155,7 @@ def all_bounds(bounds: Bounds) -> list[Bounds]:
 
 
 def _channels(data: mi.TensorXf) -> Values:
-    """Lowest, mean and highest value over the channels of every voxel."""
+    """Compute lowest, mean and highest value over the channels of every voxel."""
     if data.shape[3] == 1:
         return 3 * (mi.TensorXf(data.array, data.shape[:3]),)
     channels = [data[..., k] for k in range(data.shape[3])]
@@ -167,10 +167,11 @@ def _channels(data: mi.TensorXf) -> Values:
 
 
 def _support(low: int, high: int, n: int, neighbours: bool = True) -> NDArray[np.int64]:
-    """Voxels that lookups in each cell may use (cells x voxels), for the range low..high of an axis with n voxels.
+    """Return the voxels that lookups in each cell may use (cells x voxels), for the range low..high of an axis.
 
-    With trilinear interpolation these are the cell's own voxels and one more on either side. Outside the grid they are
-    the last voxel (clamp), the voxel at the other end (repeat), or the mirror image. Short rows repeat their entries.
+    With trilinear interpolation these are the cell's own voxels and one more on either side. Outside the n voxels of
+    the axis, they are the last voxel (clamp), the voxel at the other end (repeat), or the mirror image. Short rows
+    repeat their entries.
     """
     rows = []
     for start in range(low, high, BASE):
@@ -201,7 +202,7 @@ def _merged(values: Values, axis: int, near: NDArray[np.int64], inside: NDArray[
 
 
 def cheapest(levels: list[Bounds], rates: list[float], chord: float) -> int:
-    """Index of the level whose cells make a ray through the volume cheapest.
+    """Return the index of the level whose cells make a ray through the volume cheapest.
 
     The cost is that of the tentative collisions, ``rates[i]`` per unit length on average, and of the steps between
     cells, over the mean length ``chord`` of a ray in the volume. A single cell needs no steps.
@@ -214,6 +215,6 @@ def cheapest(levels: list[Bounds], rates: list[float], chord: float) -> int:
 
 
 def mean_chord(box: mi.BoundingBox3f) -> float:
-    """Mean length of a random line in a box: four times the volume over the surface area (Cauchy)."""
+    """Return the mean length of a random line in a box: four times the volume over the surface area (Cauchy)."""
     x, y, z = (float(e) for e in box.extents())
     return 0.0 if x * y * z == 0 else 2 * x * y * z / (x * y + y * z + z * x)
