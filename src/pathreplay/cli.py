@@ -136,11 +136,12 @@ def check(
     """Compare gradients with finite differences of Mitsuba's path tracer; exit status 1 if a check fails."""
     with interrupts.undisturbed():  # as in `optimize`
         from pathreplay.platform import backend
+        from pathreplay.platform.atomic_files import require_writable
         from pathreplay.scenes.loading import load_scene_for
         from pathreplay.testing import command
 
     if json is not None:
-        command.require_writable(json)
+        require_writable(json, "--json")
     with interrupts.undisturbed():
         backend.set_variant(variant)
     loaded, notes = load_scene_for(scene, param)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -19,8 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from pathreplay.errors import PathreplayError
-from pathreplay.platform.files import file_problem
+from pathreplay.platform.atomic_files import write_whole
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.parameters import resolve_differentiable
 from pathreplay.testing.gradient import GradientCheck, check_gradient
@@ -48,14 +46,14 @@ def check_all(
     tested = integrator_under_test(integrator, scene, max_depth, boundary)
     keys = resolve_differentiable(traversed(scene), patterns, tested)
     for i, key in enumerate(keys):
-        with _told(f"{key} ({i + 1}/{len(keys)})") as progress:
+        with _progress(f"{key} ({i + 1}/{len(keys)})") as progress:
             result = check_gradient(scene, key, integrator=tested, progress=progress, **options)
         yield result
 
 
 @contextmanager
-def _told(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A transient progress bar on standard error; if that is not a terminal, occasional lines."""
+def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a transient progress bar on standard error, or occasional lines if that is not a terminal."""
     console = Console(stderr=True, force_jupyter=False)
     if console.is_terminal:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -80,7 +78,7 @@ def _told(what: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def print_checks(results: Iterable[GradientCheck]) -> list[GradientCheck]:
-    """Print the compared integrators, then per parameter the verdict, both estimates and an explanation.
+    """Print the compared integrators, then for each parameter the verdict, both estimates and an explanation.
 
     Each result is printed as soon as it arrives. Returns all results.
     """
@@ -105,7 +103,7 @@ def print_checks(results: Iterable[GradientCheck]) -> list[GradientCheck]:
 
 
 def _with_error(value: float, error: float) -> str:
-    """'+0.03199 ± 0.00015': the value, rounded to the last digit of its error, which has two digits."""
+    """Format a value and its error, '+0.03199 ± 0.00015': the error has two digits, the value as many decimals."""
     if not (math.isfinite(value) and math.isfinite(error)):
         return f"{value:+.4g}"
     if error == 0:
@@ -117,21 +115,10 @@ def _with_error(value: float, error: float) -> str:
 
 
 def write_checks(results: Sequence[GradientCheck], path: Path) -> None:
-    """Write all fields of the checks, including samples, as a JSON list; NaN and infinity become null."""
+    """Write all fields of the checks, including samples, as a JSON list; NaN and infinity become null.
+
+    Raises PathreplayError if the file cannot be written: see `write_whole`.
+    """
     records = [{**asdict(result), "passed": result.passed, "variant": mi.variant()} for result in results]
     finite = json.loads(json.dumps(records), parse_constant=lambda name: None)
-    try:
-        path.write_text(json.dumps(finite, indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise PathreplayError(f"{path} cannot be written ({error.strerror}); give --json another file") from None
-
-
-def require_writable(path: Path) -> None:
-    """Raise PathreplayError if ``path`` is no regular file, its folder does not exist, or permissions are missing."""
-    problem = file_problem(path)
-    if problem.startswith(("is ", "cannot be reached")):
-        raise PathreplayError(f"{path} {problem}; give --json the name of a file")
-    if not path.parent.is_dir():
-        raise PathreplayError(f"Folder {path.parent} for {path.name} does not exist; create it first")
-    if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise PathreplayError(f"{path} cannot be written (its permissions); give --json another file")
+    write_whole(path, json.dumps(finite, indent=2).encode() + b"\n", "--json")

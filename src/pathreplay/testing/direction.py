@@ -1,8 +1,8 @@
-"""The direction in parameter space along which a gradient is checked, and the points on that line.
+"""The line in parameter space along which a gradient is checked.
 
-A gradient with respect to a thousand texels is checked through one number, its product with a direction. The direction
-is random, so that no particular error can stay hidden, and all its entries have the same sign. Contributions then add
-up; random signs would reduce the derivative by the square root of their number without reducing its noise.
+A gradient with respect to a thousand texels is checked through one number, its dot product with a direction. The
+direction is random, so that no specific error can remain hidden. All its entries have the same sign, so that their
+contributions add up. Random signs would reduce the derivative by the square root of their number, but not its noise.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Line:
     stencil: Stencil
 
     def move(self, value: Any, t: mi.Float) -> Any:
-        """The point at t, computed from the parameter's own ``value`` and of the same type."""
+        """Return the point at t, computed from the parameter's own ``value`` and of the same type."""
         return displaced(value, self.direction, t)
 
 
@@ -54,11 +54,11 @@ def choose_line(
     far: bool = False,
     spectra: bool = False,
 ) -> Line:
-    """The line through ``value`` along ``direction``, or along a random direction whose largest entry is 1.
+    """Choose the line through ``value`` along ``direction``, or along a random direction whose largest entry is 1.
 
-    By default the entry that moves most moves by a hundredth of the parameter's size. If this would make a non-negative
-    parameter negative (a black texel), the differences are one-sided: a linear texture tolerates negative reflectances,
-    but a roughness or density must not be negative. Transforms are translated randomly; those of infinitely ``far``
+    By default the largest change of an entry is a hundredth of the parameter's size. If this would make a non-negative
+    parameter negative (a black texel), the differences are one-sided: a negative reflectance of a linear texture is
+    harmless, but a negative roughness or density is invalid. Transforms are translated randomly. Infinitely ``far``
     emitters (sun, sky), which translation does not change, are rotated about a random axis. Coefficients of ``spectra``
     move such that the decoded values change by such steps: see :mod:`pathreplay.scenes.spectra`.
 
@@ -107,7 +107,7 @@ def _require_seen(key: str, value: np.ndarray, direction: np.ndarray, step: floa
 def _random_direction(
     value: np.ndarray, transform: bool, far: bool, spectra: bool, seed: int
 ) -> tuple[np.ndarray, str]:
-    """A direction of the shape of ``value``, and a description of its choice: see `choose_line`."""
+    """Draw a direction of the shape of ``value``; return it and a description: see `choose_line`."""
     if value.size == 1:
         return np.ones(value.shape), "scalar"
     v = np.zeros(value.shape)
@@ -136,6 +136,6 @@ def _choose_stencil(key: str, value: np.ndarray, move: np.ndarray) -> Stencil:
             return FORWARD
         if (value - 2 * move >= 0).all():
             return BACKWARD
-    # Central also if both directions lead below zero (a given direction of mixed signs at zeros): linear parameters
-    # tolerate it.
+    # Central differences also if both sides have negative entries (a given direction of mixed signs at zeros), which
+    # linear parameters tolerate.
     return CENTRAL

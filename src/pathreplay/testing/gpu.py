@@ -50,7 +50,7 @@ TIMINGS: dict[str, tuple[dict[str, Any], int, int, int]] = {
         ("replay", "pathreplay", {"adjoint": "replay"}),
     )
 }
-# The choice that `auto` has to make: the cost of deep records, and of replay.
+# Cost of deep records and of replay, between which `auto` chooses.
 TIMINGS |= {
     f"{adjoint}, 512 x 512, depth {depth}": ({"type": "pathreplay", "adjoint": adjoint}, 512, 16, depth)
     for adjoint, depth in (("recorded", 256), ("recorded", 448), ("replay", 448), ("replay", 2048))
@@ -59,7 +59,7 @@ TIMINGS |= {
 
 @dataclass(frozen=True)
 class Item:
-    """The result of one item: facts, or the reason why there are none."""
+    """The result of one item: measured facts, or an error message."""
 
     name: str
     facts: dict[str, Any]
@@ -67,7 +67,7 @@ class Item:
 
 
 def examine(variant: str | None, output: Path, names: Sequence[str] = (), tell: Callable[[str], None] = print) -> str:
-    """Run all items (or those named) in a variant (default: cuda_ad_rgb), write the file, return a summary line.
+    """Run all items (or the named ones) in a variant (default: cuda_ad_rgb), write the file, return a summary line.
 
     Raises PathreplayError if the variant does not run on this machine, or the file cannot be written.
     """
@@ -80,7 +80,7 @@ def examine(variant: str | None, output: Path, names: Sequence[str] = (), tell: 
     results = []
     for name in names or (*(f"truth: {n}" for n in TRUTHS), *(f"time: {n}" for n in TIMINGS)):
         results.append(_in_process(chosen, name))
-        tell(f"{name}: {results[-1].error or _told(results[-1].facts)}")
+        tell(f"{name}: {results[-1].error or _summary(results[-1].facts)}")
     report = {
         "pathreplay": __version__,
         "mitsuba": version("mitsuba"),
@@ -97,7 +97,7 @@ def examine(variant: str | None, output: Path, names: Sequence[str] = (), tell: 
     return f"{output}: {len(results)} items, {len(wrong)} failed" + (f" ({'; '.join(wrong)})" if wrong else "")
 
 
-def _told(facts: dict[str, Any]) -> str:
+def _summary(facts: dict[str, Any]) -> str:
     if "verdict" in facts:
         return f"{facts['verdict']} (z = {facts['z']:+.1f})"
     return f"{facts['seconds']:.4f} s"
@@ -129,7 +129,7 @@ def truth(name: str) -> dict[str, Any]:
 
 
 def timing(name: str) -> dict[str, Any]:
-    """Time gradient passes in seconds: the first, and median and minimum of the others."""
+    """Time gradient passes: return seconds of the first pass, and median and minimum of the others."""
     import drjit as dr
     import mitsuba as mi
 

@@ -1,7 +1,7 @@
 """Gradient checks: the derivative of any integrator against finite differences of a plain path tracer.
 
 Each check draws two sets of independent samples of one directional derivative, and derives standard errors and a
-verdict.
+verdict from them.
 """
 
 from __future__ import annotations
@@ -91,15 +91,16 @@ def check_gradient(  # noqa: PLR0913 (most are keyword-only)
     Args:
         scene: a scene of an AD variant; its parameters and gradients are restored in any case.
         key: a differentiable parameter of ``mi.traverse(scene)``.
-        integrator: the one under test: object, dictionary, plugin name, or None for the scene's own if it is made for
-            differentiation and ``pathreplay`` otherwise. Names get the path limits of the scene's integrator.
+        integrator: the integrator under test: an object, a dictionary, a plugin name, or None. None selects the scene's
+            own integrator if it is differentiable, else ``pathreplay``. Names get the path limits of the scene's
+            integrator.
         reference: the integrator whose images are differenced; None for Mitsuba's ``path`` (``volpath`` with media)
-            with the same limits.
+            with the same path limits.
         max_depth: path length, if ``integrator`` is None or a name.
         sensor: index of the sensor; its film determines the resolution.
-        seeds: number n of independent seeds for the gradient, and of n others for the reference.
+        seeds: number n of independent seeds for the gradient; the reference uses n other seeds.
         spp: samples per pixel of one gradient.
-        fd_spp: samples per pixel of one image of the reference (None: the same). Each reference seed takes four images,
+        fd_spp: samples per pixel of one image of the reference (None: ``spp``). Each reference seed takes four images,
             at ±h and ±h/2 with common random numbers.
         step: h; None for a hundredth of max(1, largest absolute entry).
         direction: array of the parameter's shape, not normalised; None for 1 (scalars), a random translation
@@ -151,7 +152,7 @@ class _Plan:
     ) -> GradientCheck:
         n, stencil = self.seeds, line.stencil
         self._tell()
-        # Distinct 32-bit seeds: of the gradient's primal image, its derivative, the reference, and the weights.
+        # Distinct 32-bit seeds for the primal image of each gradient, its derivative, the reference, and the weights.
         words = [int(word) for word in np.random.SeedSequence(self.seed).generate_state(3 * n + 1)]
         objective.weigh_by(loss, plain, words[-1], self.fd_spp)
         self._tick()
@@ -192,7 +193,7 @@ class _Plan:
 def _line(
     params: mi.SceneParameters, key: str, by: mi.Integrator, step: float | None, direction: ArrayLike | None, seed: int
 ) -> Line:
-    """The line to check along; raises PathreplayError if the parameter cannot be differentiated or differenced."""
+    """Choose the line to check along. Raises PathreplayError for parameters without derivative or differences."""
     require_differentiable(params, key, by)
     require_finite(params)
     value, owner = get_array(params[key]), params.properties[key][2]

@@ -61,7 +61,7 @@ class Objective:
         self.sensor = scene.sensors()[sensor]
 
     def put(self, t: mi.Float) -> None:
-        """Set the parameter to its value at t; update() evaluates it, so that all t share one kernel."""
+        """Set the parameter to its value at t. update() evaluates the value, so that all t share one kernel."""
         self.params[self.key] = self.move(self.value, t)
         self.params.update()
 
@@ -71,7 +71,7 @@ class Objective:
         self.weights = np.array(self.adjoint, np.float64)
 
     def weigh_by(self, loss: Loss | None, plain: mi.Integrator, seed: int, spp: int) -> None:
-        """Set smooth weights, or the derivative of a loss at an image; and the scale Σ |w_k I_k| / n of F."""
+        """Set smooth weights or the derivative of a loss at a rendered image, and the scale Σ |w_k I_k| / n of F."""
         image = self._render(plain, seed, spp)
         if loss is None:
             w = smooth_weights(image.shape, _has_alpha(self.sensor))
@@ -92,20 +92,20 @@ class Objective:
         self.scale = float(np.abs(w * np.array(image, np.float64)).sum())
 
     def dot(self, image: np.ndarray) -> float:
-        """The weighted sum, in double precision because differences of it are taken."""
+        """Return the weighted sum, in double precision because its differences are taken."""
         return float(np.vdot(self.weights, image))
 
     def image(self, integrator: mi.Integrator, seed: int, spp: int, t: float = 0.0) -> np.ndarray:
-        """The image at t (height x width x channels)."""
+        """Render the image at t (height x width x channels)."""
         self.put(dr.opaque(mi.Float, t))
         return np.array(self._render(integrator, seed, spp), np.float64)
 
     def difference(self, integrator: mi.Integrator, stencil: Stencil, h: float, seed: int, spp: int) -> np.ndarray:
-        """Finite difference of the image."""
+        """Compute the finite difference of the image."""
         return stencil(lambda t: self.image(integrator, seed, spp, t), h)
 
     def derivative(self, integrator: mi.Integrator, mode: Mode, primal: int, seed: int, spp: int) -> float:
-        """dF/dt at 0 through ``mi.render``, with separate seeds for image and derivative, as in user code."""
+        """Compute dF/dt at 0 through ``mi.render``, with separate seeds for image and derivative, as in user code."""
         name = integrator_name(integrator)
         with errors_as(
             f"Integrator '{name}' cannot differentiate '{self.key}' in {mode} mode", (RuntimeError, TypeError)
@@ -122,19 +122,19 @@ class Objective:
             return float(dr.grad(t)[0])
 
     def forward(self, integrator: mi.Integrator, seed: int, spp: int) -> np.ndarray:
-        """Derivative of the image from the integrator's forward pass alone."""
+        """Compute the derivative of the image from the integrator's forward pass alone."""
         dr.forward(self._attached(), dr.ADFlag.ClearEdges)
         image = integrator.render_forward(self.scene, self.params, self.sensor, seed=seed, spp=spp)
         return np.array(image, np.float64)
 
     def backward(self, integrator: mi.Integrator, seed: int, spp: int) -> float:
-        """dF/dt from the integrator's reverse pass alone."""
+        """Compute dF/dt from the integrator's reverse pass alone."""
         t = self._attached()
         integrator.render_backward(self.scene, self.params, self.adjoint, self.sensor, seed=seed, spp=spp)
         return self.collect(t)
 
     def transpose_error(self, ahead: mi.Integrator, back: mi.Integrator, seed: int, spp: int) -> float:
-        """|<W, J v> - <J^T W, v>| / Σ |W J v|: a forward pass against a reverse pass with the same random numbers."""
+        """Compute |<W, J v> - <J^T W, v>| / Σ |W J v| from a forward and a reverse pass with equal random numbers."""
         tangent = self.forward(ahead, seed, spp)
         return abs(self.dot(tangent) - self.backward(back, seed, spp)) / self.dot(np.abs(tangent))
 
@@ -145,14 +145,14 @@ class Objective:
         return float(dr.grad(t)[0])
 
     def judge(self, line: Line, gradients: np.ndarray, full: np.ndarray, half: np.ndarray) -> Judgement:
-        """The verdict on gradients, from differences along the line with its stencil and with half the step."""
+        """Judge gradients by finite differences along the line, with its stencil and with half the step."""
         # Worst case: rounding errors of half a unit in the last place of every image, all of the same sign.
         unit = np.finfo(get_array(self.value).dtype).eps / 2
         rounding = line.stencil.rounding() * unit * self.scale / line.step
         return judge(gradients, full, half, rounding=rounding, negligible=NEGLIGIBLE * self.scale / line.size)
 
     def _attached(self) -> mi.Float:
-        """t = 0 with gradients enabled; the parameter is set to its value at t."""
+        """Return t = 0 with gradients enabled, after setting the parameter to its value at t."""
         t = dr.opaque(mi.Float, 0)
         dr.enable_grad(t)
         self.put(t)
@@ -168,11 +168,11 @@ def _has_alpha(sensor: mi.Sensor) -> bool:
 
 
 def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
-    """w / n with w = 1 + cos(2π (0.7 x + 0.4 y + c/3)) / 2 for pixel (x, y) in [0, 1]² and channel c.
+    """Return w / n with w = 1 + cos(2π (0.7 x + 0.4 y + c/3)) / 2 for pixel (x, y) in [0, 1]² and channel c.
 
-    Positive and smooth, because random signs would reduce the signal, as for a direction. The wave runs obliquely
-    across the image and is out of phase between channels, so that a mirror symmetry of the scene does not make it
-    constant.
+    The weights are positive and smooth, because random signs would reduce the signal (see `direction`). The wave runs
+    obliquely across the image and is out of phase between channels, so that mirror symmetry of the scene does not make
+    it constant.
     """
     height, width, channels = shape
     y, x, c = np.ogrid[:height, :width, :channels]
@@ -183,7 +183,7 @@ def smooth_weights(shape: tuple[int, ...], alpha: bool) -> np.ndarray:
 
 
 def integrator_name(integrator: mi.Integrator) -> str:
-    """Name of the integrator as in a scene file, and its boundary terms; a PRBIntegrator is called 'prb'."""
+    """Return the name of the integrator as in a scene file (PRBIntegrator: 'prb'), and its boundary terms."""
     # For Python plugins Mitsuba's class_name() returns the name of the C++ base class.
     name = type(integrator).__name__ if isinstance(integrator, mi.CppADIntegrator) else str(integrator.class_name())
     name = name.removesuffix("Integrator").replace("VolumetricPath", "Volpath").lower()

@@ -1,4 +1,4 @@
-"""The integrators that a check compares: the one under test, and the plain path tracer that serves as its reference.
+"""The two integrators of a check: the integrator under test, and the plain path tracer used as its reference.
 
 The reference must estimate the same image: same path length, same treatment of directly visible emitters. These
 settings are read from the integrator under test.
@@ -31,9 +31,9 @@ LONGEST_WITHOUT_ROULETTE = 64
 def integrator_under_test(
     spec: Spec, scene: mi.Scene, max_depth: int | None = None, boundary: Mapping[str, Any] | None = None
 ) -> mi.Integrator:
-    """The integrator that ``spec`` describes: an object (used unchanged), a dictionary, a plugin name, or None.
+    """Return the integrator that ``spec`` describes: an object (used unchanged), a dictionary, a plugin name, or None.
 
-    None selects the scene's own integrator if it is made for differentiation, else ``pathreplay``. A plugin given by
+    None selects the scene's own integrator if it is differentiable, else ``pathreplay``. A plugin given by
     name, or selected by None, gets the path limits of the scene's own integrator. ``max_depth`` overrides them, and
     ``boundary`` holds additional properties of `pathreplay` (``boundary``, ``boundary_spp``).
 
@@ -68,7 +68,7 @@ def integrator_under_test(
 
 
 def reference_integrator(spec: Spec, scene: mi.Scene, tested: mi.Integrator) -> mi.Integrator:
-    """The integrator whose images are differenced: ``spec`` if given, else ``path``, or ``volpath`` with media.
+    """Return the integrator whose images are differenced: ``spec`` if given, else ``path``, or ``volpath`` with media.
 
     Its Russian roulette is disabled if paths are short enough. This leaves the expected image unchanged, prevents
     decisions from changing between +h and -h, and allows throughputs to be negative, as they are next to a reflectance

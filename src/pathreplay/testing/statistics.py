@@ -1,4 +1,4 @@
-"""Statistics of few samples: means with standard errors, and differences of means as normal deviates.
+"""Statistics of small samples: means with standard errors, and differences of means as normal deviates.
 
 Standard errors are estimated from the samples, so that a difference divided by its error follows Student's
 distribution. ``z`` is the normal deviate with the same probability as that ratio: |z| < 4 means the same for 3 seeds as
@@ -23,13 +23,13 @@ class Gap(NamedTuple):
 
 
 def mean_and_error(samples: ArrayLike) -> tuple[Any, Any]:
-    """Mean of independent samples, and its standard error."""
+    """Return the mean of independent samples and its standard error."""
     samples = np.asarray(samples, np.float64)
     return samples.mean(axis=0), samples.std(axis=0, ddof=1) / np.sqrt(len(samples))
 
 
 def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
-    """mean(a) - mean(b) of independent samples (n, ...) and (m, ...); ``b`` without a sample axis is exact."""
+    """Compare the means of independent samples (n, ...) and (m, ...); ``b`` without a sample axis is exact."""
     a, b = np.asarray(a), np.asarray(b)
     known = b.ndim < a.ndim
     (mean_a, error_a), (mean_b, error_b) = mean_and_error(a), (b, 0) if known else mean_and_error(b)
@@ -38,7 +38,7 @@ def gap(a: ArrayLike, b: ArrayLike = 0.0) -> Gap:
 
 
 def welch(difference: Any, σ: Any, *parts: tuple[Any, int]) -> Any:
-    """z of difference/σ, where ``parts`` (standard error, number of samples) are the estimated contributions to σ.
+    """Convert difference/σ to z, where ``parts`` (standard error, number of samples) are estimated contributions to σ.
 
     The remaining contributions to σ are known and add no uncertainty to it (Welch-Satterthwaite).
     """
@@ -51,5 +51,5 @@ def welch(difference: Any, σ: Any, *parts: tuple[Any, int]) -> Any:
 
 
 def normal(t: Any, freedom: Any) -> Any:
-    """The normal deviate with the same tail probability as a ratio t >= 0 under Student's distribution."""
+    """Return the normal deviate with the same tail probability as a ratio t >= 0 under Student's distribution."""
     return stats.norm.isf(np.maximum(stats.t.sf(t, freedom), 1e-300))

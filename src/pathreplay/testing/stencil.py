@@ -15,19 +15,19 @@ class Stencil:
     terms: tuple[tuple[float, float], ...]
 
     def __call__(self, f: Callable[[float], Any], h: float = 1.0) -> Any:
-        """D(h), for numbers or arrays."""
+        """Compute D(h), for numbers or arrays."""
         return sum(c * f(o * h) for o, c in self.terms) / h
 
     def halved(self) -> Stencil:
-        """D(h/2), as a stencil with step h."""
+        """Return D(h/2) as a stencil with step h."""
         return Stencil(self.name, tuple((o / 2, 2 * c) for o, c in self.terms))
 
     def points(self) -> tuple[float, ...]:
-        """All offsets of D(h) and of D(h/2)."""
+        """Return all offsets of D(h) and of D(h/2)."""
         return tuple(sorted({o for o, _ in self.terms + self.halved().terms}))
 
     def rounding(self) -> float:
-        """Worst-case amplification of errors of f, in units of 1/h, in Richardson's (4 D(h/2) - D(h)) / 3."""
+        """Return the worst-case amplification of errors of f by (4 D(h/2) - D(h)) / 3, in units of 1/h."""
         full, half = dict(self.terms), dict(self.halved().terms)
         return sum(abs(4 * half.get(o, 0) - full.get(o, 0)) for o in self.points()) / 3
 
@@ -35,7 +35,7 @@ class Stencil:
 CENTRAL = Stencil("central", ((-1, -0.5), (1, 0.5)))
 FORWARD = Stencil("one-sided, up", ((0, -1.5), (1, 2), (2, -0.5)))
 BACKWARD = Stencil("one-sided, down", ((0, 1.5), (-1, -2), (-2, 0.5)))
-# Fourth and third order. They permit a step of a large fraction of the parameter. Delta tracking makes new decisions at
-# every h, so that its noise does not decrease with h as that of a smooth path does.
+# Stencils of fourth and third order, for steps that are a large fraction of the parameter. Delta tracking makes new
+# random decisions at every h, so that, unlike for smooth paths, its noise does not decrease with h.
 WIDE = Stencil("wide", ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12)))
 UPWARD = Stencil("wide, up", ((0, -11 / 6), (1, 3), (2, -1.5), (3, 1 / 3)))

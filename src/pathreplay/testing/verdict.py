@@ -1,7 +1,7 @@
 """The verdict on a gradient: the conclusion that two sets of independent samples permit, in pure arithmetic.
 
 Given are n samples of the gradient under test and n of its reference, all from independent seeds. The reference
-consists of two finite differences per seed, with steps h and h/2, whose error is O(h²). Their Richardson combination (4
+consists of two finite differences per seed, with steps h and h/2, whose error is O(h²). The Richardson extrapolation (4
 D(h/2) - D(h)) / 3 removes this term. The change caused by halving the step, beyond noise, bounds the remaining error.
 
     σ² = se(gradient)² + se(reference)² + step_error²,      z = (mean gradient - mean reference) / σ
@@ -22,7 +22,7 @@ from pathreplay.testing.statistics import mean_and_error, welch
 Verdict = Literal["pass", "zero", "fail", "inconclusive"]
 
 Z_LIMIT = 4.0
-"""A correct gradient exceeds it once in 16 000 checks, so that hundreds of checks rarely produce a false alarm."""
+"""A correct gradient exceeds this |z| once in 16 000 checks, so that hundreds of checks rarely raise a false alarm."""
 
 RESOLUTION = 0.1
 """Largest σ, as a fraction of the larger of the two means, at which agreement is meaningful."""
@@ -63,9 +63,9 @@ def judge(
     ``rounding`` bounds the error of floating-point arithmetic in the reference; ``negligible`` is the size below which
     a derivative counts as zero. Shapes (n,), n >= 2.
 
-    Rule: |z| >= 4 or a gradient that is not finite *fails*. Otherwise, if σ is at most a tenth of the larger mean, it
-    *passes*. If not, it passes as *zero* if both means are within 4 σ of zero and 4 σ is negligible. Otherwise nothing
-    is resolved and it is *inconclusive*.
+    Rule: the gradient *fails* if |z| >= 4 or if it is not finite. Otherwise it *passes* if σ is at most a tenth of the
+    larger mean. Otherwise it passes as *zero* if both means are within 4 σ of zero and 4 σ is negligible. Otherwise
+    the noise is too large and the check is *inconclusive*.
     """
     with np.errstate(invalid="ignore"):  # infinite samples are handled below
         reference = (4 * half_step - full_step) / 3
