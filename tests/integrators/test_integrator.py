@@ -345,7 +345,7 @@ def _differentiate(scene, key, integrator, forward=False):
 @pytest.mark.parametrize("forward", [False, True])
 def test_edges_behind_mirrors_are_told_once(log, forward: bool) -> None:
     scene = mi.load_dict(lit_room({"type": "dielectric_ad"}), optimize=False)
-    for key, words in (("object.bsdf.eta", "edge of a light"), ("object.to_world", "moving edges")):
+    for key, words in (("object.bsdf.eta", "glass or mirrors"), ("object.to_world", "moving edges")):
         integrator = plugin(boundary="none")
         log.clear()
         for _ in range(2):

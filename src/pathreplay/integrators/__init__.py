@@ -1,1 +1,1 @@
-"""Integrators: one pass over an image, the terms of its gradient, and the `pathreplay` plugin that Mitsuba sees."""
+"""Integrators: one pass over an image, the terms of its gradient, and the `pathreplay` plugin."""

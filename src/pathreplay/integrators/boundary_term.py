@@ -46,7 +46,7 @@ class Boundary:
 
     film: bool = True  # edges seen by the camera
     inner: bool = True  # edges seen by surfaces and particles
-    spp: int = 0  # segments per pixel, for each of the two; 0: as many as the samples of the pass
+    spp: int = 0  # segments per pixel, for each search; 0: as many as the samples of the pass
 
     def forward(self, view: Pass, trace: TraceConfig, learned: Baseline | None) -> TermResult:
         """Compute the tangent of the image: see `Term`."""
@@ -134,7 +134,7 @@ def segments_of(view: Pass, places: FilmPlaces, spp: int) -> int:
 
 
 def _still_cameras(view: Pass) -> list[mi.Sensor]:
-    """Return the sensors that count as still: the others, and this one if the film flow handles its motion."""
+    """Return the static sensors: all except that of the pass, and also that one if a film flow contains its motion."""
     return [sensor for sensor in view.scene.sensors() if sensor != view.sensor or view.flow is not None]
 
 

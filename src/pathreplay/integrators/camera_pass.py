@@ -61,7 +61,7 @@ class _PassSensor:
     view: Pass
 
     def __getattr__(self, name: str) -> object:
-        """Forward to the sensor."""
+        """Forward attribute access to the sensor."""
         return getattr(self.view.sensor, name)
 
     def sample_ray_differential(
@@ -131,7 +131,7 @@ class Pass:
         """
         bits = (paths - 1).bit_length()
         morton = morton_index(pixel % width, pixel // width)
-        # Bits of the path index beyond 32 select the set as well.
+        # Bits of the index that exceed 32 bits select the set as well.
         overflow = morton >> (32 - bits) if bits else mi.UInt32(0)
         return OwenSobolSampler.of((morton << bits) | path, key_of(self.opaque_seed, mi.UInt32(of), overflow))
 

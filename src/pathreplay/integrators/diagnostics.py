@@ -74,7 +74,7 @@ def missing_edges(trace: TraceConfig, sensor: mi.Sensor, edges: str) -> tuple[st
         return edges_note(moving, edges), True
     if edges == "none" and trace.traits.lobes and trace.traits.area_lights:
         return (
-            "something moves in a scene with delta lobes and area lights: the motion of silhouettes and of borders of "
-            "lights that are seen through glass or mirrors is missing from the gradient"
+            "something moves in a scene with delta lobes and area lights: the motion of edges (silhouettes, borders of "
+            "lights) that are seen through glass or mirrors is missing from the gradient"
         ), False
     return "", False

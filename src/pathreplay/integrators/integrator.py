@@ -119,7 +119,7 @@ class PathReplayIntegrator(PathIntegrator):
                 f"{self.name}: boundary = '{self.boundary}' with attach = '{self.attach}': boundary terms need "
                 "attach = 'delta': use that, or boundary = 'none'"
             )
-        self.baseline: tuple[ReferenceType[SceneFacts], BaselineState] | None = None  # of this scene
+        self.baseline: tuple[ReferenceType[SceneFacts], BaselineState] | None = None  # the scene, and its learned state
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -152,11 +152,11 @@ class PathReplayIntegrator(PathIntegrator):
         return view, replace(trace, may_slide=self.boundary != "primary" and trace.media is None), (*terms, *motion)
 
     def _may_follow(self, view: Pass, trace: TraceConfig) -> bool:
-        """Whether film positions may follow visible surfaces: all edges that then move over the film can be sampled."""
+        """Return whether film positions may follow visible surfaces: all edges that then move can be sampled."""
         return self.boundary != "primary" and can_follow(trace, view.sensor) and not facts_of(view.scene).has_seams
 
     def _needs_edges(self, view: Pass, trace: TraceConfig) -> bool:
-        """Whether boundary terms are needed and, with ``auto``, available. Logs a note about their cost or absence."""
+        """Return whether boundary terms are needed and, with ``auto``, available. Logs their cost or absence."""
         if not Boundary.move(view, trace):
             return False
         why = Boundary.obstacle(view) if self.boundary == "auto" else ""
@@ -171,7 +171,7 @@ class PathReplayIntegrator(PathIntegrator):
         return True
 
     def supports_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> bool:
-        """Whether `render_value_and_grad` can be used, for all pixels or for a subset (``some``)."""
+        """Return whether `render_value_and_grad` can be used, for all pixels or for a subset (``some``)."""
         return not self.why_no_pixel_sweep(scene, sensor, spp, some)
 
     def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:
@@ -282,7 +282,7 @@ class PathReplayIntegrator(PathIntegrator):
         return {} if self.baseline is None else self.baseline[1].state_dict()
 
     def load_state_dict(self, scene: mi.Scene, learned: Mapping[str, np.ndarray]) -> None:
-        """Restore a `state_dict` for the same scene; an empty one resets. Raises PathreplayError if it is invalid."""
+        """Restore a `state_dict` of the same scene; an empty one resets it. Raises PathreplayError if invalid."""
         box = scene.bbox()
         baseline = BaselineState.restored(box, learned) if learned else BaselineState.fresh(box)
         self.baseline = ref(facts_of(scene)), baseline

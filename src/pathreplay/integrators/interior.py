@@ -1,4 +1,4 @@
-"""The interior term: the derivative of path contributions at fixed visibility, by any driver of camera paths."""
+"""The interior term: derivative of path contributions at fixed visibility, computed by a driver of camera paths."""
 
 from __future__ import annotations
 

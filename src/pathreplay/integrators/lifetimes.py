@@ -42,9 +42,7 @@ class _Entry(Generic[T]):
 
     scene: mi.Scene
     about: T
-    held_once: object = field(
-        default_factory=object
-    )  # has the reference count of a scene that only this entry references
+    held_once: object = field(default_factory=object)  # its reference count equals that of an unreferenced scene
 
     @property
     def is_unreferenced(self) -> bool:
@@ -79,7 +77,7 @@ SCENES: SceneMemory = SceneMemory()
 """Facts about the scenes of this process, released according to the rules above."""
 _ONE_THREAD = threading.RLock()
 _AT_COLLECTION = threading.Lock()
-"""Held by `_on_collection` while it briefly holds `_ONE_THREAD`, in any thread that triggers a collection."""
+"""Lock of `_on_collection`, held while a garbage collection in any thread briefly holds `_ONE_THREAD`."""
 _passes = 0  # number of nested passes in progress
 _hidden = False  # whether objects are hidden from the collector
 
@@ -136,7 +134,7 @@ def careful() -> Iterator[None]:
 
 
 def _acquire() -> bool:
-    """Acquire the lock without blocking, except for a garbage collection in another thread; return success."""
+    """Try to acquire the lock, waiting only for a garbage collection in another thread. Return whether it succeeded."""
     while not _ONE_THREAD.acquire(blocking=False):
         if not _AT_COLLECTION.locked():
             return _ONE_THREAD.acquire(blocking=False)

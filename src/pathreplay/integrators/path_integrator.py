@@ -74,7 +74,7 @@ class PathIntegrator:
     name = ""
     attach = "none"
     uses_sobol = False  # Owen-scrambled Sobol samples replace independent ones
-    boundary = "none"  # the estimated boundary terms
+    boundary = "none"  # estimated boundary terms
     baseline: Any = None  # learned state
     interior: Term
     max_depth: int  # this and the following are members of Mitsuba's integrator
@@ -170,9 +170,7 @@ class PathIntegrator:
                     part, trace, terms = self._planned(part, state)
                     learned = self._learned(part, trace, state)
                     weighted = grad_in if part.share == 1 else grad_in * part.share
-                    with (
-                        dr.isolate_grad()
-                    ):  # the graph of the film flow, which terms share, is traversed once at the end
+                    with dr.isolate_grad():  # traverses the graph of the shared film flow once, at the end
                         result = reduce(add, [term.backward(part, trace, weighted, learned) for term in terms])
                 self._log_notes(part, trace, result)
                 state = state.after(result)

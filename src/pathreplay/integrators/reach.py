@@ -16,8 +16,8 @@ def reached_sensors(
 ) -> list[bool]:
     """Return for each sensor whether its image can depend on one of the ``keys`` of ``params``.
 
-    A parameter of a camera affects only the images of that camera. Any other parameter is assumed to affect all images.
-    So is a parameter of a medium that a camera shares with a shape.
+    A parameter of a camera affects only the images of that camera. Any other parameter is assumed to affect all images,
+    for example a parameter of a medium that a camera shares with a shape.
     """
     owners = {params.properties[key][2] for key in keys}
     below = {sensor: nodes_of(sensor) | {sensor} for sensor in {*scene.sensors(), *sensors}}

@@ -1,4 +1,4 @@
-"""Facts about a scene: its objects are collected once, and which of them have gradients is determined in every pass."""
+"""Facts about a scene. Its objects are collected once; every pass determines which of them have gradients."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ class Stateless:
         return self.name in _RECORDABLE and not has_media
 
     def is_reached(self, scene: mi.Scene, sensor: Which = 0) -> bool:
-        """Return True: unknown, hence assumed."""
+        """Return True, because the answer is unknown."""
         return True
 
     def why_no_pixel_sweep(self, scene: mi.Scene, sensor: Which = 0, spp: int = 0, some: bool = False) -> str:

@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import mitsuba as mi
 
 SETS = 4
-"""Number of low-discrepancy sets per pixel, if it has that many paths. With fewer sets, fewer other paths weight
-each set; with more, each set is less evenly distributed."""
+"""Number of low-discrepancy sets per pixel, if it has that many paths. With fewer sets, the weight of a path is the
+mean of fewer independent paths; with more, the samples of a set are less evenly distributed."""
 
 
 class PixelSamples(Protocol):

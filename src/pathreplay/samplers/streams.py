@@ -29,7 +29,7 @@ class Stream(IntEnum):
     ARCS = 0x38B34AE5
     # First index in a key.
     ARC = 0x100
-    BEYOND_EDGE = 0x20000  # radiance arriving from beyond an edge
+    BEYOND_EDGE = 0x20000  # radiance that arrives from behind an edge
     BEAM = 0x30000
     BEAM_EMITTER = 0x30010
     CAMERA = 0x40000

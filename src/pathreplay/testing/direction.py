@@ -91,7 +91,7 @@ def choose_line(
     return Line(value, v, description, size, float(step), _choose_stencil(key, value, v * step))
 
 
-# A parameter that is a million times larger or smaller belongs to a different scene.
+# Largest step relative to the size of the parameter: larger changes give a different scene.
 _LONGEST_STEP = 1e6
 
 

@@ -41,9 +41,7 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
     sampler, path = start.sampler, PathState.begin(trace, start)
     if dr.hint(path_moves(trace, start, path.at), mode="scalar"):
         raise PathreplayError("prb_volume_listing does not differentiate motion: use 'pathreplay'")
-    L = walk_on(trace, sampler.clone(), dr.copy(path))[
-        0
-    ]  # β_i L_i, from which the loop subtracts β_i e_i at each vertex
+    L = walk_on(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i; the loop subtracts β_i e_i at each vertex
     ctx = mi.BSDFContext()
 
     while dr.hint(path.active, exclude=[trace, ctx], label="pathreplay: listing"):
@@ -69,7 +67,7 @@ def listing(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonF
             if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
                 backward(dr.sum(δL * Lo))
 
-        # The collisions along the shadow ray transmit the radiance of the emitter sample.
+        # Differentiate the collisions along the shadow ray, which transmit the radiance of the emitter sample.
         ray, begins = v.origin.spawn_ray_to(light.p), shadow_start(v, light, path.at.medium)
         differentiate_shadow(trace, ray, begins, past, kept.lit, δL * path.β * dr.detach(lighting))
         path = onward

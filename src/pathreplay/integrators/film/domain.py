@@ -91,7 +91,7 @@ class FilmPlaces:
         return _splat_adjoint(lambda L: self.pixels(pixel, L, wavelengths), dr.width(pixel), block_grad)
 
     def pixels(self, pixel: mi.UInt32, L: mi.Spectrum, wavelengths: mi.Spectrum) -> mi.TensorXf:
-        """Return the pixels of a block without filter: each is the sum of the ``L`` with its row-major index."""
+        """Sum radiance ``L`` by pixel (row-major index) in a block without filter, and return its pixels."""
         film, filtered = self.view.sensor.film(), self._block()
         offset, size = mi.ScalarPoint2i(film.crop_offset()), mi.ScalarVector2u(film.crop_size())
         block = mi.ImageBlock(size, offset, filtered.channel_count())

@@ -89,7 +89,7 @@ def require_film(sensor: mi.Sensor, name: str, spp: Mapping[str, int], also: int
 
 
 def fit_film(sensor: mi.Sensor, shape: Sequence[int]) -> None:
-    """Resize the film of a sensor to an image of shape (height, width, ...), unless it or its crop window fits."""
+    """Resize the film of a sensor to an image of shape (height, width, ...), unless its crop window has that size."""
     size = mi.ScalarVector2u(int(shape[1]), int(shape[0]))
     if tuple(sensor.film().crop_size()) != tuple(size):
         params = mi.traverse(sensor)

@@ -5,7 +5,8 @@ With the filter h_j of pixel j, restricted to the film D, and the velocity v of 
     dI_j/dπ = 1/∫_D h_j · ( ∫_D div(h_j v) L ds - ∮_∂D h_j L v·n dl ).
 
 Filters are products h_j = f(x) f(y), and at the border of the film f(x) jumps to zero. Both parts with ∂f/∂x therefore
-form one integral over a measure df(x), whose mass outside the film is concentrated at the border:
+form one integral over a measure df(x), whose mass outside the film is concentrated at the border. The three integrals
+are
 
     ∫ f(y) dy ∫ v_x L df(x),        ∫ f(x) dx ∫ v_y L df(y),        ∫_D h_j (∂v_x/∂x + ∂v_y/∂y) L ds.
 
@@ -110,22 +111,19 @@ class FilmMotion:
         return dr.select(f.single, self.flow.divergence(f.sample), dr.select(f.axis == 0, v.x, v.y))
 
     def _smooth_factors(self, view: Pass, f: FlowPaths) -> list[tuple[mi.UInt32, mi.Float]]:
-        """Return pixels and factors by which each path of a pair weighs the smooth part W̄ of the adjoint.
+        """Return pixels and factors: each path of a pair receives the sum of factor times W̄ of the pixel.
 
         The factors are relative to the weight of the path's own pixel. The first entry subtracts W̄ of that pixel, which
         the full adjoint W contains.
         """
         width, height = view.size
         derivative, along_x = f.derivative, f.axis == 0
-        position, most = (
-            dr.select(along_x, f.pixel % width, f.pixel // width),
-            dr.select(along_x, mi.Int32(width), height),
-        )
+        index, most = dr.select(along_x, f.pixel % width, f.pixel // width), dr.select(along_x, mi.Int32(width), height)
         first, total = mi.Int32(dr.ceil(f.offset - derivative.radius)), mi.Float(0)
         masses = []
         for k in range(math.ceil(2 * derivative.radius)):
             i = first + k
-            inside = ~f.single & (mi.Int32(position) + i >= 0) & (mi.Int32(position) + i < most)
+            inside = ~f.single & (mi.Int32(index) + i >= 0) & (mi.Int32(index) + i < most)
             mass = dr.select(inside, derivative.mass(f.offset - mi.Float(i)), 0)
             pixel = mi.UInt32(mi.Int32(f.pixel) + i * dr.select(along_x, mi.Int32(1), width))
             masses.append((dr.select(inside, pixel, f.pixel), mass))

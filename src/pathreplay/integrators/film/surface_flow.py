@@ -1,12 +1,12 @@
 """Flow of a static camera: film positions follow the visible surfaces, so that surfaces move little under a pixel.
 
-A few probe rays sample the scene. A point p that a probe ray hits moves with its surface, and crosses the film with
+A few probe rays sample the scene. A point p that a probe ray hits moves with its surface, and crosses the film at
 
     u = (∂(o + t d)/∂s)⁺ ∂p/∂π,
 
 where o + t d is the point at the same distance t on the ray through the film position s. If film positions are fixed,
-the surface slides under them by u / cos, with the angle between normal and ray, which is unbounded at silhouettes.
-Points at grazing angles therefore have the largest weights. The velocity at a node of a grid is the mean
+the surface slides under them at u / cos, where cos is the cosine between normal and ray. This is unbounded at
+silhouettes, so that points at grazing angles have the largest weights. The velocity at a node of a grid is the mean
 
     v = Σ K W u / (K_0 + Σ K (W + S)),     W = 1 / (cos² + GRAZING²),     K = max(1 - (r / REACH)², 0)² / (r² + NEAR²)²
 
@@ -56,9 +56,7 @@ class SurfaceFlow:
 
     sensor: mi.Sensor
     nodes: mi.Vector2f  # velocities at grid nodes: their values are zero, and they are attached to moving surfaces
-    flows: (
-        mi.Bool
-    )  # for each cell, by its first node: whether the velocity may be non-zero there or in an adjacent cell
+    flows: mi.Bool  # for each cell, at its first node: whether the velocity may be non-zero in or next to it
     is_all: bool = False
     samples: int = 5
 
