@@ -90,7 +90,7 @@ def test_nothing_comes_from_outside_of_the_film() -> None:
 
 
 def test_centres_are_drawn_with_their_density() -> None:
-    even = SegmentDensity.even(mi.ScalarVector2f(5, 3), 0.5)
+    even = SegmentDensity.uniform(mi.ScalarVector2f(5, 3), 0.5)
     rng = np.random.default_rng(1)
     seen = mi.Point2f(2.0, 1.0) + 0 * mi.Float(rng.random(50))
     centres = even.refined(seen, mi.Float(1))
@@ -311,14 +311,14 @@ def test_what_is_closer_than_rays_begin_is_rounding() -> None:
     si.p, si.n = mi.Point3f(2, -7, 0.5), mi.Normal3f(0, 0, 1)
     beside = dr.norm(si.spawn_ray(mi.Vector3f(0, 0, 1)).o - si.p)
     observer: Any = SimpleNamespace(origin=si)
-    far = ObserverVertex.is_off(observer, beside * mi.Float(0, 1e-5, 9.9, 10.1, 100))
+    far = ObserverVertex.is_far(observer, beside * mi.Float(0, 1e-5, 9.9, 10.1, 100))
     assert np.array(far).tolist() == [False, False, False, True, True]
 
 
 def test_samples_of_a_ball_are_asked_for_on_a_disk() -> None:
     """As many by area, and places that are close to each other have directions that are."""
     trace: Any = SimpleNamespace(traits=SimpleNamespace(ball_lights=True))
-    lamp: Any = SimpleNamespace(around=mi.Bool(True))
+    lamp: Any = SimpleNamespace(polar=mi.Bool(True))
     x, y = dr.meshgrid(*2 * (dr.linspace(mi.Float, 0.005, 0.995, 100),))
     u = sample_at(trace, lamp, mi.Point2f(x, y))
     counts, *_ = np.histogram2d(*np.array(u), bins=4, range=((0, 1), (0, 1)))
@@ -326,7 +326,7 @@ def test_samples_of_a_ball_are_asked_for_on_a_disk() -> None:
     close = [sample_at(trace, lamp, mi.Point2f(0.5 + d, 0.5)) for d in (-1e-3, 1e-3)]
     there = [dr.sqrt(p.x) * mi.Point2f(dr.cos(dr.two_pi * p.y), dr.sin(dr.two_pi * p.y)) for p in close]
     assert dr.all(dr.norm(there[1] - there[0]) < 1e-2)
-    assert dr.all(sample_at(trace, SimpleNamespace(around=mi.Bool(False)), close[0]).x == close[0].x)
+    assert dr.all(sample_at(trace, SimpleNamespace(polar=mi.Bool(False)), close[0]).x == close[0].x)
 
 
 def test_chains_in_fog_are_not_ended_by_roulette() -> None:

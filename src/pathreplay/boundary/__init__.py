@@ -1,1 +1,1 @@
-"""Boundary terms: what moving edges add to a gradient."""
+"""Boundary terms: contributions of moving edges to gradients."""

@@ -1,6 +1,6 @@
-"""Edges that are no outlines: where two surfaces meet, where a smooth one turns dark, and where a hard shadow ends.
+"""Edges that are not outlines: contacts of two surfaces, dark limits of smooth shading, and hard shadow boundaries.
 
-A smooth mesh goes dark where its shading normal is at right angles to the ray, a little before its outline.
+A smooth-shaded mesh turns black where its shading normal is perpendicular to the ray, slightly before its outline.
 """
 
 from __future__ import annotations
@@ -18,33 +18,34 @@ from pathreplay.transport.signature import place_met, shape_met, turned_away
 from pathreplay.transport.vertex import Arrival, TraceConfig
 
 MEETS = 1e-3
-"""Relative difference of two distances up to which surfaces meet."""
+"""Largest relative difference of distances at which two surfaces are considered in contact."""
 ASIDE = 2.0
-"""Distance from a line of contact at which light is looked at, over the least at which rays begin between its sides."""
+"""Distance from a contact line to which hits are moved, relative to the smallest distance at which ray origins, with
+their offset, lie in front of both surfaces."""
 STEEPEST = 8.0
-"""Cotangent of half the angle of the sharpest corner for which that is far enough: it has 14 degrees."""
+"""Cotangent of half the angle of the sharpest corner for which that distance suffices: 14 degrees."""
 
 Side: TypeAlias = "tuple[mi.PreliminaryIntersection3f, mi.Ray3f]"
-"""What a ray met, and the ray."""
+"""A hit and its ray."""
 
 
 @dataclass
 class Crease:
-    """An edge that is no outline between what two rays met, if there is one."""
+    """An edge other than an outline between the hits of two rays, if there is one."""
 
     a: mi.PreliminaryIntersection3f
     b: mi.PreliminaryIntersection3f
-    meets: mi.Bool  # two surfaces meet there, at an angle
-    turns: mi.Bool  # it is one sheet of one surface, the shading normal of which is at right angles to the ray
-    shadow: HardShadow | None  # where there are lights that cast them
+    meets: mi.Bool  # two surfaces are in contact, at an angle
+    turns: mi.Bool  # on one sheet, the shading normal turns away from the ray
+    shadow: HardShadow | None  # None without lights that cast hard shadows
 
     @staticmethod
     def of(trace: TraceConfig, side_a: Side, side_b: Side, shadow: HardShadow | None, active: mi.Bool) -> Crease:
-        """Detached."""
+        """Classify the edge between two hits. Detached."""
         (a, ray_a), (b, ray_b) = side_a, side_b
         both = active & a.is_valid() & b.is_valid()
         if shadow is not None:
-            both &= ~shadow.there
+            both &= ~shadow.exists
         flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
         si_a, si_b = (hit.compute_surface_interaction(ray, flags, both) for hit, ray in (side_a, side_b))
         meets = both & at_an_angle(si_a.n, si_b.n) & (dr.abs(a.t - b.t) < MEETS * dr.minimum(a.t, b.t))
@@ -53,51 +54,51 @@ class Crease:
         return Crease(a, b, meets, turns, shadow)
 
     @property
-    def there(self) -> mi.Bool:
-        """Whether there is one."""
-        there = self.meets | self.turns
-        return there if self.shadow is None else there | self.shadow.there
+    def exists(self) -> mi.Bool:
+        """Whether there is such an edge."""
+        exists = self.meets | self.turns
+        return exists if self.shadow is None else exists | self.shadow.exists
 
     def gap(self, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-        """B: zero on the edge, and wherever there is none; differentiable in the ray and in the shapes."""
+        """Evaluate B, zero on the edge and in lanes without one. Differentiable in the ray and in the shapes."""
         meets, turns = active & self.meets, active & self.turns
         t = [hit.compute_surface_interaction(ray, mi.RayFlags.All, meets).t for hit in (self.a, self.b)]
         si = self.a.compute_surface_interaction(ray, mi.RayFlags.All, turns)
         B = dr.select(meets, t[0] - t[1], dr.select(turns, dr.dot(si.sh_frame.n, ray.d), 0))
-        return B if self.shadow is None else dr.select(self.shadow.there, self.shadow.gap(ray, active), B)
+        return B if self.shadow is None else dr.select(self.shadow.exists, self.shadow.gap(ray, active), B)
 
 
 def off_contact(trace: TraceConfig, a: Arrival, b: Arrival, active: mi.Bool) -> list[Arrival]:
-    """The arrivals at two sides of an edge; where two surfaces meet in a hollow, a little further from each other.
+    """Return the arrivals on two sides of an edge, moved apart where two surfaces form a concave corner.
 
-    Rays begin beside their surface. Closer to a line of contact than that they begin behind the other surface, and see
-    what is there: a sky below the floor. Light is continuous along each surface, so that an error is left that is
-    proportional to the distance, some thousandths of the size of things.
+    Ray origins are offset from their surface. Closer to a contact line than this offset, they lie behind the other
+    surface, and rays may see the sky below a floor. Radiance is continuous along each surface. The error of moving the
+    hits is therefore proportional to the distance, which is some thousandths of the size of objects.
     """
     sides = [(at, at.hit.compute_surface_interaction(at.ray, mi.RayFlags.Minimal, active)) for at in (a, b)]
     normals = [dr.select(dr.dot(si.n, at.ray.d) > 0, -si.n, si.n) for at, si in sides]
-    along, cosine = dr.cross(*normals), dr.dot(*normals)
+    contact, cosine = dr.cross(*normals), dr.dot(*normals)
     ok = active & a.hit.is_valid() & b.hit.is_valid() & at_an_angle(*normals)
     cot = dr.minimum(dr.safe_sqrt((1 - cosine) / (1 + cosine)), STEEPEST)
     x = ASIDE * mi.math.RayEpsilon * (1 + cot) * (1 + dr.max(dr.abs(sides[0][1].p)))
-    across = dr.cross(a.ray.d, along)  # for the eye, from the one to the other
-    parts = dr.dot(across, a.ray.d - b.ray.d)
+    across = dr.cross(a.ray.d, contact)  # image direction from one surface to the other
+    separation = dr.dot(across, a.ray.d - b.ray.d)
     moved = []
-    for (at, si), n, other, side in zip(sides, normals, reversed(normals), (parts, -parts), strict=True):
-        away = dr.normalize(other - dr.dot(other, n) * n)  # along the surface, to the front of the other one
+    for (at, si), n, other, side in zip(sides, normals, reversed(normals), (separation, -separation), strict=True):
+        away = dr.normalize(other - dr.dot(other, n) * n)  # along the surface, towards the front of the other
         moved.append(_towards(trace, at, si.p + x * away, 4 * x, ok & (dr.dot(across, away) * side > 0)))
     return moved
 
 
 def _towards(trace: TraceConfig, at: Arrival, p: mi.Point3f, short: mi.Float, active: mi.Bool) -> Arrival:
-    """The arrival at another point close by: looked for from ``short`` of it on, and the same where it is elsewhere."""
-    ray, line = mi.Ray3f(at.ray), p - at.ray.o
-    ray.d = dr.normalize(line)
-    gone = dr.maximum(dr.norm(line) - short, 0)
-    rest = mi.Ray3f(ray)
-    rest.o, rest.maxt = ray.o + gone * ray.d, dr.inf
-    hit = meet(trace, rest, active)
-    hit.t += gone
+    """Move an arrival to the nearby point ``p``, unless a ray that starts ``short`` before p hits another surface."""
+    ray, to_p = mi.Ray3f(at.ray), p - at.ray.o
+    ray.d = dr.normalize(to_p)
+    offset = dr.maximum(dr.norm(to_p) - short, 0)
+    onward = mi.Ray3f(ray)
+    onward.o, onward.maxt = ray.o + offset * ray.d, dr.inf
+    hit = meet(trace, onward, active)
+    hit.t += offset
     places = [place_met(trace, h, active, shape_met(trace, h, r, active)) for h, r in ((hit, ray), (at.hit, at.ray))]
     same = active & (places[0] == places[1])
     return dr.select(same, replace(at, ray=ray, hit=hit), at)

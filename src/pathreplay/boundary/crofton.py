@@ -1,11 +1,13 @@
-"""Crofton's formula: edges are found by what differs between the ends of short segments, and not listed.
+"""Crofton's formula: find edges by comparing the ends of short random segments, without a list of edges.
 
-Segments of length l are thrown at random on a surface, such as the film or the sphere of directions. With p(c) the
-density of their centres and directions that are uniform, the expected sum of g / p(c) over all crossings with edges is
-2 l / π times the integral of g along the edges. Signatures tell that there is a crossing; bisection finds where.
+Segments of length l are distributed at random over a surface, for example the film or the sphere of directions. Let
+p(c) be the density of their centres, and let their directions be uniform. The expected sum of g / p(c) over all
+crossings with edges is 2 l / π times the integral of g along the edges. Different signatures at the ends of a segment
+indicate a crossing; bisection locates it.
 
-Two crossings of one segment go unseen, as at a corner. So segments whose ends agree are probed in the middle, too; what
-only the middle finds is weighted by its length, for the segments that have such a part elsewhere: see `alone`.
+Two crossings of one segment, for example at a corner, leave its ends equal. Segments with equal ends are therefore also
+probed in the middle. A segment on which only the middle differs also represents segments that contain the differing
+part elsewhere: see `middle_weight`.
 """
 
 from __future__ import annotations
@@ -18,63 +20,66 @@ import drjit as dr
 import mitsuba as mi
 
 BISECTIONS = 12
-"""How often a segment is halved: what is left of it is 2^-12 as long."""
+"""Number of bisections of a segment: the final interval has 2^-12 of its length."""
 OFF_PLANE = 0.1
-"""Share of their distance by which two points leave each other's tangent planes, where a surface hides itself."""
+"""Distance of a point from another point's tangent plane, relative to the distance of the two points, above which their
+surface may occlude itself."""
 ROUNDING = 1e-5
-"""Share of their coordinates by which points may be wrong."""
+"""Relative rounding error of the coordinates of points."""
 HIDES, BENDS = 0.25, 0.02
-"""Importance of an edge between two points of one shape, where two shapes have 1. Most of these are bends: there each
-point is on the same side of the other's tangent plane."""
+"""Importance of an edge between two points of one shape, relative to points of two shapes. The lower value applies if
+each point is in front of the other's tangent plane, or each is behind it: most such surfaces are merely curved."""
 ANGLE = 1e-3
-"""Between two surfaces, from which on they meet at an edge."""
-STILL = 8
-"""Halvings in a row that leave one end of a segment where it was: of segments with an edge 1 in 2^7 does."""
+"""Smallest angle between two surfaces, in radians, that counts as an edge."""
+CRACK_BISECTIONS = 8
+"""Number of successive bisections with the same fixed end that suggest a crack; of true edges, 1 in 2^7 reaches it."""
 PARTS = 3
-"""Halvings of half a segment that tell where what the middle sees ends."""
-LEAST = 9 / 32
-"""Share of a segment: see `alone`. Halfway between two that `part_seen` tells apart."""
+"""Number of bisections in each half of a segment that locate the end of the differing part."""
+MIN_FRACTION = 9 / 32
+"""Fraction below which `middle_weight` is constant; halfway between two results of `middle_fraction`."""
 BEYOND = 1.5
-"""Lengths of what is left of a segment, by which one probes beyond such an end. (Within the `BORDER` of emitters.)"""
+"""Distance beyond the fixed end at which a suspected crack is probed, in lengths of the final interval. In the square
+of an emitter this distance is less than `emitters.BORDER`."""
 
 
 @dataclass
 class VisibilityProbe:
-    """What is seen at a place of a segment: two of them tell whether there is an edge between."""
+    """Visibility at one position of a segment. If two probes differ, an edge lies between them."""
 
     signature: mi.UInt32
-    p: mi.Point3f  # where the view ends; zero where it does not
+    p: mi.Point3f  # point that is visible; zero if there is none
     n: mi.Normal3f
-    moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # between two that do not, an edge does nothing
-    # Importance of an edge beside it, as far as a probe can tell:
-    near: mi.Float = field(default_factory=lambda: mi.Float(1))  # how close it is
-    bright: mi.Float = field(default_factory=lambda: mi.Float(1))  # how much light comes from it
-    # Of a mesh that is shaded smoothly and is not smooth:
-    triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 0: no matter
-    light: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # directions that are scattered, or none:
-    lobe: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # its plane may hide what is there
+    moves: mi.Bool = field(default_factory=lambda: mi.Bool(True))  # edges between static points are ignored
+    # Importance of an adjacent edge, as far as a single probe can estimate it:
+    near: mi.Float = field(default_factory=lambda: mi.Float(1))  # reciprocal distance of the visible point
+    bright: mi.Float = field(default_factory=lambda: mi.Float(1))  # estimate of the radiance
+    # For coarse meshes with smooth shading, where the plane of a triangle may occlude light:
+    triangle: mi.UInt32 = field(default_factory=lambda: mi.UInt32(0))  # 1 + its index; 0: irrelevant
+    light: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the emitter sample, or zero
+    lobe: mi.Vector3f = field(default_factory=lambda: mi.Vector3f(0))  # direction of the BSDF sample, or zero
 
     @staticmethod
     def of(signature: int | mi.UInt32 = 0) -> VisibilityProbe:
-        """What nothing but its signature tells apart."""
+        """Create a probe that consists of a signature only."""
         return VisibilityProbe(mi.UInt32(signature), mi.Point3f(0), mi.Normal3f(0))
 
     def differs(self, other: VisibilityProbe) -> mi.Bool:
-        """Whether it is another shape, or another sheet of the same: see `hides_itself`."""
-        return self.hint(other) > 0
+        """Return whether the probes see different shapes, or different sheets of one shape: see `hides_itself`."""
+        return self.edge_importance(other) > 0
 
-    def hint(self, other: VisibilityProbe) -> mi.Float:
-        """How likely it is that there is an edge between, as an importance: 0 where there is none for certain."""
+    def edge_importance(self, other: VisibilityProbe) -> mi.Float:
+        """Estimate how likely an edge between the probes is, as an importance: 0 if there is certainly none."""
         across = other.p - self.p
         bend = dr.dot(self.n, across) * dr.dot(other.n, across) < 0
         same = dr.select(hides_itself(self, other), dr.select(bend, mi.Float(BENDS), HIDES), 0)
-        hint = dr.select((self.signature != other.signature) | self._crease(other), 1, same)
-        return dr.select(self.moves | other.moves, hint, 0)
+        importance = dr.select((self.signature != other.signature) | self._crease(other), 1, same)
+        return dr.select(self.moves | other.moves, importance, 0)
 
     def _crease(self, other: VisibilityProbe) -> mi.Bool:
-        """Whether another triangle is seen, and a direction is between their planes, or close: it jumps what they hide.
+        """Return whether the probes see different triangles, and a direction lies between the planes of the two.
 
-        Directions turn with the shading normal on the way to the crease, by no more than triangles do.
+        The occlusion of such a direction by the triangles is discontinuous. Directions close to the planes count, too:
+        up to the crease they turn with the shading normal, by at most the angle between the triangles.
         """
         between = mi.Bool(False)
         for d in (self.light, self.lobe, other.light, other.lobe):
@@ -84,14 +89,14 @@ class VisibilityProbe:
 
 
 def at_an_angle(n: mi.Normal3f, n_other: mi.Normal3f) -> mi.Bool:
-    """Whether two surfaces with these normals meet at an edge, if they meet."""
+    """Return whether two surfaces with these normals would form an edge where they meet."""
     return dr.squared_norm(dr.cross(n, n_other)) > dr.square(ANGLE)
 
 
 def hides_itself(a: VisibilityProbe | mi.SurfaceInteraction3f, b: VisibilityProbe | mi.SurfaceInteraction3f) -> mi.Bool:
-    """Whether two points of one shape may be on different sheets: one is off the tangent plane of the other.
+    """Return whether two points of one shape may lie on different sheets: one is off the tangent plane of the other.
 
-    Or the shape bends between them, which only points that are closer to each other can tell.
+    The shape may also be curved between the points. Only points that are closer to each other can distinguish the two.
     """
     across = b.p - a.p
     off = dr.maximum(dr.abs(dr.dot(a.n, across)), dr.abs(dr.dot(b.n, across)))
@@ -100,7 +105,7 @@ def hides_itself(a: VisibilityProbe | mi.SurfaceInteraction3f, b: VisibilityProb
 
 
 Probe: TypeAlias = "Callable[[mi.Float, mi.Bool], VisibilityProbe]"
-"""(place, active) -> what is seen there. Places of a segment of length l are from -l / 2 to l / 2."""
+"""(position, active) -> `VisibilityProbe`. Positions on a segment of length l range from -l / 2 to l / 2."""
 
 
 @dataclass
@@ -108,7 +113,7 @@ class PlaneSegment:
     """A segment in a plane."""
 
     c: mi.Point2f
-    w: mi.Vector2f  # its direction
+    w: mi.Vector2f  # unit direction
     length: mi.Float
 
     def at(self, t: mi.Float) -> mi.Point2f:
@@ -116,26 +121,26 @@ class PlaneSegment:
 
 
 def heading(turn: mi.Float) -> mi.Vector2f:
-    """A direction in the plane, from a number in [0, 1)."""
+    """Return the unit vector in the plane at the angle 2π ``turn``."""
     sin, cos = dr.sincos(dr.two_pi * turn)
     return mi.Vector2f(cos, sin)
 
 
 @dataclass
-class Crossed:
-    """A piece of a segment, from ``a`` to ``b``, with an edge on it."""
+class Bracket:
+    """An interval of a segment, from ``a`` to ``b``, that contains an edge."""
 
     a: mi.Float
     b: mi.Float
-    weight: mi.Float  # number of crossings that it stands for; 0: none
+    weight: mi.Float  # number of crossings that it represents; 0: no edge
 
     def per_length(self, length: mi.Float | float, density: mi.Float) -> mi.Float:
-        """Crofton's weight of the crossing, π/2 / (l p(c)) each: the length of edge that it stands for."""
+        """Return the Crofton weight, π/2 / (l p(c)) per crossing: the length of edge that the interval represents."""
         return 0.5 * dr.pi * self.weight / (length * density)
 
 
-def passed(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f) -> mi.Spectrum:
-    """K: jump · sgn(w·∂B) / |∂B|, zero where that is not finite; ``slope`` is ∂B, ``jump`` the rest of K."""
+def crossing_weight(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f) -> mi.Spectrum:
+    """Return K = jump · sgn(w·∂B) / |∂B|, or zero if that is not finite; ``slope`` is ∂B."""
     n = dr.norm(slope)
     K = jump * (dr.sign(dr.dot(w, slope)) / n)
     return dr.select((n > 0) & dr.all(dr.isfinite(K)), K, 0)
@@ -143,98 +148,102 @@ def passed(w: mi.Vector2f, jump: mi.Spectrum, slope: mi.Vector2f) -> mi.Spectrum
 
 @dataclass
 class Survey:
-    """What the probes of a segment tell."""
+    """Summary of the probes of a segment."""
 
-    found: mi.Float  # how much the segment counts as one with an edge, 0 where it has none
-    near: mi.Float  # of what is seen along it, the most
-    bright: mi.Float
+    presence: mi.Float  # likelihood and weight of an edge on the segment; 0: no edge
+    near: mi.Float  # largest value of the probes
+    bright: mi.Float  # largest value of the probes
 
     @staticmethod
     def of(probes: list[VisibilityProbe], active: mi.Bool) -> Survey:
-        """By what is seen at `probed`."""
+        """Summarise the probes at `probe_positions`."""
         a, b, c = probes
-        ends, halves = a.hint(b), dr.maximum(c.hint(a), c.hint(b))
-        # Of two crossings one is chosen, for both, and counts more than once: see `alone`.
-        found = dr.select(ends > 0, dr.maximum(ends, halves), 4 * halves)
+        ends, halves = a.edge_importance(b), dr.maximum(c.edge_importance(a), c.edge_importance(b))
+        # If only the middle differs, one of two crossings represents both, with a larger weight: see `middle_weight`.
+        presence = dr.select(ends > 0, dr.maximum(ends, halves), 4 * halves)
         near = dr.maximum(dr.maximum(a.near, b.near), c.near)
         bright = dr.maximum(dr.maximum(a.bright, b.bright), c.bright)
-        return Survey(dr.select(active, found, 0), near, bright)
+        return Survey(dr.select(active, presence, 0), near, bright)
 
 
-def probed(length: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """Where segments are probed to detect edges: at their ends, and in the middle."""
+def probe_positions(length: mi.Float) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """Return the positions at which segments are probed to detect edges: both ends and the middle."""
     return -0.5 * length, 0.5 * length, mi.Float(0)
 
 
 def detect(probe: Probe, length: mi.Float, active: mi.Bool) -> mi.Float:
-    """How much a segment counts as one with an edge: 0 where it has none."""
-    return Survey.of([probe(t, active) for t in probed(length)], active).found
+    """Probe a segment, and return `Survey.presence`: 0 if no edge is detected."""
+    return Survey.of([probe(t, active) for t in probe_positions(length)], active).presence
 
 
-def alone(m: mi.Float) -> mi.Float:
-    """The weight of a segment that is the same at both ends and otherwise in the middle, on a share ``m`` of it.
+def middle_weight(m: mi.Float) -> mi.Float:
+    """Return the weight of a segment whose ends are equal and whose middle differs, on a fraction ``m`` of its length.
 
-    Such a part lies within the segment for beginnings along 1 - m of its length, and in the middle, too, for
-    min(m, 1 - m) of it. The ratio has no bounds for small parts, and is constant below `LEAST`, so that it is right
-    on average over parts that a corner cuts off: there all m are as likely.
+    Consider all shifts of the segment along itself. The differing part lies inside it on a fraction 1 - m of its
+    length, and also covers its middle on min(m, 1 - m). The weight is the ratio of the two. The ratio is unbounded for
+    small m. Below `MIN_FRACTION` the weight is a constant with the right mean for parts cut off by a corner, where all
+    m are equally likely.
     """
-    return dr.select(m < LEAST, 2 / LEAST - 1, dr.select(m < 0.5, (1 - m) / m, 1))
+    return dr.select(m < MIN_FRACTION, 2 / MIN_FRACTION - 1, dr.select(m < 0.5, (1 - m) / m, 1))
 
 
 @dr.syntax
-def part_seen(
+def middle_fraction(
     probe: Probe, length: mi.Float, at_a: VisibilityProbe, at_b: VisibilityProbe, active: mi.Bool
 ) -> mi.Float:
-    """The share of a segment around its middle in which it looks as at neither end, within a sixteenth on each side.
+    """Return the fraction of a segment, around its middle, that differs from both ends; each side is exact to 1/16.
 
-    There may be edges within: what counts is that a segment with its middle there finds something.
+    This part may contain further edges: it is the set of midpoints for which the segment detects an edge.
     """
     half = 0.5 * length
-    n, share, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)
+    n, fraction, reach, step = mi.UInt32(0), mi.Float(0), mi.Float(0), mi.Float(0.5)
     while dr.hint(active & (n < 2 * PARTS), exclude=[probe], label="pathreplay: part of a segment"):
         side = dr.select(n < PARTS, mi.Float(-1), 1)
-        further = reach + step
-        there = probe(side * half * further, mi.Bool(True))
-        within = there.differs(at_a) | there.differs(at_b)
-        reach, step = dr.select(within, further, reach), 0.5 * step
+        candidate = reach + step
+        seen = probe(side * half * candidate, mi.Bool(True))
+        differs = seen.differs(at_a) | seen.differs(at_b)
+        reach, step = dr.select(differs, candidate, reach), 0.5 * step
         n += 1
         done = (n == PARTS) | (n == 2 * PARTS)
-        share += dr.select(done, 0.5 * (reach + step), 0)
+        fraction += dr.select(done, 0.5 * (reach + step), 0)
         reach, step = dr.select(done, 0, reach), dr.select(done, 0.5, step)
-    return share
+    return fraction
 
 
 @dr.syntax
-def bisect(probe: Probe, length: mi.Float, weight: mi.Float, generator: mi.PCG32) -> Crossed:
-    """A piece of each segment with an edge, 2^-12 as long as it, where ``weight`` is not zero.
+def bisect(probe: Probe, length: mi.Float, weight: mi.Float, generator: mi.PCG32) -> Bracket:
+    """Bisect each segment of non-zero ``weight`` to an interval with an edge, 2^-12 as long as the segment.
 
-    Of several crossings one is chosen, by how likely they are edges; what only the middle found counts as `alone` says.
-    None, where a surface was merely bent, weighs 0. Nor does a crack between two triangles count, through which
-    very few rays slip: an end in a crack never moves, and beyond it all is as at the other end.
+    Of several crossings one is selected in proportion to the likelihood of an edge, and represents all of them. If only
+    the middle differs, `middle_weight` applies. The weight becomes 0 where a surface is merely curved, and at cracks
+    between triangles, through which few rays slip. An end of the interval inside a crack never moves, and a probe just
+    beyond it equals the other end.
     """
-    a, b, _ = probed(length)
+    a, b, _ = probe_positions(length)
     weight = mi.Float(weight)
     at_a, at_b = probe(a, weight > 0), probe(b, weight > 0)
     only_middle = (weight > 0) & ~at_a.differs(at_b)
-    weight = dr.select(only_middle, alone(part_seen(probe, length, at_a, at_b, only_middle)) * weight, weight)
-    n, still, was_left = mi.UInt32(0), mi.UInt32(0), mi.Bool(False)
+    weight = dr.select(
+        only_middle, middle_weight(middle_fraction(probe, length, at_a, at_b, only_middle)) * weight, weight
+    )
+    n, unchanged, was_left = mi.UInt32(0), mi.UInt32(0), mi.Bool(False)
     while dr.hint(
-        (weight > 0) & ((n < BISECTIONS) | ((n == BISECTIONS) & (still >= STILL))),
+        (weight > 0) & ((n < BISECTIONS) | ((n == BISECTIONS) & (unchanged >= CRACK_BISECTIONS))),
         exclude=[probe],
         label="pathreplay: bisection",
     ):
-        halve, beyond = n < BISECTIONS, BEYOND * (b - a)
-        c = dr.select(halve, 0.5 * (a + b), dr.select(was_left, a - beyond, b + beyond))
+        halve, step = n < BISECTIONS, BEYOND * (b - a)
+        c = dr.select(halve, 0.5 * (a + b), dr.select(was_left, a - step, b + step))
         at_c = probe(c, mi.Bool(True))
-        to_a, to_b = at_c.hint(at_a), at_c.hint(at_b)
-        both = to_a + to_b
-        left = (to_b == 0) | (generator.next_float32() * both < to_a)
-        likely = dr.select(both > 0, both / dr.select(left, to_a, to_b), 0)
+        to_a, to_b = at_c.edge_importance(at_a), at_c.edge_importance(at_b)
+        total = to_a + to_b
+        left = (to_b == 0) | (generator.next_float32() * total < to_a)
+        inv_probability = dr.select(total > 0, total / dr.select(left, to_a, to_b), 0)
         no_crack = dr.select(was_left, to_b, to_a) > 0
-        weight *= dr.select(halve, likely, dr.select(no_crack, 1, 0))
-        still = dr.select(left == was_left, still + 1, 1)
+        weight *= dr.select(halve, inv_probability, dr.select(no_crack, 1, 0))
+        unchanged = dr.select(left == was_left, unchanged + 1, 1)
         was_left = left
         a, at_a = dr.select(left | ~halve, a, c), dr.select(left, at_a, at_c)
         b, at_b = dr.select(left & halve, c, b), dr.select(left, at_c, at_b)
         n += 1
-    return Crossed(a, b, weight)
+    return Bracket(a, b, weight)

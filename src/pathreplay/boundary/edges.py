@@ -1,12 +1,12 @@
-"""Edges: what their motion adds to a gradient, carried from where they were found back to parameters and camera.
+"""Edges: propagate the motion of edges along the paths that see them, to and from the parameters and the camera.
 
-An edge is where B(ray, π) = 0, and moves by dB/dπ; what it adds to the radiance at the place s of the film is
+An edge is the zero set of a function B(ray, π), and moves with dB/dπ. It contributes to the radiance at film position s
 
     - Σ K dB/dπ,
 
-over its crossings: `primary` and `volumetric` find one of each edge, `secondary` up to three. Reverse mode takes the
-adjoint of the ray that sees the edge back along the records of the path, forward mode brings its tangent from the
-camera.
+summed over the crossings of boundary segments with the edge. A lane has one crossing in `primary` and `volumetric` and
+up to three in `secondary`. Reverse mode propagates the adjoint of the ray that sees the edge back along the records of
+the path. Forward mode propagates the tangent of the camera ray to the edge.
 """
 
 from __future__ import annotations
@@ -36,78 +36,79 @@ from pathreplay.transport.vertex import TraceConfig
 
 
 class FilmDomain(Protocol):
-    """Where on a film paths may begin: places (Point2f, in pixels) from its corner to ``size``."""
+    """The part of the film on which paths start; positions (Point2f, in pixels) range from its corner to ``size``."""
 
     @property
     def size(self) -> mi.ScalarVector2f: ...
 
     def ray(self, s: mi.Point2f, key: mi.UInt32) -> tuple[mi.Ray3f, mi.Spectrum]:
-        """The camera ray through a place and its weight; attached to the camera and ``s``, if those have gradients.
+        """Return the camera ray through a film position, and its weight (Spectrum).
 
-        What else is random about it (time, wavelengths, aperture) comes from the ``key``.
+        Both are attached to the camera and to ``s`` if these have gradients. ``key`` determines all other random
+        properties of the ray (time, wavelengths, aperture).
         """
 
     def flows(self, s: mi.Point2f) -> mi.Bool:
-        """Whether what stands still may slide under a place."""
+        """Return whether static surfaces may move relative to a film position."""
 
     def of_point(self, p: mi.Point3f) -> tuple[mi.Point2f, mi.Bool]:
-        """The place where a point of space would be seen, and whether there is one that the sensor knows."""
+        """Project a point onto the film: return its position, and whether the projection exists and is supported."""
 
 
 class Crossing(Protocol):
-    """A crossing of an edge."""
+    """A crossing of a boundary segment with an edge."""
 
-    weight: mi.Spectrum  # K, zero where nothing was found
+    weight: mi.Spectrum  # K, zero without an edge
 
     def gap(self, at: Any) -> mi.Float:
-        """B: zero on the edge. Differentiable in the shapes and in ``at``, that which sees it.
+        """Evaluate B, which is zero on the edge. Differentiable in the shapes and in ``at``.
 
-        It is the ray that slides over the edge or, if there is one, the observer (`ObserverVertex.moved`).
+        ``at`` is the observer (`ObserverVertex.moved`) or, if there is none, the ray that slides over the edge.
         """
 
 
 @dataclass
 class EdgePath:
-    """The path from the camera that sees an edge: ``k`` vertices, and the ray from the last."""
+    """The camera path that sees an edge: ``k`` vertices, and the ray from the last vertex to the edge."""
 
-    s: mi.Point2f  # where it begins
-    key: mi.UInt32  # of its random numbers
-    k: mi.UInt32  # zero where nothing was found
+    s: mi.Point2f  # film position
+    key: mi.UInt32  # seed of its random numbers
+    k: mi.UInt32  # zero without an edge
     ray: mi.Ray3f
     layout: Layout
-    records: Any  # of its vertices, and one more: of that which sees the edge
+    records: Any  # k vertices, and the arrival at the observer or at the edge
 
 
 @dataclass
 class Edges:
-    """An edge for each lane."""
+    """One edge per lane."""
 
     path: EdgePath
     crossings: Sequence[Crossing]
-    observer: ObserverVertex | None  # the vertex that sees it; None: the path slides over it
+    observer: ObserverVertex | None  # the vertex that sees the edge; None: the path slides over the edge
 
     def motion(self, ray: mi.Ray3f) -> mi.Spectrum:
-        """- Σ K B, with the ``ray`` that arrives: differentiable in it, and in what moves."""
+        """Evaluate - Σ K B, differentiable in the last ``ray`` of the path and in the shapes (Spectrum)."""
         at = ray if self.observer is None else self.observer.moved(ray)
         return -reduce(add, [crossing.weight * crossing.gap(at) for crossing in self.crossings])
 
 
 def edges_backward(trace: TraceConfig, film: FilmDomain, edges: Edges, W: mi.Spectrum, lost: NonFiniteCounter) -> None:
-    """Back-propagate W·motion into the parameters; ``W`` is the adjoint of radiance that arrives at the places."""
+    """Back-propagate W·motion into the parameters; ``W`` is the adjoint of the radiance at the film positions."""
     path = edges.path
     q = backward_ray(path.ray, lambda ray: dr.sum(W * edges.motion(ray)))
     q = ray_to_camera(trace, film, path, q, lost)
     with dr.resume_grad():
         ray, _ = film.ray(path.s, path.key)
         if dr.grad_enabled(ray.o, ray.d):
-            # Every parameter of the camera sums over these apart, which would search as often.
+            # Each camera parameter sums over these values separately. Unevaluated, every sum would repeat the search.
             dr.eval(q, path.s, path.key)
             backward(dr.dot(q.o, ray.o) + dr.dot(q.d, ray.d))
 
 
 @dr.syntax
 def edges_forward(trace: TraceConfig, film: FilmDomain, edges: Edges) -> mi.Spectrum:
-    """The tangent of the motion, which is that of the radiance at the places. Parameters carry their tangents."""
+    """Return the tangent of the radiance at the film positions. The parameters must carry tangents."""
     path = edges.path
     with dr.resume_grad():
         ray = film.ray(path.s, path.key)[0]
@@ -130,7 +131,10 @@ def ray_to_camera(
     lost: NonFiniteCounter,
     rays_only: bool = False,
 ) -> RayDerivative:
-    """The adjoint of the camera ray, from that of the ray that sees the edge; ``rays_only``: reaching no parameter."""
+    """Propagate the adjoint ``q`` of the ray that sees the edge back to the camera ray.
+
+    With ``rays_only`` no parameter receives a gradient.
+    """
     k, none = path.k, mi.Spectrum(0)
     ray0 = dr.detach(film.ray(path.s, path.key)[0])
     recorded = RecordedPath(path.layout, path.records, mi.UInt32(0), mi.UInt32(k), mi.UInt32(k), ray0)

@@ -1,10 +1,13 @@
-"""Edges of shadows, as a vertex sees them among the samples of an emitter: on one side that is seen, or it is hidden.
+"""Shadow edges in the domain of emitter samples: the emitter is visible on one side and occluded on the other.
 
-Segments lie in a unit square. Of most emitters it is that of their samples. Samples of balls go around the middle of
-what is seen of them: there straight edges would be bent without bounds, and segments too long to tell; so these are
-mapped to a disk first, evenly. Samples of meshes jump in theirs from triangle to triangle; so for these the square is
-mapped, evenly, to the cone of directions around a ball that holds the mesh. What follows the emitter, the point that is
-glued to it, is the same in both.
+Segments lie in a unit square. For most emitters this is the square of their random numbers. Two kinds differ:
+
+- A sphere samples directions in polar coordinates. Close to the pole, straight edges have unbounded curvature in these
+  coordinates, and segments are too long to resolve them. The square is therefore mapped to a disk first.
+- The samples of a mesh are discontinuous where they change from one triangle to the next. The square is therefore
+  mapped to the cone of directions around a bounding sphere of the mesh.
+
+Both maps are uniform. They do not change which emitter point a direction follows when the scene moves.
 """
 
 from __future__ import annotations
@@ -22,9 +25,9 @@ from pathreplay.boundary.crofton import (
     Survey,
     VisibilityProbe,
     bisect,
+    crossing_weight,
     heading,
-    passed,
-    probed,
+    probe_positions,
 )
 from pathreplay.boundary.observer import ObserverVertex
 from pathreplay.boundary.worth import STEEP, Worth, closeness, own_plane
@@ -35,77 +38,78 @@ from pathreplay.transport.surface import surface_point
 from pathreplay.transport.vertex import TraceConfig, mis_weight
 
 BORDER = 1e-4
-"""Width of the border of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
+"""Margin of the unit square that is left out: some emitters are singular there (the cone of a sphere)."""
 INSIDE = 1 - 2 * BORDER
 JUMP = 4.0
-"""Emitter samples jump where a bisected piece ends this many times as far from the edge as its slope predicts."""
+"""Largest ratio of the change of B over an interval to the change that its slope predicts. Above it, the interval
+contains a discontinuity of the emitter samples instead of an edge."""
 
 
 @dataclass
 class SampledEmitter:
-    """An emitter, and a ball around it: its radius is 0 where it is no mesh."""
+    """An emitter and, for a mesh, its bounding sphere; the radius is 0 for all others."""
 
-    emitter: mi.EmitterPtr
+    ptr: mi.EmitterPtr
     centre: mi.Point3f
     radius: mi.Float
-    around: mi.Bool  # its samples go around: see `sample_at`
+    polar: mi.Bool  # it samples in polar coordinates: see `sample_at`
 
     @staticmethod
     def of(trace: TraceConfig, index: mi.UInt32, active: mi.Bool) -> SampledEmitter:
-        """The emitter of an index."""
-        emitter = dr.gather(mi.EmitterPtr, trace.scene.emitters_dr(), index, active)
-        around = mi.Bool(False)
+        """Look up an emitter by its index in the scene."""
+        ptr = dr.gather(mi.EmitterPtr, trace.scene.emitters_dr(), index, active)
+        polar = mi.Bool(False)
         if trace.traits.ball_lights:
-            around = emitter.get_shape().shape_type() == int(mi.ShapeType.Sphere)
+            polar = ptr.get_shape().shape_type() == int(mi.ShapeType.Sphere)
         if not trace.traits.mesh_lights:
-            return SampledEmitter(emitter, mi.Point3f(0), mi.Float(0), around)
-        ball = dr.gather(mi.Vector4f, trace.traits.tables.emitter_bounds, index, active)
-        return SampledEmitter(emitter, mi.Point3f(ball.x, ball.y, ball.z), ball.w, around)
+            return SampledEmitter(ptr, mi.Point3f(0), mi.Float(0), polar)
+        sphere = dr.gather(mi.Vector4f, trace.traits.tables.emitter_bounds, index, active)
+        return SampledEmitter(ptr, mi.Point3f(sphere.x, sphere.y, sphere.z), sphere.w, polar)
 
     def may_move(self, trace: TraceConfig) -> mi.Bool:
-        """Whether it is known not to stand still."""
+        """Return whether the emitter may move."""
         moving = trace.traits.moving
         moves = mi.Bool(moving is None)
         for shape in moving or ():
             if shape.is_emitter():
-                moves |= self.emitter == mi.EmitterPtr(shape.emitter())
+                moves |= self.ptr == mi.EmitterPtr(shape.emitter())
         return moves
 
 
 @dataclass
-class Glimpse:
-    """What is seen of an emitter at a place of its square."""
+class EmitterProbe:
+    """The emitter sample at a position of the square, and the hit of its shadow ray."""
 
     light: mi.DirectionSample3f
-    Le: mi.Spectrum  # over the density of the place
-    density: mi.Float  # with which samples of the emitter have its direction
+    Le: mi.Spectrum  # radiance over the density of the position
+    density: mi.Float  # of emitter sampling, in this direction
     ray: mi.Ray3f
-    hit: mi.PreliminaryIntersection3f  # what it meets: of a mesh that is seen, that
+    hit: mi.PreliminaryIntersection3f  # of the shadow ray; a visible mesh emitter is a hit, too
     hidden: mi.Bool
 
 
 def _hides(hit: mi.PreliminaryIntersection3f, emitter: mi.EmitterPtr, active: mi.Bool) -> mi.Bool:
-    # An emitter's own limb hides it by rounding only.
+    # At its silhouette, an emitter occludes itself by rounding only.
     return active & hit.is_valid() & (hit.shape.emitter() != emitter)
 
 
-def sample_at(trace: TraceConfig, lamp: SampledEmitter, u: mi.Point2f) -> mi.Point2f:
-    """The sample of an emitter at a place; of a ball that at the place's distance and angle on the disk, as evenly."""
+def sample_at(trace: TraceConfig, emitter: SampledEmitter, u: mi.Point2f) -> mi.Point2f:
+    """Return an emitter's random numbers at a position of the square; for a sphere, through an equal-area disk map."""
     if not trace.traits.ball_lights:
         return u
     p = mi.warp.square_to_uniform_disk_concentric(u)
     turn = dr.inv_two_pi * dr.atan2(p.y, p.x)
-    return dr.select(lamp.around, mi.Point2f(dr.squared_norm(p), turn - dr.floor(turn)), u)
+    return dr.select(emitter.polar, mi.Point2f(dr.squared_norm(p), turn - dr.floor(turn)), u)
 
 
-def direction(lamp: SampledEmitter, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
-    """A direction in the cone from o around the ball, and the solid angle of that; differentiable in u.
+def direction(emitter: SampledEmitter, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float]:
+    """Return a direction in the cone from o around the bounding sphere, and the cone's solid angle.
 
-    All directions where o is in the ball.
+    If o is inside the sphere, the cone contains all directions. Differentiable in u.
     """
-    to = dr.detach(lamp.centre - o)
-    dist2, r2 = dr.squared_norm(to), dr.square(lamp.radius)
-    # 1 - cos of the cone, without the difference.
+    to = dr.detach(emitter.centre - o)
+    dist2, r2 = dr.squared_norm(to), dr.square(emitter.radius)
+    # 1 - cos(half-angle of the cone), without cancellation.
     s = dr.select(dist2 > r2, r2 / (dist2 + dr.safe_sqrt(dist2 * (dist2 - r2))), 2)
     p = mi.warp.square_to_uniform_disk_concentric(u)
     n = dr.squared_norm(p)
@@ -116,157 +120,158 @@ def direction(lamp: SampledEmitter, o: mi.Point3f, u: mi.Point2f) -> tuple[mi.Ve
 
 @dataclass
 class EmitterSegment(PlaneSegment):
-    """A segment in the unit square of one emitter (see `emitters`), which is reflected at the border."""
+    """A segment in the unit square of one emitter (see `emitters`), reflected at the margin."""
 
     observer: ObserverVertex
     key: mi.UInt32
-    lamp: SampledEmitter
-    share: mi.Float  # 1 / probability of the emitter
+    emitter: SampledEmitter
+    inv_probability: mi.Float  # 1 / selection probability of the emitter
 
     @staticmethod
     def draw(observer: ObserverVertex, l: float, key: mi.UInt32) -> EmitterSegment:
-        numbers, scene = CounterSampler.of(key), observer.trace.scene
-        which, turn = numbers.next_2d()
-        index, share, _ = scene.sample_emitter(which)
-        c = BORDER + INSIDE * numbers.next_2d()
-        lamp = SampledEmitter.of(observer.trace, index, observer.active)
-        return EmitterSegment(mi.Point2f(c), heading(turn), mi.Float(l), observer, key, lamp, share)
+        sampler, scene = CounterSampler.of(key), observer.trace.scene
+        which, turn = sampler.next_2d()
+        index, inv_probability, _ = scene.sample_emitter(which)
+        c = BORDER + INSIDE * sampler.next_2d()
+        emitter = SampledEmitter.of(observer.trace, index, observer.active)
+        return EmitterSegment(mi.Point2f(c), heading(turn), mi.Float(l), observer, key, emitter, inv_probability)
 
     def at(self, t: mi.Float) -> mi.Point2f:
-        return self._folded(t)[0]
+        return self._reflected(t)[0]
 
     def direction(self, t: mi.Float) -> mi.Vector2f:
-        """Its direction at a place."""
-        return self._folded(t)[1]
+        """Return the direction of the reflected segment at position ``t``."""
+        return self._reflected(t)[1]
 
-    def _folded(self, t: mi.Float) -> tuple[mi.Point2f, mi.Vector2f]:
+    def _reflected(self, t: mi.Float) -> tuple[mi.Point2f, mi.Vector2f]:
         x = (self.c + t * self.w - BORDER) / INSIDE
         x -= 2 * dr.floor(0.5 * x)
-        back = x > 1
-        return BORDER + INSIDE * dr.select(back, 2 - x, x), dr.select(back, -self.w, self.w)
+        reflected = x > 1
+        return BORDER + INSIDE * dr.select(reflected, 2 - x, x), dr.select(reflected, -self.w, self.w)
 
-    def glimpse(self, t: mi.Float, active: mi.Bool) -> Glimpse:
-        """The light at a place, or what hides it. Detached."""
-        observer, trace, lamp, u = self.observer, self.observer.trace, self.lamp, self.at(t)
-        in_cone = active & (lamp.radius > 0)
-        light, Le = lamp.emitter.sample_direction(observer.origin, sample_at(trace, lamp, u), active & ~in_cone)
+    def probe_emitter(self, t: mi.Float, active: mi.Bool) -> EmitterProbe:
+        """Sample the emitter at position ``t``, and trace the shadow ray. Detached."""
+        observer, trace, emitter, u = self.observer, self.observer.trace, self.emitter, self.at(t)
+        in_cone = active & (emitter.radius > 0)
+        light, Le = emitter.ptr.sample_direction(observer.origin, sample_at(trace, emitter, u), active & ~in_cone)
         ray = observer.origin.spawn_ray_to(light.p)
-        looks = active & (light.pdf != 0)
+        tested = active & (light.pdf != 0)
         if not trace.traits.mesh_lights:
-            hit = observer.behind(ray, observer.hit(ray, looks), looks)
-            return Glimpse(light, Le, light.pdf, ray, hit, _hides(hit, light.emitter, looks))
-        d, Ω = direction(lamp, observer.origin.p, u)
+            hit = observer.behind(ray, observer.hit(ray, tested), tested)
+            return EmitterProbe(light, Le, light.pdf, ray, hit, _hides(hit, light.emitter, tested))
+        d, Ω = direction(emitter, observer.origin.p, u)
         ray = dr.select(in_cone, observer.origin.spawn_ray(d), ray)
-        looks |= in_cone
-        first = observer.hit(ray, looks)
-        at_lamp = in_cone & first.is_valid() & (first.shape.emitter() == lamp.emitter)  # also if light goes through it
-        hit = dr.select(at_lamp, first, observer.behind(ray, first, looks & ~at_lamp))
-        seen = in_cone & hit.is_valid() & (hit.shape.emitter() == lamp.emitter)
+        tested |= in_cone
+        first = observer.hit(ray, tested)
+        # The emitter itself is a hit, even if its surface transmits light.
+        on_emitter = in_cone & first.is_valid() & (first.shape.emitter() == emitter.ptr)
+        hit = dr.select(on_emitter, first, observer.behind(ray, first, tested & ~on_emitter))
+        seen = in_cone & hit.is_valid() & (hit.shape.emitter() == emitter.ptr)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, seen)
-        there = mi.DirectionSample3f(trace.scene, si=si, ref=observer.origin)
-        there.d = d
-        light, density = dr.select(in_cone, there, light), dr.select(in_cone, 0, light.pdf)
-        Le = dr.select(in_cone, dr.select(seen, lamp.emitter.eval(si, seen) * Ω, 0), Le)
-        density = dr.select(seen, lamp.emitter.pdf_direction(observer.origin, there, seen), density)
-        # What is behind the ball does not hide it.
-        near = ~in_cone | (hit.t < dr.norm(lamp.centre - observer.origin.p) + lamp.radius)
-        return Glimpse(light, Le, density, ray, hit, _hides(hit, lamp.emitter, looks) & near)
+        on_mesh = mi.DirectionSample3f(trace.scene, si=si, ref=observer.origin)
+        on_mesh.d = d
+        light, density = dr.select(in_cone, on_mesh, light), dr.select(in_cone, 0, light.pdf)
+        Le = dr.select(in_cone, dr.select(seen, emitter.ptr.eval(si, seen) * Ω, 0), Le)
+        density = dr.select(seen, emitter.ptr.pdf_direction(observer.origin, on_mesh, seen), density)
+        # Surfaces behind the bounding sphere do not occlude the emitter.
+        near = ~in_cone | (hit.t < dr.norm(emitter.centre - observer.origin.p) + emitter.radius)
+        return EmitterProbe(light, Le, density, ray, hit, _hides(hit, emitter.ptr, tested) & near)
 
-    def followed(self, origin: mi.Interaction3f, u: mi.Point2f, glue: Glimpse, active: mi.Bool) -> mi.Vector3f:
-        """The direction to a place of the emitter, differentiable in it, and in the origin and the emitter.
+    def followed(self, origin: mi.Interaction3f, u: mi.Point2f, anchor: EmitterProbe, active: mi.Bool) -> mi.Vector3f:
+        """Return the direction to position ``u`` of the emitter, differentiable in ``u``, origin and emitter.
 
-        On a mesh the point that follows it is that which ``glue`` sees.
+        On a mesh, the direction follows the point that the ray of ``anchor`` hit.
         """
-        trace, lamp = self.observer.trace, self.lamp
-        in_cone = active & (lamp.radius > 0)
-        light, _ = lamp.emitter.sample_direction(origin, sample_at(trace, lamp, u), active & ~in_cone)
+        trace, emitter = self.observer.trace, self.emitter
+        in_cone = active & (emitter.radius > 0)
+        light, _ = emitter.ptr.sample_direction(origin, sample_at(trace, emitter, u), active & ~in_cone)
         if not trace.traits.mesh_lights:
             return light.d
-        d, _ = direction(lamp, origin.p, u)
-        y = surface_point(glue.hit, dr.detach(glue.ray), in_cone & glue.hit.is_valid()).p
+        d, _ = direction(emitter, origin.p, u)
+        y = surface_point(anchor.hit, dr.detach(anchor.ray), in_cone & anchor.hit.is_valid()).p
         to_y = dr.normalize(dr.select(in_cone, y - origin.p, mi.Vector3f(0, 0, 1)))
         return dr.select(in_cone, d + (to_y - dr.detach(to_y)), light.d)
 
     def probe(self, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-        """What is seen at a place: see `Probe`."""
-        return self._probe(self.glimpse(t, active))
+        """Probe position ``t``: see `Probe`."""
+        return self._probe(self.probe_emitter(t, active))
 
-    def _probe(self, seen: Glimpse) -> VisibilityProbe:
+    def _probe(self, sample: EmitterProbe) -> VisibilityProbe:
         trace, moves = self.observer.trace, self.observer.selected.moves
-        moving = moves | self.lamp.may_move(trace) | may_move(trace, seen.hit)
-        return VisibilityProbe.of(seen.hidden & moving)
+        moving = moves | self.emitter.may_move(trace) | may_move(trace, sample.hit)
+        return VisibilityProbe.of(sample.hidden & moving)
 
     def detect(self) -> Worth:
-        """What an edge on the segment may be worth. Where no lobe is narrow, the middle tells what is scattered."""
+        """Estimate the importance of an edge; without narrow lobes, evaluate scattering only in the middle."""
         trace, x, active = self.observer.trace, self.observer.selected, self.observer.active
-        glimpses = [self.glimpse(t, active) for t in probed(self.length)]
-        a, b, c = (seen.light.d for seen in glimpses)
+        samples = [self.probe_emitter(t, active) for t in probe_positions(self.length)]
+        a, b, c = (sample.light.d for sample in samples)
         if trace.traits.narrow:
             scattered = [self.observer.towards(d, active) for d in (a, b, c)]
         else:
             scattered = [self.observer.towards(c, active)] * 3
-        probes = [self._probe(seen) for seen in glimpses]
-        for probe, seen, (f, pdf) in zip(probes, glimpses, scattered, strict=True):
-            probe.bright = dr.mean(dr.abs(x.β * f * seen.Le)) * self.share * self._mis(seen, pdf)
+        probes = [self._probe(sample) for sample in samples]
+        for probe, sample, (f, pdf) in zip(probes, samples, scattered, strict=True):
+            probe.bright = dr.mean(dr.abs(x.β * f * sample.Le)) * self.inv_probability * self._mis(sample, pdf)
         survey = Survey.of(probes, active)
-        first = reduce(lambda p, q: dr.select(q.hidden & ~(p.hidden & (p.hit.t <= q.hit.t)), q, p), glimpses)
+        first = reduce(lambda p, q: dr.select(q.hidden & ~(p.hidden & (p.hit.t <= q.hit.t)), q, p), samples)
         survey.near = dr.select(first.hidden, closeness(trace, first.hit), 0)
         turn = dr.norm(a - c) + dr.norm(c - b)
         return Worth.of(survey, survey.bright, own_plane(self.observer, a, b) / (turn + self.length * STEEP))
 
-    def _mis(self, seen: Glimpse, pdf: mi.Float) -> mi.Float:
-        """The weight of multiple importance sampling; ``pdf`` is that of the BSDF."""
-        return dr.select(seen.light.delta, 1, mis_weight(seen.density / self.share, pdf))
+    def _mis(self, sample: EmitterProbe, pdf: mi.Float) -> mi.Float:
+        """Return the MIS weight of an emitter sample; ``pdf`` is the density of the BSDF."""
+        return dr.select(sample.light.delta, 1, mis_weight(sample.density / self.inv_probability, pdf))
 
     def resolve(self, weight: mi.Float, generator: mi.PCG32) -> ShadowCrossing:
         """Bisect the segment, and weigh the edge: see `EdgeSearch.resolve`."""
         observer = self.observer
-        crossed = bisect(self.probe, self.length, dr.select(observer.active, weight, 0), generator)
-        active = crossed.weight > 0
-        a, b = (self.glimpse(t, active) for t in (crossed.a, crossed.b))
+        bracket = bisect(self.probe, self.length, dr.select(observer.active, weight, 0), generator)
+        active = bracket.weight > 0
+        a, b = (self.probe_emitter(t, active) for t in (bracket.a, bracket.b))
         active &= a.hidden != b.hidden
         lit, dark = dr.select(a.hidden, b, a), dr.select(a.hidden, a, b)
-        active &= (self.lamp.radius == 0) | (dark.hit.t < lit.hit.t)  # or it is the mesh that ends there
-        active &= observer.is_off(dark.hit.t)
+        active &= (self.emitter.radius == 0) | (dark.hit.t < lit.hit.t)  # else the outline of the mesh emitter
+        active &= observer.is_far(dark.hit.t)
         f, pdf = observer.towards(lit.light.d, active)
         T = observer.transmittance_past_edge(lit.light, dark.hit.t, self.key, active)
-        jump = observer.selected.β * f * lit.Le * T * (self.share * self._mis(lit, pdf))
-        jump *= crossed.per_length(self.length, mi.Float(INSIDE**-2)) * dr.select(a.hidden, -1, 1)
+        jump = observer.selected.β * f * lit.Le * T * (self.inv_probability * self._mis(lit, pdf))
+        jump *= bracket.per_length(self.length, mi.Float(INSIDE**-2)) * dr.select(a.hidden, -1, 1)
         active &= dr.any(jump != 0) & dr.all(dr.isfinite(jump))
-        u, u_lit = (self.at(dr.select(a.hidden, *t)) for t in ((crossed.a, crossed.b), (crossed.b, crossed.a)))
-        own = active & observer.parts(lit.light.d, dark.light.d)  # not that of the ray, which begins a little beside
+        u, u_lit = (self.at(dr.select(a.hidden, *t)) for t in ((bracket.a, bracket.b), (bracket.b, bracket.a)))
+        own = active & observer.separates(lit.light.d, dark.light.d)  # light.d, because rays have offset origins
         n = edge_normal(dark.hit, dark.ray, active)
         crossing = ShadowCrossing(jump, self, u, lit, dark, n, own, active)
-        return crossing.weighted(self.direction(crossed.a), u_lit)
+        return crossing.weighted(self.direction(bracket.a), u_lit)
 
 
 @dataclass
 class ShadowCrossing:
-    """A crossing in the square of an emitter, where the lit side ends: see `Crossing`."""
+    """Crossing of a segment in an emitter's square with the boundary of the lit part: see `Crossing`."""
 
     weight: mi.Spectrum
     segment: EmitterSegment
-    u: mi.Point2f  # at the side in the shadow
-    lit: Glimpse
-    dark: Glimpse  # at u: it hits what casts the shadow
+    u: mi.Point2f  # on the occluded side
+    lit: EmitterProbe
+    dark: EmitterProbe  # at u: its ray hits the occluder
     n: mi.Vector3f
-    own: mi.Bool  # what hides the emitter is the plane of the observer's own triangle
+    own: mi.Bool  # the occluder is the plane of the observer's own triangle
     active: mi.Bool
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
         return self._gap(at, self.u)
 
     def _gap(self, at: mi.Interaction3f, u: mi.Point2f) -> mi.Float:
-        """B for the emitter sample ``u``: distance of the line to it from the edge."""
+        """Evaluate B for the emitter sample ``u``: the distance of the shadow ray from the edge."""
         d, dark = self.segment.followed(at, u, self.lit, self.active), self.dark
         return dr.select(self.own, dr.dot(at.n, d), outline_gap(self.n, at.p, d, dark.hit, dark.ray, self.active))
 
     def weighted(self, w: mi.Vector2f, u_lit: mi.Point2f) -> ShadowCrossing:
-        """The crossing with K: its weight so far is the jump along ``w``; ``u_lit`` is the sample at the lit side."""
+        """Replace the weight, the jump along ``w``, by K; ``u_lit`` is the emitter sample on the lit side."""
         observer, dark = self.segment.observer, self.dark
         at = observer.moved(observer.at.ray)
         slope = derivative_by_place(self.u, lambda u: self._gap(at, u))
-        # Where a sample of the emitter jumps there is no edge: its other side is far off.
+        # At a jump of the emitter samples there is no edge: the lit end is far from the occluded end.
         off = dr.abs(self._gap(at, u_lit) - self._gap(at, self.u))
         jumps = off > JUMP * dr.norm(slope) * dr.norm(u_lit - self.u) + ROUNDING * (dr.norm(dark.ray.o) + dark.hit.t)
-        return replace(self, weight=dr.select(self.active & ~jumps, passed(w, self.weight, slope), 0))
+        return replace(self, weight=dr.select(self.active & ~jumps, crossing_weight(w, self.weight, slope), 0))

@@ -1,6 +1,6 @@
-"""The vertex that sees an edge: which one of a path, where it is and how it scatters.
+"""The observer, the vertex of a path that sees an edge: its selection, its motion and its scattering.
 
-It is a point of a surface or, in a medium, a particle.
+The observer is a point on a surface or, in a medium, a real collision.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from pathreplay.transport.volume.media import carried, span
 from pathreplay.transport.volume.passage import further, skip_null, transmittance_past_edge, transmittance_up_to
 
 NEAR = 10.0
-"""So many times as far as rays begin beside a surface is what they see well: directions are off by a tenth at most."""
+"""Smallest usable distance of an edge, in multiples of the ray offset; directions are wrong by at most a tenth."""
 
 
 def may_see(trace: TraceConfig, at: Arrival, step: SampledStep) -> tuple[mi.Bool, mi.Spectrum]:
-    """Whether the vertex that a path arrived at scatters smoothly, and the weight of the flight before it."""
+    """Return the lanes whose vertex scatters smoothly, and the weight of the flight before it (Spectrum)."""
     if trace.media is None:
         return surface_sees(trace, at), mi.Spectrum(1)
     flight = step.kept.media.flight
@@ -39,36 +39,36 @@ def may_see(trace: TraceConfig, at: Arrival, step: SampledStep) -> tuple[mi.Bool
 
 
 def surface_sees(trace: TraceConfig, at: Arrival) -> mi.Bool:
-    """Whether a path arrived at a surface that scatters smoothly."""
+    """Return the lanes whose path arrived at a surface that scatters smoothly."""
     valid = at.hit.is_valid()
     return valid & is_smooth(shape_met(trace, at.hit, at.ray, valid).bsdf())
 
 
 @dataclass
 class SelectedVertex:
-    """The vertex of a camera path that looks for edges."""
+    """The vertex of a camera path from which edges are searched."""
 
     at: Arrival
-    k: mi.UInt32  # records before
-    depth: mi.UInt32  # vertices before: as many, but null boundaries are none
-    β: mi.Spectrum  # throughput before, over the probability of the choice
-    mass: mi.Float  # by which it was chosen
-    moves: mi.Bool  # it, or a vertex before, may move
+    k: mi.UInt32  # number of records before
+    depth: mi.UInt32  # number of vertices before, without null boundaries
+    β: mi.Spectrum  # throughput before, over the selection probability
+    mass: mi.Float  # the selection probability is proportional to it
+    moves: mi.Bool  # this or an earlier vertex may move
     active: mi.Bool
-    flight: Flight | None = None  # before it, with media
+    flight: Flight | None = None  # flight to the vertex; None in scenes without media
 
 
 @dr.syntax
 def choose_vertex(
-    trace: TraceConfig, numbers: CounterSampler, ray: mi.Ray3f, flows: mi.Bool, layout: Layout, records: Any
+    trace: TraceConfig, sampler: CounterSampler, ray: mi.Ray3f, flows: mi.Bool, layout: Layout, records: Any
 ) -> tuple[Any, SelectedVertex]:
-    """Walk along a camera path, and choose one of the vertices that scatter smoothly, by what they count.
+    """Trace a camera path, and select one of its smoothly scattering vertices in proportion to the throughput.
 
-    ``flows``: all vertices may move under the place where the path begins. Vertices up to the chosen one are recorded,
-    if there are ``records``. The last vertex that ``trace`` allows scatters nothing: the walk ends before.
+    Where ``flows``, all vertices may move relative to the film position. Vertices are written to ``records`` unless
+    that is None. The last vertex that ``trace`` allows scatters no light, so the path ends before it.
     """
     trace = replace(trace, max_depth=max(trace.max_depth - 1, 0))
-    path = PathState.begin(trace, CameraStart(ray, numbers, mi.Bool(True)))
+    path = PathState.begin(trace, CameraStart(ray, sampler, mi.Bool(True)))
     if dr.hint(trace.max_depth == 1 and trace.media is None and records is None, mode="scalar"):
         return None, _first_vertex(trace, path, flows)
     none, no = mi.UInt32(0), mi.Bool(False)
@@ -78,10 +78,10 @@ def choose_vertex(
     count = mi.UInt32(0)
     moves = mi.Bool(flows)
     while dr.hint(path.active, exclude=[trace, layout], label="pathreplay: choose a vertex"):
-        choice = numbers.next_1d()
-        u, step = path.choose(trace, numbers)
-        here, w = may_see(trace, path.at, step)
-        m = dr.select(path.active & here, dr.mean(dr.abs(path.β * w)), 0)
+        choice = sampler.next_1d()
+        u, step = path.choose(trace, sampler)
+        scatters, w = may_see(trace, path.at, step)
+        m = dr.select(path.active & scatters, dr.mean(dr.abs(path.β * w)), 0)
         mass += m
         moves |= may_move(trace, path.at.hit)
         take = (m > 0) & (choice * mass < m)
@@ -99,7 +99,7 @@ def choose_vertex(
 
 
 def _first_vertex(trace: TraceConfig, path: PathState, flows: mi.Bool) -> SelectedVertex:
-    """The first vertex, which is the only candidate; nothing is traced beyond it."""
+    """Return the first vertex, the only candidate, without tracing further."""
     at, none = path.at, mi.UInt32(0)
     active = path.active & surface_sees(trace, at)
     return SelectedVertex(
@@ -108,7 +108,7 @@ def _first_vertex(trace: TraceConfig, path: PathState, flows: mi.Bool) -> Select
 
 
 class ObserverVertex:
-    """A vertex, detached; ``moved`` is where it is while things move."""
+    """The vertex that sees an edge, detached; `moved` returns it with derivatives."""
 
     def __init__(self, trace: TraceConfig, vertex: SelectedVertex) -> None:
         self.trace, self.selected = trace, vertex
@@ -120,10 +120,10 @@ class ObserverVertex:
         else:
             self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
-        self.keeps = scatter.keeps_direction(trace, self.si, active)  # and slides over facets, too
+        self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # such continuations slide over facets
 
     def moved(self, ray: mi.Ray3f) -> mi.Interaction3f:
-        """The vertex, differentiable in the ``ray`` that arrives and in what moves it: see `fly_again`."""
+        """Return the vertex with derivatives by the arriving ``ray`` and by the surface or medium: see `fly_again`."""
         si = met(self.at.hit, ray, self.active)
         if self.flight is None:
             return si
@@ -134,14 +134,14 @@ class ObserverVertex:
         return origin
 
     def towards(self, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
-        """What is scattered from a direction, and the density of sampling it."""
+        """Evaluate scattering of light from direction ``d`` (Spectrum), and the density of sampling ``d``."""
         ctx, si = mi.BSDFContext(), self.si
         if self.trace.media is None:
             return si.bsdf().eval_pdf(ctx, si, si.to_local(d), active)
         return scatter.towards(self.vertex, ctx, d, active)
 
     def sample(self, lobe: mi.Float, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Bool]:
-        """A direction in which it scatters, and whether there is one that is not of a delta lobe."""
+        """Sample a scattering direction; the mask excludes delta lobes and failed samples."""
         si, active = self.si, self.active
         surface = active if self.trace.media is None else active & self.vertex.surface
         sample, _ = si.bsdf().sample(mi.BSDFContext(), si, lobe, u, surface)
@@ -153,50 +153,50 @@ class ObserverVertex:
         return d, active & (pdf > 0) & ~delta
 
     def may_scatter(self, d: mi.Vector3f) -> mi.Bool:
-        """Whether it may scatter light from a direction: it is on the side that is looked at, or lets light through."""
+        """Return whether light from ``d`` may be scattered: from the side of the viewer, or by transmission."""
         above = mi.Frame3f.cos_theta(self.si.to_local(d)) * mi.Frame3f.cos_theta(self.si.wi) > 0
         both = above | mi.has_flag(self.si.bsdf().flags(), mi.BSDFFlags.Transmission)
         return both if self.trace.media is None else both | self.event
 
-    def parts(self, a: mi.Vector3f, b: mi.Vector3f) -> mi.Bool:
-        """Whether the plane of its own surface lies between two directions.
+    def separates(self, a: mi.Vector3f, b: mi.Vector3f) -> mi.Bool:
+        """Return whether the plane of the observer's own triangle separates two directions.
 
-        Where shading normals are interpolated, a vertex scatters light from below that plane, where its own shape
-        hides all emitters.
+        With interpolated shading normals, a vertex also scatters light from below that plane, where its own shape
+        occludes all emitters.
         """
         n = self.si.n
         between = dr.dot(n, a) * dr.dot(n, b) < 0
         return between if self.trace.media is None else between & ~self.event
 
-    def is_off(self, t: mi.Float) -> mi.Bool:
-        """Whether a distance is well beyond that by which rays begin beside their surface.
+    def is_far(self, t: mi.Float) -> mi.Bool:
+        """Return whether a distance is much larger than the offset of ray origins from their surface.
 
-        What is closer is seen where it is not, if it is there at all; and one over such distances has no bounds.
+        Closer hits have inaccurate positions or are artefacts of rounding, and their reciprocal distance is unbounded.
         """
         return t > NEAR * mi.math.RayEpsilon * (1 + dr.max(dr.abs(self.origin.p)))
 
     def holds(self, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.Bool:
-        """Whether a direction follows what it hits: from particles only what scatters or emits, see `scatter`."""
-        active = active & ~self.keeps & ~scatter.is_seen_through(self.trace, hit)
+        """Return whether directions follow ``hit``; from a medium, only hits that scatter or emit: see `scatter`."""
+        active = active & ~self.keeps_direction & ~scatter.is_seen_through(self.trace, hit)
         if self.trace.media is None:
             return active
         seen = is_smooth(hit.shape.bsdf()) | (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
         return active & (~self.event | seen)
 
     def hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
-        """What a ray from here meets."""
+        """Intersect a ray from the observer with the scene."""
         return meet(self.trace, ray, active)
 
     def behind(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
-        """The same without null boundaries."""
+        """Return the hit, or the first hit behind null boundaries."""
         return hit if self.trace.media is None else skip_null(self.trace, ray, hit, active)
 
-    def edges(
+    def edge_surfaces(
         self, rays: list[mi.Ray3f], firsts: list[mi.PreliminaryIntersection3f], active: mi.Bool
     ) -> tuple[list[mi.PreliminaryIntersection3f], mi.Bool]:
-        """What has an edge between two rays: what they met first or, where that is one null boundary, what is behind.
+        """Return the hits that form the edge between two rays: the first hits, or those behind a common null boundary.
 
-        Also, where that is.
+        The mask selects the lanes of the second case.
         """
         if self.trace.media is None:
             return firsts, mi.Bool(False)
@@ -209,47 +209,47 @@ class ObserverVertex:
         return [dr.select(through, self.behind(ray, first, active), first) for ray, first in pairs], through
 
     def medium(self, d: mi.Vector3f) -> mi.MediumPtr | None:
-        """What there is in a direction."""
+        """Return the medium in direction ``d``; None in scenes without media."""
         if self.trace.media is None:
             return None
         turns = self.vertex.surface & self.si.is_medium_transition()
         return dr.select(turns, self.si.target_medium(d), self.at.medium)
 
     def arrival(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, pdf: mi.Float) -> Arrival:
-        """What a path comes to along a ray from here."""
+        """Return the arrival at ``hit`` of a path that continues from the observer along ``ray``."""
         at = Arrival(ray, hit, pdf, mi.Bool(False), mi.Bool(False))
         if self.trace.media is None:
             return at
-        alone = self.event & ~self.at.medium.use_emitter_sampling()
-        return replace(at, delta=alone, medium=self.medium(ray.d), behind=mi.Float(0))
+        unsampled = self.event & ~self.at.medium.use_emitter_sampling()
+        return replace(at, delta=unsampled, medium=self.medium(ray.d), behind=mi.Float(0))
 
     def transmittance_past_edge(
         self, light: mi.DirectionSample3f, t: mi.Float, key: mi.UInt32, active: mi.Bool
     ) -> mi.Spectrum:
-        """What media leave of an emitter sample's light past an edge at ``t``; not all particles ask for any."""
+        """Estimate the transmittance to an emitter sample past an edge at ``t``; zero without emitter sampling."""
         if self.trace.media is None:
             return mi.Spectrum(1)
-        asks = active & (~self.event | self.at.medium.use_emitter_sampling())
+        needed = active & (~self.event | self.at.medium.use_emitter_sampling())
         ray = self.origin.spawn_ray_to(light.p)
         T = transmittance_past_edge(
-            self.trace, ray, t, self.medium(light.d), CounterSampler.stream(key, Stream.TRANSMITTANCE_PAST_EDGE), asks
+            self.trace, ray, t, self.medium(light.d), CounterSampler.stream(key, Stream.TRANSMITTANCE_PAST_EDGE), needed
         )
-        return dr.select(asks, T, 0)
+        return dr.select(needed, T, 0)
 
     def onward(
         self, arrivals: list[Arrival], t: mi.Float, key: mi.UInt32, active: mi.Bool
     ) -> tuple[mi.Spectrum, list[Arrival]]:
-        """Where ``active``, the arrivals as seen from ``t`` on their ray, and the transmittance up to there."""
+        """Where ``active``, return the transmittance up to ``t``, and the arrivals along the rest of their rays."""
         if self.trace.media is None:
             return mi.Spectrum(1), arrivals
-        others = CounterSampler.stream(key, Stream.TRANSMITTANCE_TO_EDGE)
-        T, medium = transmittance_up_to(self.trace, arrivals[0].ray, t, arrivals[0].medium, others, active)
+        sampler = CounterSampler.stream(key, Stream.TRANSMITTANCE_TO_EDGE)
+        T, medium = transmittance_up_to(self.trace, arrivals[0].ray, t, arrivals[0].medium, sampler, active)
         T = dr.select(active, T, 1)
-        return T, [dr.select(active, going_on(self.trace, at, t, medium, active), at) for at in arrivals]
+        return T, [dr.select(active, arrival_beyond(self.trace, at, t, medium, active), at) for at in arrivals]
 
 
-def going_on(trace: TraceConfig, at: Arrival, t: mi.Float, medium: mi.MediumPtr, active: mi.Bool) -> Arrival:
-    """The same arrival, as it is seen from distance ``t`` on its ray, where there is ``medium``."""
+def arrival_beyond(trace: TraceConfig, at: Arrival, t: mi.Float, medium: mi.MediumPtr, active: mi.Bool) -> Arrival:
+    """Return the arrival ``at`` for the rest of its ray, which starts at distance ``t``, inside ``medium``."""
     ray = further(at.ray, t)
     hit = meet(trace, ray, active)
     if trace.hide_emitters:

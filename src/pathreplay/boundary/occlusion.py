@@ -1,7 +1,7 @@
-"""Edges between surfaces, as a vertex sees them among the directions in which it scatters.
+"""Edges between surfaces, seen from a vertex in the directions in which it scatters.
 
-Segments are arcs (see `arcs`). At their ends different surfaces are seen, or different sheets of one. One hides the
-other, it bends, or a hard shadow ends on it.
+Segments are arcs (see `arcs`). Different surfaces, or different sheets of one surface, are visible at the ends of an
+arc. The edge between them is an outline, a crease or the boundary of a hard shadow.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathreplay.adjoint.autodiff import derivative_by_ray
 from pathreplay.adjoint.primal import walk_on
 from pathreplay.boundary.arcs import Arc
 from pathreplay.boundary.creases import Crease, off_contact
-from pathreplay.boundary.crofton import Crossed, Survey, VisibilityProbe, bisect, probed
+from pathreplay.boundary.crofton import Bracket, Survey, VisibilityProbe, bisect, probe_positions
 from pathreplay.boundary.edges import Crossing
 from pathreplay.boundary.hard_shadows import HardShadow, ShadowTest
 from pathreplay.boundary.observer import ObserverVertex
@@ -30,15 +30,15 @@ from pathreplay.transport.volume.passage import SHORT_OF
 
 
 class ArcSegment(Arc):
-    """An arc, and what is seen along it."""
+    """An arc with visibility probes."""
 
     @property
     def hard(self) -> bool:
-        """Whether hard shadows are seen."""
+        """Whether hard shadows are probed."""
         return self.observer.trace.traits.hard_lights and self.observer.trace.media is None
 
     def probe(self, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-        """What is seen at a place: see `Probe`."""
+        """Probe position ``t``: see `Probe`."""
         return self._probe(t, active, self.hard)
 
     def _probe(self, t: mi.Float, active: mi.Bool, hard: bool) -> VisibilityProbe:
@@ -47,7 +47,7 @@ class ArcSegment(Arc):
         first = observer.hit(ray, active & observer.may_scatter(ray.d))
         seen = observer.behind(ray, first, active)
         counts, moves = self._counts(seen), x.moves | may_move(trace, seen)
-        close = active & counts  # nothing else is looked at closely
+        close = active & counts  # the surface is evaluated only there
         if trace.media is None:
             close &= moves
         at = seen.compute_surface_interaction(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, close)
@@ -55,13 +55,13 @@ class ArcSegment(Arc):
             at.shape = seen.shape
         turned = dr.select(turned_away(at, ray.d), mi.UInt32(1), 0)
         place = dr.select(
-            observer.keeps, *(place_met(trace, seen, active, at.shape, facets) for facets in (True, False))
+            observer.keeps_direction, *(place_met(trace, seen, active, at.shape, facets) for facets in (True, False))
         )
         lengths = trace.traits.tables.blend_lengths
-        facets = close & ~observer.keeps & jumps_at_facets(lengths, observer.origin, seen, at.p, at.n)
+        facets = close & ~observer.keeps_direction & jumps_at_facets(lengths, observer.origin, seen, at.p, at.n)
         place = mixed(place, dr.select(facets, seen.prim_index + 1, 0))
         near = closeness(trace, seen)
-        if trace.media is not None:  # directions follow null boundaries, too
+        if trace.media is not None:  # directions also follow null boundaries
             boundary = place_met(trace, first, active, shape_met(trace, first, ray, active), facets=False)
             place, moves = mixed(place, boundary), moves | may_move(trace, first)
             near = dr.maximum(near, closeness(trace, first))
@@ -70,12 +70,12 @@ class ArcSegment(Arc):
             place, moves = mixed(place, dr.select(shade.dark, mi.UInt32(1), 0)), moves | may_move(trace, shade.hit)
         bright = dr.select(seen.is_valid(), DIM, mi.Float(trace.scene.environment() is not None))
         probe = VisibilityProbe(mixed(place, turned), at.p, at.n, moves, near, bright)
-        # As nothing, a sky would be.
+        # Signature 1, since 0 stands for the sky.
         dark = replace(VisibilityProbe.of(1), moves=moves, near=near, bright=bright)
         return dr.select(counts, probe, dark)
 
     def _counts(self, seen: mi.PreliminaryIntersection3f) -> mi.Bool:
-        """Whether light may come from what is seen: at the end of a path only what glows has any."""
+        """Return whether light may come from a hit: at the last vertex of a path, only from emitters."""
         trace = self.observer.trace
         if trace.media is not None:
             return mi.Bool(True)
@@ -83,49 +83,49 @@ class ArcSegment(Arc):
         return glows | (self.observer.selected.depth + 2 < trace.max_depth)
 
     def _shadow_test(self, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool) -> ShadowTest:
-        """What of it lies in the shadow of a light without extent: that which `walk_on` draws there."""
-        numbers, depth = CounterSampler.stream(self.key, Stream.BEYOND_EDGE), self.observer.selected.depth
+        """Test the shadow of the light that `walk_on` samples at the hit."""
+        sampler, depth = CounterSampler.stream(self.key, Stream.BEYOND_EDGE), self.observer.selected.depth
         arrival = self.observer.arrival(ray, hit, mi.Float(1))
-        return ShadowTest.of(self.observer.trace, arrival, numbers, depth + 1, active)
+        return ShadowTest.of(self.observer.trace, arrival, sampler, depth + 1, active)
 
     def detect(self) -> Worth:
-        """What an edge on the arc may be worth."""
+        """Estimate the importance of an edge on the arc."""
         light = dr.select(self.active, dr.mean(dr.abs(self.observer.selected.β * self.f)) / self.p, 0)
-        a, b, c = probed(self.length)
+        a, b, c = probe_positions(self.length)
         survey = Survey.of([self.probe(t, self.active) for t in (a, b, c)], self.active)
-        survey.found *= self.importance()
+        survey.presence *= self.importance()
         return Worth.of(survey, light, light * own_plane(self.observer, self.at(a), self.at(b)) / self.longest)
 
     def resolve(self, weight: mi.Float, generator: mi.PCG32) -> list[Crossing]:
         """Bisect the arc, and weigh both sides of the edge: see `EdgeSearch.resolve`."""
         observer, trace = self.observer, self.observer.trace
-        crossed = bisect(self.probe, self.length, dr.select(self.active, weight, 0), generator)
-        active = crossed.weight > 0
-        rays = [observer.origin.spawn_ray(self.at(t)) for t in (crossed.a, crossed.b)]
+        bracket = bisect(self.probe, self.length, dr.select(self.active, weight, 0), generator)
+        active = bracket.weight > 0
+        rays = [observer.origin.spawn_ray(self.at(t)) for t in (bracket.a, bracket.b)]
         firsts = [observer.hit(ray, active) for ray in rays]
-        edges, through = observer.edges(rays, firsts, active)
+        edges, through = observer.edge_surfaces(rays, firsts, active)
         near_a, shadow = edges[0].t <= edges[1].t, None
         if self.hard:
-            a, b = (self._probe(t, active, hard=False) for t in (crossed.a, crossed.b))
+            a, b = (self._probe(t, active, hard=False) for t in (bracket.a, bracket.b))
             tests = [self._shadow_test(ray, first, active) for ray, first in zip(rays, firsts, strict=True)]
             shadow = HardShadow.between(trace, tests[0], tests[1], active & ~a.differs(b))
-            near_a = dr.select(shadow.there, shadow.in_a, near_a)
+            near_a = dr.select(shadow.exists, shadow.in_a, near_a)
         sides = zip(rays, firsts, edges, strict=True)
         near, far = (Side(*side) for side in sides)
         near, far = dr.select(near_a, near, far), dr.select(near_a, far, near)
-        active = active & near.edge.is_valid() & observer.is_off(near.edge.t)
+        active = active & near.edge.is_valid() & observer.is_far(near.edge.t)
         crease = Crease.of(trace, (near.edge, near.ray), (far.edge, far.ray), shadow, active)
         edge = OcclusionEdge.of(observer, near, far, crease, active)
-        K_near, K_far = self._weights(crossed, edge, near, far, through)
+        K_near, K_far = self._weights(bracket, edge, near, far, through)
         return [HeldEdge(K_far - K_near, edge), MovedSide(K_near, edge, near), MovedSide(-K_far, edge, far)]
 
     def _weights(
-        self, crossed: Crossed, edge: OcclusionEdge, near: Side, far: Side, through: mi.Bool
+        self, bracket: Bracket, edge: OcclusionEdge, near: Side, far: Side, through: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """π/2 f / (l p(c)) of the two sides: near the edge and far, both with the same random numbers."""
+        """Return π/2 f / (l p(c)) on the near and on the far side, both with the same random numbers."""
         observer, trace, x, active = self.observer, self.observer.trace, self.observer.selected, edge.active
         f, pdf = observer.towards(far.ray.d, active)
-        per_length = 0.5 * dr.pi * crossed.weight * self.weight(pdf, active)
+        per_length = 0.5 * dr.pi * bracket.weight * self.weight(pdf, active)
         common = x.β * f * per_length
         active = active & dr.any(common != 0)
         at_near, at_far = (observer.arrival(side.ray, side.hit, pdf) for side in (near, far))
@@ -141,73 +141,73 @@ class ArcSegment(Arc):
 
 @dataclass
 class Side:
-    """What is seen at one side of an edge."""
+    """One side of an edge."""
 
     ray: mi.Ray3f
-    hit: mi.PreliminaryIntersection3f  # may be none
-    edge: mi.PreliminaryIntersection3f  # what has the edge: the same or, if that is a null boundary, what is behind
+    hit: mi.PreliminaryIntersection3f  # may be a miss
+    edge: mi.PreliminaryIntersection3f  # hit with the edge: `hit` or, behind a shared null boundary, the next one
 
 
 @dataclass
 class OcclusionEdge:
-    """An edge that a vertex sees between two directions, ``n`` normal to it and from the near one to the far one."""
+    """An edge that a vertex sees between two directions; the normal ``n`` points from the near to the far direction."""
 
     observer: ObserverVertex
     near: Side
     crease: Crease
-    own: mi.Bool  # it is the plane of the observer's own triangle
+    own: mi.Bool  # the edge is in the plane of the observer's own triangle
     n: mi.Vector3f
-    slope: mi.Float  # of B along n, where nothing hides anything
+    slope: mi.Float  # derivative of B along n at a crease, else 1
     active: mi.Bool
 
     @staticmethod
     def of(observer: ObserverVertex, near: Side, far: Side, crease: Crease, active: mi.Bool) -> OcclusionEdge:
-        """Detached."""
-        own, d = observer.parts(near.ray.d, far.ray.d), near.ray.d
-        shadow = mi.Bool(False) if crease.shadow is None else crease.shadow.there
+        """Classify the edge between two sides, and compute its normal. Detached."""
+        own, d = observer.separates(near.ray.d, far.ray.d), near.ray.d
+        shadow = mi.Bool(False) if crease.shadow is None else crease.shadow.exists
         edge = OcclusionEdge(observer, near, crease, active & ~shadow & own, observer.si.n, mi.Float(1), active)
-        slope = derivative_by_ray(near.ray, lambda ray: edge.bend(ray, observer.si.n)).d
+        slope = derivative_by_ray(near.ray, lambda ray: edge.crease_gap(ray, observer.si.n)).d
         slope -= dr.dot(slope, d) * d
-        bent = edge.bends & (dr.squared_norm(slope) > 0)
-        n = dr.select(bent, dr.normalize(slope), edge_normal(near.edge, near.ray, active))
+        is_bent = edge.is_crease & (dr.squared_norm(slope) > 0)
+        n = dr.select(is_bent, dr.normalize(slope), edge_normal(near.edge, near.ray, active))
         n = dr.select(dr.dot(n, far.ray.d - d) < 0, -n, n)
-        return replace(edge, n=n, slope=dr.select(bent, dr.dot(slope, n), 1), active=active & (bent | ~shadow))
+        return replace(edge, n=n, slope=dr.select(is_bent, dr.dot(slope, n), 1), active=active & (is_bent | ~shadow))
 
     @property
-    def bends(self) -> mi.Bool:
-        """Whether nothing hides anything."""
-        return self.own | self.crease.there
+    def is_crease(self) -> mi.Bool:
+        """Whether no surface occludes another at the edge."""
+        return self.own | self.crease.exists
 
-    def bend(self, ray: mi.Ray3f, n: mi.Normal3f) -> mi.Float:
-        """B where nothing hides anything: zero on the edge. ``n`` is the normal of the observer's triangle."""
+    def crease_gap(self, ray: mi.Ray3f, n: mi.Normal3f) -> mi.Float:
+        """Evaluate B of a crease, zero on the edge. ``n`` is the normal of the observer's triangle."""
         return dr.select(self.own, dr.dot(n, ray.d), self.crease.gap(ray, self.active & ~self.own))
 
 
 @dataclass
 class HeldEdge:
-    """An edge where one surface hides another: it follows the point of the near one. See `Crossing`."""
+    """The edge of an occluder, which moves with the visible point of the near surface. See `Crossing`."""
 
     weight: mi.Spectrum
     edge: OcclusionEdge
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        """B = n·d, whose motion is n·V_edge."""
+        """Evaluate B = n·d, whose derivative is n·V_edge; 0 at a crease."""
         e = self.edge
         d = held_direction(at, e.near.ray.d, e.near.edge, e.active)
-        return dr.select(e.active & ~e.bends, dr.dot(e.n, d), 0)
+        return dr.select(e.active & ~e.is_crease, dr.dot(e.n, d), 0)
 
 
 @dataclass
 class MovedSide:
-    """A side of the edge, whose direction moves with the velocity that the interior gives it. See `Crossing`."""
+    """One side of an edge, where the direction moves with the velocity of the interior term. See `Crossing`."""
 
     weight: mi.Spectrum
     edge: OcclusionEdge
     side: Side
 
     def gap(self, at: mi.Interaction3f) -> mi.Float:
-        """B = n·d, whose motion is n·V; where nothing hides anything, B of the surface that bends."""
+        """Evaluate B = n·d, whose derivative is n·V; at a crease, B of the crease over its slope."""
         e, hit, lengths = self.edge, self.side.hit, self.edge.observer.trace.traits.tables.blend_lengths
         d, _ = moved_direction(lengths, at, self.side.ray.d, hit, e.observer.holds(hit, e.active))
         ray = mi.Ray3f(at.spawn_ray(dr.detach(d)).o, d)
-        return dr.select(e.active, dr.select(e.bends, e.bend(ray, at.n) / e.slope, dr.dot(e.n, d)), 0)
+        return dr.select(e.active, dr.select(e.is_crease, e.crease_gap(ray, at.n) / e.slope, dr.dot(e.n, d)), 0)

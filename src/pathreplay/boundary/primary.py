@@ -1,23 +1,25 @@
-"""Edges on the film: what silhouettes, creases and borders do to an image, seen directly, in mirrors and through glass.
+"""Primary boundary term: edges on the film, seen directly, in mirrors or through glass.
 
-A camera ray and the delta lobes after it slide over what they meet: the place s on the film is fixed, the point that
-is seen is not. At an edge the radiance f(s) jumps, and if the edge moves, an integral over the film changes by the
-jump times the area that is swept. Edges are found by short segments on the film (see `crofton`), and with N of them
+A camera ray and the delta lobes after it slide over the surfaces that they hit: the film position s is fixed, the
+visible point is not. The radiance f(s) jumps at an edge. If the edge moves, the integral over the film changes by the
+jump times the area that the edge sweeps. Short segments on the film find the edges (see `crofton`). With N segments,
 
     dI/dπ = - Σ K dB/dπ,    K = π/2 · (f_a - f_b) / (l p(c) N) · sgn(w·∂B/∂s) / |∂B/∂s|,
 
-with B(s, π) = 0 on the edge, f_a and f_b the radiances at its two sides, and w the direction from a to b. At an outline
-B = n·(o + t d - z): z is the point of the near surface, glued to it, o + t d the same point on the path, and n normal
-to both edge and ray. Where two surfaces meet, B is the difference of their distances. A smooth mesh goes dark where its
-shading normal is at right angles to the ray, a little before its outline; there B is their product.
+where B(s, π) = 0 on the edge, f_a and f_b are the radiances on its two sides, and w is the direction from a to b. The
+function B depends on the kind of edge:
 
-Lights without extent cast hard shadows, the borders of which are in the image as well. There the point x that is seen
-slides with the path, and B = n·(x + r d - z), with the point z of what is in the way, r away in the direction d of the
-light.
+- outline: B = n·(o + t d - z), where z is the point of the nearer surface with fixed surface coordinates, o + t d is
+  the same point on the path, and n is perpendicular to edge and ray
+- contact of two surfaces: the difference of their distances
+- smooth-shaded mesh: the dot product of ray direction and shading normal; it vanishes slightly before the outline, and
+  the mesh is black from there on
+- boundary of a hard shadow: B = n·(x + r d - z), where the visible point x slides with the path, and z is the point of
+  the occluder at distance r from x in the direction d of the light
 
-Through media both sides of an edge at distance t₀ share the way to it, and all that is scattered there. So the radiance
-jumps by T(t₀) (L of the near surface - L of the ray that goes on in the same medium), and beyond t₀ paths are walked as
-ever.
+In a medium, both sides of an edge at distance t₀ share the transmittance T and all light scattered before t₀. The
+radiance jump is T(t₀) (L of the near surface - L of the ray that continues in the same medium). Beyond t₀ paths are
+sampled as usual.
 """
 
 from __future__ import annotations
@@ -42,8 +44,8 @@ from pathreplay.boundary.creases import Crease, off_contact
 from pathreplay.boundary.crofton import VisibilityProbe, heading
 from pathreplay.boundary.edges import Edges, ray_to_camera
 from pathreplay.boundary.hard_shadows import HardShadow
-from pathreplay.boundary.observer import going_on
-from pathreplay.boundary.search import FilmSearch, FilmSegment, looks_of
+from pathreplay.boundary.observer import arrival_beyond
+from pathreplay.boundary.search import FilmSearch, FilmSegment, pilot_size
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.path import PathState
@@ -54,7 +56,7 @@ from pathreplay.transport.volume.passage import SHORT_OF
 
 @dataclass
 class FilmCrossing:
-    """A crossing on the film: see `Crossing`."""
+    """Crossing of a film segment with an edge: see `Crossing`."""
 
     weight: mi.Spectrum
     near: Arrival
@@ -64,12 +66,12 @@ class FilmCrossing:
 
     def gap(self, at: mi.Ray3f) -> mi.Float:
         outline = outline_gap(self.n, at.o, at.d, self.near.hit, at, self.active)
-        return dr.select(self.crease.there, self.crease.gap(at, self.active), outline)
+        return dr.select(self.crease.exists, self.crease.gap(at, self.active), outline)
 
 
 @dataclass(frozen=True)
 class PrimarySearch(FilmSearch[FilmSegment]):
-    """The search on the film."""
+    """Edge search on the film."""
 
     bisection = Stream.BISECT_PRIMARY
 
@@ -78,10 +80,10 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         return chain_config(self.trace)
 
     def guided(self, n: int, seed: mi.UInt32) -> PrimarySearch:
-        """See `EdgeSearch`. The segments of the first look are twice as long."""
-        wide, few = replace(self, length=2 * self.length), looks_of(n, self.film.size)
-        first = wide.draw(dr.arange(mi.UInt32, few), few, Stream.FIRST_LOOK.of(seed))
-        return replace(self, density=self.density.refined(first.c, wide.detect(first) * first.density))
+        """See `EdgeSearch`. Pilot segments are twice as long."""
+        wide, n_pilot = replace(self, length=2 * self.length), pilot_size(n, self.film.size)
+        pilot = wide.draw(dr.arange(mi.UInt32, n_pilot), n_pilot, Stream.FIRST_LOOK.of(seed))
+        return replace(self, density=self.density.refined(pilot.c, wide.detect(pilot) * pilot.density))
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> FilmSegment:
         x, y, turn = quasi_random(i, n, seed, 3)
@@ -97,13 +99,13 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         ends, key = (segment.at(a), segment.at(b)), segment.key
         (ray_a, weight), (ray_b, _) = (self.film.ray(s, key) for s in ends)
         split = split_chains(self.chain, (ray_a, ray_b), key, active)
-        active = active & split.found
+        active = active & split.parted
         jump = weight * split.β * self._jump(split, ray_a, key, active)
 
         near_a, shadow = split.a.hit.t <= split.b.hit.t, None
         if split.shadows is not None:
             shadow = HardShadow.between(self.chain, split.shadows[0], split.shadows[1], active)
-            near_a = dr.select(shadow.there, shadow.in_a, near_a)
+            near_a = dr.select(shadow.exists, shadow.in_a, near_a)
         near, s = dr.select(near_a, split.a, split.b), dr.select(near_a, *ends)
         active = active & near.hit.is_valid()
         n = edge_normal(near.hit, near.ray, active)
@@ -112,16 +114,16 @@ class PrimarySearch(FilmSearch[FilmSegment]):
         return Edges(path, [FilmCrossing(dr.select(active, jump, 0), near, n, crease, active)], None)
 
     def _jump(self, split: ChainSplit, ray: mi.Ray3f, key: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
-        """f_a - f_b, with the same random numbers on both sides. ``ray`` is the camera's."""
+        """Estimate f_a - f_b with the same random numbers on both sides. ``ray`` is the camera ray of side a."""
         trace = self.trace
-        # Coarse meshes cut lobes off at creases, and nothing else is to jump beyond an edge.
+        # The triangle planes of coarse meshes clip lobes. With steady frames, no other difference remains at a crease.
         onward = replace(trace, steady_frames=trace.traits.coarse_meshes and not trace.traits.brushed_meshes)
         sides, T = off_contact(self.chain, split.a, split.b, active), mi.Spectrum(1)
         if trace.media is not None:
             t = SHORT_OF * dr.minimum(split.a.hit.t, split.b.hit.t)
             T, medium = transmittance_of_chain(trace, ray, key, split.k, t, active)
             active = active & dr.any(T != 0)
-            sides = [going_on(trace, side, t, medium, active) for side in sides]
+            sides = [arrival_beyond(trace, side, t, medium, active) for side in sides]
         f = []
         for side in sides:
             path = PathState(side, mi.Spectrum(1), None, mi.Float(1), mi.UInt32(split.k), mi.Bool(active))

@@ -1,8 +1,8 @@
-"""The search for edges, the same in all domains: draw segments, detect edges, resample, bisect, weigh and record.
+"""Edge search, common to all domains: draw segments, detect edges, resample, bisect, weigh and record.
 
-Most segments find nothing. So all of them are probed first, which is one kernel; of those with an edge a fixed number
-is resampled and resolved, in another, which thus wastes no lane and has the same width each time. A first look with few
-segments decides where on the film the others are drawn.
+Most segments cross no edge. A first kernel therefore probes all segments. Segments are then resampled by importance,
+and a second kernel resolves a fixed number of them. No lane of it is wasted, and its width is the same in every pass. A
+pilot pass with few segments determines where on the film all others are drawn.
 """
 
 from __future__ import annotations
@@ -16,59 +16,59 @@ from typing import ClassVar, Generic, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from pathreplay.boundary.crofton import PlaneSegment, VisibilityProbe, bisect, detect, passed
+from pathreplay.boundary.crofton import PlaneSegment, VisibilityProbe, bisect, crossing_weight, detect
 from pathreplay.boundary.edges import Edges, FilmDomain
 from pathreplay.samplers.counter_sampler import ROUNDS
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.vertex import TraceConfig
 
-LOOKS, PER_PIXEL = 8, 2
-"""Of so many segments one belongs to the first look, which has at most so many segments per pixel."""
+PILOT_RATIO, PILOT_PER_PIXEL = 8, 2
+"""Ratio of segments to pilot segments, and the largest number of pilot segments per pixel."""
 AROUND = 1.0
-"""Segments that are drawn at the pixels around what was found, for one at its own."""
-EVENLY = 0.25
-"""Share of the segments that are drawn evenly, unless one asks for more: the first look misses some."""
+"""Segments drawn in the eight neighbours of a pixel with an edge, per segment in the pixel itself."""
+UNREFINED = 0.25
+"""Default fraction of segments that keep the previous density: the pilot pass misses some edges."""
 
 Segments = TypeVar("Segments")
-"""A segment for each lane."""
+"""One segment per lane."""
 
 
 @dataclass(frozen=True)
 class EdgeSearch(ABC, Generic[Segments]):
-    """A template: its domains say what segments are, how an edge is detected on one, and what the edge weighs."""
+    """Template of an edge search. A domain defines its segments, their edge detection, and the weights of edges."""
 
     trace: TraceConfig
     film: FilmDomain
-    density: SegmentDensity  # of the places where paths begin
+    density: SegmentDensity  # of the film positions of paths
 
-    bisection: ClassVar[Stream]  # of the choice among the crossings of one segment
+    bisection: ClassVar[Stream]  # random stream that selects among the crossings of one segment
 
-    def find(self, n: int, closer: int, seed: mi.UInt32) -> Edges:
-        """Edges on ``n`` segments, of which ``closer`` are resolved. Detached."""
+    def find(self, n: int, resolved: int, seed: mi.UInt32) -> Edges:
+        """Probe ``n`` segments, resample ``resolved`` of them by importance, and return their edges. Detached."""
         search = self.guided(n, seed)
         importance = search.detect(search.draw(dr.arange(mi.UInt32, n), n, seed))
-        chosen = Resampled.of(importance, closer, seed)
-        share = chosen.weight * dr.opaque(mi.Float, 1 / n)  # opaque: one kernel for all numbers of segments
-        generator = mi.PCG32(closer, initstate=seed + int(self.bisection), initseq=dr.arange(mi.UInt32, closer))
-        return search.resolve(search.draw(chosen.index, n, seed), share, generator)
+        chosen = Resampled.of(importance, resolved, seed)
+        weight = chosen.weight * dr.opaque(mi.Float, 1 / n)  # opaque: one kernel for all values of n
+        generator = mi.PCG32(resolved, initstate=seed + int(self.bisection), initseq=dr.arange(mi.UInt32, resolved))
+        return search.resolve(search.draw(chosen.index, n, seed), weight, generator)
 
     def guided(self, n: int, seed: mi.UInt32) -> EdgeSearch[Segments]:
-        """The search with what a first look tells of where segments are to be drawn. Without one, the same."""
+        """Return a search whose density a pilot pass has refined; without a pilot pass, the same search."""
         return self
 
     @abstractmethod
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> Segments:
-        """The i-th of n segments."""
+        """Draw the i-th of n segments."""
 
     @abstractmethod
     def detect(self, segments: Segments) -> mi.Float:
-        """The importance of resolving each segment: zero where it has no edge."""
+        """Return the importance of each segment, zero where no edge is detected."""
 
     @abstractmethod
     def resolve(self, segments: Segments, weight: mi.Float, generator: mi.PCG32) -> Edges:
-        """Bisect the segments, weigh what crosses them and record the path to it. A lane stands for ``weight`` of all.
+        """Bisect the segments, weigh the edges that cross them, and record the paths to these edges.
 
-        Lanes of weight zero find nothing.
+        ``weight`` is the weight of each lane in the mean over all segments; lanes of weight zero return no edge.
         """
 
 
@@ -76,8 +76,8 @@ class EdgeSearch(ABC, Generic[Segments]):
 class FilmSegment(PlaneSegment):
     """A segment on the film."""
 
-    key: mi.UInt32  # of the random numbers that its paths share
-    density: mi.Float  # of its centre, per pixel, and of what else is drawn
+    key: mi.UInt32  # seed of the random numbers that its paths share
+    density: mi.Float  # of its centre, per pixel, times that of all other drawn quantities
     active: mi.Bool
 
 
@@ -86,118 +86,118 @@ OnFilm = TypeVar("OnFilm", bound=FilmSegment)
 
 @dataclass(frozen=True)
 class FilmSearch(EdgeSearch[OnFilm]):
-    """A search by segments on the film, of a ``length`` in pixels."""
+    """Edge search by film segments of a ``length`` in pixels."""
 
     length: float
 
     @classmethod
     def of(cls, trace: TraceConfig, film: FilmDomain, length: float) -> FilmSearch[OnFilm]:
-        return cls(trace, film, SegmentDensity.even(film.size, length), length)
+        return cls(trace, film, SegmentDensity.uniform(film.size, length), length)
 
     @abstractmethod
     def probe(self, segment: OnFilm, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-        """What is seen at a place of a segment: see `Probe`."""
+        """Probe the position ``t`` of a segment: see `Probe`."""
 
     @abstractmethod
     def edge(self, segment: OnFilm, a: mi.Float, b: mi.Float, active: mi.Bool) -> Edges:
-        """The edge between two places of a segment. Its crossing weighs the jump of the radiance, from ``a`` to ``b``.
+        """Return the edge between positions ``a`` and ``b`` of a segment.
 
-        Where there is none it weighs 0.
+        The weight of its crossing is the radiance at ``a`` minus the radiance at ``b``; 0 if there is no edge.
         """
 
     @abstractmethod
     def slope(self, segment: OnFilm, edges: Edges) -> mi.Vector2f:
-        """∂B/∂s: how fast the edge is passed on the film. Reaches no parameter."""
+        """Compute ∂B/∂s, the gradient of B by film position. No parameter receives a gradient."""
 
     def detect(self, segments: OnFilm) -> mi.Float:
         return detect(partial(self.probe, segments), segments.length, segments.active) / segments.density
 
     def resolve(self, segments: OnFilm, weight: mi.Float, generator: mi.PCG32) -> Edges:
         weight = dr.select(segments.active, weight, 0)
-        crossed = bisect(partial(self.probe, segments), segments.length, weight, generator)
-        edges = self.edge(segments, crossed.a, crossed.b, crossed.weight > 0)
+        bracket = bisect(partial(self.probe, segments), segments.length, weight, generator)
+        edges = self.edge(segments, bracket.a, bracket.b, bracket.weight > 0)
         (crossing,) = edges.crossings
-        jump = crossing.weight * crossed.per_length(segments.length, segments.density)
-        K = passed(segments.w, jump, self.slope(segments, edges))
+        jump = crossing.weight * bracket.per_length(segments.length, segments.density)
+        K = crossing_weight(segments.w, jump, self.slope(segments, edges))
         return replace(edges, crossings=[replace(crossing, weight=K)])  # type: ignore[type-var]
 
 
 @dataclass
 class Resampled:
-    """A segment for each lane, by its index among many, and what the lane stands for."""
+    """Index of the segment that each lane resolves, and the weight of the lane."""
 
     index: mi.UInt32
-    weight: mi.Float  # 1 / expected number of lanes with that segment; 0: no segment finds anything
+    weight: mi.Float  # 1 / expected number of lanes with that segment; 0: no segment has an edge
 
     @staticmethod
     def of(mass: mi.Float, lanes: int, seed: mi.UInt32) -> Resampled:
-        """As often as ``mass`` says, which is that of each segment."""
-        dr.eval(mass)  # before it is used twice
+        """Resample segments in proportion to their ``mass``, with one stratum per lane."""
+        dr.eval(mass)  # used twice below
         n = dr.width(mass)
-        until = dr.cumsum(mi.Float64(mass))
-        total = dr.gather(mi.Float64, until, n - 1)
+        cdf = dr.cumsum(mi.Float64(mass))
+        total = dr.gather(mi.Float64, cdf, n - 1)
         lane = dr.arange(mi.UInt32, lanes)
         x = (mi.Float64(lane) + mi.Float64(mi.sample_tea_float32(seed, lane, ROUNDS))) * (total / lanes)
-        found = dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float64, until, i) <= x)
-        index = mi.UInt32(dr.minimum(found, n - 1))  # a number where there is one segment
-        own = dr.gather(mi.Float, mass, index)
-        return Resampled(index, dr.select(own > 0, mi.Float(total / lanes) / own, 0))
+        index = dr.binary_search(0, n - 1, lambda i: dr.gather(mi.Float64, cdf, i) <= x)
+        index = mi.UInt32(dr.minimum(index, n - 1))  # a Python integer if there is one segment
+        importance = dr.gather(mi.Float, mass, index)
+        return Resampled(index, dr.select(importance > 0, mi.Float(total / lanes) / importance, 0))
 
 
-def looks_of(n: int, size: mi.ScalarVector2f) -> int:
-    """How many segments the first look has, of ``n`` in all, on a film of ``size`` pixels."""
-    return max(min(n // LOOKS, PER_PIXEL * int(size.x) * int(size.y)), 1)
+def pilot_size(n: int, size: mi.ScalarVector2f) -> int:
+    """Return the number of pilot segments, for ``n`` segments on a film of ``size`` pixels."""
+    return max(min(n // PILOT_RATIO, PILOT_PER_PIXEL * int(size.x) * int(size.y)), 1)
 
 
 @dataclass(frozen=True)
 class SegmentDensity:
-    """A distribution of places: constant in each pixel of a grid that covers the film, and l beyond."""
+    """Density of film positions: constant in each pixel of a grid that covers the film and a margin of width l."""
 
     width: int
     height: int
-    margin: float  # l
-    until: mi.Float | None = None  # of each pixel, the probability of those up to it; None: all alike
+    margin: float  # l, the length of segments
+    cdf: mi.Float | None = None  # cumulative probabilities of the pixels; None: uniform
 
     @staticmethod
-    def even(size: mi.ScalarVector2f, l: float) -> SegmentDensity:
-        """Uniform density over a film of this size in pixels, for segments of length l."""
+    def uniform(size: mi.ScalarVector2f, l: float) -> SegmentDensity:
+        """Create a uniform density over a film of this size in pixels, for segments of length l."""
         return SegmentDensity(int(size.x + 2 * l + 1), int(size.y + 2 * l + 1), l)
 
-    def refined(self, s: mi.Point2f, found: mi.Float, evenly: float = EVENLY) -> SegmentDensity:
-        """More often where there was something, at places ``s`` so much, and around: edges go on.
+    def refined(self, s: mi.Point2f, importance: mi.Float, unrefined: float = UNREFINED) -> SegmentDensity:
+        """Increase the density at and around positions ``s`` of given ``importance``, because edges continue there.
 
-        By the root of how much: variance is a sum of (what segments find, squared) / density, which is then least.
-        ``evenly`` is the share of places that are drawn as before.
+        Probabilities are proportional to the square root of the importance in each pixel. This minimises the variance,
+        a sum of (contribution of a segment)² / density. A fraction ``unrefined`` of the segments keeps the old density.
         """
         n, c = self.width * self.height, s + self.margin
         counts = dr.zeros(mi.Float, n)
         for dy, dx in product((-1, 0, 1), repeat=2):
             x, y = mi.Int32(c.x) + dx, mi.Int32(c.y) + dy
             inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
-            part = 1.0 if dx == dy == 0 else AROUND / 8
-            dr.scatter_add(counts, part * dr.minimum(found, 1), mi.UInt32(y * self.width + x), inside)
+            weight = 1.0 if dx == dy == 0 else AROUND / 8
+            dr.scatter_add(counts, weight * dr.minimum(importance, 1), mi.UInt32(y * self.width + x), inside)
         counts = dr.sqrt(counts)
         total = dr.sum(counts)
-        before = self._share(dr.arange(mi.UInt32, n))
-        share = dr.select(total > 0, dr.fma(counts, (1 - evenly) / total, evenly * before), before)
-        until = dr.cumsum(share)
-        return SegmentDensity(self.width, self.height, self.margin, until / dr.gather(mi.Float, until, n - 1))
+        previous = self._probability(dr.arange(mi.UInt32, n))
+        probability = dr.select(total > 0, dr.fma(counts, (1 - unrefined) / total, unrefined * previous), previous)
+        cdf = dr.cumsum(probability)
+        return SegmentDensity(self.width, self.height, self.margin, cdf / dr.gather(mi.Float, cdf, n - 1))
 
-    def _share(self, i: mi.UInt32) -> mi.Float:
-        """The probability of a pixel."""
-        if self.until is None:
+    def _probability(self, i: mi.UInt32) -> mi.Float:
+        """Return the probability of a pixel."""
+        if self.cdf is None:
             return mi.Float(1 / (self.width * self.height))
-        begin = dr.select(i > 0, dr.gather(mi.Float, self.until, i - 1, i > 0), 0)
-        return dr.gather(mi.Float, self.until, i) - begin
+        begin = dr.select(i > 0, dr.gather(mi.Float, self.cdf, i - 1, i > 0), 0)
+        return dr.gather(mi.Float, self.cdf, i) - begin
 
     def draw(self, u: mi.Point2f) -> tuple[mi.Point2f, mi.Float]:
-        """A place on the film, and its density, from random numbers in the unit square."""
+        """Sample a film position from random numbers in the unit square; return it with its density."""
         n = self.width * self.height
-        if self.until is None:
+        if self.cdf is None:
             return u * mi.Point2f(self.width, self.height) - self.margin, mi.Float(1 / n)
-        below = lambda i: dr.gather(mi.Float, self.until, i) <= u.x  # noqa: E731
-        i = mi.UInt32(dr.minimum(dr.binary_search(0, n - 1, below), n - 1))  # a number where there is one pixel
-        share = self._share(i)
-        begin = dr.gather(mi.Float, self.until, i) - share
-        x = dr.clip((u.x - begin) / share, 0, dr.one_minus_epsilon(mi.Float))
-        return mi.Point2f(mi.Float(i % self.width) + x, mi.Float(i // self.width) + u.y) - self.margin, share
+        below = lambda i: dr.gather(mi.Float, self.cdf, i) <= u.x  # noqa: E731
+        i = mi.UInt32(dr.minimum(dr.binary_search(0, n - 1, below), n - 1))  # an integer if there is one pixel
+        probability = self._probability(i)
+        begin = dr.gather(mi.Float, self.cdf, i) - probability
+        x = dr.clip((u.x - begin) / probability, 0, dr.one_minus_epsilon(mi.Float))
+        return mi.Point2f(mi.Float(i % self.width) + x, mi.Float(i // self.width) + u.y) - self.margin, probability

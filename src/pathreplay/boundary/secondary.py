@@ -1,16 +1,16 @@
-"""Edges that points of surfaces see, and particles of media: shadows, and what moves in and out of indirect light.
+"""Secondary boundary term: edges seen from surface points and medium events, in direct shadows and in indirect light.
 
-At a vertex x that scatters, light arrives from a direction ω, which the interior lets move with a velocity V when
-parameters move: it follows the number u that drew it (emitter samples), or the point that it hit (other samples, with
-the share φ, see `velocity`; in narrow lobes it stays, see `keeps_direction`). At an edge the integrand jumps from
-f_near to f_far, and what V does not follow is
+At a scattering vertex x, light arrives from a direction ω. When parameters change, the interior term moves ω with a
+velocity V. An emitter sample follows its random numbers u. Any other sample follows its hit point, to the degree φ (see
+`velocity`), except in narrow lobes, where it keeps its direction (see `keeps_direction`). At an edge the integrand
+jumps from f_near to f_far. The boundary term contains the motion of the edge relative to V:
 
     dJ/dπ = ∫ [f_near (V_edge - V_near) - f_far (V_edge - V_far)]·n dl,        n normal to the edge, from near to far.
 
-One vertex of each camera path is chosen. Edges are found by short segments (see `crofton`) in the unit square of
-emitter samples, where the visibility changes, and by short arcs around samples of the BSDF, where it is another surface
-that is seen. Multiple importance sampling belongs to both integrands, which thus add up. What moves x goes back along
-the path. Where x does not move, all that does not move looks alike, so that no segment is spent on edges that stay.
+One vertex of each camera path is selected. Edges are found by short segments (see `crofton`) in the unit square of
+emitter samples, where visibility changes, and by short arcs around BSDF samples, where the visible surface changes.
+Both integrands include their MIS weights, so the two terms add up. The motion of x is propagated along the path. If x
+is static, edges between static surfaces are ignored, and no segment is spent on them.
 """
 
 from __future__ import annotations
@@ -27,36 +27,35 @@ from pathreplay.boundary.edges import EdgePath, Edges, FilmDomain
 from pathreplay.boundary.emitters import EmitterSegment
 from pathreplay.boundary.observer import ObserverVertex, SelectedVertex, choose_vertex
 from pathreplay.boundary.occlusion import ArcSegment
-from pathreplay.boundary.search import EdgeSearch, SegmentDensity, looks_of
+from pathreplay.boundary.search import EdgeSearch, SegmentDensity, pilot_size
 from pathreplay.boundary.worth import MOST, UNFORESEEN, Worth, radiance_of, weighed
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of, quasi_random
 from pathreplay.samplers.streams import Stream
 from pathreplay.transport.vertex import TraceConfig
 
-WIDELY = 0.8
-"""Share of the segments that are drawn as before the first look: shadows are seen by way of other surfaces, too."""
+UNGUIDED = 0.8
+"""Fraction of the segments that keep the previous density: shadows are also visible through other surfaces."""
 
 
 @dataclass
 class CameraPath:
-    """The path to the vertex of a segment. Each vertex has two, one among emitter samples and one on the sphere."""
+    """A camera path to the vertex of two segments: one in the unit square of emitter samples, and one arc."""
 
-    s: mi.Point2f  # where it begins
+    s: mi.Point2f  # film position
     density: mi.Float  # of s, per pixel
-    key: mi.UInt32  # of its random numbers
-    on_arc: mi.Bool  # which of the two segments is meant
+    key: mi.UInt32  # seed of its random numbers
+    on_arc: mi.Bool  # the lane stands for the arc
 
 
 @dataclass(frozen=True)
 class SecondarySearch(EdgeSearch[CameraPath]):
-    """A search from vertices, by segments of two ``lengths``: in the unit square, and on the sphere (radians).
+    """Edge search from path vertices, by segments of two ``lengths``: in the unit square, and on arcs (radians).
 
-    What light counts that arrives at the film decides nothing here, since forward mode would not know it and choose
-    otherwise.
+    The search does not use the adjoint of the image: forward mode does not know it, and would select other segments.
     """
 
     lengths: tuple[float, float]
-    radiance: mi.Float | None = None  # brightness seen by arcs, estimated by the first probe
+    radiance: mi.Float | None = None  # mean radiance seen by arcs, from the pilot pass
 
     bisection = Stream.BISECT_SECONDARY
 
@@ -66,34 +65,38 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         return SecondarySearch(trace, film, SegmentDensity(int(film.size.x), int(film.size.y), 0.0), lengths)
 
     def guided(self, n: int, seed: mi.UInt32) -> SecondarySearch:
-        """See `EdgeSearch`. Shadows that are cast decide where the first look is taken."""
+        """See `EdgeSearch`. Cast shadows determine the density of the pilot segments."""
         density = self.density
         if shapes := casters(self.trace):
             s, falls = cast_shadows(self.trace, shapes, self.film, Stream.CAST_SHADOWS.of(seed))
-            density = density.refined(s, dr.select(falls, mi.Float(1), 0), WIDELY)
-        few = looks_of(n, self.film.size)
-        first = replace(self, density=density).draw(dr.arange(mi.UInt32, few), few, Stream.FIRST_LOOK.of(seed))
-        worths = self._worths(first)
+            density = density.refined(s, dr.select(falls, mi.Float(1), 0), UNGUIDED)
+        n_pilot = pilot_size(n, self.film.size)
+        pilot = replace(self, density=density).draw(dr.arange(mi.UInt32, n_pilot), n_pilot, Stream.FIRST_LOOK.of(seed))
+        worths = self._worths(pilot)
         radiance = radiance_of(worths)
         worth = weighed(worths, radiance)[1]
-        s = mi.Point2f(*(dr.concat([x, x]) for x in first.s))
-        often = dr.concat([first.density, first.density]) * (density.width * density.height)
-        usual = dr.rcp(dr.maximum(dr.sum(dr.select(worth > 0, dr.rcp(often), 0)), dr.smallest(mi.Float)))
-        relative = dr.minimum(worth * often / (MOST * usual), 1)
-        return replace(self, density=density.refined(s, dr.square(relative) / often, WIDELY), radiance=radiance)
+        s = mi.Point2f(*(dr.concat([x, x]) for x in pilot.s))
+        relative_density = dr.concat([pilot.density, pilot.density]) * (density.width * density.height)
+        mean_worth = dr.rcp(
+            dr.maximum(dr.sum(dr.select(worth > 0, dr.rcp(relative_density), 0)), dr.smallest(mi.Float))
+        )
+        relative = dr.minimum(worth * relative_density / (MOST * mean_worth), 1)
+        return replace(
+            self, density=density.refined(s, dr.square(relative) / relative_density, UNGUIDED), radiance=radiance
+        )
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> CameraPath:
-        """See `EdgeSearch`. From the n-th on, segments are arcs."""
+        """See `EdgeSearch`. Indices from ``n`` on denote arcs."""
         on_arc = i >= n
         i = dr.select(on_arc, i - n, i)
         s, density = self.density.draw(mi.Point2f(quasi_random(i, n, seed)))
         return CameraPath(s, density, key_of(i, Stream.SECONDARY_KEYS.of(seed)), on_arc)
 
     def detect(self, segments: CameraPath) -> mi.Float:
-        """See `EdgeSearch`. All segments among emitter samples, and then all arcs."""
+        """See `EdgeSearch`. Returns all segments in emitter squares first, followed by all arcs."""
         assert self.radiance is not None
-        found, worth = weighed(self._worths(segments), self.radiance)
-        return worth + UNFORESEEN * found
+        presence, worth = weighed(self._worths(segments), self.radiance)
+        return worth + UNFORESEEN * presence
 
     def resolve(self, segments: CameraPath, weight: mi.Float, generator: mi.PCG32) -> Edges:
         layout = Layout.of(self.trace, True)
@@ -108,10 +111,10 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         return Edges(path, [*sides, shadow], observer)
 
     def _vertex(self, path: CameraPath, layout: Layout | None, records: Any) -> tuple[Any, SelectedVertex]:
-        """The vertex of each path, which is recorded if there are ``records``."""
+        """Select a vertex of each camera path, and record the path unless ``records`` is None."""
         ray, weight = dr.detach(self.film.ray(path.s, path.key))
-        numbers, flows = CounterSampler.of(path.key), self.film.flows(path.s)
-        records, x = choose_vertex(self.trace, numbers, ray, flows, layout, records)
+        sampler, flows = CounterSampler.of(path.key), self.film.flows(path.s)
+        records, x = choose_vertex(self.trace, sampler, ray, flows, layout, records)
         x.β *= weight / path.density
         return records, x
 
@@ -124,11 +127,11 @@ class SecondarySearch(EdgeSearch[CameraPath]):
         )
 
     def _worths(self, path: CameraPath) -> list[Worth]:
-        """What edges on the segments may be worth: of those among emitter samples, and of arcs."""
+        """Estimate the importance of the segments in emitter squares, and of the arcs."""
         _, x = self._vertex(path, None, None)
         none = dr.zeros(mi.Float, dr.width(path.key))
-        path.density += none  # as many as paths, as all of these
+        path.density += none  # broadcast to the number of paths
         worths = [segment.detect() for segment in self._segments(ObserverVertex(self.trace, x), path.key)]
-        worths = [replace(w, found=w.found / path.density, edges=w.edges + none) for w in worths]
+        worths = [replace(w, presence=w.presence / path.density, edges=w.edges + none) for w in worths]
         dr.eval(path.s, path.density, worths)
         return worths

@@ -1,12 +1,13 @@
-"""Beams: borders of the hard shadows that lights without extent cast into media.
+"""Volumetric boundary term: boundaries of the hard shadows that lights without extent cast into media.
 
-The camera sees particles x = o + τ d at all distances τ, and x is lit or not. So there are edges on the film for each
-τ, found by short segments on which τ stays the same (see `crofton`), as for hard shadows on surfaces:
+The camera sees points x = o + τ d of a medium at all distances τ. Each x is either lit or in shadow, so there is an
+edge on the film for each τ. Short segments with constant τ find it (see `crofton`), as for hard shadows on surfaces:
 
     dI/dπ = - Σ K dB/dπ,    K = π/2 · f / (l p(c) p(τ) N) · sgn(w·∂B/∂s) / |∂B/∂s|,    B = n·(x + r d - z),
 
-f is what the lit side sends to the camera, with the transmittance of both ways. dB/dπ is taken with x as the interior
-moves it, ∂B/∂s with τ held, since places and distances together are the domain of the integral.
+where f is the radiance that the lit side scatters to the camera, with the transmittances from the light to x and from x
+to the camera. dB/dπ follows the motion of x in the interior term. ∂B/∂s is taken at constant τ, because the domain of
+the integral consists of film positions and distances.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from pathreplay.transport.volume.passage import skip_null, transmittance_past_ed
 
 @dataclass
 class BeamSegment(FilmSegment):
-    """A segment on the film, and of particles that are seen there at one distance."""
+    """A segment on the film, at one distance τ along all its camera rays."""
 
     τ: mi.Float
 
@@ -48,7 +49,7 @@ class BeamSegment(FilmSegment):
 
 @dataclass
 class BeamCrossing:
-    """A crossing of the border of a beam: see `Crossing`."""
+    """Crossing of a film segment with a shadow boundary in a medium: see `Crossing`."""
 
     weight: mi.Spectrum
     shadow: HardShadow
@@ -60,7 +61,7 @@ class BeamCrossing:
 
 @dataclass(frozen=True)
 class VolumetricSearch(FilmSearch[BeamSegment]):
-    """The search on the film and along its rays. There is no first look: beams fill much of what they are seen in."""
+    """Edge search over film positions and distances, without a pilot pass: beams cover much of the image."""
 
     bisection = Stream.BISECT_VOLUMETRIC
 
@@ -70,56 +71,56 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
 
     def draw(self, i: mi.UInt32, n: int, seed: mi.UInt32) -> BeamSegment:
         key = key_of(i, Stream.VOLUMETRIC_KEYS.of(seed))
-        numbers = CounterSampler.stream(key, Stream.BEAM)
-        w = heading(numbers.next_1d())
+        sampler = CounterSampler.stream(key, Stream.BEAM)
+        w = heading(sampler.next_1d())
         c, density = self.density.draw(mi.Point2f(quasi_random(i, n, Stream.VOLUMETRIC_CENTRES.of(seed))))
         reach = self._reach(dr.detach(self.film.ray(c, key)[0]))
-        τ = numbers.next_1d() * reach
+        τ = sampler.next_1d() * reach
         ok = dr.isfinite(reach) & (reach > 0)
         density = density * dr.select(ok, dr.rcp(reach), 1)
         return BeamSegment(c, w, mi.Float(self.length), key, density, ok, dr.select(ok, τ, 0))
 
     def probe(self, segment: BeamSegment, t: mi.Float, active: mi.Bool) -> VisibilityProbe:
-        there, test = self._light(segment, t, active)
-        return VisibilityProbe.of(dr.select(there, mi.UInt32(1), 0) | dr.select(test.dark, mi.UInt32(2), 0))
+        visible, test = self._shadow_test(segment, t, active)
+        return VisibilityProbe.of(dr.select(visible, mi.UInt32(1), 0) | dr.select(test.dark, mi.UInt32(2), 0))
 
-    def _light(self, segment: BeamSegment, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, ShadowTest]:
-        """Whether nothing hides the particle at a place from the camera, and what hides the light from it."""
+    def _shadow_test(self, segment: BeamSegment, t: mi.Float, active: mi.Bool) -> tuple[mi.Bool, ShadowTest]:
+        """Return whether the camera sees the medium point at position ``t``, and the shadow test of that point."""
         ray = dr.detach(self.film.ray(segment.at(t), segment.key)[0])
-        before = self._hit(ray, active)
-        there = active & ~(before.is_valid() & (before.t < segment.τ))
-        return there, ShadowTest.at(self.trace, _place_on(ray, segment.τ), segment.emitter_sample, there)
+        hit = self._hit(ray, active)
+        visible = active & ~(hit.is_valid() & (hit.t < segment.τ))
+        return visible, ShadowTest.at(self.trace, _point_on(ray, segment.τ), segment.emitter_sample, visible)
 
     def edge(self, segment: BeamSegment, a: mi.Float, b: mi.Float, active: mi.Bool) -> Edges:
-        (there_a, test_a), (there_b, test_b) = (self._light(segment, t, active) for t in (a, b))
-        shadow = HardShadow.between(self.trace, test_a, test_b, active & there_a & there_b)
-        bright = dr.select(shadow.in_a, test_b, test_a)
+        (visible_a, test_a), (visible_b, test_b) = (self._shadow_test(segment, t, active) for t in (a, b))
+        shadow = HardShadow.between(self.trace, test_a, test_b, active & visible_a & visible_b)
+        lit_test = dr.select(shadow.in_a, test_b, test_a)
         s = segment.at(dr.select(shadow.in_a, a, b))
         ray, weight = dr.detach(self.film.ray(s, segment.key))
-        path, observer = self._particle(s, ray, segment, shadow.there & bright.lit)
-        jump = weight * dr.select(shadow.in_a, -1, 1) * self._radiance(ray, segment, observer, shadow, bright)
+        path, observer = self._particle(s, ray, segment, shadow.exists & lit_test.lit)
+        jump = weight * dr.select(shadow.in_a, -1, 1) * self._radiance(ray, segment, observer, shadow, lit_test)
         return Edges(path, [BeamCrossing(dr.select(observer.active, jump, 0), shadow, observer.active)], observer)
 
     def slope(self, segment: BeamSegment, edges: Edges) -> mi.Vector2f:
         (crossing,), path = edges.crossings, edges.path
-        return derivative_by_place(path.s, lambda s: crossing.gap(_place_on(self.film.ray(s, path.key)[0], segment.τ)))
+        return derivative_by_place(path.s, lambda s: crossing.gap(_point_on(self.film.ray(s, path.key)[0], segment.τ)))
 
     def _radiance(
-        self, ray: mi.Ray3f, segment: BeamSegment, observer: ObserverVertex, shadow: HardShadow, bright: ShadowTest
+        self, ray: mi.Ray3f, segment: BeamSegment, observer: ObserverVertex, shadow: HardShadow, lit_test: ShadowTest
     ) -> mi.Spectrum:
-        """f: what the particle sends to the camera, where it is lit."""
+        """Estimate f, the radiance that the lit medium point scatters to the camera."""
         trace, active = self.trace, observer.active
-        numbers = CounterSampler.stream(segment.key, Stream.TRANSMITTANCE_OF_BEAM)
-        T = transmittance_up_to(trace, ray, segment.τ, medium_around(trace), numbers, active)[0]
-        T *= transmittance_past_edge(trace, bright.ray, shadow.test.hit.t, observer.at.medium, numbers, active)
-        return T * observer.selected.β * observer.towards(bright.ray.d, active)[0] * bright.Le
+        sampler = CounterSampler.stream(segment.key, Stream.TRANSMITTANCE_OF_BEAM)
+        T = transmittance_up_to(trace, ray, segment.τ, medium_around(trace), sampler, active)[0]
+        T *= transmittance_past_edge(trace, lit_test.ray, shadow.test.hit.t, observer.at.medium, sampler, active)
+        return T * observer.selected.β * observer.towards(lit_test.ray.d, active)[0] * lit_test.Le
 
     def _hit(self, ray: mi.Ray3f, active: mi.Bool) -> mi.PreliminaryIntersection3f:
-        """What a ray meets behind null boundaries."""
+        """Return the first hit of a ray that is not a null boundary."""
         return skip_null(self.trace, ray, meet(self.trace, ray, active), active)
 
     def _reach(self, ray: mi.Ray3f) -> mi.Float:
-        """How far particles are looked for: up to what the ray meets or, if that is nothing, the end of the scene."""
+        """Return the largest distance τ on a ray: that of its hit or, if it misses, that of the end of the scene."""
         hit, box = self._hit(ray, mi.Bool(True)), self.trace.scene.bbox()
         far = dr.norm(ray.o - box.center()) + 0.5 * dr.norm(box.extents())
         return dr.select(hit.is_valid(), hit.t, far)
@@ -128,27 +129,27 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
     def _particle(
         self, s: mi.Point2f, ray: mi.Ray3f, segment: BeamSegment, active: mi.Bool
     ) -> tuple[EdgePath, ObserverVertex]:
-        """Record the way to the particle, through null boundaries; the path there, and the particle."""
+        """Record the path through null boundaries to the medium point; return the path, and the point as observer."""
         trace, layout, τ = self.trace, Layout.of(self.trace, True), segment.τ
         records: Any = dr.alloc_local(record_type(layout), room_for(trace))
-        numbers = CounterSampler.of(segment.key)
-        path = PathState.begin(trace, CameraStart(ray, numbers, active))
+        sampler = CounterSampler.of(segment.key)
+        path = PathState.begin(trace, CameraStart(ray, sampler, active))
         at, flight = path.at, Flight.none(trace.media)
-        gone, k, count = mi.Float(0), mi.UInt32(0), mi.UInt32(0)
+        travelled, k, count = mi.Float(0), mi.UInt32(0), mi.UInt32(0)
         go_on = path.active & (count < room_for(trace))
         while dr.hint(go_on, exclude=[trace, layout, self], label="pathreplay: to a particle"):
             length = dr.select(path.at.hit.is_valid(), path.at.hit.t, dr.inf)
-            event = (gone + length > τ) & (path.at.medium != None)  # noqa: E711 (an array of pointers)
-            here = Flight.none(trace.media)
-            here.event, here.t = event, dr.select(event, τ - gone, 0)
-            u = VertexSamples.draw(numbers)
-            step = choose_step(trace, Visit(path.at, path.β, mi.Bool(False), path.active), u, numbers, here)
+            event = (travelled + length > τ) & (path.at.medium != None)  # noqa: E711 (an array of pointers)
+            event_flight = Flight.none(trace.media)
+            event_flight.event, event_flight.t = event, dr.select(event, τ - travelled, 0)
+            u = VertexSamples.draw(sampler)
+            step = choose_step(trace, Visit(path.at, path.β, mi.Bool(False), path.active), u, sampler, event_flight)
             onward, v = path.advance(trace, u, step)
             records[count] = record(layout, v)
             at, k = dr.select(event, path.at, at), dr.select(event, count, k)
-            flight = dr.select(event, here, flight)
-            gone += dr.norm(onward.at.ray.o - path.at.ray.o)
-            go_on = onward.active & step.null & ~event & (gone < τ)
+            flight = dr.select(event, event_flight, flight)
+            travelled += dr.norm(onward.at.ray.o - path.at.ray.o)
+            go_on = onward.active & step.null & ~event & (travelled < τ)
             path = onward
             count += 1
         active = active & flight.event
@@ -159,8 +160,8 @@ class VolumetricSearch(FilmSearch[BeamSegment]):
         return edge_path, ObserverVertex(trace, x)
 
 
-def _place_on(ray: mi.Ray3f, τ: mi.Float) -> mi.Interaction3f:
-    """The place of a particle at a distance."""
+def _point_on(ray: mi.Ray3f, τ: mi.Float) -> mi.Interaction3f:
+    """Return the interaction at distance ``τ`` along a ray."""
     x = dr.zeros(mi.Interaction3f)
     x.p, x.t, x.time, x.wavelengths = ray.o + τ * ray.d, mi.Float(0), ray.time, ray.wavelengths
     return x

@@ -1,7 +1,8 @@
-"""Importance of edges on a segment, estimated from its probes: it decides which segments are resolved, nothing else.
+"""Importance of a segment, estimated from its probes. It affects only which segments are resolved, not the mean.
 
-An edge at a distance r turns by 1 / r as things move, and the integrand jumps there by a part of what is scattered. The
-radiance of what is seen is unknown before a path is traced: the sky counts fully, everything else by `DIM`.
+An edge at distance r turns by 1 / r per unit of motion, and the integrand jumps there by a fraction of the scattered
+radiance. The radiance of a visible surface is unknown before a path is traced: the sky has importance 1, any other
+surface has importance `DIM`.
 """
 
 from __future__ import annotations
@@ -16,30 +17,30 @@ from pathreplay.boundary.observer import ObserverVertex
 from pathreplay.transport.vertex import TraceConfig
 
 WITHIN = 2.0
-"""`blend_length`s of what is seen: closer than these nothing counts more."""
+"""Distance below which importance hardly increases, in `blend_length`s of the visible surface."""
 DIM, OWN = 0.3, 0.1
-"""How much an edge counts where no sky is seen, and where the plane of the seer's own triangle may be all there is."""
+"""Importance of an edge where no sky is visible, and where it may be only the plane of the observer's own triangle."""
 UNFORESEEN = 0.1
-"""Fraction of the importance that goes by the presence of an edge alone: probes do not foresee all that counts."""
+"""Weight of the mere presence of an edge in its importance: probes do not predict every large contribution."""
 MOST = 4.0
-"""Largest importance of a segment in the first look, over the mean: the first look has few segments."""
+"""Largest importance of a pilot segment, relative to the mean: there are few pilot segments."""
 STEEP = 0.03
-"""Least angle that an emitter subtends across its square, in radians: bounds the importance of small emitters."""
+"""Smallest assumed angle of an emitter across its square, in radians: it bounds the importance of small emitters."""
 
 
 @dataclass
 class Worth:
     """Importance of a segment."""
 
-    found: mi.Float  # see `Survey`
-    edges: mi.Float  # what they may be worth
-    light: mi.Float  # scattered radiance, of emitters or of indirect light
+    presence: mi.Float  # see `Survey`
+    edges: mi.Float  # importance of the edges
+    light: mi.Float  # scattered radiance, from emitters or from arcs
 
     @staticmethod
-    def of(seen: Survey, light: mi.Float, scale: mi.Float) -> Worth:
-        """Of a segment with this survey; ``scale`` is the rest of its importance. What is not finite counts as zero."""
-        edges = seen.found * seen.near * seen.bright * scale
-        return Worth(_finite(seen.found), _finite(edges), _finite(light))
+    def of(survey: Survey, light: mi.Float, scale: mi.Float) -> Worth:
+        """Compute the importance from a survey and all other factors (``scale``). Non-finite values become zero."""
+        edges = survey.presence * survey.near * survey.bright * scale
+        return Worth(_finite(survey.presence), _finite(edges), _finite(light))
 
 
 def _finite(x: mi.Float) -> mi.Float:
@@ -47,27 +48,27 @@ def _finite(x: mi.Float) -> mi.Float:
 
 
 def closeness(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Float:
-    """1 / r, as fast as what was hit turns when it moves on; see `WITHIN`."""
+    """Return 1 / r, the rotation of the hit point per unit of its motion, bounded through `WITHIN`; 0 on a miss."""
     shape = dr.reinterpret_array(mi.UInt32, hit.shape)
     h0 = dr.gather(mi.Float, trace.traits.tables.blend_lengths, shape, hit.is_valid())
     return dr.select(hit.is_valid(), dr.rcp(hit.t + WITHIN * h0), 0)
 
 
 def own_plane(observer: ObserverVertex, a: mi.Vector3f, b: mi.Vector3f) -> mi.Float:
-    """`OWN` where the plane of the seer's own triangle lies between two directions, else 1."""
-    return dr.select(observer.parts(a, b), OWN, mi.Float(1))
+    """Return `OWN` where the plane of the observer's own triangle separates two directions, else 1."""
+    return dr.select(observer.separates(a, b), OWN, mi.Float(1))
 
 
 def radiance_of(worths: list[Worth]) -> mi.Float:
-    """Radiance of what arcs see, relative to emitters, as one number: taken to be that of what emitters light."""
-    lit, all_of_it = (dr.sum(worth.light) for worth in worths)
-    return dr.select((lit > 0) & (all_of_it > 0), lit / all_of_it, 1)
+    """Estimate the mean radiance seen by arcs: scattered emitter light over the scattering weights of the arcs."""
+    from_emitters, total = (dr.sum(worth.light) for worth in worths)
+    return dr.select((from_emitters > 0) & (total > 0), from_emitters / total, 1)
 
 
 def weighed(worths: list[Worth], radiance: mi.Float) -> list[mi.Float]:
-    """Presence and importance of edges on the segments of both kinds, one after the other, normalised to sum to 1."""
+    """Concatenate presence and importance of the edges on both kinds of segments; normalise each to sum to 1."""
     in_squares, on_arcs = worths
-    found = dr.concat([in_squares.found, on_arcs.found])
+    presence = dr.concat([in_squares.presence, on_arcs.presence])
     worth = dr.concat([in_squares.edges, radiance * on_arcs.edges])
-    dr.eval(found, worth)
-    return [x / dr.maximum(dr.sum(x), dr.smallest(mi.Float)) for x in (found, worth)]
+    dr.eval(presence, worth)
+    return [x / dr.maximum(dr.sum(x), dr.smallest(mi.Float)) for x in (presence, worth)]
