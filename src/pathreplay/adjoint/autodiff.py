@@ -15,7 +15,7 @@ from pathreplay.transport.vertex import Arrival, Step, TraceConfig, VertexRecord
 
 
 class Unreached(PathreplayError):
-    """No parameter with gradients reaches the light paths. Who knows sensor and scene says what to do."""
+    """No parameter with gradients reaches the light paths. Callers that know sensor and scene add the remedy."""
 
 
 @dataclass
@@ -28,11 +28,11 @@ class RayDerivative:
 
     @staticmethod
     def zero() -> RayDerivative:
-        # Not dr.zeros, which remembers the types of the variant in which it saw a class first.
+        # Not dr.zeros, which caches the field types of a class from the first variant in which it is used.
         return RayDerivative(mi.Point3f(0), mi.Vector3f(0), mi.Float(0))
 
     def finite_part(self) -> tuple[RayDerivative, mi.Bool]:
-        """The derivative where it is finite and zero elsewhere, and where that is."""
+        """Replace non-finite derivatives by zero; also return the mask of finite ones."""
         ok = dr.all(dr.isfinite(self.o)) & dr.all(dr.isfinite(self.d)) & dr.isfinite(self.pdf)
         return dr.select(ok, self, RayDerivative.zero()), ok
 
@@ -44,16 +44,16 @@ class NonFiniteCounter:
         self.count = dr.zeros(mi.UInt32, 1)
 
     def add(self, lost: mi.Bool) -> None:
-        """Count lanes, inside the loop.
+        """Count lanes from inside a loop.
 
-        There it is a side effect, like the gradients. A mask that left the loop and were evaluated by itself would run
-        the whole kernel once more.
+        The count is a side effect of the loop, as gradients are. A mask that leaves the loop would be evaluated
+        separately, which would run the whole kernel again.
         """
         dr.scatter_add(self.count, mi.UInt32(1), mi.UInt32(0), lost)
 
 
 def _attached_arrival(at: Arrival) -> Arrival:
-    """A copy of an arrival whose ray and density are AD variables of their own."""
+    """Copy an arrival, with ray and density as independent AD variables."""
     ray, pdf = _attached_ray(at.ray), mi.Float(dr.detach(at.pdf))
     dr.enable_grad(pdf)
     return replace(at, ray=ray, pdf=pdf)
@@ -69,10 +69,10 @@ def backward_step(
     active: mi.Bool,
     rays_only: bool = False,
 ) -> tuple[mi.Spectrum, RayDerivative, mi.Bool]:
-    """Back-propagate  δL β_i·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters; gives L_i, q_i, and its loss.
+    """Back-propagate  δL β_i·(e_i + w_i L_{i+1}) + q_{i+1}·r_{i+1}  into the parameters; return L_i and q_i.
 
-    ``L`` is L_{i+1}. Where not ``attached``, q stays zero and costs nothing. A q_i that is not finite is dropped: the
-    last result tells where.
+    ``L`` is L_{i+1}. If not ``attached``, q stays zero at no cost. A non-finite q_i is set to zero; the last result is
+    the mask of these lanes. With ``rays_only`` no parameter receives a gradient.
     """
     lost = mi.Bool(False)
     with dr.resume_grad():
@@ -94,7 +94,7 @@ def backward_step(
 def forward_step(
     trace: TraceConfig, v: VertexRecord, attached: bool, tangent: RayDerivative, active: mi.Bool
 ) -> tuple[Step, mi.Spectrum, mi.Spectrum, RayDerivative]:
-    """The step, the tangents of e_i and w_i, and that of the next arrival."""
+    """Evaluate a step again; return it with the tangents of e_i, of w_i and of the next arrival."""
     with dr.resume_grad():
         at = v.at
         if attached:
@@ -108,7 +108,7 @@ def forward_step(
 
 
 def backward_ray(ray: mi.Ray3f, f: Callable[[mi.Ray3f], mi.Float]) -> RayDerivative:
-    """Back-propagate a function of a ray into the parameters; gives the adjoint of the ray, where that is finite."""
+    """Back-propagate a function of a ray into the parameters; return the adjoint of the ray, zero if not finite."""
     with dr.resume_grad():
         ray = _attached_ray(ray)
         backward(f(ray))
@@ -116,7 +116,7 @@ def backward_ray(ray: mi.Ray3f, f: Callable[[mi.Ray3f], mi.Float]) -> RayDerivat
 
 
 def forward_ray(ray: mi.Ray3f, tangent: RayDerivative, f: Callable[[mi.Ray3f], mi.Spectrum]) -> mi.Spectrum:
-    """The tangent of a function of a ray, from those of the ray and of the parameters."""
+    """Return the tangent of a function of a ray, given the tangents of the ray and of the parameters."""
     with dr.resume_grad():
         ray = _attached_ray(ray)
         dr.set_grad(ray.o, tangent.o)
@@ -125,7 +125,7 @@ def forward_ray(ray: mi.Ray3f, tangent: RayDerivative, f: Callable[[mi.Ray3f], m
 
 
 def derivative_by_ray(ray: mi.Ray3f, f: Callable[[mi.Ray3f], mi.Float]) -> RayDerivative:
-    """The derivative of a function by a ray, where that is finite. Reaches no parameter."""
+    """Differentiate a function with respect to a ray; zero if not finite. No parameter receives a gradient."""
     with dr.resume_grad():
         ray = _attached_ray(ray)
     with dr.resume_grad(ray.o, ray.d):
@@ -134,18 +134,18 @@ def derivative_by_ray(ray: mi.Ray3f, f: Callable[[mi.Ray3f], mi.Float]) -> RayDe
 
 
 def derivative_by_place(s: mi.Point2f, f: Callable[[mi.Point2f], mi.Float]) -> mi.Vector2f:
-    """The derivative of a function by a place in the plane. Reaches no parameter."""
+    """Differentiate a function with respect to a point in the plane. No parameter receives a gradient."""
     s = mi.Point2f(dr.detach(s))
     with dr.resume_grad():
         dr.enable_grad(s)
     with dr.resume_grad(s):
-        # What is the same everywhere, such as the direction of a light without extent, has no gradient.
+        # f(s) has no gradient if it is constant, as for the samples of a light without extent.
         dr.backward_from(f(s), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         return mi.Vector2f(dr.grad(s))
 
 
 def _attached_ray(ray: mi.Ray3f) -> mi.Ray3f:
-    """A copy of a ray, origin and direction of which are variables of their own."""
+    """Copy a ray, with origin and direction as independent AD variables."""
     ray = mi.Ray3f(ray)
     ray.o, ray.d = mi.Point3f(dr.detach(ray.o)), mi.Vector3f(dr.detach(ray.d))
     dr.enable_grad(ray.o, ray.d)
@@ -153,7 +153,7 @@ def _attached_ray(ray: mi.Ray3f) -> mi.Ray3f:
 
 
 def tangents(*values: Any) -> list[Any]:
-    """Forward-propagate from the parameters to all values at once; zero for those that no parameter reaches."""
+    """Forward-propagate from the parameters to all values at once; tangents of unreached values are zero."""
     attached = [value for value in values if dr.grad_enabled(value)]
     if not attached:
         return [dr.zeros(type(value)) for value in values]
@@ -165,10 +165,10 @@ def tangents(*values: Any) -> list[Any]:
 def backward(target: mi.Float) -> None:
     """Back-propagate from a scalar per path.
 
-    Raises Unreached when no parameter with gradients reaches it: the gradient would silently be zero.
+    Raises Unreached if no parameter with gradients reaches the scalar, where the gradient would silently be zero.
     """
     if not dr.grad_enabled(target):
         if not dr.flag(dr.JitFlag.SymbolicLoops) and not dr.flag(dr.JitFlag.SymbolicCalls):
-            return  # only what these very paths meet is called: others, or other vertices, may meet the parameter
+            return  # evaluated calls: other paths or vertices may still reach a parameter
         raise Unreached("no parameter with gradients reaches the light paths")
     dr.backward_from(target)

@@ -21,29 +21,29 @@ from pathreplay.transport.vertex import VertexRecord
 from pathreplay.transport.volume.media import interaction, majorant, span
 
 # Cells along each axis of space, and along each side of the octahedron of directions. 8³ x 4² cells of two averages
-# with four numbers each are 256 KiB, three times: what is known, its sums, and what the present pass sees. More cells
-# know less each, so that gradients get noisier again: see the cloud of `pathreplay bench media`.
+# with four values each take 256 KiB. Three such arrays exist: averages, their sums, and the sums of the present pass.
+# With more cells each has fewer samples, and gradients get noisier again: see the cloud of `pathreplay bench media`.
 CELLS, SIDES = 8, 4
 AVERAGES = 2 * CELLS**3 * SIDES**2  # X and Y side by side
-# How much of what was known before stays when a pass has been learned: about the last ten passes count.
+# Factor of the previous sums when a pass is added: about the last ten passes contribute.
 MEMORY = 0.9
-# What a null collision counts at first (see `branch_weight`): as if there were fifty on a path.
+# Initial weight of a null collision (see `branch_weight`), as for fifty null collisions per path.
 FIRST_BRANCHING = 0.02
 SLOTS = 256
-# A cell believes the mean of all cells as much as this many samples of its own.
+# Weight of the mean of all cells in the average of a cell, in samples of that cell.
 PRIOR = 2.0
 
 
 def _channels() -> int:
-    """Channels that are told apart. Wavelengths differ from path to path in spectral variants: there only the mean."""
+    """Return the number of channels: 3 in rgb variants; 1, their mean, in others, where wavelengths vary by path."""
     return 3 if mi.is_rgb else 1
 
 
 @dataclass(frozen=True)
 class BaselineCells:
-    """The cells of position and direction, in a box that holds all media."""
+    """The cells of position and direction, in a box that contains all media."""
 
-    low: tuple[float, ...]  # numbers that a frozen function takes as they are
+    low: tuple[float, ...]  # Python values, constants for a frozen function
     scale: tuple[float, ...]  # cells per unit of length
 
     @staticmethod
@@ -52,7 +52,7 @@ class BaselineCells:
         return BaselineCells(tuple(map(float, box.min)), tuple(scale))
 
     def index(self, p: mi.Point3f, d: mi.Vector3f) -> mi.UInt32:
-        """Index of the first average of the cell."""
+        """Return the index of the first average of a cell."""
         at = mi.Vector3u(
             dr.clip(mi.Vector3f(p - mi.ScalarPoint3f(self.low)) * mi.ScalarVector3f(self.scale), 0, CELLS - 1)
         )
@@ -66,17 +66,17 @@ class BaselineCells:
 
 @dataclass
 class BaselineStats:
-    """What gradient passes saw of the media: sums, so that those of several passes or shards can be added."""
+    """Radiance that gradient passes have seen in media, as sums: those of several passes or shards can be added."""
 
     cells: BaselineCells
-    sums: mi.Float  # Σ weight·L in three channels and Σ weight, of each average
-    nulls: mi.Float  # null collisions, in parts that float32 can hold
-    paths: int  # that these collisions are of
+    sums: mi.Float  # for each average, Σ weight·L in three channels and Σ weight
+    nulls: mi.Float  # numbers of null collisions, in partial sums that float32 can hold
+    paths: int  # number of paths of these collisions
     passes: frozenset[Hashable]  # keys of the passes
 
     @staticmethod
     def none(cells: BaselineCells, *keys: Hashable) -> BaselineStats:
-        """For the pass with that key to begin with; recorded ones have none."""
+        """Create empty statistics for passes with these keys; a recorded pass has no key."""
         sums, nulls = dr.zeros(mi.Float, 4 * AVERAGES), dr.zeros(mi.Float, SLOTS)
         dr.make_opaque(sums, nulls)
         return BaselineStats(cells, sums, nulls, 0, frozenset(keys))
@@ -86,7 +86,7 @@ class BaselineStats:
         return BaselineStats(self.cells, sums, nulls, paths, self.passes | other.passes)
 
     def learn(self, replayed: VertexRecord, L: mi.Spectrum) -> None:
-        """Collect the radiance ``L`` that came back along the ray of a replayed vertex; in the loop of a pass."""
+        """Add the radiance ``L`` that arrived along the ray of a replayed vertex; called in the loop of a pass."""
         at, flight = replayed.at, replayed.kept.media.flight
         in_medium = at.medium != None  # noqa: E711 (an array of pointers)
         event = in_medium & flight.event
@@ -97,7 +97,7 @@ class BaselineStats:
         x = interaction(at.medium, at.ray, flight.t)
         y = interaction(at.medium, at.ray, a + flight.along * length)
         self._add(self.cells.index(x.p, at.ray.d), L, mi.Float(1), event)
-        # Long flights are seldom cut at any given point of theirs; lengths make up for it, in mean free paths.
+        # y is sampled with density 1 / length. The weight, the length in mean free paths, compensates for it.
         weight = length * majorant(at.medium, at.ray, length > 0)
         self._add(self.cells.index(y.p, at.ray.d) + 1, L, weight, length > 0)
 
@@ -107,7 +107,7 @@ class BaselineStats:
         dr.scatter_add(self.sums, mi.Vector4f(x, y, z, 1) * weight, cell, active)
 
     def tally(self, nulls: mi.Float) -> None:
-        """Collect the number of null collisions of each path."""
+        """Add the number of null collisions of each path."""
         paths = dr.width(nulls)
         dr.scatter_add(self.nulls, nulls, dr.arange(mi.UInt32, paths) % SLOTS)
         self.paths += paths
@@ -115,9 +115,9 @@ class BaselineStats:
 
 @dataclass(frozen=True)
 class Baseline:
-    """What a pass asks of a baseline, which a frozen function can be handed.
+    """The part of a baseline that a pass reads, suitable as an input of a frozen function.
 
-    ``branching`` is what a null collision is to count.
+    ``branching`` is the relative weight of a null collision, see `branch_weight`.
     """
 
     cells: BaselineCells
@@ -125,7 +125,7 @@ class Baseline:
     branching: mi.Float
 
     def look(self, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool) -> mi.Spectrum:
-        """The guess at an interaction, for radiance that travels along -mei.wi; σ̄ is the majorant."""
+        """Look up the baseline at an interaction, for radiance from the direction -mei.wi; σ̄ is the majorant."""
         mei, σ_t = dr.detach(mei), dr.detach(σ_t)
         cell = self.cells.index(mei.p, -mei.wi)
         X, Y = dr.gather(mi.Vector4f, self.known, cell, active), dr.gather(mi.Vector4f, self.known, cell + 1, active)
@@ -136,12 +136,12 @@ class Baseline:
 
 @dataclass(frozen=True)
 class BaselineState:
-    """What is known of the media of a scene. ``after`` is what is known when more has been seen."""
+    """The learned state for the media of a scene; `after` returns the state after further passes."""
 
     cells: BaselineCells
-    sums: mi.Float  # those of `BaselineStats`, of which older passes count less
+    sums: mi.Float  # like `BaselineStats.sums`, with smaller weights for older passes
     branching: mi.Float
-    passes: frozenset[Hashable] = frozenset()  # keys of the passes that were learned from: none is its own judge
+    passes: frozenset[Hashable] = frozenset()  # keys of the passes that contributed: they must not use this state
     guess: Baseline = field(init=False)
 
     def __post_init__(self) -> None:
@@ -150,37 +150,37 @@ class BaselineState:
 
     @staticmethod
     def fresh(box: mi.ScalarBoundingBox3f) -> BaselineState:
-        """Nothing is known yet of what is in the box."""
+        """Create the initial state for media in a box."""
         return BaselineState(BaselineCells.of(box), dr.zeros(mi.Float, 4 * AVERAGES), mi.Float(FIRST_BRANCHING))
 
     def after(self, seen: BaselineStats) -> BaselineState:
-        """What is known when passes have seen that, too. Ask when their kernels have been launched."""
+        """Return the state after passes with these statistics; call it once their kernels have been launched."""
         branching = seen.paths / (seen.paths + dr.sum(seen.nulls)) if seen.paths else self.branching
         sums, passes = MEMORY * self.sums + seen.sums, self.passes | seen.passes
         return BaselineState(self.cells, sums, branching, passes)
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        """All that it knows, as float32 arrays by name, from which `restored` makes the same again."""
+        """Return the state as float32 arrays by name; `restored` is the inverse."""
         return {"sums": self.sums.numpy(), "branching": self.branching.numpy()}
 
     @staticmethod
     def restored(box: mi.ScalarBoundingBox3f, learned: Mapping[str, np.ndarray]) -> BaselineState:
-        """One that knows what `state_dict` told of another. Raises PathreplayError if that cannot be."""
+        """Create a state from the result of `state_dict`. Raises PathreplayError if shapes or values do not fit."""
         shapes = {name: np.shape(value) for name, value in learned.items()}
         wanted = {"sums": (4 * AVERAGES,), "branching": (1,)}
         if shapes != wanted or not 0 < learned["branching"][0] <= 1:
             raise PathreplayError(
-                f"What was learned of the media has the shapes {shapes}, not {wanted}, or branching beyond 0 to 1; "
-                "start the job from its config"
+                f"the learned baseline of the media has the shapes {shapes} instead of {wanted}, "
+                "or a branching weight outside (0, 1]: start the job from its config"
             )
-        # In memory of Dr.Jit's own: recorded passes want it aligned as it was.
+        # Copy into memory of Dr.Jit: recorded passes require the same alignment.
         one = dr.opaque(mi.Float, 1)
         sums, branching = (mi.Float(np.array(learned[name], np.float32)) * one for name in ("sums", "branching"))
         return BaselineState(BaselineCells.of(box), sums, branching)
 
 
 def _averages(sums: mi.Float) -> mi.Float:
-    """The averages that follow from the sums; cells that saw little lean on all of them."""
+    """Compute the averages from the sums; the mean of all cells supports cells with few samples."""
     i = dr.arange(mi.UInt32, AVERAGES)
     is_y = i % 2 == 1
     weight = dr.gather(mi.Float, sums, 4 * i + 3)

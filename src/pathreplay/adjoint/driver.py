@@ -12,19 +12,19 @@ from pathreplay.transport.vertex import TraceConfig
 
 
 class Driver(Protocol):
-    """Back-propagates the adjoint radiance ``δL`` of each path into the parameters, and into the ``start``.
+    """Back-propagates the adjoint radiance ``δL`` of each path into the parameters and into the ``start``.
 
-    Returns whether the paths move with the parameters. ``lost`` counts paths that lost a part of their gradient. Called
-    under `dr.suspend_grad`. Its docstring says what it does not differentiate.
+    Returns whether the paths move with the parameters. ``lost`` counts paths that lost a part of their gradient. The
+    caller suspends gradients (`dr.suspend_grad`). The docstring of a driver says what it does not differentiate.
     """
 
     def __call__(self, trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool: ...
 
 
 class ForwardDriver(Protocol):
-    """Gives the tangent of the radiance, whether anything was met (both per path), and whether the paths move.
+    """Returns the tangent of the radiance, whether the path met anything (both per path), and whether the paths move.
 
-    The parameters carry their tangents already.
+    The parameters carry tangents.
     """
 
     def __call__(

@@ -22,20 +22,21 @@ from pathreplay.transport.vertex import TraceConfig
 
 
 def only_emission_varies(trace: TraceConfig, start: CameraStart) -> bool:
-    """Whether nothing has gradients but what lights emit: no weight, and nothing that moves. For scenes without media.
+    """Return whether only emitted radiance has gradients: no weight depends on a parameter, and nothing moves.
 
-    Found out by tracing, so never where Dr.Jit evaluates what is called as it goes: there some may not be met.
+    False in scenes with media. The test traces the code, and so it is also False if Dr.Jit evaluates virtual calls
+    immediately: the first vertices may then not reach all objects.
     """
     if trace.media is not None or not trace.traits.lights_vary or not dr.flag(dr.JitFlag.SymbolicCalls):
         return False
-    if not trace.scene.shapes():  # nothing that could be lit is traced, and so nothing met
+    if not trace.scene.shapes():  # without surfaces, the test would trace no BSDF
         return False
     at = PathState.begin(trace, start).at
     return not path_moves(trace, start, at) and not weights_vary(trace, at)
 
 
 def lights_or(other: Driver) -> Driver:
-    """A driver: `emission_only` where that will do, and the ``other`` elsewhere."""
+    """Return a driver that is `emission_only` where only emission varies, and ``other`` elsewhere."""
 
     def driver(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
         return (emission_only if only_emission_varies(trace, start) else other)(trace, start, δL, lost)
@@ -45,11 +46,11 @@ def lights_or(other: Driver) -> Driver:
 
 @dr.syntax
 def emission_only(trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter) -> bool:
-    """Back-propagate the adjoint radiance ``δL`` into what lights emit. Of any depth; for `lights_alone`.
+    """Back-propagate the adjoint radiance ``δL`` into emitted radiance, for `only_emission_varies`; of any depth.
 
-    At each vertex what was hit, and an emitter sample, by the weights of the picture; in the end what is around the
-    scene, which each path meets once. Returns that paths do not move.
-    Not differentiated: all but what lights emit. Raises PathreplayError when no parameter reaches the paths.
+    Each vertex contributes the emission of the hit surface and the emitter sample, with the weights of the image. A
+    path that leaves the scene also contributes the background. Returns False: paths do not move.
+    Not differentiated: everything but emitted radiance. Raises PathreplayError if no parameter reaches the paths.
     """
     trace = replace(trace, background_apart=True)
     sampler, path = start.sampler, PathState.begin(trace, start)

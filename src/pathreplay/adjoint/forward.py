@@ -15,12 +15,12 @@ from pathreplay.transport.vertex import TraceConfig
 
 @dr.syntax
 def forward(trace: TraceConfig, start: CameraStart, lost: NonFiniteCounter) -> tuple[mi.Spectrum, mi.Bool, bool]:
-    """Tangent of the radiance along the rays of a ``start``: ``(δL, valid, moves)``, the first two per ray.
+    """Compute the tangent of the radiance along the rays of a ``start``.
 
-    The parameters must carry their tangents already (propagate to them before the call). Nothing is divided, so a
-    weight that is exactly zero keeps its derivative: δβ_{i+1} = δβ_i w_i + β_i δw_i. If the path ``moves`` with the
-    parameters, ``lost`` counts paths with a tangent that was not finite and was dropped. Visibility is not
-    differentiated and, with ``attach='none'``, nothing that moves.
+    Returns ``(δL, valid, moves)``, the first two per ray. The parameters must carry tangents before the call. A weight
+    that is exactly zero keeps its derivative, because no division occurs: δβ_{i+1} = δβ_i w_i + β_i δw_i. If the path
+    ``moves`` with the parameters, ``lost`` counts the paths whose tangent was not finite and was dropped. Not
+    differentiated: visibility and, with ``attach='none'``, all motion.
     """
     with dr.resume_grad():
         δo, δd = tangents(*start.repeat())

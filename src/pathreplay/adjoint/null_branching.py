@@ -22,16 +22,16 @@ from pathreplay.transport.volume.media import interaction, majorant
 
 @dataclass
 class Branch:
-    """The null collision that was kept so far (loop state); zero before there is any."""
+    """The null collision that is kept so far (loop state); zero before the first one."""
 
-    p: mi.Point3f  # where
-    d: mi.Vector3f  # direction of the path that came there
+    p: mi.Point3f  # position of the collision
+    d: mi.Vector3f  # direction of the path before the collision
     medium: mi.MediumPtr
-    weight: mi.Spectrum  # throughput and weight of the collision, over its share of the mass
+    weight: mi.Spectrum  # throughput times the weight of the collision, over its mass
     bare: mi.Spectrum  # the same without the null collisions before it on its flight
-    mass: mi.Float  # of all null collisions so far
-    number: mi.Float  # of null collisions so far
-    depth: mi.UInt32  # vertices before
+    mass: mi.Float  # sum over all null collisions so far
+    number: mi.Float  # number of null collisions so far
+    depth: mi.UInt32  # number of vertices before
     η: mi.Float  # relative index of refraction since the camera
 
     @staticmethod
@@ -40,7 +40,7 @@ class Branch:
         return Branch(o, d, dr.zeros(mi.MediumPtr), black, black, mi.Float(0), mi.Float(0), mi.UInt32(0), mi.Float(1))
 
     def offer(self, path: PathState, step: SampledStep) -> Branch:
-        """This one, or the null collision of one more flight, by their masses."""
+        """Choose between this null collision and that of another flight, in proportion to their masses."""
         ray, null = path.at.ray, step.kept.media.flight.null
         active = path.active & dr.any(path.β != 0)
         mass = self.mass + dr.select(active, null.mass, 0)
@@ -53,7 +53,7 @@ class Branch:
 
 
 def branch_backward(trace: TraceConfig, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f, δL: mi.Spectrum) -> None:
-    """Back-propagate ``δL`` through the branch's part of the radiance, if any parameter reaches it."""
+    """Back-propagate ``δL`` through the branch's contribution to the radiance, if a parameter reaches it."""
     with dr.resume_grad():
         term = branch_term(trace, branch, sampler, ray)
         if dr.grad_enabled(term):
@@ -61,10 +61,10 @@ def branch_backward(trace: TraceConfig, branch: Branch, sampler: mi.Sampler, ray
 
 
 def branch_term(trace: TraceConfig, branch: Branch, sampler: mi.Sampler, ray: mi.Ray3f) -> mi.Spectrum:
-    """What has the branch's part of the radiance's derivative for derivative; its value means nothing.
+    """Return a term whose derivative is the branch's contribution to the derivative of the radiance (Spectrum).
 
-    Walks the extra path, detached; time and wavelengths are those of the camera ``ray``. Differentiable in the
-    coefficients of the medium. Call it under `dr.resume_grad`.
+    The value of the term has no meaning. The extra path is detached; time and wavelengths are those of the camera
+    ``ray``. Differentiable in the coefficients of the medium. The caller resumes gradients (`dr.resume_grad`).
     """
     onward = replace(trace, branching=None)
     active = branch.mass > 0

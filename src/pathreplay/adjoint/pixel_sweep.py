@@ -3,15 +3,16 @@
 The adjoint of a path is known only after its pixel is complete. Each lane therefore samples all N paths of a pixel,
 records them one after the other as `sweep` does for one path, and then sweeps back through all of them. Let I be the
 mean of the radiances L_s. For a loss with derivative f'(I), the adjoint of a path must not depend on its own radiance:
-the covariance of L_s and its derivative would bias the gradient. Nor must it depend on correlated paths, as stratified
-samples of one pixel are. Paths are therefore drawn in mutually independent sets S, and the adjoint of each path uses
-the other sets only:
+the covariance of L_s and its derivative would bias the gradient. It must not depend on correlated paths either, for
+example on other stratified samples of the pixel. Paths are therefore drawn in mutually independent sets S, and the
+adjoint of each path uses the other sets only:
 
     δL_s = f'(I_{-S}) / N,    I_{-S} = (N I - Σ_S L) / (N - |S|),    f'(I) = offset + slope · I.
 
-The expected gradient is that with an independent image. The variance differs by the covariance of f'(I) dL_s and the
-change of f' with L_s. It is lower where the loss demands more light and higher where it demands less. It also differs,
-to second order in 1/N, by the product of the noise of the image and that of the derivative.
+The expected gradient equals that of an independent image. The variances differ. One difference is the covariance of
+f'(I) dL_s with the change of f' due to L_s: it lowers the variance where the loss demands more light, and raises it
+where the loss demands less. The other, of second order in 1/N, is the product of the noise of the image and the noise
+of the derivative.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from pathreplay.transport.vertex import TraceConfig
 
 @dataclass(frozen=True)
 class PixelLoss:
-    """Derivative of a loss by each lane's pixel: offset + slope · I."""
+    """Derivative of a loss with respect to the pixel of each lane: offset + slope · I."""
 
     offset: mi.Spectrum
     slope: mi.Spectrum
@@ -50,11 +51,11 @@ def pixel_sweep(
     loss: PixelLoss,
     lost: NonFiniteCounter,
 ) -> tuple[bool, mi.Spectrum]:
-    """Walk ``paths`` paths (two or more) in every lane and back-propagate the loss.
+    """Trace ``paths`` paths (two or more) in every lane and back-propagate the loss.
 
-    Returns whether the paths move with the parameters, and the mean of their radiances. ``camera`` gives rays,
-    detached, and their weights: (sampler, active) -> (Ray3f, Spectrum). For scenes without media. What is not
-    differentiated, what is counted as ``lost`` and what is raised: see `sweep`.
+    Returns whether the paths move with the parameters, and the mean of their radiances. ``camera`` maps (sampler,
+    active) to detached rays and their weights (Ray3f, Spectrum). The scene must have no media. `sweep` describes what
+    is not differentiated, what ``lost`` counts, and which errors are raised.
     """
     room, size = room_for(trace), numbers.together(paths)
     total = mi.Spectrum(0)  # radiance of all paths
@@ -64,10 +65,10 @@ def pixel_sweep(
         start = CameraStart(ray0, sampler, mi.Bool(True))
         layout = Layout.of(trace, path_moves(trace, start, PathState.begin(trace, start).at))
     records = dr.alloc_local(record_type(layout), paths * room)
-    counts = dr.alloc_local(mi.UInt32, paths)  # of each path the number of its records
-    ends = dr.alloc_local(mi.Spectrum, paths)  # what comes from beyond them
-    sets = dr.alloc_local(mi.Spectrum, -(-paths // size), dr.zeros(mi.Spectrum))  # of each set the sum of its radiances
-    s = mi.UInt32(0)  # number of the path
+    counts = dr.alloc_local(mi.UInt32, paths)  # number of records of each path
+    ends = dr.alloc_local(mi.Spectrum, paths)  # radiance from beyond the records of each path
+    sets = dr.alloc_local(mi.Spectrum, -(-paths // size), dr.zeros(mi.Spectrum))  # sum of radiances of each set
+    s = mi.UInt32(0)  # index of the path
 
     while dr.hint(
         s < paths, exclude=[trace, numbers, camera, layout, start, lost], label="pathreplay: paths of a pixel"

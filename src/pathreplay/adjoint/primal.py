@@ -14,10 +14,10 @@ from pathreplay.transport.vertex import TraceConfig
 
 
 def primal(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool]:
-    """Estimate the radiance along the rays of a ``start``: ``(L, valid)``, per ray.
+    """Estimate the radiance along the rays of a ``start``; return ``(L, valid)`` per ray.
 
-    ``valid`` is Mitsuba's alpha: the path met a particle, or a surface that does not merely let it pass. Nothing is
-    differentiated.
+    ``valid`` is Mitsuba's alpha: the path had a collision in a medium, or met a surface that did not pass it
+    unscattered. Nothing is differentiated.
     """
     path = PathState.begin(trace, start)
     L, valid = walk_on(trace, start.sampler, path)
@@ -26,9 +26,9 @@ def primal(trace: TraceConfig, start: CameraStart) -> tuple[mi.Spectrum, mi.Bool
 
 @dr.syntax
 def walk_on(trace: TraceConfig, sampler: mi.Sampler, path: PathState) -> tuple[mi.Spectrum, mi.Bool]:
-    """Radiance that arrives at a path from where it is on, and whether anything was met there.
+    """Continue a path from its present state; return the radiance that arrives along it, and whether it met anything.
 
-    Relative to its throughput, which has to be one.
+    The throughput of the path must be one: the radiance is relative to it.
     """
     trace = replace(trace, background_apart=trace.media is None)
     L = mi.Spectrum(0)  # radiance so far

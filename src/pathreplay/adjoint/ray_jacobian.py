@@ -20,8 +20,9 @@ from pathreplay.transport.path import PathState
 from pathreplay.transport.step import repeat_step
 from pathreplay.transport.vertex import Arrival, TraceConfig, VertexRecord, VertexSamples, reciprocal
 
-# Noise is needed where `independence` is below this. At held smooth lobes it would be zero but for float32 rounding,
-# which makes it 1e-7; at mirrors, glass and attached rough metal it is above 1e-3. float64 forgives 1e-4.
+# Noise is added where `independence` is below this value. For smooth lobes that follow their hit point, independence is
+# zero up to float32 rounding (1e-7). For mirrors, glass and attached rough metal it is above 1e-3. float64 tolerates
+# 1e-4.
 ILL_CONDITIONED = 1e-4
 
 
@@ -29,19 +30,20 @@ ILL_CONDITIONED = 1e-4
 class Recovery:
     """How ray adjoints are recovered: solve (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i, in float64.
 
-    ``noise`` is the standard deviation of ε_i, which is +noise or -noise with even odds: of all noise of mean zero and
-    that variance it stays furthest from zero, and so the matrix from being singular. 0 turns it off. X_i is the
-    identity on directions and zero on origins, and only where A_i is ill-conditioned.
+    ``noise`` is the standard deviation of ε_i, which is +noise or -noise with equal probability. Of all distributions
+    with mean zero and this variance, this one stays furthest from zero, and thus keeps the matrix furthest from being
+    singular. 0 turns the noise off. Where A_i is ill-conditioned, X_i is the identity on directions and zero on
+    origins; elsewhere it is zero.
     """
 
     noise: float = 0.01
 
     def real(self, kind: type) -> type:
-        """The array type in which the books are kept that belongs to a type of the variant."""
+        """Return the float64 counterpart of an array type of the variant, in which adjoints are recovered."""
         return dr.float64_array_t(kind)  # type: ignore[no-any-return]
 
     def regularised(self, A: mi.Matrix4f, sign: mi.Float, smooth: mi.Bool) -> mi.Matrix4f:
-        """A + ε X; ``smooth`` tells where a smooth lobe was sampled."""
+        """Return A + ε X; ``smooth`` selects the lanes in which a smooth lobe was sampled."""
         ε = dr.select(independence(A) >= ILL_CONDITIONED, 0, type(A[0, 0])(self.noise * sign))
         return A + type(A)(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, ε, 0, 0, 0, 0, ε)
 
@@ -72,47 +74,47 @@ class RayFrame:
 
 @dataclass
 class Slope:
-    """Derivative of δL·β e of a vertex with respect to what its ray alone does not tell."""
+    """Derivative of δL·β e of a vertex with respect to the two quantities that are not functions of its ray."""
 
-    pdf: mi.Float  # by the density of the ray
-    slide: mi.Float  # by the length that the origin slides forward along the ray
+    pdf: mi.Float  # density of the ray
+    slide: mi.Float  # distance by which the origin slides forward along the ray
 
 
 @dataclass
 class Linearised:
     """A step linearised in the four coordinates of its ray."""
 
-    A: mi.Matrix4f  # coordinates of the next ray by those of this ray
+    A: mi.Matrix4f  # derivative of the next ray's coordinates by those of this ray
     e: mi.Vector4f  # derivative of δL·β_i e_i + (slope of e_{i+1})·(pdf, slide)
-    log_w: list[mi.Spectrum]  # four: derivative of log w_i, by each coordinate; 0 where w_i is 0
+    log_w: list[mi.Spectrum]  # derivative of log w_i by each of the four coordinates; 0 where w_i is 0
     slope: Slope  # of the next vertex
     frame_next: RayFrame  # of the next ray
 
 
 @dataclass
 class PeeledPath:
-    """Result of the first pass of attached replay, which the second updates from vertex to vertex."""
+    """Result of the first pass of attached replay; the second pass updates it from vertex to vertex."""
 
     δL: mi.Spectrum  # adjoint of the radiance of the path
     L: mi.Spectrum  # β_i L_i
     q: mi.Vector4f  # adjoint of the ray, in the coordinates of its `RayFrame`
-    overflow: mi.Bool  # q was not finite, and is zero
+    overflow: mi.Bool  # q was not finite, and was set to zero
 
 
 def has_smooth_lobes(trace: TraceConfig) -> bool:
-    """Whether any BSDF of the scene has a lobe other than delta lobes."""
+    """Return whether any BSDF of the scene has a lobe that is not a delta lobe."""
     return bool(trace.traits.detached_names or trace.traits.attachables)
 
 
 def length_scale(scene: mi.Scene) -> float:
-    """Half the diagonal of the scene: a unit of length in which offsets and angles are alike. 1 for an empty scene."""
+    """Return half the diagonal of the scene (1 if empty): a unit in which offsets are comparable to angles."""
     extents = scene.bbox().extents()
     diagonal = sum(float(x) ** 2 for x in extents) ** 0.5
     return diagonal / 2 if 0 < diagonal < float("inf") else 1.0
 
 
 def emission_slope(trace: TraceConfig, at: Arrival, weight: mi.Spectrum, active: mi.Bool) -> Slope:
-    """How weight·e (detached weight) changes with the density of an arrival and the distance it came."""
+    """Differentiate weight·e (detached weight) by the density of an arrival and by the distance from its origin."""
     if not has_smooth_lobes(trace):
         return Slope(mi.Float(0), mi.Float(0))
     slopes = []
@@ -139,10 +141,10 @@ def local_terms(
     frame_next: RayFrame,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Spectrum, list[mi.Float]]:
-    """The step at ``v`` with a differentiable arrival: what its adjoint is made of.
+    """Evaluate the step at ``v`` with a differentiable arrival; return the terms that make up its adjoint.
 
-    δL·β_i e_i + (slope of e_{i+1})·(pdf, slide), w_i/detach(w_i) (0 where w_i is 0) and the four coordinates of
-    the next ray. ``weight`` is δL β_i, ``slope`` that of the next vertex.
+    These are δL·β_i e_i + (slope of e_{i+1})·(pdf, slide), w_i/detach(w_i) (0 where w_i is 0), and the four coordinates
+    of the next ray. ``weight`` is δL β_i, and ``slope`` belongs to the next vertex.
     """
     step = repeat_step(trace, replace(v, at=at), True, active)
     o, d = step.ray_next.o, step.ray_next.d
@@ -157,14 +159,14 @@ def linearise(
 ) -> Linearised:
     """Differentiate `local_terms` by the four coordinates of the ray, and by nothing else.
 
-    ``onward`` is the path at the next vertex, ``scale`` the unit of length. Both passes call this very function, so
-    that they see the same numbers to the last bit.
+    ``onward`` is the path at the next vertex, ``scale`` the unit of length. Both passes call this function, so that
+    their values agree to the last bit.
     """
     slope = emission_slope(trace, onward.at, δL * onward.β, v.go_on)
     frame, frame_next = RayFrame.of(v.at.ray, scale), RayFrame.of(onward.at.ray, scale)
     columns = []
     for k in range(4):
-        # One graph per column: traversing one twice ends the process (Dr.Jit 1.5, virtual calls in a loop).
+        # One graph per column: traversing a graph twice crashes the process (Dr.Jit 1.5, virtual calls in a loop).
         x = [mi.Float(0) for _ in range(4)]
         x[k] = _unit_tangent(0)
         with dr.resume_grad(x[k]):
@@ -179,10 +181,10 @@ def linearise(
 
 
 def _unit_tangent(value: mi.Float) -> mi.Float:
-    """An AD variable of its own with tangent 1, also where gradients are suspended.
+    """Create an independent AD variable with tangent 1, also where gradients are suspended.
 
-    Resume gradients for it alone: a virtual call would push tangents from parameters, too, across the border of the
-    loop.
+    Gradients must be resumed for this variable only: virtual calls would otherwise propagate tangents of parameters
+    across the loop boundary.
     """
     variable = mi.Float(dr.detach(value))
     with dr.resume_grad():
@@ -192,16 +194,17 @@ def _unit_tangent(value: mi.Float) -> mi.Float:
 
 
 def random_sign(u: VertexSamples) -> mi.Float:
-    """+1 or -1 with even odds: a hash of a vertex's numbers, so it repeats and takes none from the sampler."""
+    """Return +1 or -1 with equal probability, as a hash of the vertex's samples: both passes get the same sign."""
     bits = [dr.reinterpret_array(mi.UInt32, x) for x in (u.light.x, u.roulette)]
     return dr.select((mi.sample_tea_32(bits[0], bits[1], 4)[0] & 1) == 0, mi.Float(1), mi.Float(-1))
 
 
 def independence(A: mi.Matrix4f) -> mi.Float64:
-    """How far the columns of a 4x4 matrix are from linear dependence, about 1 / its condition number.
+    """Measure how far the columns of a 4x4 matrix are from linear dependence: about 1 / condition number.
 
-    The smallest part of a column that the columns before it do not span, relative to the Frobenius norm, by modified
-    Gram-Schmidt. (Cofactors, and so `dr.rcp`, cannot tell: of a matrix of rank two they are rounding alone.)
+    Modified Gram-Schmidt removes from each column the components along earlier columns. The result is the smallest
+    remaining norm, relative to the Frobenius norm. Cofactors, and so `dr.rcp`, cannot measure this: for a matrix of
+    rank two they consist of rounding errors.
     """
     real = dr.float64_array_t(mi.Float)
     columns = [[real(A[i, k]) for i in range(4)] for k in range(4)]

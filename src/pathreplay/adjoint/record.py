@@ -1,6 +1,6 @@
-"""The record of one path vertex in the sweep drivers: plain numbers for thread-local memory.
+"""The record of one path vertex in the sweep drivers: plain values in thread-local memory.
 
-One table lists the recorded fields; the record type and the functions that write and read it are derived from the
+One table lists the recorded fields. The record type and the functions that write and read it are derived from the
 table.
 """
 
@@ -27,20 +27,20 @@ from pathreplay.transport.vertex import (
     VertexSamples,
 )
 
-# Deepest path that the thread-local record holds: 16 lanes x 2048 vertices x up to 136 bytes are 4.5 MB, and a
-# thread's stack is 8 MB. Beyond the stack the process would die without a word.
+# Largest depth that the thread-local record holds: 16 lanes x 2048 vertices x up to 136 bytes are 4.5 MB, and a
+# thread's stack is 8 MB. A stack overflow would end the process without a message.
 MAX_DEPTH = 2048
 LARGEST_RECORD = 136
-"""Bytes of a vertex without media, in rgb variants."""
-# With media a vertex takes up to 210 bytes, and null boundaries have records of their own.
+"""Bytes per vertex without media, in rgb variants."""
+# With media a vertex takes up to 210 bytes, and null boundaries have their own records.
 MAX_DEPTH_MEDIA = 1024
 MAX_RECORDS_MEDIA = 2000
 
 
 def deepest(trace: TraceConfig, device: Device | None = None) -> int:
-    """The largest ``max_depth`` that the sweep driver can hold in this scene, on the device of the active variant.
+    """Return the largest ``max_depth`` that the sweep driver can hold for a scene, on the active variant's device.
 
-    On a GPU that is a share of its memory: see `pathreplay.platform.device`.
+    On a GPU the records may use a fraction of its memory: see `pathreplay.platform.device`.
     """
     device = device_of(mi.variant()) if device is None else device
     if not device.is_gpu:
@@ -51,17 +51,17 @@ def deepest(trace: TraceConfig, device: Device | None = None) -> int:
 
 
 def largest_record(trace: TraceConfig) -> int:
-    """Bytes of a vertex, whether the path moves or not: in the one case light is remembered, in the other numbers."""
+    """Return the larger size of a record in bytes: static paths record light, moving paths record random numbers."""
     return max(_bytes(Layout.of(trace, moves)) for moves in (False, True))
 
 
 def _bytes(layout: Layout) -> int:
     kinds = [_plain(kind) for _, kind, remembered in FIELDS if getattr(layout, remembered)]
-    return 4 * sum(dr.size_v(kind) if dr.depth_v(kind) > 1 else 1 for kind in kinds) + 4  # and the word
+    return 4 * sum(dr.size_v(kind) if dr.depth_v(kind) > 1 else 1 for kind in kinds) + 4  # plus the word of bits
 
 
 def room_for(trace: TraceConfig) -> int:
-    """How many vertices the record has room for: with media also two null boundaries at each, as convex ones need."""
+    """Return the number of vertices that fit; with media also two null boundaries per vertex, as convex media need."""
     if trace.media is None:
         return device_of(mi.variant()).room(max(trace.max_depth, 1))
     return min(3 * trace.max_depth + 8, MAX_RECORDS_MEDIA)
@@ -69,28 +69,28 @@ def room_for(trace: TraceConfig) -> int:
 
 @dataclass(frozen=True)
 class Layout:
-    """What the walk decides about its records."""
+    """The properties of a trace that determine which fields are recorded."""
 
     variant: str
     moves: bool  # the path moves with the parameters
-    resamples: bool  # BSDFs are sampled once more
-    fixed: bool  # what emitters bring to surfaces is known, and rays that leave the scene arrive at no vertex
-    glows: bool  # of these emitters some are surfaces
+    resamples: bool  # BSDFs are sampled again in later passes
+    fixed: bool  # the light at surfaces is recorded, and rays that leave the scene reach no vertex
+    glows: bool  # the same, and some emitter is a surface
     media: bool
     chromatic: bool
     emissive: bool
     passes: bool
     branch: bool
-    always: bool = True  # of what every record has
+    always: bool = True  # condition of the fields in every record
 
     @property
     def varies(self) -> bool:
-        """What emitters bring is to be found out again."""
+        """Whether later passes evaluate emitters again."""
         return not self.fixed
 
     @staticmethod
     def of(trace: TraceConfig, moves: bool) -> Layout:
-        """The layout for a walk."""
+        """Return the layout of the records of a trace."""
         media = trace.media is not None
         fixed = not media and not moves and not trace.traits.lights_vary
         kinds = {name: media and getattr(trace.media, name) for name in ("chromatic", "emissive", "passes")}
@@ -98,7 +98,7 @@ class Layout:
         return Layout(mi.variant(), moves, resamples, fixed, glows, media=media, branch=trace.branch, **kinds)
 
 
-# Where it stands in a Replayed, its type in Mitsuba, and what of the layout has it remembered.
+# Field of `VertexRecord`, its type in Mitsuba, and the property of `Layout` under which it is recorded.
 FIELDS = (
     ("at.ray.o", "Point3f", "always"),
     ("at.ray.d", "Vector3f", "always"),
@@ -136,7 +136,7 @@ FIELDS = (
     ("kept.media.shadow.length", "Float", "media"),
 )
 
-# Dr.Jit's local memory cannot hold Bool: these share a word, one bit each, and the lobe takes the bits above.
+# Dr.Jit's local memory cannot hold Bool. These fields share a word, one bit each; the lobe takes the upper bits.
 BITS = (
     ("at.hit.valid", "always"),
     ("at.delta", "varies"),
@@ -152,32 +152,32 @@ LOBE_SHIFT = 16
 
 
 def _require_known(place: str, remembered: str) -> None:
-    """Raise TypeError if `VertexRecord` has no such field, or `Layout` no such condition."""
+    """Raise TypeError if `VertexRecord` has no such field, or `Layout` has no such property."""
     kind: Any = VertexRecord
     for name in place.split("."):
         types = {each.name: str(each.type).split(" ")[0] for each in fields(kind)}
         if name not in types:
             raise TypeError(f"{kind.__name__} has no '{name}': '{place}' cannot be recorded")
         kind = getattr(vertex, types[name], None)
-        if kind is None:  # a class of Mitsuba's or Dr.Jit's
+        if kind is None:  # the remaining names belong to a class of Mitsuba or Dr.Jit
             break
     if remembered not in {each.name for each in fields(Layout)} | {"varies"}:
         raise TypeError(f"Layout has no '{remembered}', on which '{place}' depends")
 
 
-for _place, *_, _remembered in (*FIELDS, *BITS):  # fails at import, rather than in a kernel, after a rename
+for _place, *_, _remembered in (*FIELDS, *BITS):  # after a rename, fail on import and not in a kernel
     _require_known(_place, _remembered)
 
 
 @cache
 def record_type(layout: Layout) -> type:
-    """The dataclass that holds a vertex."""
+    """Return the dataclass of a recorded vertex."""
     kept = {_name(place): _plain(kind) for place, kind, remembered in FIELDS if getattr(layout, remembered)}
     return make_dataclass("Record", [*kept.items(), ("word", mi.UInt32)])
 
 
 def record(layout: Layout, v: VertexRecord) -> Any:
-    """A vertex, to be written."""
+    """Convert a vertex to its record."""
     kept = {}
     for place, kind, remembered in FIELDS:
         if getattr(layout, remembered):
@@ -191,7 +191,7 @@ def record(layout: Layout, v: VertexRecord) -> Any:
 
 
 def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, ray0: mi.Ray3f) -> VertexRecord:
-    """The vertex recorded at ``index``.
+    """Read the vertex recorded at ``index``.
 
     ``last`` is the index of the path's last vertex; time and wavelengths are those of the ray ``ray0``.
     """
@@ -199,7 +199,7 @@ def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, r
     if layout.fixed:
         return v
     onward = _read(layout, records[dr.minimum(index + 1, last)], ray0).at
-    # The next vertex remembers how the path came to it.
+    # The record of the next vertex holds the continuation of this one.
     kept = replace(v.kept, d=onward.ray.d, delta=onward.delta)
     if layout.passes:
         kept.delta |= kept.media.null
@@ -222,7 +222,7 @@ def _read(layout: Layout, read: Any, ray0: mi.Ray3f) -> VertexRecord:
 
 
 def _blank(layout: Layout, ray0: mi.Ray3f) -> VertexRecord:
-    """A vertex of which nothing is known yet; what is not remembered stays what it is here."""
+    """Return an empty vertex, whose values remain in all fields that are not recorded."""
     zero, no = mi.Float(0), mi.Bool(False)
     ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0), ray0.time, ray0.wavelengths)
     at = Arrival(ray, dr.zeros(mi.PreliminaryIntersection3f), zero, no, no)

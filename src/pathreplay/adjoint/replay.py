@@ -1,8 +1,8 @@
-"""The replay driver: sample the path again with the same random numbers and peel its radiance, vertex by vertex.
+"""The replay driver: sample a path again with the same random numbers, and subtract the radiance of each vertex.
 
-This is path replay backpropagation (Vicini, Speierer, Jakob 2021). The first pass stores one number, L_0. The second
-pass recovers the radiance beyond each vertex by subtracting the contributions of the vertices before. Memory does not
-depend on depth. Where the path moves with the parameters, `replay_attached` peels the adjoint of the ray as well.
+This is path replay backpropagation (Vicini, Speierer, Jakob 2021). The first pass stores only L_0. The second pass
+recovers the radiance beyond each vertex by subtracting the contributions of the vertices before it. Memory does not
+depend on depth. If the path moves with the parameters, `replay_attached` recovers the adjoint of the ray as well.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ def replay(
     lost: NonFiniteCounter,
     recovery: Recovery = Recovery(),  # noqa: B008 (it is frozen)
 ) -> bool:
-    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
+    """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start``.
 
-    Returns whether the path moves with the parameters; if so, ``recovery`` says how ray adjoints are found, ``lost``
-    counts paths with one that was not finite, and a warning tells, once, of smooth lobes. Not differentiated:
-    visibility, weights that are exactly zero (the sweep driver keeps their derivatives) and, with ``attach='none'``,
-    everything that moves.
+    Returns whether the path moves with the parameters. If it does, ray adjoints are recovered according to
+    ``recovery``, ``lost`` counts the paths with a non-finite ray adjoint, and a warning reports smooth lobes once. Not
+    differentiated: visibility, weights that are exactly zero (the sweep driver keeps their derivatives) and, with
+    ``attach='none'``, all motion.
     """
-    path = PathState.begin(trace, start, sustained=trace.branch)  # so that branches get the numbers of other drivers
+    path = PathState.begin(trace, start, sustained=trace.branch)  # branches get the same samples as in other drivers
     moves = path_moves(trace, start, path.at)
     if not moves:
         _replay_still(trace, start, path, δL)
@@ -58,11 +58,11 @@ def replay(
 
 @cache
 def _warn_of_smooth_lobes() -> None:
-    """Said once per process: the driver is at the edge of what it can do."""
+    """Warn once per process that the noise of the gradient grows with every smooth bounce."""
     mi.Log(
         mi.LogLevel.Warn,
         "pathreplay: adjoint = 'replay' follows moving paths over smooth BSDFs, where the Jacobian of the ray is "
-        "singular: noise makes the gradient unbiased, but it gets worse with every such bounce. "
+        "singular: added noise keeps the gradient unbiased, but its variance grows with every such bounce. "
         "adjoint = 'recorded' has no such limit, and is faster",
     )
 
@@ -71,11 +71,11 @@ def _warn_of_smooth_lobes() -> None:
 def _replay_still(trace: TraceConfig, start: CameraStart, path: PathState, δL: mi.Spectrum) -> None:
     """Replay a path that does not move.
 
-    Peels β_{i+1} L_{i+1} = β_i L_i - β_i e_i and differentiates it as (β_i L_{i+1}) w_i through the relative
+    Computes β_{i+1} L_{i+1} = β_i L_i - β_i e_i and differentiates it as (β_i L_{i+1}) w_i through the relative
     derivative of w_i.
     """
     sampler, ray0 = start.sampler, path.at.ray
-    L = walk_on(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, peeled on the way
+    L = walk_on(trace, sampler.clone(), dr.copy(path))[0]  # β_i L_i, updated at each vertex
     branch = Branch.none()
 
     while dr.hint(path.active, exclude=[trace], label="pathreplay: replay"):

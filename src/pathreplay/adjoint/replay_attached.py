@@ -1,6 +1,6 @@
 """Attached path replay: also recover the adjoint of the ray, by inverting one 4x4 Jacobian per vertex.
 
-The first pass stores L_0 and q_0 = δL·∂L_0/∂r_0. The second samples the path again and peels both,
+The first pass stores L_0 and q_0 = δL·∂L_0/∂r_0. The second recovers ("peels") both beyond each vertex in turn,
 
     β_{i+1} L_{i+1} = β_i L_i - β_i e_i,      (A_i + ε_i X_i)^T q_{i+1} = q_i - p_i,      A_i = ∂r_{i+1}/∂r_i,
 
@@ -32,11 +32,11 @@ from pathreplay.transport.vertex import TraceConfig
 def replay_attached(
     trace: TraceConfig, start: CameraStart, path: PathState, δL: mi.Spectrum, lost: NonFiniteCounter, recovery: Recovery
 ) -> None:
-    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start`` of a ``path``.
+    """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start`` of a ``path``.
 
-    ``lost`` counts the paths on which a q was not finite, and what it had to tell was left out. Exact on chains of
-    delta lobes. Behind smooth lobes A_i has rank two: without noise q is lost there, with noise the result is unbiased
-    as long as rounding is not magnified beyond it. Not differentiated: visibility, and weights that are exactly zero.
+    ``lost`` counts the paths on which some q was not finite and was dropped. The result is exact on chains of delta
+    lobes. At smooth lobes A_i has rank two: without noise q cannot be recovered, and with noise the result is unbiased
+    unless rounding errors, amplified, exceed it. Not differentiated: visibility, and weights that are exactly zero.
     """
     scale = length_scale(trace.scene)
     again = start.sampler.clone()
@@ -46,7 +46,7 @@ def replay_attached(
     with dr.resume_grad():
         o, d = start.repeat()
         if dr.grad_enabled(o, d):
-            dr.eval(q, L, overflow)  # else each entry of a camera's matrix runs the first pass again
+            dr.eval(q, L, overflow)  # else each entry of the camera matrix runs the first pass again
             x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
             backward(sum(q0[k] * x[k] for k in range(4)))
@@ -57,12 +57,12 @@ def replay_attached(
 def _tangents(
     trace: TraceConfig, sampler: mi.Sampler, path: PathState, δL: mi.Spectrum, recovery: Recovery, scale: float
 ) -> tuple[mi.Spectrum, mi.Vector4f]:
-    """First pass: L_0 and δL·∂L_0/∂r_0."""
+    """Run the first pass: compute L_0 and q_0 = δL·∂L_0/∂r_0."""
     Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
-    L = Spectrum(0)  # δL is not part of it
+    L = Spectrum(0)  # without the factor δL
     q = Vector(0)
     J = Matrix(1)  # ∂r_i/∂r_0
-    κ = [Spectrum(0) for _ in range(4)]  # ∂ log β_i / ∂r_0, by each coordinate
+    κ = [Spectrum(0) for _ in range(4)]  # ∂ log β_i / ∂r_0 for each coordinate
 
     while dr.hint(path.active, exclude=[trace, recovery, scale], label="pathreplay: tangents"):
         u, step = path.choose(trace, sampler)
@@ -89,7 +89,7 @@ def _peel(
     recovery: Recovery,
     scale: float,
 ) -> None:
-    """Second pass: peel L and q, feed the parameters."""
+    """Run the second pass: peel L and q, and back-propagate into the parameters."""
     δL, L, q, overflow = peeled.δL, peeled.L, peeled.q, peeled.overflow
     Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
     broken = mi.Bool(False)  # this path has been counted as lost
@@ -112,7 +112,7 @@ def _peel(
             e, w, x_next = local_terms(trace, v, v.at, δL * v.β, local.slope, local.frame_next, path.active)
             q_next = mi.Vector4f(q)
             target = e + dr.sum(δL * mi.Spectrum(L) * w) + sum(q_next[k] * x_next[k] for k in range(4))
-            if dr.hint(dr.grad_enabled(target), mode="scalar"):  # not so where the camera alone moves
+            if dr.hint(dr.grad_enabled(target), mode="scalar"):  # false if only the camera moves
                 backward(target)
 
         path = onward

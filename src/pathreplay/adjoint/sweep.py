@@ -1,7 +1,7 @@
 """The sweep driver: record a path vertex by vertex, then back-propagate from its last vertex to the first.
 
-The record is in thread-local memory: its size depends on ``max_depth`` and on the number of running threads, not on the
-number of paths. On the way back L_i = e_i + w_i L_{i+1} is rebuilt, so nothing is divided or subtracted.
+The record is in thread-local memory. Its size depends on ``max_depth`` and on the number of running threads, not on the
+number of paths. The reverse pass computes L_i = e_i + w_i L_{i+1} again, without any division or subtraction.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from pathreplay.transport.vertex import TraceConfig
 def sweep(
     trace: TraceConfig, start: CameraStart, δL: mi.Spectrum, lost: NonFiniteCounter, seen: BaselineStats | None = None
 ) -> bool:
-    """Back-propagate the adjoint radiance ``δL`` into the parameters, and into the ``start``.
+    """Back-propagate the adjoint radiance ``δL`` into the parameters and into the ``start``.
 
-    Returns whether the path moves with the parameters; if so, ``lost`` counts paths with an adjoint that was not
-    finite, and those that crossed so many null boundaries between media that they had to end. ``seen`` collects what
-    this pass sees of media, for later ones. A weight that is exactly zero keeps its derivative. Not differentiated:
-    visibility and, with ``attach='none'``, everything that moves.
-    Raises PathreplayError when ``max_depth`` is above `deepest`, or when no parameter reaches the paths.
+    Returns whether the path moves with the parameters. If it does, ``lost`` counts the paths with a non-finite adjoint.
+    It also counts the paths that ended because they crossed too many null boundaries. ``seen`` collects radiance in
+    media for the baseline of later passes. A weight that is exactly zero keeps its derivative. Not differentiated:
+    visibility and, with ``attach='none'``, all motion.
+    Raises PathreplayError if ``max_depth`` exceeds `deepest`, or if no parameter reaches the paths.
     """
     if trace.max_depth > deepest(trace):
         raise PathreplayError(
@@ -53,6 +53,6 @@ def sweep(
     with dr.resume_grad():
         o, d = start.repeat()
         if moves and dr.grad_enabled(o, d):
-            dr.eval(q)  # every parameter of the camera sums over it apart, which would run the loops as often
+            dr.eval(q)  # each camera parameter sums over q separately; unevaluated, each sum would run the loops again
             backward(dr.dot(q.o, o) + dr.dot(q.d, d))
     return moves

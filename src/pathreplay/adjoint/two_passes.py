@@ -1,4 +1,4 @@
-"""The two passes of the sweep drivers: one that records a path, and one from its last vertex back to the first."""
+"""The two passes of the sweep drivers: record a path, and sweep back from its last vertex to the first."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ def first_walk(
     first: mi.UInt32,
     lost: NonFiniteCounter,
 ) -> tuple[Any, mi.UInt32, mi.Spectrum, mi.Spectrum, Branch]:
-    """Record a path from ``first`` on.
+    """Record a path from index ``first`` on.
 
-    Returns the records, their number, the radiance, its part from beyond the records (relative to the throughput
-    there), and the branch.
+    Returns the records, their number, the radiance of the path, the radiance from beyond the last record (relative to
+    the throughput there), and the branch.
 
-    All lanes of a packet write to the same place: elsewhere writes to local memory get lost (Dr.Jit 1.5).
+    All lanes of a packet write to the same index: otherwise, writes to local memory are lost (Dr.Jit 1.5).
     """
     trace = replace(trace, background_apart=layout.fixed)
     L, beyond = mi.Spectrum(0), mi.Spectrum(0)  # radiance so far
-    count = mi.UInt32(0)  # vertices, and null boundaries
+    count = mi.UInt32(0)  # number of vertices and null boundaries
     branch, left = Branch.none(), mi.Bool(False)
     if dr.hint(trace.background_apart, mode="scalar"):
         path, left = path.leave()
@@ -94,10 +94,10 @@ def walk_back(
     seen: BaselineStats | None = None,
     rays_only: bool = False,
 ) -> PathAdjoint:
-    """Back-propagate from the last of the recorded vertices to the first.
+    """Back-propagate from the last recorded vertex to the first.
 
-    Takes the ``adjoint`` along the ray that leaves the last vertex, and returns that along the ray that arrives at the
-    first.
+    ``adjoint`` belongs to the ray that leaves the last vertex; the result belongs to the ray that arrives at the first.
+    With ``rays_only`` no parameter receives a gradient.
     """
     layout, records, first, count, last = path.layout, path.records, path.first, path.count, path.last
     ray0, δL, L, q = path.ray0, adjoint.δL, adjoint.L, adjoint.q
