@@ -239,7 +239,7 @@ class ObserverVertex:
     def onward(
         self, arrivals: list[Arrival], t: mi.Float, key: mi.UInt32, active: mi.Bool
     ) -> tuple[mi.Spectrum, list[Arrival]]:
-        """Where ``active``, return the transmittance up to ``t``, and the arrivals along the rest of their rays."""
+        """Return the transmittance up to ``t``, and the arrivals along the rest of their rays, in ``active`` lanes."""
         if self.trace.media is None:
             return mi.Spectrum(1), arrivals
         sampler = CounterSampler.stream(key, Stream.TRANSMITTANCE_TO_EDGE)

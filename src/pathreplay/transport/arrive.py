@@ -87,7 +87,7 @@ def repeat(trace: TraceConfig, again: VertexRecord, attached: bool, active: mi.B
 
 
 def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
-    """Radiance along rays that ``left`` the scene, MIS weighted; differentiable in the environment's radiance."""
+    """Return the radiance along rays that ``left`` the scene, MIS weighted; differentiable in the environment."""
     if trace.scene.environment() is None:
         return mi.Spectrum(0)
     si = dr.zeros(mi.SurfaceInteraction3f)
@@ -96,7 +96,7 @@ def background(trace: TraceConfig, at: Arrival, left: mi.Bool) -> mi.Spectrum:
 
 
 def sees_lights(trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-    """Lanes that count the emission at the end of a ray: ``hide_emitters`` hides the environment from camera rays."""
+    """Return the lanes that count emission at a ray's end: ``hide_emitters`` hides the environment from the camera."""
     return active & (~at.camera | si.is_valid()) if trace.hide_emitters else active
 
 

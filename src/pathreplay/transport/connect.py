@@ -24,11 +24,11 @@ class Connection:
     shadow: Shadow = None  # type: ignore[assignment]  # None in scenes without media
 
     def mis(self, pdf: mi.Float) -> mi.Float:
-        """MIS weight of the sample; ``pdf`` is the density of sampling its direction at the vertex."""
+        """Return the MIS weight of the sample; ``pdf`` is the density of sampling its direction at the vertex."""
         return dr.select(self.light.delta, 1, mis_weight(self.light.pdf, pdf))
 
     def reaches(self, pdf: mi.Float, attached: bool) -> mi.Spectrum:
-        """MIS-weighted radiance at the vertex (Spectrum); ``pdf`` is the density of sampling its direction there."""
+        """Return the MIS-weighted radiance at the vertex (Spectrum); ``pdf`` is the density of its direction there."""
         mis = self.mis(pdf)
         # The MIS weights of a detached path need no derivative: they sum to one for all values of the parameters.
         return self.Le * (mis if attached else dr.detach(mis))
@@ -55,12 +55,12 @@ def choose(
 
 
 def shadow_start(v: Vertex, light: mi.DirectionSample3f, medium: mi.MediumPtr) -> mi.MediumPtr:
-    """The medium in which a shadow ray starts, if the path arrived through ``medium``."""
+    """Return the medium in which a shadow ray starts, if the path arrived through ``medium``."""
     return dr.select(v.surface & v.si.is_medium_transition(), v.si.target_medium(light.d), medium)
 
 
 def repeat(trace: TraceConfig, v: Vertex, again: VertexRecord, ctx: mi.BSDFContext, attached: bool) -> mi.Spectrum:
-    """The contribution of the recorded emitter sample to e (Spectrum), differentiably.
+    """Evaluate the contribution of the recorded emitter sample to e again (Spectrum), differentiably.
 
     If ``attached``, the point on the emitter follows the emitter. Visibility is not differentiated.
     """

@@ -1,4 +1,4 @@
-"""Radiance that a vertex adds by itself: emission at the hit point, and emitter samples."""
+"""Emitted radiance at a vertex: emission at the hit point, and emitter samples."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathreplay.transport.volume.passage import skip_null
 
 
 def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool) -> mi.Spectrum:
-    """Radiance emitted towards the ray's origin by the surface that it hit (on a miss: the environment), MIS weighted.
+    """Return the MIS-weighted radiance that the hit surface, or on a miss the environment, emits to the ray's origin.
 
     Differentiable in the emitter's radiance and, if ``attached``, in the ray, the hit point and the density ``at.pdf``.
     The MIS weights of a detached path need no derivative: they sum to one for all values of the parameters.
@@ -31,7 +31,7 @@ def emission(scene: mi.Scene, at: Arrival, si: mi.SurfaceInteraction3f, attached
 def vertex_glow(
     trace: TraceConfig, at: Arrival, si: mi.SurfaceInteraction3f, attached: bool, active: mi.Bool
 ) -> mi.Spectrum:
-    """The `emission` at a vertex; zero where the background is added separately and no surface of the scene emits."""
+    """Return the `emission` at a vertex; zero if no surface emits and the background is added separately."""
     if trace.background_apart and not trace.traits.area_lights:
         return mi.Spectrum(0)
     return emission(trace.scene, at, si, attached, active)
@@ -63,7 +63,7 @@ def redraw_emitter(
     attached: bool,
     lit: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """The emitter sample of the sampling pass again, with Le/p, differentiable.
+    """Evaluate the emitter sample of the sampling pass again, differentiably; return it with Le/p.
 
     ``light`` is the sample itself if it is still available, else None. If ``attached``, the point keeps its coordinates
     on the emitter and so moves with it, and direction, distance and density follow. Otherwise the point is fixed in
@@ -117,7 +117,7 @@ def _glued(
 
 
 def _mesh_growth(scene: mi.Scene, origin: mi.Interaction3f, light: mi.DirectionSample3f, lit: mi.Bool) -> mi.Float:
-    """Area of the sampled emissive triangle over its detached value: 1, with the derivative of log area.
+    """Return the area of the sampled emissive triangle over its detached value: 1, with the derivative of log area.
 
     Mitsuba samples a mesh with the triangle areas at load time and does not differentiate them.
     """

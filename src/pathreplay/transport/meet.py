@@ -16,7 +16,7 @@ from pathreplay.transport.signature import shape_met
 from pathreplay.transport.vertex import TraceConfig
 
 ROUNDING = 2.0**-22
-"""Rounding error of v = (s + k) / n for local parameter s of segment k, in segments, per preceding segment."""
+"""Rounding error of v = (s + k) / n in segments, per preceding segment; s is the local parameter of segment k."""
 
 
 def meet(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool, coherent: bool = False) -> mi.PreliminaryIntersection3f:
@@ -28,7 +28,7 @@ def meet(trace: TraceConfig, ray: mi.Ray3f, active: mi.Bool, coherent: bool = Fa
 def short_of_end(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """The hit, moved away from the end of its segment if it lies on a B-spline curve."""
+    """Return the hit, moved away from the end of its segment if it lies on a B-spline curve."""
     if trace.traits.splines:
         kind = shape_met(trace, hit, ray, active).shape_type()
         on_spline = active & hit.is_valid() & (kind == int(mi.ShapeType.BSplineCurve))

@@ -37,7 +37,7 @@ def moving_shapes(scene: mi.Scene, still: Collection[mi.Object]) -> tuple[mi.Sha
 
 
 def may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
-    """Whether a parameter may move the surface that was hit; False for rays that hit nothing."""
+    """Return whether a parameter may move the surface that was hit; False for rays that hit nothing."""
     moving = trace.traits.moving
     if moving is None:
         return mi.Bool(True)
@@ -48,7 +48,7 @@ def may_move(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
 
 
 def path_moves(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
-    """Whether hit points, sampled directions or emitter samples depend on parameters with gradients.
+    """Return whether hit points, sampled directions or emitter samples depend on parameters with gradients.
 
     ``at`` is the first arrival. Motion can enter at four places, which are checked: the start of the path, the shapes,
     the BSDFs whose sampled directions are differentiated, and the emitters. Nothing is evaluated.
@@ -57,7 +57,7 @@ def path_moves(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
 
 
 def edges_move(trace: TraceConfig, start: CameraStart, at: Arrival) -> bool:
-    """Whether an occluder, or a point that sees or lights the scene, depends on parameters with gradients.
+    """Return whether an occluder, or a point that sees or lights the scene, depends on parameters with gradients.
 
     Like `path_moves`, without texture coordinates and the tangents that follow them: a texture occludes nothing. A
     projector or spot light that rotates moves the boundary of the region that it lights, although the origin of its
@@ -87,7 +87,7 @@ def _depends(trace: TraceConfig, start: CameraStart, at: Arrival, painted: bool)
 
 
 def weights_vary(trace: TraceConfig, at: Arrival) -> bool:
-    """Whether weights of continuations on surfaces depend on parameters with gradients, in a scene where nothing moves.
+    """Return whether weights of continuations on surfaces depend on parameters with gradients, if nothing moves.
 
     ``at`` is the first arrival. The weight of an arbitrary lobe is probed in the way that later passes evaluate it.
     Nothing is evaluated.

@@ -32,7 +32,7 @@ class PathState:
 
     @staticmethod
     def begin(trace: TraceConfig, start: CameraStart, sustained: bool = False) -> PathState:
-        """Paths at their first vertices; with ``sustained``, zero weights do not end a path that has derivatives."""
+        """Start paths at their first vertices; if ``sustained``, zero weights do not end paths with derivatives."""
         active = mi.Bool(start.active) & (trace.max_depth > 0)
         β_alive = mi.Spectrum(1) if sustained else None
         return PathState(start.choose(trace, active), mi.Spectrum(1), β_alive, mi.Float(1), mi.UInt32(0), active)
@@ -52,7 +52,7 @@ class PathState:
         return replace(self, active=self.active & ~left), left
 
     def passed(self, trace: TraceConfig, step: SampledStep) -> mi.UInt32:
-        """Number of vertices before the next one; with media a null boundary is not counted."""
+        """Return the number of vertices before the next one; with media a null boundary is not counted."""
         return self.depth + (1 if trace.media is None else dr.select(step.null, mi.UInt32(0), 1))
 
     def advance(
@@ -77,7 +77,7 @@ class PathState:
 def survival(
     β: mi.Spectrum, η: mi.Float, depth: mi.UInt32, u: mi.Float, trace: TraceConfig, step: SampledStep
 ) -> tuple[mi.Float, mi.Bool]:
-    """Russian roulette: 1 / (survival probability), and whether the path survives. Detached.
+    """Play Russian roulette: return 1 / (survival probability), and whether the path survives. Detached.
 
     The probability is min(max β · η², 0.95) from depth ``rr_depth`` on and one before. η² removes the compression of
     solid angle from the radiance throughput. Null boundaries between media do not terminate paths.
@@ -90,7 +90,7 @@ def survival(
 
 
 def sustain(β_alive: mi.Spectrum, β: mi.Spectrum, step: SampledStep) -> mi.Spectrum:
-    """The throughput that decides how long to continue a differentiated path: one zero weight per channel is left out.
+    """Return the throughput that keeps a differentiated path alive: one zero weight per channel is left out.
 
     A weight of zero still has a derivative, which multiplies the radiance beyond it. The path therefore continues as if
     that weight were the largest among the channels (or one if all are zero). A second zero makes all derivatives zero

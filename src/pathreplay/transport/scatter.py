@@ -111,7 +111,7 @@ def towards(v: Vertex, ctx: mi.BSDFContext, d: mi.Vector3f, active: mi.Bool) -> 
 def repeat(
     trace: TraceConfig, v: Vertex, again: VertexRecord, ctx: mi.BSDFContext, attached: bool
 ) -> tuple[mi.Spectrum, mi.Vector3f, mi.Float]:
-    """Weight w, world direction and density of the recorded continuation, differentiably.
+    """Evaluate weight w, world direction and density of the recorded continuation again, differentiably.
 
     Not differentiated: the choice among lobes and, unless ``attached``, direction and density.
     """
@@ -150,7 +150,7 @@ def _at_surface(
     else:
         f, pdf = bsdf.eval(ctx, si, wo, smooth), kept.pdf
     w = f * J * dr.detach(reciprocal(kept.pdf))
-    # A failed sample (`roughdielectric` may reflect to the far side) has weight zero whatever f is there. A black BSDF
+    # A failed sample (`roughdielectric` may reflect to the far side) has weight zero, whatever f is. A black BSDF
     # has weight zero because f is zero, and keeps its derivative.
     w = dr.select(kept.black & dr.any(dr.detach(f) != 0), 0, w)
 
@@ -163,7 +163,7 @@ def _at_surface(
 
 
 def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-    """Lanes in which smooth continuations keep their direction instead of their hit point: those with narrow lobes.
+    """Return the lanes with narrow lobes, where smooth continuations keep their direction instead of their hit point.
 
     A narrow lobe turns the motion of the surface that it hits into noise. Applies only if boundary terms are estimated,
     because a fixed direction slides over edges. The decision depends on the vertex and the incident ray only, so that
@@ -176,7 +176,7 @@ def keeps_direction(trace: TraceConfig, si: mi.SurfaceInteraction3f, active: mi.
 
 
 def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi.Bool:
-    """Lanes whose hit lets part of the light pass unscattered. There, a continuation keeps its direction.
+    """Return the lanes whose hit lets part of the light pass unscattered. There, a continuation keeps its direction.
 
     A continuation that followed a moving transparent sheet would slide over the surfaces behind it and over their
     edges. Applies only if boundary terms are estimated, which include the outline of the sheet.
@@ -187,7 +187,7 @@ def is_seen_through(trace: TraceConfig, hit: mi.PreliminaryIntersection3f) -> mi
 
 
 def _followed(trace: TraceConfig, v: Vertex, u: VertexSamples, ctx: mi.BSDFContext, active: mi.Bool) -> mi.Bool:
-    """Lanes whose smooth lobe is sampled attached; decided by the lobe, never by the sampled direction."""
+    """Return the lanes whose smooth lobe is sampled attached; depends on the lobe, not on the sampled direction."""
     if not trace.follows:
         return mi.Bool(False)
     index = dr.reinterpret_array(mi.UInt32, v.bsdf)
@@ -208,7 +208,7 @@ def _delta_weight(
     w: mi.Spectrum,
     active: mi.Bool,
 ) -> mi.Spectrum:
-    """Weight of a sampled delta lobe, with the derivative of (weight of the lobe alone) / (probability of its choice).
+    """Return the weight of a sampled delta lobe, with the derivative of its own weight over its selection probability.
 
     A BSDF that chooses among lobes returns weights in which the selection probability has cancelled. In some plugins
     (``thindielectric``, ``plastic``) the derivative of the Fresnel term cancels with it. The lobe is therefore sampled

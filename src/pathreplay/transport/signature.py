@@ -1,4 +1,4 @@
-"""Signature: identify the surface that a ray meets, so that two rays with an edge between them differ; edge normals."""
+"""Surface signatures, which differ for two rays with an edge between them, and edge normals."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ GRAZING = 0.05
 def place_met(
     trace: TraceConfig, hit: mi.PreliminaryIntersection3f, active: mi.Bool, shape: mi.ShapePtr, facets: bool = True
 ) -> mi.UInt32:
-    """Hash of the surface that a ray met: 0 for none, else a value per shape, instance and smoothing group.
+    """Compute a hash of the surface that a ray met: 0 for none, else a value per shape, instance and smoothing group.
 
-    ``shape`` is the result of `shape_met`. Smoothing groups are told apart only if ``facets``; each triangle of a
+    ``shape`` is the result of `shape_met`. Smoothing groups are distinguished only if ``facets``; each triangle of a
     flat-shaded mesh is its own group.
     """
     met = active & hit.is_valid()
@@ -39,7 +39,7 @@ def _group(tables: Tables, shape: mi.UInt32, triangle: mi.UInt32, met: mi.Bool) 
 
 
 def shape_met(trace: TraceConfig, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.ShapePtr:
-    """The shape that a ray met; for an instance the instanced shape, which a preliminary intersection does not hold."""
+    """Return the shape that a ray met; for an instance the instanced shape, which preliminary intersections lack."""
     if not trace.traits.copies:
         return hit.shape
     return hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, active & hit.is_valid()).shape
@@ -52,7 +52,7 @@ def mixed(h: mi.UInt32, x: mi.UInt32) -> mi.UInt32:
 
 
 def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
-    """Whether the shading normal of a mesh faces away from a ray along ``d``, so that shading is black there.
+    """Return whether the shading normal of a mesh faces away from a ray along ``d``, so that shading is black.
 
     Other shapes face away only at their silhouette, by rounding. A discontinuity there is an outline and nothing else.
     """
@@ -60,14 +60,14 @@ def turned_away(si: mi.SurfaceInteraction3f, d: mi.Vector3f) -> mi.Bool:
 
 
 def edge_normal(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Vector3f:
-    """Unit vector perpendicular to the ray and to the edge of the shape next to the hit. Detached.
+    """Compute the unit vector perpendicular to the ray and to the edge of the shape next to the hit. Detached.
 
     The edge is the nearest side of the triangle on meshes, the rim on rectangles and disks, the nearer of rim and
     silhouette on tubes, and the silhouette on other shapes.
     """
     with dr.suspend_grad():
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        kind = si.shape.shape_type()  # the shape of a hit on an instance has no type
+        kind = si.shape.shape_type()  # not of hit.shape, which has no type on an instance
         on_mesh = active & si.shape.is_mesh()
         square, disk = kind == int(mi.ShapeType.Rectangle), kind == int(mi.ShapeType.Disk)
         limb = dr.abs(dr.dot(si.n, ray.d)) < GRAZING
@@ -97,7 +97,7 @@ def outline_gap(
     ray: mi.Ray3f,
     active: mi.Bool,
 ) -> mi.Float:
-    """B = n·(o + t d - z): signed distance along n between a line and an outline point z, which ``ray`` hit at t.
+    """Evaluate B = n·(o + t d - z): signed distance along n of a line from an outline point z, which ``ray`` hit at t.
 
     z has fixed surface coordinates on its shape. Differentiable in o, d and the shape; zero where not ``active``.
     """
@@ -115,6 +115,6 @@ def _nearest_side(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
     a, b, c = corners
     sides = (c - b, c - a, b - a)  # facing a, b, c
     weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
-    heights = [dr.abs(w) * dr.rcp(dr.norm(side)) for w, side in zip(weights, sides, strict=True)]  # over 2 areas
+    heights = [dr.abs(w) * dr.rcp(dr.norm(side)) for w, side in zip(weights, sides, strict=True)]  # over twice the area
     nearest = dr.select(heights[1] < heights[2], sides[1], sides[2])
     return dr.select(heights[0] < dr.minimum(heights[1], heights[2]), sides[0], nearest)

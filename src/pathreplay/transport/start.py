@@ -21,7 +21,7 @@ class CameraStart:
     active: mi.Bool
 
     def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:
-        """The first arrival along the rays, detached; ``hide_emitters`` makes area emitters transparent."""
+        """Find the first arrival along the rays, detached; ``hide_emitters`` makes area emitters transparent."""
         ray = mi.Ray3f(dr.detach(self.ray))
         hit = meet(trace, ray, active, coherent=True)
         if trace.skips_null:
@@ -35,14 +35,14 @@ class CameraStart:
         return at
 
     def repeat(self) -> tuple[mi.Point3f, mi.Vector3f]:
-        """Origin and direction of the rays, differentiably."""
+        """Return origin and direction of the rays, differentiably."""
         return self.ray.o, self.ray.d
 
 
 def behind_emitters(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """The hit, or the first hit behind area emitters if one was hit; distances are measured along ``ray``."""
+    """Return the hit, or the first hit behind area emitters if one was hit; distances are measured along ``ray``."""
     passed = active & hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 (an array of pointers)
     si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, passed)
     onward = si.spawn_ray(ray.d)
@@ -53,6 +53,6 @@ def behind_emitters(
 
 
 def medium_around(trace: TraceConfig) -> mi.MediumPtr:
-    """The medium that contains the camera."""
+    """Return the medium that contains the camera."""
     around = trace.media.around
     return dr.zeros(mi.MediumPtr) if around is None else mi.MediumPtr(around)

@@ -16,7 +16,7 @@ GRAZES = 0.01
 
 
 def met(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> mi.SurfaceInteraction3f:
-    """The surface interaction of a hit, differentiable in the ray and the shape.
+    """Compute the surface interaction of a hit, differentiable in the ray and the shape.
 
     The distance to a sphere or cylinder is a root whose derivative is proportional to 1 / c, with c the cosine between
     ray and normal. Its square has no finite mean over rays, and where rounding puts a ray onto the silhouette the
@@ -69,7 +69,7 @@ class SurfacePoint:
 
 
 def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool) -> SurfacePoint:
-    """The point that ``ray`` hit, with fixed surface coordinates.
+    """Return the point that ``ray`` hit, with fixed surface coordinates.
 
     On meshes A is computed from the triangle itself. Derivatives with respect to texture coordinates would vanish where
     these are degenerate, and would follow the texture coordinates where these move.
@@ -83,7 +83,7 @@ def surface_point(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.B
 
 
 def _curvature(y: mi.SurfaceInteraction3f) -> mi.Float:
-    """The curvature κ with dn = κ dp for all tangents; infinite if no such κ exists."""
+    """Return the curvature κ with dn = κ dp for all tangents; infinite if no such κ exists."""
     turn = dr.squared_norm(y.dn_du) + dr.squared_norm(y.dn_dv)
     κ = dr.dot(y.dn_du, y.dp_du) / dr.squared_norm(y.dp_du)
     rest = dr.squared_norm(y.dn_du - κ * y.dp_du) + dr.squared_norm(y.dn_dv - κ * y.dp_dv)

@@ -37,7 +37,7 @@ CLOSE = 7.0
 
 
 def blend_length(shape: mi.Shape) -> float:
-    """The length h0 of a shape: BLEND times the diagonal of its bounding box; 0 for an empty shape group."""
+    """Return the length h0 of a shape: BLEND times the diagonal of its bounding box; 0 for an empty shape group."""
     size = sum(float(x) ** 2 for x in shape.bbox().extents()) ** 0.5
     return BLEND * size if math.isfinite(size) else 0.0
 
@@ -70,7 +70,7 @@ def moved_direction(
 def jumps_at_facets(
     lengths: mi.Float, origin: mi.Interaction3f, hit: mi.PreliminaryIntersection3f, p: mi.Point3f, n: mi.Normal3f
 ) -> mi.Bool:
-    """Whether V is discontinuous between facets at ``hit``, at position ``p`` with normal ``n``.
+    """Return whether V is discontinuous between facets at ``hit``, at position ``p`` with normal ``n``.
 
     Near the surface φ depends on the plane of the triangle that was hit.
     """
@@ -83,7 +83,7 @@ def jumps_at_facets(
 def held_direction(
     origin: mi.Interaction3f, d: mi.Vector3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.Vector3f:
-    """The direction from ``origin`` to the point hit by a ray along ``d``, fixed on its surface; its value is ``d``.
+    """Attach ``d`` to the point that it hits from ``origin``: return ``d`` with the derivatives of that direction.
 
     Differentiable in ``origin`` and in the shape that was hit.
     """
@@ -94,7 +94,7 @@ def held_direction(
 
 
 def _share(h0: mi.Float, y: SurfacePoint, towards: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Vector3f]:
-    """The blend factor φ, and the vector ``slope`` with ∇φ·V_H = slope·d_H'. Detached."""
+    """Compute the blend factor φ, and the vector ``slope`` with ∇φ·V_H = slope·d_H'. Detached."""
     r = dr.norm(towards)
     n = dr.normalize(y.A)
     turned = dr.dot(n, towards) > 0

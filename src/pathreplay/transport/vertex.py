@@ -25,8 +25,8 @@ class TraceConfig:
 
     # Properties of the integrator.
     attach: str
-    """Selects what follows the parameters when they move things: ``none`` nothing, ``delta`` hit points and the
-    directions of delta lobes, ``all`` also the directions of the BSDFs in ``traits.attachables``."""
+    """Selects the quantities that follow moving parameters: with ``none`` nothing, with ``delta`` hit points and the
+    directions of delta lobes, with ``all`` also the directions of the BSDFs in ``traits.attachables``."""
     hide_emitters: bool
     """Hides directly visible emitters."""
     max_depth: int
@@ -149,7 +149,7 @@ class Flight:
 
     @staticmethod
     def none(media: Media) -> Flight:
-        """An empty flight, as the sampling pass represents it."""
+        """Create an empty flight, as the sampling pass represents it."""
         zero, nothing = mi.Float(0), mi.Spectrum(0)
         flight = Flight(mi.Bool(False), zero, mi.Float(1), mi.Spectrum(1), mi.Float(0), σ_s=nothing)
         if media.emissive:
@@ -219,7 +219,7 @@ class VertexRecord:
 
 @dataclass
 class Signature:
-    """The discrete choices at a vertex: between two paths with different signatures lies a discontinuity."""
+    """The discrete choices at a vertex. A discontinuity separates paths with different signatures."""
 
     met: mi.Bool  # the ray met a surface or had a real collision in a medium
     shape: mi.UInt32  # registry index of the shape, 0 in a medium or on a miss
@@ -255,17 +255,17 @@ class SampledStep(Step):
 
 
 def mis_weight(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
-    """Veach's power heuristic, p_a² / (p_a² + p_b²); zero where that is not finite."""
+    """Evaluate Veach's power heuristic, p_a² / (p_a² + p_b²); zero where that is not finite."""
     a2 = dr.square(pdf_a)
     weight = a2 / dr.fma(pdf_b, pdf_b, a2)
     return dr.select(dr.isfinite(weight), weight, 0)
 
 
 def reciprocal(x: mi.Float) -> mi.Float:
-    """1/x where x is not zero, else zero."""
+    """Return 1/x where x is not zero, else zero."""
     return dr.select(x != 0, dr.rcp(x), 0)
 
 
 def is_smooth(bsdf: mi.BSDFPtr) -> mi.Bool:
-    """Lanes whose BSDF has a lobe that next-event estimation can reach."""
+    """Return the lanes whose BSDF has a lobe that next-event estimation can reach."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)

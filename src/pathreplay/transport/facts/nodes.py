@@ -18,7 +18,7 @@ _COLLECTORS: dict[type, type] = {}
 
 
 def _collector() -> Any:
-    """A traversal callback of the active variant, which collects the child objects and values of a node."""
+    """Create a traversal callback of the active variant, which collects the child objects and values of a node."""
     base = mi.TraversalCallback
     if base not in _COLLECTORS:
 
@@ -33,7 +33,7 @@ def _collector() -> Any:
 
 
 def _contents(node: mi.Object) -> tuple[list[tuple[str, mi.Object]], list[tuple[str, object, type | None]]]:
-    """The child objects of a node, and its values with their C++ types."""
+    """Return the child objects of a node, and its values with their C++ types."""
     callback = _collector()
     callback.children, callback.values = [], []
     node.traverse(callback)
@@ -41,7 +41,7 @@ def _contents(node: mi.Object) -> tuple[list[tuple[str, mi.Object]], list[tuple[
 
 
 def nodes_of(root: mi.Object) -> set[mi.Object]:
-    """All objects reachable from ``root``, a scene or one of its objects."""
+    """Find all objects reachable from ``root``, a scene or one of its objects."""
     seen: set[mi.Object] = set()
     waiting = [root]
     while waiting:

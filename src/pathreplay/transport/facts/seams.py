@@ -22,7 +22,7 @@ JUMPS = 0.5
 
 
 def has_seams(textures: Iterable[mi.Texture]) -> bool:
-    """Whether one of the textures is discontinuous. Bitmaps do not expose their filter, so they are evaluated."""
+    """Return whether a texture is discontinuous. Bitmaps do not expose their filter and are therefore evaluated."""
     return any(map(_jumps, textures))
 
 
@@ -34,7 +34,7 @@ def _jumps(texture: mi.Texture) -> bool:
 
 
 def _is_nearest(texture: mi.Texture) -> bool:
-    """Whether a bitmap differs as much across texel borders as between texel centres."""
+    """Return whether a bitmap differs as much across texel borders as between texel centres."""
     params = mi.traverse(texture)
     height, width, channels = params["data"].shape
     raw = texture.eval_3 if channels == 3 else texture.eval_1
@@ -47,7 +47,7 @@ def _is_nearest(texture: mi.Texture) -> bool:
     from_texels = np.linalg.inv(np.array(params["to_uv"].matrix, np.float64))
 
     def differences(beside: float) -> np.ndarray:
-        """Differences between values ``beside`` texels before and after a texel border."""
+        """Return the differences between values ``beside`` texels before and after a texel border."""
         sides = []
         for side in (-1, 1):
             at = (border + side * beside) / along, middle

@@ -18,17 +18,17 @@ WELD, ULPS = 1e-5, 4
 
 
 def mesh_smoothing_groups(mesh: mi.Mesh) -> np.ndarray:
-    """The `smoothing_groups` of a mesh with vertex normals; one group for Mitsuba's rectangle, which hides its mesh."""
+    """Return the `smoothing_groups` of a smooth mesh; zeros for Mitsuba's rectangle, which hides its mesh."""
     params = mi.traverse(mesh)
     if "faces" not in params:
         return np.zeros(mesh.face_count(), int)
     faces, positions = (np.array(params[key]).reshape(-1, 3) for key in ("faces", "vertex_positions"))
-    # Emission has no seams: segments that found one would be wasted, and missing for the emitter's outline.
+    # Emission is continuous across seams: segments that detect one would be wasted, and fewer would find the outline.
     return smoothing_groups(faces, positions, 0 if mesh.is_emitter() else WELD)
 
 
 def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WELD) -> np.ndarray:
-    """Index of each triangle's group: different on the two sides of an edge, zero in a mesh without edges.
+    """Return the index of each triangle's group: different on the two sides of an edge, zero in a mesh without edges.
 
     Triangles connected by vertices form a group. Where a group meets itself without sharing vertices, as at the end of
     an edge, each triangle is a group of its own. Vertices coincide if their distance is at most ``weld`` times the
@@ -50,7 +50,7 @@ def smoothing_groups(faces: np.ndarray, positions: np.ndarray, weld: float = WEL
 
 
 def _places(positions: np.ndarray, vertices: np.ndarray, weld: float) -> np.ndarray:
-    """Index of the position of each vertex, equal for vertices that coincide up to rounding.
+    """Return the index of the position of each vertex, equal for vertices that coincide up to rounding.
 
     Modelling programs compute both ends of a seam separately, say by sines of 0 and of 2π, which differ in the last
     bits.

@@ -29,7 +29,7 @@ INSTANCE, PROJECTOR, SPOT = "Instance", "Projector", "SpotLight"
 WHOLE, FACETS = 0, 0xFFFFFFFF
 """Table entries of shapes whose only edges are outlines, and of flat-shaded meshes."""
 COARSE = 1.0
-"""Mean angle in degrees between triangles and shading normals above which their difference matters."""
+"""Mean angle in degrees between triangles and shading normals above which a mesh is coarse."""
 
 MOST_RUNS = 4096
 """Largest number of runs of equal values that a frozen recording writes one by one."""
@@ -45,7 +45,7 @@ class Tables:
     A frozen function receives them as input or from the integrator; otherwise the recording writes them, see `_array`.
     """
 
-    attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: nowhere)
+    attachable: mi.Bool | None  # the smooth lobes of this BSDF may be sampled attached (None: no BSDF)
     blend_lengths: mi.Float  # `velocity.blend_length` by shape
     groups_at: mi.UInt32  # by shape: offset of its triangles in `groups`, or `WHOLE` or `FACETS`
     groups: mi.UInt32  # concatenated `smoothing_groups` of these meshes; entry 0 is unused
@@ -63,7 +63,7 @@ class Traits:
     area_lights: bool  # some emitter has an outline
     hard_lights: bool  # some emitter casts hard shadows
     projectors: tuple[mi.Emitter, ...]  # projectors: the region that they light has a hard boundary
-    spots: tuple[mi.Emitter, ...]  # spot lights: the same where beam_width is at least cutoff_angle
+    spots: tuple[mi.Emitter, ...]  # spot lights: their cone has a hard boundary if beam_width >= cutoff_angle
     mesh_lights: bool  # some mesh emits
     ball_lights: bool  # some sphere emits
     coarse_meshes: bool  # some smooth-shaded mesh is coarse: see `is_coarse`
@@ -75,9 +75,9 @@ class Traits:
     veils: bool  # some surface may scatter part of the light and pass the rest unscattered
     masks_mirrors: bool  # some mask covers delta lobes
     narrow: bool  # some surface may have a narrow smooth lobe
-    glossy: bool  # the same, and no checkerboard has seams over which such a lobe would slide
+    glossy: bool  # narrow, and no checkerboard has seams over which such a lobe would slide
     outlines: bool  # some surface point may see the outline of a shape or emitter, or a texture seam
-    tables: Tables = None  # type: ignore[assignment]  # of the current pass, as all fields below
+    tables: Tables = None  # type: ignore[assignment]  # for the current pass, like all fields below
     # Whether these have gradients:
     lights_deform: bool = False  # vertex positions of an emissive mesh
     instances_move: bool = False  # the to_world of an instance
@@ -126,7 +126,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
 def tables_of(
     attachables: Iterable[mi.BSDF], shapes: list[mi.Shape], emitters: list[mi.Emitter], edges: bool = True
 ) -> Tables:
-    """The tables of a scene in its present state; without ``edges``, the possibly long smoothing groups are omitted."""
+    """Create the tables of a scene in its present state; without ``edges``, omit the long smoothing groups."""
     attachable = _by_index(mi.BSDFPtr, attachables, lambda bsdf: True, False)
     return Tables(
         _array(mi.Bool, attachable) if attachables else None,
@@ -137,7 +137,7 @@ def tables_of(
 
 
 def _array(kind: type, values: Any) -> Any:
-    """An array of these values.
+    """Create an array of these values.
 
     `dr.freeze` does not know host arrays that are created while it records. There the recording writes the array
     instead, in runs of equal values.
@@ -159,12 +159,12 @@ def _array(kind: type, values: Any) -> Any:
 
 
 def blend_lengths(shapes: list[mi.Shape]) -> mi.Float:
-    """The `blend_length` of each shape, by registry index."""
+    """Return the `blend_length` of each shape, by registry index."""
     return _array(mi.Float, _by_index(mi.ShapePtr, shapes, blend_length, 0.0))
 
 
 def smoothing_groups_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
-    """The tables of smoothing groups: the offset of each shape, and the group of each triangle."""
+    """Create the tables of smoothing groups: the offset of each shape, and the group of each triangle."""
     blocks: list[np.ndarray] = [np.zeros(1, np.uint32)]
 
     def begin(shape: mi.Shape) -> int:
@@ -183,7 +183,7 @@ def smoothing_groups_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
 
 
 def is_coarse(mesh: mi.Mesh) -> bool:
-    """Whether triangles of a mesh deviate from their shading normals by `COARSE` degrees or more on average.
+    """Return whether triangles of a mesh deviate from their shading normals by `COARSE` degrees or more on average.
 
     Near their silhouette such triangles hide emitters that the smooth shading would see.
     """
@@ -200,14 +200,14 @@ def is_coarse(mesh: mi.Mesh) -> bool:
 
 
 def is_brushed(bsdf: mi.BSDF) -> bool:
-    """Whether a BSDF, or one nested in it, depends on the shading tangent."""
+    """Return whether a BSDF, or one nested in it, depends on the shading tangent."""
     if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Anisotropic):
         return True
     return any(isinstance(node, mi.BSDF) and node.class_name() in RELIEFS for node in {bsdf, *nodes_of(bsdf)})
 
 
 def emitter_bounds(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Float:
-    """Bounding sphere of each mesh emitter, in the order of the scene's emitters: centre, and radius (0 for others)."""
+    """Return the bounding sphere of each emitter of the scene: centre, and radius (0 for all but mesh emitters)."""
     lamps = {lamp.emitter(): lamp for lamp in _mesh_lamps(shapes)}
     balls = [_ball(lamps[emitter]) if emitter in lamps else np.zeros(4) for emitter in emitters]
     return _array(mi.Float, np.ravel(balls or [np.zeros(4)]))  # an empty array would crash the process
@@ -218,7 +218,7 @@ def _mesh_lamps(shapes: list[mi.Shape]) -> list[mi.Shape]:
 
 
 def _ball(mesh: mi.Mesh) -> np.ndarray:
-    """Bounding sphere around the centre of the bounding box. Radius 0 for Mitsuba's rectangle, which hides its mesh."""
+    """Return a bounding sphere around the box centre; radius 0 for Mitsuba's rectangle, which hides its mesh."""
     params = mi.traverse(mesh)
     if "vertex_positions" not in params:
         return np.zeros(4)
@@ -228,13 +228,13 @@ def _ball(mesh: mi.Mesh) -> np.ndarray:
 
 
 def _by_index(pointer: type, objects: Iterable[T], value: Callable[[T], V], otherwise: V) -> list[V]:
-    """A list of the objects' values, ordered by Dr.Jit's registry index."""
+    """Return the list of the objects' values, ordered by Dr.Jit's registry index."""
     by_index = {dr.reinterpret_array(mi.UInt32, pointer(x))[0]: value(x) for x in objects}
     return [by_index.get(i, otherwise) for i in range(max(by_index, default=0) + 1)]
 
 
 def is_null(bsdf: mi.BSDF | mi.BSDFPtr) -> bool | mi.Bool:
-    """Whether (or in which lanes) a BSDF does nothing but pass light unscattered."""
+    """Return whether (or in which lanes) a BSDF does nothing but pass light unscattered."""
     others = mi.BSDFFlags.Smooth | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission
     return bsdf.flags() & (others | mi.BSDFFlags.Null) == +mi.BSDFFlags.Null
 
@@ -248,17 +248,17 @@ def _attachables(nodes: set[mi.Object], shapes: list[mi.Shape]) -> list[mi.BSDF]
 
 
 def is_painted(emitter: mi.Emitter | mi.EmitterPtr) -> bool | mi.Bool:
-    """Whether (or in which lanes) the radiance of an emitter is textured."""
+    """Return whether (or in which lanes) the radiance of an emitter is textured."""
     return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 
 def _is_narrow(bsdfs: list[mi.BSDF]) -> bool:
-    """Whether a surface may have a narrow smooth lobe."""
+    """Return whether a surface may have a narrow smooth lobe."""
     return any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) and b.class_name() not in DULL for b in bsdfs)
 
 
 def _seamless(shapes: list[mi.Shape], nodes: set[mi.Object]) -> bool:
-    """Whether no surface point sees an edge: the scene has a single shape, which sees no edge of itself.
+    """Return whether no surface point sees an edge: the scene has a single shape, which sees no edge of itself.
 
     A flat shape does not see itself at all. A sphere sees itself from the inside, where a texture would have a seam.
     """

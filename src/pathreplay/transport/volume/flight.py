@@ -26,11 +26,11 @@ POINTS = 4
 
 
 def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
-    """1 / (p + c (1 - p)), where p is the probability of a real collision and c the relative weight of null collisions.
+    """Return 1 / (p + c (1 - p)) for probability p of a real collision and relative weight c of null collisions.
 
     The derivative of a collision, dσ_s L_s, is needed also where σ_s is zero and collisions are never real. Real
     collisions estimate the fraction p / (p + c (1 - p)) of it and null collisions the rest, c (1 - p) / (p + c (1 -
-    p)). Each real collision has an estimate of L_s, but only one null collision per path has. With c the inverse of the
+    p)). L_s is estimated at each real collision, but at only one null collision per path. With c the inverse of the
     number of null collisions, all estimates have equal weight.
     """
     return dr.rcp(p + c * (1 - p))
@@ -121,7 +121,7 @@ def _tentative(
     σ: mi.Float,
     active: mi.Bool,
 ) -> tuple[mi.Float, mi.Float]:
-    """Distance from ``t`` to the next tentative collision, and the majorant there: σ, except in grids."""
+    """Return the distance from ``t`` to the next tentative collision, and the majorant there: σ, except in grids."""
     step = dr.select(σ > 0, -dr.log(1 - u) * dr.rcp(σ), dr.inf)
     for grid in trace.media.grids:
         mine = active & is_grid(grid, medium)
@@ -133,7 +133,7 @@ def _tentative(
 
 
 def _reality(media: Media, βW: mi.Spectrum, σ_t: mi.Spectrum, σ_bar: mi.Float) -> mi.Float:
-    """The probability that a collision is real."""
+    """Return the probability that a collision is real."""
     p = σ_t[0] / σ_bar
     if media.chromatic:
         total = dr.sum(βW)
@@ -146,14 +146,14 @@ class Flown:
     """A recorded flight, evaluated again differentiably."""
 
     mei: mi.MediumInteraction3f  # the interaction at the collision
-    w: mi.Spectrum  # weight of the radiance from the end: σ_s/density at a collision, times 1 = relative transmittance
+    w: mi.Spectrum  # weight of radiance from the end: relative transmittance (1), times σ_s/density at a collision
     e: mi.Spectrum  # emission along the flight, and a control variate with value zero and a derivative of mean zero
 
 
 def fly_again(
     trace: TraceConfig, at: Arrival, flight: Flight, reach: mi.Float, attached: bool, active: mi.Bool
 ) -> Flown:
-    """The recorded flight, differentiable in the medium's coefficients and, if ``attached``, in ray and ``reach``.
+    """Evaluate a recorded flight again, differentiable in the coefficients and, if ``attached``, in ray and ``reach``.
 
     ``reach`` is the distance to the surface (infinity if there is none). A collision keeps its position relative to the
     two ends of the medium on its ray. It thus moves with the ray and with the surface, and no derivative is lost at the
@@ -180,7 +180,7 @@ def fly_again(
 
     σ_s, _, σ_t = medium.get_scattering_coefficients(mei, event)
     σ_y = [medium.get_scattering_coefficients(y, through)[2] for y in points]
-    if trace.branch:  # null collisions estimate the rest of the collision's derivative, except that by its position
+    if trace.branch:  # null collisions estimate the rest of the derivative at fixed position
         rest = 1 - flight.p * branch_weight(flight.p, trace.branching)
         still = medium.get_scattering_coefficients(dr.detach(mei), event) if attached else (σ_s, None, σ_t)
         σ_s, σ_t = (σ - rest * (σ_0 - dr.detach(σ_0)) for σ, σ_0 in ((σ_s, still[0]), (σ_t, still[2])))
@@ -221,6 +221,6 @@ def fly_again(
 def _guess(
     trace: TraceConfig, mei: mi.MediumInteraction3f, σ_t: mi.Spectrum, σ_bar: mi.Float, active: mi.Bool
 ) -> mi.Spectrum:
-    """The baseline; zero where it would cause bias, where collisions are never real and no null ones are kept."""
+    """Evaluate the baseline; zero where it would cause bias (collisions are never real, and no null ones are kept)."""
     b = trace.baseline(mei, σ_t, σ_bar, active)  # type: ignore[misc]
     return b if trace.branch else mi.Spectrum(dr.select(dr.detach(σ_t) != 0, b, 0))

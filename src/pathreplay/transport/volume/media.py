@@ -63,19 +63,19 @@ def _is_chromatic(medium: mi.Medium) -> bool:
 
 
 def wants_branch(media: Sequence[mi.Medium]) -> bool:
-    """Whether some extinction gradient needs null collisions, to include scattering where collisions are never real."""
+    """Return whether an extinction gradient needs null collisions, as where collisions are never real."""
     return any(map(_misses, media))
 
 
 def _misses(medium: mi.Medium) -> bool:
-    """Whether the extinction has gradients and varies in space or is zero (unknown while `dr.freeze` records)."""
+    """Return whether extinction has gradients and varies in space or is zero (unknown while `dr.freeze` records)."""
     moving = with_gradients(medium, "sigma_t", "scale")
     known = medium.is_homogeneous() and not dr.flag(dr.JitFlag.FreezingScope)
     return bool(moving) and not (known and all(dr.all(dr.detach(value) != 0, axis=None) for value in moving))
 
 
 def interaction(medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float) -> mi.MediumInteraction3f:
-    """The medium interaction at distance ``t`` along ``ray``, differentiable in both."""
+    """Create the medium interaction at distance ``t`` along ``ray``, differentiable in both."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.t = t
     mei.p = ray.o + t * ray.d
@@ -88,7 +88,7 @@ def interaction(medium: mi.MediumPtr, ray: mi.Ray3f, t: mi.Float) -> mi.MediumIn
 
 
 def span(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """The part [a, b] of the ray, up to ``reach``, in which the medium may interact; a = b = 0 if it is empty.
+    """Return the part [a, b] of the ray, up to ``reach``, in which the medium may interact; a = b = 0 if it is empty.
 
     Differentiable in the ray and in ``reach``.
     """
@@ -100,7 +100,7 @@ def span(medium: mi.MediumPtr, ray: mi.Ray3f, reach: mi.Float, active: mi.Bool) 
 
 
 def carried(t: mi.Float, a: mi.Float, b: mi.Float, where: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """A distance with fixed position relative to the moving ends of [a, b], and the stretch factor of the interval.
+    """Return a distance with fixed position relative to the moving ends of [a, b], and the interval's stretch factor.
 
     The values are those without motion, ``t`` and 1. The derivatives are those of a + x (b - a) and (b - a) / (b₀ -
     a₀), with x the relative position. Where ``where`` is false or b is infinite, nothing moves.
@@ -113,10 +113,10 @@ def carried(t: mi.Float, a: mi.Float, b: mi.Float, where: mi.Bool) -> tuple[mi.F
 
 
 def majorant(medium: mi.MediumPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
-    """An upper bound of the extinction in all channels and everywhere in the medium. Detached."""
+    """Return an upper bound of the extinction in all channels and everywhere in the medium. Detached."""
     return dr.max(dr.detach(medium.get_majorant(interaction(medium, dr.detach(ray), mi.Float(0)), active)))
 
 
 def is_grid(grid: mi.Medium, medium: mi.MediumPtr) -> mi.Bool:
-    """Lanes whose medium is this grid."""
+    """Return the lanes whose medium is this grid."""
     return medium == mi.MediumPtr(grid)

@@ -1,4 +1,4 @@
-"""Rays through null boundaries: the first hit behind them, and the transmittance of the media on the way.
+"""Rays through null boundaries: the first hit behind them, and the transmittance of the media in between.
 
 The search for edges ignores null boundaries: light passes straight through them, so they occlude nothing.
 """
@@ -24,11 +24,11 @@ STEP = 1e-5
 def skip_null(
     trace: TraceConfig, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, active: mi.Bool
 ) -> mi.PreliminaryIntersection3f:
-    """The hit, or the first hit behind null boundaries; distances are measured along ``ray``."""
+    """Return the hit, or the first hit behind null boundaries; distances are measured along ``ray``."""
     here, onward, t = mi.PreliminaryIntersection3f(hit), mi.Ray3f(ray), mi.Float(hit.t)
     passing = active & _is_boundary(here)
     while dr.hint(passing, exclude=[trace, ray], label="pathreplay: beyond null boundaries"):
-        # Stays on the line of the ray; `spawn_ray` would offset the origin sideways.
+        # Keep the origin on the ray; `spawn_ray` would offset it sideways.
         gone = t + STEP * (1 + dr.max(dr.abs(ray.o)) + t)
         onward.o, onward.maxt = ray.o + gone * ray.d, ray.maxt - gone
         here = meet(trace, onward, passing)
@@ -46,7 +46,7 @@ def _is_boundary(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
 def transmittance_up_to(
     trace: TraceConfig, ray: mi.Ray3f, reach: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.MediumPtr]:
-    """Transmittance over the first ``reach`` of a ray from inside ``medium``, and the medium at its end. Detached."""
+    """Estimate the transmittance up to ``reach``, from inside ``medium``; also return the last medium. Detached."""
     ray = mi.Ray3f(ray)
     ray.maxt = reach
     stretch = Stretch.begin(ray, medium, active)
@@ -61,7 +61,7 @@ def transmittance_up_to(
 def transmittance_past_edge(
     trace: TraceConfig, ray: mi.Ray3f, t: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
 ) -> mi.Spectrum:
-    """Transmittance of a shadow ray that passes an edge at distance ``t``. Detached.
+    """Estimate the transmittance of a shadow ray that passes an edge at distance ``t``. Detached.
 
     It is computed in two parts, so that the ray passes the edge on its own side: `spawn_ray` at null boundaries shifts
     rays sideways by more than their distance from the edge.
@@ -72,7 +72,7 @@ def transmittance_past_edge(
 
 
 def further(ray: mi.Ray3f, t: mi.Float) -> mi.Ray3f:
-    """The rest of a ray, from distance ``t`` on."""
+    """Return the rest of a ray, from distance ``t`` on."""
     rest = mi.Ray3f(ray)
     rest.o, rest.maxt = ray.o + t * ray.d, ray.maxt - t
     return rest

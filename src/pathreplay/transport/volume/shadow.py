@@ -29,12 +29,12 @@ class Stretch:
 
     @staticmethod
     def begin(ray: mi.Ray3f, medium: mi.MediumPtr, active: mi.Bool) -> Stretch:
-        """The first segment of a ray that starts in ``medium``. Detached."""
+        """Return the first segment of a ray that starts in ``medium``. Detached."""
         ray = mi.Ray3f(dr.detach(ray))
         return Stretch(ray, mi.Float(ray.maxt), mi.Float(0), mi.MediumPtr(medium), mi.Bool(active))
 
     def part(self, trace: TraceConfig) -> tuple[mi.PreliminaryIntersection3f, mi.Float, mi.Float, mi.Bool]:
-        """The surface at the segment's end, the part [a, b] of the ray inside a medium, and where it is non-empty."""
+        """Return the surface at the segment's end, the part [a, b] inside a medium, and the mask of non-empty parts."""
         self.ray.maxt = self.far - self.gone
         hit = meet(trace, self.ray, self.active)
         inside = self.active & (self.medium != None)  # noqa: E711 (an array of pointers)
@@ -42,7 +42,7 @@ class Stretch:
         return hit, a, b, inside & (a < b)
 
     def beyond(self, hit: mi.PreliminaryIntersection3f, T: mi.Spectrum) -> tuple[Stretch, mi.Spectrum]:
-        """The segment behind that surface, and ``T`` times the null transmission of the surface."""
+        """Return the segment behind that surface, and ``T`` times the null transmission of the surface."""
         met, ray = self.active & hit.is_valid(), mi.Ray3f(self.ray)
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All, met)
         T = dr.select(met, T * si.bsdf(ray).eval_null_transmission(si, met), T)
@@ -82,7 +82,7 @@ def transmittance(
     sampler: mi.Sampler,
     active: mi.Bool,
 ) -> mi.Spectrum:
-    """Unbiased estimate of the transmittance of one medium between the distances a and b."""
+    """Estimate the transmittance of one medium between the distances a and b, without bias."""
     media = trace.media
     T = mi.Spectrum(1)
     rest = mi.Bool(active)
@@ -106,7 +106,7 @@ def transmittance(
 def ratio_tracking(
     medium: mi.MediumPtr, ray: mi.Ray3f, a: mi.Float, b: mi.Float, sampler: mi.Sampler, active: mi.Bool
 ) -> mi.Spectrum:
-    """T = Π (1 - σ_t/σ̄) over tentative collisions between a and b, with Mitsuba's global majorant of the medium."""
+    """Estimate T = Π (1 - σ_t/σ̄) over tentative collisions between a and b, with Mitsuba's global majorant."""
     σ_bar = majorant(medium, ray, active)
     active = active & (σ_bar > 0)
     t = mi.Float(a)
@@ -121,7 +121,7 @@ def ratio_tracking(
 
 
 def shadow_again(trace: TraceConfig, ray: mi.Ray3f, kept: Shadow, attached: bool, active: mi.Bool) -> mi.Spectrum:
-    """The recorded transmittance, differentiable in σ_t and, if ``attached``, in the two ends of the ray.
+    """Return the recorded transmittance, differentiable in σ_t and, if ``attached``, in the two ends of the ray.
 
     The point y keeps its position relative to the two surfaces (or ray ends) next to it.
     """
@@ -143,7 +143,7 @@ def shadow_again(trace: TraceConfig, ray: mi.Ray3f, kept: Shadow, attached: bool
 
 
 def _boundary(trace: TraceConfig, ray: mi.Ray3f, still: mi.Ray3f, y: mi.Float, sign: int, active: mi.Bool) -> mi.Float:
-    """Distance along ``ray`` to the first surface beyond y, towards the end (sign 1) or the origin (sign -1).
+    """Return the distance along ``ray`` of the surface next to y, towards the end (sign 1) or the origin (sign -1).
 
     If there is none, the distance is that of the ray's end, or 0. Differentiable in the ray and in the surface.
     """
