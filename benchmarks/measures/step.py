@@ -96,7 +96,7 @@ class Step:
 
     def _own(self, run: Run) -> tuple[float, np.ndarray]:
         run.values = {self.key: get_array(self.start)}
-        seconds, _ = stopwatch(lambda: take_step(self.problem, self.config, run, len(run.history)))
+        seconds, _ = stopwatch(lambda: take_step(self.problem, run, len(run.history)))
         return seconds, np.ravel(run.optimiser.seen[self.key])  # type: ignore[attr-defined]
 
     def _usual(self, integrator: mi.Integrator, adam: drjit.opt.Adam, seed: int) -> tuple[float, np.ndarray]:

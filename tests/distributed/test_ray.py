@@ -123,7 +123,7 @@ def test_ranges_of_samples_are_means_over_more_seeds(noise: bool) -> None:
 
     run.executor.evaluate = watched  # type: ignore[attr-defined]
     with one_thread(True):
-        take_step(problem, config, run, 0)
+        take_step(problem, run, 0)
     assert [shard.samples for shard in shards] == 8 * [4]
     assert len({shard.seeds for shard in shards}) == 8
     mean = {key: sum(each.gradients[key].astype(np.float64) for each in kept) / 4 for key in kept[0].gradients}

@@ -120,7 +120,7 @@ def test_each_view_is_recorded_once(changes: dict[str, Any]) -> None:
     problem = build_problem(config, Path.cwd())
     run = new_run(problem, problem.integrator)
     for i in range(6):
-        take_step(problem, config, run, i)
+        take_step(problem, run, i)
     assert times_recorded(run.executor.evaluate) == [1, 1]  # type: ignore[attr-defined]
 
 
@@ -143,9 +143,9 @@ def test_pictures_leave_recordings_as_they_are(changes: dict[str, Any]) -> None:
     problem = build_problem(config, Path.cwd())
     run = new_run(problem, problem.integrator)
     for i in range(6):
-        take_step(problem, config, run, i)
+        take_step(problem, run, i)
         if i % 2:
-            render_views(problem, config, run.values)
+            render_views(problem, run.values)
     assert times_recorded(run.executor.evaluate) == [1, 1]  # type: ignore[attr-defined]
 
 
@@ -163,6 +163,6 @@ def test_observers_hear_of_everything_in_order() -> None:
     config = make_config({**JOB, "iterations": 3, "parameters": grid})
     problem = build_problem(config, Path.cwd())
     run = new_run(problem, problem.integrator)
-    heard = list(iterate(problem, config, run, Stop()))
+    heard = list(iterate(problem, run, Stop()))
     first, second, third = (Stepped(entry) for entry in run.history)
     assert heard == [Started(0, 3), first, second, Refined(TEXTURE, (4, 4, 3)), third, Stopped(3)]

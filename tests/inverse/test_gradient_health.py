@@ -167,7 +167,7 @@ def test_halves_are_two_shards_and_their_mean_is_stepped_by() -> None:
     problem = build_problem(config, Path.cwd())
     run = new_run(problem, problem.integrator, record=False)
     start, evaluate = dict(run.values), run.executor.evaluate  # type: ignore[attr-defined]
-    list(iterate(problem, config, run, Stop()))
+    list(iterate(problem, run, Stop()))
     seeds = config.seeds(0, 0, 0)
     halves = [evaluate(start, Shard((0,), 4, (seed,)), {}) for seed in seeds]
     a, b = (each.gradients[KEY] for each in halves)
@@ -190,7 +190,7 @@ def test_a_gradient_that_is_noise_is_told_of_once(capsys: pytest.CaptureFixture[
     config = make_config(halved(iterations=WINDOW + 4))
     problem = build_problem(config, Path.cwd())
     run = replace(new_run(problem, problem.integrator), executor=Noise())
-    heard = list(iterate(problem, config, run, Stop()))
+    heard = list(iterate(problem, run, Stop()))
     told = [event for event in heard if isinstance(event, LowSNR)]
     assert told == [LowSNR(KEY, 0.0, WINDOW - 1, 8)]
     with Progress(True) as bar:

@@ -48,7 +48,7 @@ def test_a_stage_computes_what_a_job_of_its_own_does(integrator: str) -> None:
     single = build_problem(make_config(other), Path.cwd())
     values = {v.key: get_array(v.like) for v in problem.variables}
     with one_thread(True):
-        evaluate = Staged(problem, config, problem.integrator, config.integrator, record=False)
+        evaluate = Staged(problem, problem.integrator, config.integrator, record=False)
         found = evaluate(values, Shard((0, 1), 8, (3, 4), 0), {})
         views = tuple(scaled(view, 2) for view in problem.views)
         assert views[0].target.shape == (5, 6, 3)
@@ -104,10 +104,10 @@ def test_a_job_goes_through_its_stages() -> None:
 def test_stages_choose_views_and_batches() -> None:
     config = staged(stages=[{"iterations": 1, "sensors": [1]}, {"iterations": 1, "view_batch_size": 1}])
     problem = build_problem(config, Path.cwd())
-    one, two = (part_at(problem, config, i) for i in (0, 1))
-    assert [view.name for view in one.problem.trained().values()] == ["right"] and two.config.view_batch_size == 1
-    assert len(two.problem.trained()) == 2
-    assert part_at(problem, config, 99).number == 1
+    one, two = (part_at(problem, i) for i in (0, 1))
+    assert [view.name for view in one.problem.trained().values()] == ["right"]
+    assert two.problem.config.view_batch_size == 1 and len(two.problem.trained()) == 2
+    assert part_at(problem, 99).number == 1
 
 
 GRID = {"parameters": [{"key": TEXTURE, "initial": 0.5, "resolutions": [2, 3, 4]}, {"key": FLOOR, "initial": 0.5}]}

@@ -11,7 +11,7 @@ def steps(problem, config, passes: str) -> np.ndarray:
     """Loss and norm of the gradient of four steps, recorded (from the second on) or traced anew each time."""
     run = new_run(problem, problem.integrator, record=passes == "recorded")
     for i in range(4):
-        take_step(problem, config, run, i)
+        take_step(problem, run, i)
     # The first step is traced in any case; the others launch what the second recorded, view by view.
     frozen = run.executor.evaluate._recordings[config.spp]._frozen.values()
     assert [each.n_recordings for each in frozen] == [1] * len(problem.views) * (passes == "recorded")

@@ -102,7 +102,7 @@ class RayActor:
             plugin, integrator = config.integrator, problem.integrator
             if baseline and config.baseline is not None and problem.baseline is not None:
                 plugin, integrator = config.baseline, problem.baseline
-            self.evaluators[baseline] = evaluator_of(problem, config, integrator, plugin)
+            self.evaluators[baseline] = evaluator_of(problem, integrator, plugin)
         return self.evaluators[baseline]
 
 

@@ -15,7 +15,6 @@ from pathreplay.inverse.loop.checkpoint import Run
 from pathreplay.inverse.loop.events import Event
 from pathreplay.inverse.loop.loop import ended, render_views
 from pathreplay.inverse.loop.verdict import verdict_of
-from pathreplay.inverse.objective.evaluate import computing
 from pathreplay.inverse.problem.feasibility import require_finite_loss
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.platform.interrupts import Stop
@@ -61,7 +60,7 @@ class FolderRun:
     def observe(self, event: Event) -> None:
         """Write what is due. Raises PathreplayError if the folder has disappeared or cannot be written."""
         self._saving.observe(event)
-        with computing(self._problem.config):
+        with self._problem.computing():
             self.previews.observe(event)
 
     @contextmanager
@@ -85,12 +84,12 @@ class FolderRun:
 
     def finish(self) -> RunResult:
         """Write values, images and report at the end of the run. Raises as `observe` does."""
-        problem, config = self._problem, self._problem.config
-        with computing(config):
-            run = ended(problem, config, self._run)
+        problem = self._problem
+        with problem.computing():
+            run = ended(problem, self._run)
             verdict = verdict_of(problem, run, self._stop.by is not None)
-            after = render_views(problem, config, run.values)
-            theirs = render_views(problem, config, run.baseline.values) if run.baseline else {}
+            after = render_views(problem, run.values)
+            theirs = render_views(problem, run.baseline.values) if run.baseline else {}
         outcome = outcome_of(self._job, self.folder.name, problem, run, self._before, after, theirs, verdict)
         files = result_files(outcome, self.previews.finished(after))
         problem.disk.rest()
@@ -112,8 +111,8 @@ def require_targets(folder: Path, problem: Problem) -> None:
 
 def _begun(output: Path, home: Path, job: Job, problem: Problem, run: Run) -> tuple[RunFolder, dict[str, Image]]:
     """Create the folder of a run; returns it and the images at the initial values."""
-    with computing(problem.config):
-        before = render_views(problem, problem.config, run.values)
+    with problem.computing():
+        before = render_views(problem, run.values)
     for view in problem.views:
         require_finite_loss(problem.loss, view.name, view.target, view.weight, before[view.name])
     return create_run_folder(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 from numpy.typing import ArrayLike
 
 from pathreplay.inverse.config.schema import ITERATION
-from pathreplay.inverse.objective.evaluate import Shard, computing, total
+from pathreplay.inverse.objective.evaluate import Shard, total
 from pathreplay.inverse.objective.stages import evaluator_of
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.library.problem import Problem
@@ -28,9 +29,9 @@ def value_and_grad(problem: Problem) -> ValueAndGrad:
         regularizers) and the gradients, arrays in the shapes of the values. Unbiased for ``l2`` and ``relative-l2``;
         the loss itself carries the variance of the images on top. Entries that are NaN or infinite count as zero.
     """
-    built = problem.built
-    config = built.config.model_copy(update={"stages": None})
-    evaluator = evaluator_of(built, config, built.integrator, config.integrator)
+    built = replace(problem.built, config=problem.built.config.model_copy(update={"stages": None}))
+    config = built.config
+    evaluator = evaluator_of(built, built.integrator, config.integrator)
 
     def evaluated(
         values: Mapping[str, ArrayLike] | None = None, seed: int = 0, spp: int | None = None
@@ -40,7 +41,7 @@ def value_and_grad(problem: Problem) -> ValueAndGrad:
         shards = [
             Shard((n,), samples, config.seeds(ITERATION, view.sensor, seed, 1)) for n, view in built.trained().items()
         ]
-        with computing(config):
+        with built.computing():
             found = total((evaluator(at, shard, {}) for shard in shards), owned=True)
         loss, gradients = found.loss, found.gradients
         for variable in built.variables:

@@ -17,7 +17,6 @@ from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.loop.checkpoint import Entry, Run
 from pathreplay.inverse.loop.events import Event, Stepped
 from pathreplay.inverse.loop.loop import best_values, computed, new_run, picture_of
-from pathreplay.inverse.objective.evaluate import computing
 from pathreplay.inverse.objective.stages import evaluator_of
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem
@@ -78,8 +77,8 @@ class Iteration:
 def rendered(problem: Problem, values: Arrays, view: int | str, spp: int | None) -> Image:
     """Render a view, given by index or name, with these values. Raises PathreplayError if it does not exist."""
     about = view_of(problem, view)
-    with computing(problem.config):
-        return picture_of(problem, problem.config, values, about, spp)
+    with problem.computing():
+        return picture_of(problem, values, about, spp)
 
 
 def view_of(problem: Problem, view: int | str) -> views.View:
@@ -114,7 +113,7 @@ def _run(
     if pool is not None:
         executor = RayExecutor(pool, [view.name for view in problem.views], baseline)
         return new_run(problem, integrator, optimizer=config.optimizer, executor=executor)
-    evaluate = evaluator_of(problem, config, integrator, plugin)
+    evaluate = evaluator_of(problem, integrator, plugin)
     return new_run(problem, integrator, optimizer=config.optimizer, evaluate=evaluate)
 
 
@@ -143,7 +142,7 @@ def iterations(
     names = tuple(view.name for view in problem.views)
     folder = None if kept is None else kept.folder.path
     with nullcontext() if kept is None else kept.kept():
-        for event in computed(problem, problem.config, run, stop):
+        for event in computed(problem, run, stop):
             for observe in observers:
                 observe(event)
             problem.disk.rest()

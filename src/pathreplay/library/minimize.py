@@ -16,7 +16,6 @@ from pathreplay.inverse.images.io import Image
 from pathreplay.inverse.loop.checkpoint import Entry, Run
 from pathreplay.inverse.loop.events import Event
 from pathreplay.inverse.loop.loop import ended
-from pathreplay.inverse.objective.evaluate import computing
 from pathreplay.inverse.parameters.values import Array
 from pathreplay.inverse.problem import problem as inner
 from pathreplay.inverse.problem.problem import put_values
@@ -165,9 +164,9 @@ def _minimized(
         if kept is not None:
             bar.say("writing")
             found = kept.finish().parameters
-        with computing(built.config):
+        with built.computing():
             if kept is None:
-                found = with_scene(built, ended(built, built.config, run).values)
+                found = with_scene(built, ended(built, run).values)
             put_values(built, {v.key: found[v.key] for v in built.variables})
     folder = None if kept is None else kept.folder.path
     return Result(found, run.history, stop.by or run.optimiser.finished or None, problem, folder)
@@ -208,7 +207,7 @@ def _observers(
         return [kept.observe]
     if not isinstance(bar, NotebookPanel):
         return []
-    with computing(built.config):
+    with built.computing():
         pictures = LivePictures(built, run, stop)
     bar.follow(pictures, "minimize")
     return [pictures.observe]

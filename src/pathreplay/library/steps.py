@@ -12,7 +12,7 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.loop.checkpoint import Entry, Run
 from pathreplay.inverse.loop.loop import best_values, new_run, optimiser_of, require_gradients, take_step
-from pathreplay.inverse.objective.evaluate import Executor, Local, computing
+from pathreplay.inverse.objective.evaluate import Executor, Local
 from pathreplay.inverse.objective.stages import evaluator_of
 from pathreplay.inverse.optim import adaptive
 from pathreplay.inverse.parameters.values import Array, Arrays
@@ -37,7 +37,7 @@ class _Task:
         if problem not in self._known:
             built = problem.configured(self._changes, name)
             config = built.config
-            executor = Local(evaluator_of(built, config, built.integrator, config.integrator))
+            executor = Local(evaluator_of(built, built.integrator, config.integrator))
             self._known[problem] = built, executor
         return self._known[problem]
 
@@ -134,9 +134,9 @@ def step(problem: Problem, state: State) -> State:
         )
     optimiser = task.optimiser_at(state, built)
     run = Run(executor, optimiser, dict(state._next), state._learned, list(state.history))
-    with computing(built.config):
-        take_step(built, built.config, run, min(len(state.history), built.config.iterations - 1))
-    require_gradients(built.config, run)
+    with built.computing():
+        take_step(built, run, min(len(state.history), built.config.iterations - 1))
+    require_gradients(built, run)
     found = best_values(built, run)
     kept = _copied(optimiser.state())
     after = State(found, tuple(run.history), optimiser.finished, run.values, run.learned, kept, task)

@@ -16,7 +16,6 @@ from pathreplay.inverse.images.metrics import Likeness
 from pathreplay.inverse.loop.checkpoint import Run
 from pathreplay.inverse.loop.events import Event, Stepped
 from pathreplay.inverse.loop.loop import best_values, picture_of
-from pathreplay.inverse.objective.evaluate import computing
 from pathreplay.inverse.parameters import grids
 from pathreplay.inverse.problem.problem import Problem
 from pathreplay.platform.interrupts import Stop
@@ -62,7 +61,7 @@ class LivePictures:
         """Render images when they are due. For runs without a live page."""
         if isinstance(event, Stepped) and self.is_due(event.entry.seconds):
             begin = time.perf_counter()
-            with computing(self._problem.config):
+            with self._problem.computing():
                 self.look(event.entry.iteration + 1)
             self.paid(time.perf_counter() - begin)
 
@@ -94,7 +93,7 @@ class LivePictures:
         config = self._problem.config
         spp = max(config.most_spp, min(LEAST_SPP, config.eval_spp))
         values = best_values(self._problem, self._run)
-        return {view.name: picture_of(self._problem, config, values, view, spp) for view in self.views}
+        return {view.name: picture_of(self._problem, values, view, spp) for view in self.views}
 
     def small(self) -> tuple[pages.View, ...]:
         """Return target, current image and difference of the views as thumbnails in data URIs."""

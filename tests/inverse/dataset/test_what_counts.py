@@ -127,27 +127,15 @@ def test_a_job_may_bring_its_loss(room: Path) -> None:
     assert result.history[0].loss == pytest.approx(0.18, rel=1e-3)
 
 
-class Views:
-    """As much of a problem as batches are made of."""
-
-    def __init__(self, *places: int) -> None:
-        self.places = places
-
-    def trained(self) -> dict[int, None]:
-        return dict.fromkeys(self.places)
-
-
 def test_batches_have_every_view_once_in_a_round() -> None:
-    views: Any = Views(0, 2, 3, 5, 7)
-    config = make_config({**JOB, "view_batch_size": 2, "seed": 3})
-    seen = [batch(views, config, i) for i in range(12)]
+    views = [0, 2, 3, 5, 7]
+    seen = [batch(views, 2, 3, i) for i in range(12)]
     assert [len(each) for each in seen] == 4 * [2, 2, 1]
     rounds = np.concatenate(seen).reshape(4, 5)
     assert (np.sort(rounds, axis=1) == [0, 2, 3, 5, 7]).all()
     assert len({tuple(each) for each in rounds.tolist()}) > 1
-    assert seen != [batch(views, make_config({**JOB, "view_batch_size": 2, "seed": 4}), i) for i in range(12)]
-    everything = batch(views, make_config({**JOB, "view_batch_size": 5}), 3)
-    assert everything == [7, 5, 3, 2, 0] == batch(views, make_config(JOB), 1)
+    assert seen != [batch(views, 2, 4, i) for i in range(12)]
+    assert batch(views, 5, 0, 3) == [7, 5, 3, 2, 0] == batch(views, None, 0, 1)
 
 
 @pytest.mark.slow

@@ -138,11 +138,22 @@ class Config(Table):
         """Number of shards per view and iteration: `spp_shards`, times two halves if the noise is measured."""
         return self.spp_shards * (2 if self.halves_samples else 1)
 
-    def refine_at(self, entry: Parameter) -> list[int]:
-        """Return the iterations at which the second and later resolutions of a parameter begin."""
+    def completed_entry(self, entry: Parameter) -> Parameter:
+        """Return the table of a parameter with its learning rate, and the iterations at which resolutions begin."""
+        refine_at = entry.refine_at or []
         if entry.refine_at is None and entry.resolutions is not None and self.stages is not None:
-            return begins(self.stages)[1 : len(entry.resolutions)]
-        return entry.refine_at or []
+            refine_at = begins(self.stages)[1 : len(entry.resolutions)]
+        rate = entry.learning_rate or self.learning_rate
+        return entry.model_copy(update={"refine_at": refine_at, "learning_rate": rate})
+
+    @property
+    def target_source(self) -> tuple[str, dict[str, Argument]]:
+        """The scene of rendered targets, and the arguments of a built-in one: those of the job by default."""
+        target = self.target
+        return (
+            self.scene if target.scene is None else target.scene,
+            self.scene_parameters if target.scene_parameters is None else target.scene_parameters,
+        )
 
     @model_validator(mode="after")
     def _in_stages(self) -> Config:

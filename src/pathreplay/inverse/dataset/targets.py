@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
@@ -13,7 +13,9 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.film.image import film_size, picture_shape, require_film
-from pathreplay.inverse.config.schema import TARGET, Config
+from pathreplay.inverse.config.parameter_options import Value
+from pathreplay.inverse.config.tables import Argument
+from pathreplay.inverse.config.target_options import Target
 from pathreplay.inverse.dataset.globbing import matching
 from pathreplay.inverse.dataset.undistortion import Lens
 from pathreplay.inverse.dataset.views import View
@@ -61,22 +63,20 @@ class Targets:
         return Targets({view.name: view.target for view in views}, weights)
 
 
-def target_scene(config: Config, base: Path) -> mi.Scene:
-    """Load the target scene and set the values that the job gives for it."""
-    target = config.target
-    spec = config.scene if target.scene is None else target.scene
-    arguments = config.scene_parameters if target.scene_parameters is None else target.scene_parameters
-    wanted = [*target.values, *(entry.key for entry in config.parameters), *(made.key for made in config.derived)]
-    scene = load_scene_with_floats(spec, wanted, base, **arguments)
+def target_scene(
+    spec: str, arguments: Mapping[str, Argument], given: Mapping[str, Value], wanted: Sequence[str], base: Path
+) -> mi.Scene:
+    """Load the target scene and set its ``given`` values; 8-bit textures among the ``wanted`` keys become floats."""
+    scene = load_scene_with_floats(spec, [*given, *wanted], base, **arguments)
     params = traversed(scene)
     parameters.require_finite(params)
     values = {}
-    for pattern, value in target.values.items():
+    for pattern, value in given.items():
         for key in parameters.resolve_keys(params, pattern):
             parameters.require_settable(params, key)
             form, like = form_of(params, key), seen(params, key)
-            given = form.of_colours(key, make_value(key, like, value, base))
-            values[key] = form.store(parameters.to_value(like, given))
+            colours = form.of_colours(key, make_value(key, like, value, base))
+            values[key] = form.store(parameters.to_value(like, colours))
     params.update(values)
     return scene
 
@@ -94,9 +94,11 @@ def truth_of(scene: mi.Scene, own: mi.SceneParameters, keys: Iterable[str]) -> d
     return {k: value for k, value in true.items() if comparable(value.shape, parameters.get_array(seen(own, k)).shape)}
 
 
-def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], disk: DiskStore) -> dict[str, Image]:
-    """Render the targets of all views. Raises PathreplayError if the target scene lacks a sensor."""
-    plugin = config.target.integrator
+def rendered_targets(
+    target: Target, seeds: Mapping[str, int], scene: mi.Scene, sensors: dict[str, int], disk: DiskStore
+) -> dict[str, Image]:
+    """Render the targets of all views, with a seed for each. Raises PathreplayError if the scene lacks a sensor."""
+    plugin = target.integrator
     assert plugin is not None  # set by `completed`
     integrator = load_integrator(plugin.model_dump())
     if len(scene.sensors()) <= max(sensors.values()):
@@ -104,12 +106,11 @@ def rendered_targets(config: Config, scene: mi.Scene, sensors: dict[str, int], d
             f"The target scene has {len(scene.sensors())} sensors, but the job uses the index {max(sensors.values())} "
             "(from 0); add sensors to it"
         )
-    require_films(scene, sensors, {"target.spp": config.target.spp})
+    require_films(scene, sensors, {"target.spp": target.spp})
     targets: dict[str, Image] = {}
     for name, index in sensors.items():
-        seed, _ = config.seeds(TARGET, index)
         with errors_as(f"Integrator '{plugin.type}' cannot render the target of sensor '{name}'"):
-            image = mi.render(scene, sensor=index, integrator=integrator, spp=config.target.spp, seed=mi.UInt32(seed))
+            image = mi.render(scene, sensor=index, integrator=integrator, spp=target.spp, seed=mi.UInt32(seeds[name]))
             targets[name] = np.array(image, dtype=np.float32)
             del image
         require_finite_array(f"Target image of sensor '{name}'", targets[name])

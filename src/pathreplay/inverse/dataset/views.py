@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
-from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.images.io import Image
 from pathreplay.platform.files import file_names
 
@@ -71,31 +70,31 @@ def _place(item: int | str, ids: list[str], names: list[str]) -> int:
     return index
 
 
-def test_views_of(scene: mi.Scene, sensors: dict[str, int], config: Config, shots: list[str]) -> set[str]:
-    """Return the names of the test views: those that the job names, and every n-th shot of a capture."""
+def test_views_of(scene: mi.Scene, sensors: dict[str, int], named: Sequence[int | str], shots: list[str]) -> set[str]:
+    """Return the names of the test views: the sensors ``named`` by the job, and those of these ``shots``."""
     available = sensors_of(scene, None)
     ids = [sensor.id() for sensor in scene.sensors()]
-    indices = {_place(item, ids, list(available)) for item in config.test_views}
+    indices = {_place(item, ids, list(available)) for item in named}
     names = {name for name, index in sensors.items() if index in indices}
-    every = None if config.capture is None else config.capture.test_every
     if len(names) < len(indices):
         other = next(name for name, index in available.items() if index in indices and name not in names)
         raise PathreplayError(
             f"test_views: sensor '{other}' is not among 'sensors'; add it there, or remove it from 'test_views'"
         )
-    regular = set(shots[::every]) if every else set()
-    names |= {name for name, index in sensors.items() if ids[index] in regular}
+    names |= {name for name, index in sensors.items() if ids[index] in shots}
     if len(names) == len(sensors):
         raise PathreplayError("Every sensor of the job is a test view; leave at least one for training")
     return names
 
 
-def shares_of(scene: mi.Scene, sensors: dict[str, int], config: Config, test_views: set[str]) -> dict[str, float]:
+def shares_of(
+    scene: mi.Scene, sensors: dict[str, int], weights: Mapping[str, float], test_views: set[str]
+) -> dict[str, float]:
     """Return the weight of each view by name; the mean over the training views is 1."""
-    names = named_views(scene, sensors, list(config.view_weights), "view_weights")
+    names = named_views(scene, sensors, list(weights), "view_weights")
     if out := set(names) & test_views:
         raise PathreplayError(f"view_weights: '{min(out)}' is a test view and has no weight; remove it here")
-    given = dict(zip(names, config.view_weights.values(), strict=True))
+    given = dict(zip(names, weights.values(), strict=True))
     shares = {name: given.get(name, 1.0) for name in sensors}
     mean = float(np.mean([share for name, share in shares.items() if name not in test_views]))
     return {name: share / mean for name, share in shares.items()}

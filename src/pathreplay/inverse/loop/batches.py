@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from pathreplay.inverse.config.schema import BATCH, Config
-from pathreplay.inverse.problem.problem import Problem
+from pathreplay.inverse.config.schema import BATCH
 
 
-def batch(problem: Problem, config: Config, iteration: int) -> list[int]:
-    """Return the indices of the views of an iteration, in the order of evaluation.
+def batch(views: list[int], size: int | None, seed: int, iteration: int) -> list[int]:
+    """Return those of the training ``views`` that an iteration evaluates, in this order.
 
     An epoch contains every training view once; its last batch may be smaller. The batch depends only on the seed and
     the iteration, so a resumed run continues with the same views.
     """
-    views = list(problem.trained())
-    n, size = len(views), config.view_batch_size
+    n = len(views)
     if size is None or size >= n:
         return views[::-1]  # the order of earlier versions, which affects the baselines of media
     number, k = divmod(iteration, -(-n // size))
-    return [views[i] for i in _shuffled(config, number, n)[k * size : (k + 1) * size]]
+    return [views[i] for i in _shuffled(seed, number, n)[k * size : (k + 1) * size]]
 
 
-def _shuffled(config: Config, number: int, n: int) -> list[int]:
+def _shuffled(seed: int, number: int, n: int) -> list[int]:
     """Return the permutation of n views in epoch ``number``."""
-    return np.random.default_rng([config.seed, BATCH, number]).permutation(n).tolist()
+    return np.random.default_rng([seed, BATCH, number]).permutation(n).tolist()

@@ -13,7 +13,7 @@ import numpy as np
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.optimizer_options import Optimizer
 from pathreplay.inverse.config.schedules import rate
-from pathreplay.inverse.config.schema import ITERATION, JUDGEMENT, PICTURE, Config
+from pathreplay.inverse.config.schema import ITERATION, JUDGEMENT, PICTURE
 from pathreplay.inverse.config.stage_options import place
 from pathreplay.inverse.dataset.views import View
 from pathreplay.inverse.images.io import Image
@@ -40,7 +40,6 @@ from pathreplay.inverse.objective.evaluate import (
     Local,
     Shard,
     Total,
-    computing,
     release,
     total,
 )
@@ -110,8 +109,8 @@ def best_values(problem: Problem, run: Run) -> dict[str, Array]:
     return {v.key: np.clip(best[v.key], *v.bounds) if v.key in best else run.values[v.key] for v in problem.variables}
 
 
-def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
-    """Take steps from ``len(run.history)`` to ``config.iterations``, and yield the events of the run.
+def iterate(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
+    """Take steps from ``len(run.history)`` to ``iterations``, and yield the events of the run.
 
     After each step, the run's baseline takes steps until it has used as much time. Alternating the two gives them equal
     conditions on a machine whose load varies. The baseline uses the learning rate and resolutions of the iteration of
@@ -119,7 +118,6 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
 
     Args:
         problem: the problem.
-        config: the job.
         run: the run, which is changed in place.
         stop: request to stop, which is checked after each step.
 
@@ -127,6 +125,7 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
         PathreplayError: the loss or a value is not finite, or gradients were not finite in
             `Config.max_consecutive_nonfinite` consecutive iterations.
     """
+    config = problem.config
     yield Started(len(run.history), config.iterations)
     faint: set[str] = set()
     stage, stages = None, config.stages or []
@@ -137,41 +136,42 @@ def iterate(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[
         if stages and place(stages, i) != stage:
             stage = place(stages, i)
             yield Entered(stage + 1, len(stages))
-        yield from take_step(problem, config, run, i)
+        yield from take_step(problem, run, i)
         if baseline := run.baseline:
             while baseline.seconds() < run.seconds():
-                take_step(problem, config, baseline, i)
+                take_step(problem, baseline, i)
             # Measure the image errors after the first iteration, and after each tenth of all iterations.
             if i == 0 or JUDGEMENTS * i // config.iterations < JUDGEMENTS * (i + 1) // config.iterations:
                 for measured in (run, baseline):
-                    error = judged(problem, config, measured.values, i)
+                    error = judged(problem, measured.values, i)
                     measured.history[-1] = replace(measured.history[-1], picture_error=error)
         for key, ratio in noise.ratios(run.history).items():
             if ratio < noise.FAINT and key not in faint:
                 faint.add(key)
                 yield LowSNR(key, ratio, i, run.history[-1].spp)
         yield Stepped(run.history[-1])
-        require_gradients(config, run)
+        require_gradients(problem, run)
         if stop.by is not None:
             break
     yield Stopped(len(run.history))
 
 
-def computed(problem: Problem, config: Config, run: Run, stop: Stop) -> Iterator[Event]:
-    """Yield the events of `iterate`; `computing` applies while steps are taken, not while observers handle events."""
-    events = iterate(problem, config, run, stop)
+def computed(problem: Problem, run: Run, stop: Stop) -> Iterator[Event]:
+    """Yield the events of `iterate`; `Problem.computing` applies while steps are taken, not to observers."""
+    events = iterate(problem, run, stop)
     while True:
-        with computing(config):
+        with problem.computing():
             event = next(events, None)
         if event is None:
             return
         yield event
 
 
-def require_gradients(config: Config, run: Run) -> None:
+def require_gradients(problem: Problem, run: Run) -> None:
     """Raise PathreplayError after `max_consecutive_nonfinite` iterations in which half of a gradient is not finite."""
-    last = run.history[-config.max_consecutive_nonfinite :]
-    if len(last) < config.max_consecutive_nonfinite:
+    most = problem.config.max_consecutive_nonfinite
+    last = run.history[-most:]
+    if len(last) < most:
         return
     for key in last[-1].dropped_shares:
         if all(entry.dropped_shares.get(key, 0) >= HALF for entry in last):
@@ -182,7 +182,7 @@ def require_gradients(config: Config, run: Run) -> None:
             )
 
 
-def take_step(problem: Problem, config: Config, run: Run, position: int) -> list[Event]:
+def take_step(problem: Problem, run: Run, position: int) -> list[Event]:
     """Take one step and append it to the history of the run.
 
     First, refine the grids whose next resolution is due, which resets their optimiser state. Then evaluate the views of
@@ -195,7 +195,6 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
 
     Args:
         problem: the problem.
-        config: the job.
         run: the run, which is changed in place.
         position: iteration that determines stage, learning rate and resolutions.
 
@@ -206,15 +205,15 @@ def take_step(problem: Problem, config: Config, run: Run, position: int) -> list
         PathreplayError: the loss or a value is not finite.
     """
     begin, i = time.perf_counter(), len(run.history)
-    part = part_at(problem, config, position)
+    part = part_at(problem, position)
     values, events = _refined(part, run.values, position)
-    configured, halves = part.config.spp, part.config.halves_samples
-    spp = configured if isinstance(configured, int) else noise.next_spp(config.adaptive_spp, run.history)
+    config = part.problem.config
+    spp = config.spp if isinstance(config.spp, int) else noise.next_spp(config.adaptive_spp, run.history)
     shards = _shards(part, i, spp)
     scale = len(part.problem.trained()) / len({shard.views for shard in shards})
     evaluations = run.executor.run(values, shards, run.learned)
     dropped: list[dict[str, int]] = []
-    evaluation, noise_norms = _summed(_seen(evaluations, dropped), scale / part.config.parts, halves)
+    evaluation, noise_norms = _summed(_seen(evaluations, dropped), scale / config.parts, config.halves_samples)
     if not np.isfinite(evaluation.loss):
         raise PathreplayError(
             f"The loss is {evaluation.loss} at iteration {i}; lower the learning rates, or bound the parameters that "
@@ -266,11 +265,11 @@ def _refined(part: Part, values: Arrays, position: int) -> tuple[dict[str, Array
 
 def _shards(part: Part, iteration: int, spp: int) -> list[Shard]:
     """Make the shards of an iteration: one per view, or several per view (see `Config.parts`)."""
-    same = 0 if part.config.optimizer.searches else iteration
-    config, views = part.config, part.problem.views
+    config, views = part.problem.config, part.problem.views
+    same = 0 if config.optimizer.searches else iteration
     return [
         Shard((n,), spp // config.parts, (seed,), part.number, config.pixel_batch_size)
-        for n in batch(part.problem, config, iteration)
+        for n in batch(list(part.problem.trained()), config.view_batch_size, config.seed, iteration)
         for seed in config.seeds(ITERATION, views[n].sensor, same, config.parts)
     ]
 
@@ -305,7 +304,7 @@ def _summed(evaluations: Iterator[Evaluation], scale: float, halves: bool) -> tu
 
 def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: int, loss: float) -> dict[str, Array]:
     """Step the optimiser in the coordinates of each variable, and project the values onto their bounds."""
-    config = part.config
+    config = part.problem.config
     decay, iterations = config.final_learning_rate_ratio, config.iterations
     factor = part.factor * rate(config.learning_rate_schedule, position, iterations, decay, config.warmup_steps)
     moving = [v for v in part.problem.variables if v.key in gradients]
@@ -327,46 +326,46 @@ def _stepped(part: Part, run: Run, values: Arrays, gradients: Arrays, position: 
     return {**values, **{v.key: stepped[v.key] for v in moving}}
 
 
-def render_views(problem: Problem, config: Config, values: Arrays) -> dict[str, Image]:
+def render_views(problem: Problem, values: Arrays) -> dict[str, Image]:
     """Render all views with the job's integrator at these values; all calls use the same random numbers."""
-    return {view.name: problem.disk.keep(picture_of(problem, config, values, view)) for view in problem.views}
+    return {view.name: problem.disk.keep(picture_of(problem, values, view)) for view in problem.views}
 
 
-def picture_of(problem: Problem, config: Config, values: Arrays, view: View, spp: int | None = None) -> Image:
+def picture_of(problem: Problem, values: Arrays, view: View, spp: int | None = None) -> Image:
     """Render one view as `render_views` does, with ``spp`` samples per pixel (default: ``eval_spp``)."""
     put_values(problem.home(view)[0], values)
     index = next(n for n, other in enumerate(problem.views) if other.name == view.name)
-    return exposed(values, index, _plain(problem, config, view, config.eval_spp if spp is None else spp))
+    return exposed(values, index, _plain(problem, view, problem.config.eval_spp if spp is None else spp))
 
 
-def _plain(problem: Problem, config: Config, view: View, spp: int) -> Image:
+def _plain(problem: Problem, view: View, spp: int) -> Image:
     """Render a view at exposure 1 with the current values of the scene."""
     home, there = problem.home(view)
-    return _picture(home, there, home.integrator, spp, config.seeds(PICTURE, view.sensor)[0])
+    return _picture(home, there, home.integrator, spp, problem.config.seeds(PICTURE, view.sensor)[0])
 
 
-def ended(problem: Problem, config: Config, run: Run) -> Run:
+def ended(problem: Problem, run: Run) -> Run:
     """Return the run, and its baseline, with their resulting values, including exposures of test views."""
     run = replace(run, values=best_values(problem, run))
     for each in filter(None, (run, run.baseline)):
-        each.values = dict(with_exposures(problem, config, each.values))
+        each.values = dict(with_exposures(problem, each.values))
     return run
 
 
-def with_exposures(problem: Problem, config: Config, values: Arrays) -> Arrays:
+def with_exposures(problem: Problem, values: Arrays) -> Arrays:
     """Return the values with the exposures of test views, which the run does not optimise, fitted to their targets."""
     if EXPOSURE not in values or not any(view.is_test for view in problem.views):
         return values
     put_values(problem, values)
     pictures = {
-        n: (_plain(problem, config, view, config.eval_spp), view.target, view.weight)
+        n: (_plain(problem, view, problem.config.eval_spp), view.target, view.weight)
         for n, view in enumerate(problem.views)
         if view.is_test
     }
     return with_held_out(values, pictures)
 
 
-def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> float:
+def judged(problem: Problem, values: Arrays, iteration: int) -> float:
     """Estimate the root mean square error of the training views without the noise of rendering them.
 
     With two independent renderings A and B of an image I, E[(A - T)(B - T)] = (I - T)², whereas the square of one
@@ -375,10 +374,10 @@ def judged(problem: Problem, config: Config, values: Arrays, iteration: int) -> 
 
     Args:
         problem: the problem.
-        config: the job.
         values: values of the variables.
         iteration: selects the random numbers.
     """
+    config = problem.config
     put_values(problem, values)
     squares, views = 0.0, problem.trained()
     for n, view in views.items():

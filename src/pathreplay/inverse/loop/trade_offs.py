@@ -92,7 +92,7 @@ def _rendered(problem: Problem, values: Arrays, spp: int) -> Array:
     """Render all training views with common random numbers; returns their weighted pixels in one vector."""
     pictures = []
     for view in problem.trained().values():
-        picture = picture_of(problem, problem.config, values, view, spp)
+        picture = picture_of(problem, values, view, spp)
         pictures.append((picture if view.weight is None else picture * np.sqrt(view.weight)).ravel())
     return np.concatenate(pictures)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -16,7 +15,6 @@ from pathreplay.integrators.film.image import make_ready
 from pathreplay.integrators.lifetimes import plain_errors
 from pathreplay.integrators.scene_facts import facts_of
 from pathreplay.integrators.stateful import stateful
-from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.losses.pixelwise import ELSEWHERE
 from pathreplay.inverse.objective.frozen import (
     NotRecordable,
@@ -33,8 +31,6 @@ from pathreplay.inverse.parameters.exposures import gradient as exposure_gradien
 from pathreplay.inverse.parameters.values import Array, Arrays
 from pathreplay.inverse.problem.problem import Problem, scene_values, sensor_of
 from pathreplay.platform import memory
-from pathreplay.platform.threads import one_thread
-from pathreplay.scenes.descriptions import errors_as
 from pathreplay.scenes.parameters import get_array
 
 LARGE = 2**22
@@ -283,13 +279,3 @@ class Evaluator:
             found = step(problem.params, problem.scene, self.integrator, request, target, loss)
         self.integrator.keep(problem.scene, found.state)
         return float(found.loss[0]) if dr.width(found.loss) else float("nan"), found.by_factor
-
-
-@contextmanager
-def computing(config: Config) -> Iterator[None]:
-    """Around what the job's integrators do: in one thread if that is wanted, and their errors told."""
-    names = (
-        config.integrator.type if config.baseline is None else f"{config.integrator.type}' or '{config.baseline.type}"
-    )
-    with one_thread(config.deterministic), errors_as(f"Integrator '{names}' cannot do this job"):
-        yield

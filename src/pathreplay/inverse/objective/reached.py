@@ -10,10 +10,7 @@ import mitsuba as mi
 from pathreplay.errors import PathreplayError
 from pathreplay.integrators.film.image import picture_shape
 from pathreplay.integrators.stateful import stateful
-from pathreplay.inverse.config.schema import Config
-from pathreplay.inverse.config.stage_options import begins
-from pathreplay.inverse.objective.evaluate import computing
-from pathreplay.inverse.objective.stages import Part, part_at, require_single_pixels, require_stages
+from pathreplay.inverse.objective.stages import Part, parts_of, require_single_pixels, require_stages
 from pathreplay.inverse.parameters.exposures import EXPOSURE
 from pathreplay.inverse.problem.problem import Problem, scene_values, variables_of
 
@@ -23,22 +20,21 @@ def require_possible(problem: Problem) -> None:
 
     See `require_stages`, `require_single_pixels` and `require_reached`.
     """
-    config = problem.config
     for each in problem.scenes():
-        require_stages(each, config)
-        require_single_pixels(each, config)
-        with computing(config):
-            require_reached(each, config)
+        require_stages(each)
+        require_single_pixels(each)
+        with problem.computing():
+            require_reached(each)
 
 
-def require_reached(problem: Problem, config: Config) -> None:
+def require_reached(problem: Problem) -> None:
     """Raise PathreplayError where all that moves in a stage, or in the job, reaches none of its views.
 
     An integrator of ours is asked, too, whether it differentiates what moves.
     """
-    for first in begins(config.stages)[:-1] if config.stages else [0]:
-        part = part_at(problem, config, first)
-        where = f"stages: stage {part.number + 1}: " if config.stages else ""
+    parts = parts_of(problem)
+    for part in parts:
+        where = f"stages: stage {part.number + 1}: " if len(parts) > 1 else ""
         views = part.problem.trained()
         reached = sorted(views.keys() & part.problem.reached(part.moving))
         if not reached and EXPOSURE not in part.moving:  # by which every picture is multiplied

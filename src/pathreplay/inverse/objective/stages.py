@@ -10,7 +10,7 @@ import numpy as np
 
 from pathreplay.errors import PathreplayError, shown
 from pathreplay.integrators.stateful import stateful
-from pathreplay.inverse.config.schema import Config, Plugin
+from pathreplay.inverse.config.schema import Plugin
 from pathreplay.inverse.config.stage_options import Stage, place
 from pathreplay.inverse.dataset.views import View
 from pathreplay.inverse.images.io import Image
@@ -29,31 +29,37 @@ class Part:
     """The job as it is in a stage, or throughout, if it has none."""
 
     number: int
-    config: Config
     problem: Problem
-    """With the views that are learned from; their pictures are whole (see `scaled`)."""
+    """With the options of the stage, and the views that it trains on; their images are whole (see `scaled`)."""
     moving: frozenset[str]
     """Variables that are stepped, and differentiated."""
     factor: float
     """On all learning rates."""
 
 
-def part_at(problem: Problem, config: Config, iteration: int) -> Part:
+def part_at(problem: Problem, iteration: int) -> Part:
     """The part of an iteration."""
-    if config.stages is None:
-        return Part(0, config, problem, frozenset(v.key for v in problem.variables), 1.0)
-    number = place(config.stages, iteration)
-    return _part(problem, config, number, config.stages[number])
+    stages = problem.config.stages
+    if stages is None:
+        return Part(0, problem, frozenset(v.key for v in problem.variables), 1.0)
+    number = place(stages, iteration)
+    return _part(problem, number, stages[number])
 
 
-def _part(problem: Problem, config: Config, number: int, stage: Stage) -> Part:
+def parts_of(problem: Problem) -> list[Part]:
+    """Return the part of each stage, or the one part of a job without stages."""
+    stages = problem.config.stages
+    return [_part(problem, n, stage) for n, stage in enumerate(stages)] if stages else [part_at(problem, 0)]
+
+
+def _part(problem: Problem, number: int, stage: Stage) -> Part:
     names = "spp", "view_batch_size", "pixel_batch_size"
     given = {name: value for name in names if (value := getattr(stage, name)) is not None}
     seen = _views(problem, stage)
     views = tuple(replace(v, is_test=v.is_test or (seen is not None and v.name not in seen)) for v in problem.views)
     moving = frozenset(_moving(problem, stage))
-    changed = config.model_copy(update=given)
-    return Part(number, changed, replace(problem, views=views), moving, stage.learning_rate_factor)
+    config = problem.config.model_copy(update=given)
+    return Part(number, replace(problem, views=views, config=config), moving, stage.learning_rate_factor)
 
 
 def _views(problem: Problem, stage: Stage) -> set[str] | None:
@@ -90,10 +96,11 @@ def _moving(problem: Problem, stage: Stage) -> list[str]:
     return [key for key in keys if not owners[key].isdisjoint(named)]
 
 
-def require_stages(problem: Problem, config: Config) -> None:
+def require_stages(problem: Problem) -> None:
     """Raise PathreplayError unless all stages can be done with this scene."""
+    config = problem.config
     for number, stage in enumerate(config.stages or []):
-        part = _part(problem, config, number, stage)
+        part = _part(problem, number, stage)
         for view in part.problem.trained().values():
             _require_divisible(problem.scene.sensors()[view.sensor], view.name, stage.downscale)
         if stage.max_depth is not None:
@@ -104,13 +111,13 @@ def require_stages(problem: Problem, config: Config) -> None:
             raise PathreplayError(f"stages: '{variable.key}' moves in none of them; name it in one, or leave it out")
 
 
-def require_single_pixels(problem: Problem, config: Config) -> None:
+def require_single_pixels(problem: Problem) -> None:
     """Raise PathreplayError unless all views can be rendered pixel by pixel where stages, or the job, ask for that."""
-    stages: list[Stage | None] = [*config.stages] if config.stages else [None]
-    for number, stage in enumerate(stages):
-        part = part_at(problem, config, 0) if stage is None else _part(problem, config, number, stage)
-        if part.config.pixel_batch_size is None:
+    config = problem.config
+    for part in parts_of(problem):
+        if part.problem.config.pixel_batch_size is None:
             continue
+        stage = config.stages[part.number] if config.stages else None
         for integrator, plugin in ((problem.integrator, config.integrator), (problem.baseline, config.baseline)):
             if integrator is not None and plugin is not None:
                 if stage is not None and stage.max_depth is not None:
@@ -119,10 +126,11 @@ def require_single_pixels(problem: Problem, config: Config) -> None:
 
 
 def _require_single_pixels(part: Part, integrator: mi.Integrator) -> None:
-    problem, spp = part.problem, int(part.config.spp)  # which is not "auto" there
+    problem = part.problem
+    spp = int(problem.config.spp) // problem.config.parts  # pixel batches exclude spp = "auto"
     for view in problem.trained().values():
         camera = f"{problem.scene.sensors()[view.sensor].id()}."
-        why = obstacle(problem, stateful(integrator), view.sensor, spp // part.config.parts, some=True)
+        why = obstacle(problem, stateful(integrator), view.sensor, spp, some=True)
         if moves := sorted(key for key in problem.moves(part.moving) if key.startswith(camera)):
             why = f"its camera moves; hold '{moves[0]}'"
         if why:
@@ -171,12 +179,8 @@ def _means(image: Image, n: int) -> Image:
 class Staged:
     """Evaluates shards as their stages want it: an `Evaluate`. It holds what it needs for one stage at a time."""
 
-    def __init__(
-        self, problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin, record: bool = True
-    ) -> None:
-        self.problem, self.config, self.integrator, self.plugin, self.record = (
-            problem, config, integrator, plugin, record,
-        )  # fmt: skip
+    def __init__(self, problem: Problem, integrator: mi.Integrator, plugin: Plugin, record: bool = True) -> None:
+        self.problem, self.integrator, self.plugin, self.record = problem, integrator, plugin, record
         self._number: int | None = None
         self._evaluate: Callable[[Arrays, Shard, Arrays], Evaluation] | None = None
 
@@ -188,9 +192,9 @@ class Staged:
         return self._evaluate(values, shard, learned)
 
     def _evaluator(self, number: int) -> Evaluator:
-        stages = self.config.stages or []
+        stages = self.problem.config.stages or []
         stage, integrator = stages[number], self.integrator
-        part = _part(self.problem, self.config, number, stage)
+        part = _part(self.problem, number, stage)
         if stage.max_depth is not None:
             integrator = _integrator(self.plugin, stage.max_depth)
             stateful(integrator).silence(stateful(self.integrator).warned)  # what has been said need not be said again
@@ -198,12 +202,11 @@ class Staged:
         return Evaluator(replace(part.problem, views=views), integrator, self.record, part.moving)
 
 
-def evaluator_of(problem: Problem, config: Config, integrator: mi.Integrator, plugin: Plugin) -> Evaluate:
+def evaluator_of(problem: Problem, integrator: mi.Integrator, plugin: Plugin) -> Evaluate:
     """Create the evaluator of a job in this process. Passes are recorded unless the job is deterministic.
 
     Args:
         problem: the problem.
-        config: the job.
         integrator: evaluates the problem; joint problems use the integrators of their parts.
         plugin: description of the integrator, from which stages create others.
 
@@ -213,6 +216,7 @@ def evaluator_of(problem: Problem, config: Config, integrator: mi.Integrator, pl
     Raises:
         PathreplayError: a joint problem has stages.
     """
+    config = problem.config
     record = not config.deterministic
     if isinstance(problem, JointProblem):
         if config.stages is not None:
@@ -220,4 +224,4 @@ def evaluator_of(problem: Problem, config: Config, integrator: mi.Integrator, pl
         return JointEvaluator(problem, [Evaluator(part, part.integrator, record) for part in problem.parts])
     if config.stages is None:
         return Evaluator(problem, integrator, record)
-    return Staged(problem, config, integrator, plugin, record)
+    return Staged(problem, integrator, plugin, record)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from pathreplay.errors import PathreplayError
 from pathreplay.inverse.config.parameter_options import Derivation, Displacement, Parameter
-from pathreplay.inverse.config.schema import Config
 from pathreplay.inverse.config.user_functions import Modules
 from pathreplay.inverse.parameters import limits as parameter_limits
 from pathreplay.inverse.parameters.exposures import EXPOSURE
@@ -66,13 +65,17 @@ class Variable:
 
 
 def keys_of(
-    params: mi.SceneParameters, config: Config, integrator: mi.Integrator
+    params: mi.SceneParameters,
+    recovered: Sequence[Parameter],
+    derived: Sequence[Derivation],
+    integrator: mi.Integrator,
 ) -> tuple[dict[str, Parameter], dict[str, Derivation]]:
     """Resolve the keys and globs of a job.
 
     Args:
         params: parameters of the scene.
-        config: the job.
+        recovered: tables of the recovered parameters.
+        derived: tables of the derived parameters.
         integrator: integrator that must be able to differentiate the parameters.
 
     Returns:
@@ -82,8 +85,8 @@ def keys_of(
         PathreplayError: a parameter does not exist, is not differentiable, or is named twice.
     """
     tables: dict[str, Parameter | Derivation] = {}
-    entries: list[Parameter | Derivation] = [entry for entry in config.parameters if entry.shape is None]
-    for entry in [*entries, *config.derived]:
+    entries: list[Parameter | Derivation] = [entry for entry in recovered if entry.shape is None]
+    for entry in [*entries, *derived]:
         for key in parameters.resolve_keys(params, entry.key):
             if key in tables:
                 raise PathreplayError(
@@ -97,13 +100,13 @@ def keys_of(
     )
 
 
-def free_of(params: mi.SceneParameters, config: Config) -> dict[str, Parameter]:
+def free_of(params: mi.SceneParameters, recovered: Sequence[Parameter]) -> dict[str, Parameter]:
     """Return the parameters that are not part of the scene (those with a ``shape``), by key.
 
     Raises PathreplayError if such a key is already in use or reserved.
     """
     free: dict[str, Parameter] = {}
-    for entry in config.parameters:
+    for entry in recovered:
         if entry.shape is None:
             continue
         if entry.key in params:
@@ -120,21 +123,22 @@ def make_variables(
     scene: mi.Scene,
     params: mi.SceneParameters,
     keys: dict[str, Parameter],
-    config: Config,
     base: Path,
     modules: Modules,
     starts: Mapping[str, Array] = MappingProxyType({}),
+    limit_rates: bool = True,
 ) -> tuple[list[Variable], list[Pose]]:
     """Make the variables and poses of a job; their true values are set later.
 
     Args:
         scene: the scene.
         params: parameters of the scene.
-        keys: tables of the parameters, by key.
-        config: the job.
+        keys: tables of the parameters, by key (see `Config.completed_entry`).
         base: folder that relative paths start from.
         modules: finder of user functions.
         starts: initial values by the key of a table, in place of its ``initial``.
+        limit_rates: whether learning rates are refused that are large for the range of values; the step of SGD
+            scales with the gradient, so its rate cannot be checked.
 
     Returns:
         The variables, and the poses that are computed from some of them.
@@ -145,9 +149,9 @@ def make_variables(
     variables: list[Variable] = []
     poses: list[Pose] = []
     for key, entry in keys.items():
-        rate = entry.learning_rate or config.learning_rate
-        # The step of SGD scales with the gradient, so its learning rate cannot be checked.
-        bounded = parameter_limits.require_learning_rate if config.optimizer.type != "sgd" else lambda *_: None
+        rate = entry.learning_rate
+        assert rate is not None  # see `Config.completed_entry`
+        bounded = parameter_limits.require_learning_rate if limit_rates else lambda *_: None
         if entry.pose is None:
             form = AS_STORED if entry.shape else form_of(params, key)
             like = seen(params, key) if entry.shape is None else _numbers(key, entry.shape)
@@ -158,7 +162,7 @@ def make_variables(
                 bounded(key, rate, coordinates.latent(start))
             else:
                 bounded(key, rate, start, (entry.lower, entry.upper))
-            levels = _levels(key, entry, config.refine_at(entry), start)
+            levels = _levels(key, entry, entry.refine_at or [], start)
             if levels is not None:
                 start = resampled(start, levels.shapes[0])
             if dr.is_tensor_v(like):

@@ -79,5 +79,5 @@ def joined(parts: Sequence[Problem], config: Config) -> JointProblem:
         first.loss,
         tuple(dict.fromkeys(note for part in parts for note in part.notes)),
         tuple({each.key: each for part in parts for each in part.derived}.values()),
-        parts=tuple(parts),
+        parts=tuple(replace(part, config=config) for part in parts),
     )

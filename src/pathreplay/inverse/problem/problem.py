@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import gc
 import weakref
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from pathreplay.integrators.film.image import fit_film
 from pathreplay.integrators.integrator import EDGES
 from pathreplay.integrators.reach import reached_sensors
 from pathreplay.integrators.stateful import stateful
-from pathreplay.inverse.config.schema import Config
+from pathreplay.inverse.config.schema import TARGET, Config
 from pathreplay.inverse.config.tables import Plugin
 from pathreplay.inverse.config.user_functions import Modules
 from pathreplay.inverse.dataset.capture import Shot, fingerprint, read_capture
@@ -55,7 +56,7 @@ from pathreplay.inverse.problem.completed import completed
 from pathreplay.platform.threads import one_thread
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes import parameters
-from pathreplay.scenes.descriptions import load_integrator
+from pathreplay.scenes.descriptions import errors_as, load_integrator
 from pathreplay.scenes.loading import load_scene_for
 
 
@@ -104,6 +105,14 @@ class Problem:
     """Store of images, initial values and true values."""
     cache: VariableCache = field(default_factory=VariableCache)
     """Cache of converted values."""
+
+    @contextmanager
+    def computing(self) -> Iterator[None]:
+        """Context for evaluations: one thread in deterministic jobs, and errors of integrators as PathreplayError."""
+        config = self.config
+        names = "' or '".join(plugin.type for plugin in (config.integrator, config.baseline) if plugin is not None)
+        with one_thread(config.deterministic), errors_as(f"Integrator '{names}' cannot do this job"):
+            yield
 
     def moves(self, moving: frozenset[str]) -> set[str]:
         """Return the keys of the scene parameters that depend on some of these variables."""
@@ -236,24 +245,33 @@ def build_problem(
         integrator = _gradient_integrator(config.integrator)
     else:
         _require_gradients(integrator, type(integrator).__name__)
-    named, derivations = keys_of(params, config, integrator)
-    free = free_of(params, config)
+    named, derivations = keys_of(params, config.parameters, config.derived, integrator)
+    free = free_of(params, config.parameters)
     keys = [*named, *derivations]
     notes += _edges(params, keys, integrator)
     baseline = None if config.baseline is None else _gradient_integrator(config.baseline)
     if baseline is not None:
-        keys_of(params, config, baseline)
+        keys_of(params, config.parameters, config.derived, baseline)
         _edges(params, keys, baseline)  # only to suppress its own warning; one note is enough
     judge = integrator if config.target.integrator is None else load_integrator(config.target.integrator.model_dump())
     # Cheap checks come before the rendering of targets.
     sensors = sensors_of(scene, list(shots) or None if config.sensors is None else config.sensors)
     used = {name: shots[id] for name, index in sensors.items() if (id := scene.sensors()[index].id()) in shots}
-    test_views = test_views_of(scene, sensors, config, list(shots))
+    every = None if config.capture is None else config.capture.test_every
+    test_views = test_views_of(scene, sensors, config.test_views, list(shots)[::every] if every else [])
     feasibility.require_visible(scene, params, keys)
     if config.target.alpha == "scene":
         require_known(scene, params, keys)
     require_films(scene, sensors, {"spp": config.most_spp, "eval_spp": config.eval_spp})
-    unsolved, unsolved_poses = make_variables(scene, params, named | free, config, base, modules, given.starts)
+    unsolved, unsolved_poses = make_variables(
+        scene,
+        params,
+        {key: config.completed_entry(entry) for key, entry in (named | free).items()},
+        base,
+        modules,
+        given.starts,
+        config.optimizer.type != "sgd",
+    )
     derived = make_derived(params, derivations, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
@@ -264,7 +282,7 @@ def build_problem(
     masked_all = config.target.masks is not None or config.target.alpha == "mask"
     weighted = {n for n in sensors if masked_all or (n in used and (used[n].mask or used[n].lens))}
     require_weights(targets, weighted if memory is None else set(targets.weights))
-    shares = shares_of(scene, sensors, config, test_views)
+    shares = shares_of(scene, sensors, config.view_weights, test_views)
     views = tuple(
         View(name, index, targets.images[name], targets.weights.get(name), name in test_views, shares[name])
         for name, index in sensors.items()
@@ -318,11 +336,13 @@ def _seen(
     notes: tuple[str, ...] = ()
     first = targets is None
     if not config.brings_pictures:
-        other = target_scene(config, base)
+        wanted = [entry.key for entry in config.parameters] + [entry.key for entry in config.derived]
+        other = target_scene(*config.target_source, config.target.values, wanted, base)
         truth = truth_of(other, opened.params, opened.keys)
         if targets is None:
             with one_thread(config.deterministic):
-                targets = Targets(rendered_targets(config, other, opened.sensors, disk), {})
+                seeds = {name: config.seeds(TARGET, index)[0] for name, index in opened.sensors.items()}
+                targets = Targets(rendered_targets(config.target, seeds, other, opened.sensors, disk), {})
         # Dr.Jit traces virtual calls through all live instances, so a live target scene would enlarge every kernel.
         del other
         gc.collect()
