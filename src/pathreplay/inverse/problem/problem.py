@@ -246,7 +246,6 @@ def build_problem(
     else:
         _require_gradients(integrator, type(integrator).__name__)
     named, derivations = keys_of(params, config.parameters, config.derived, integrator)
-    free = free_of(params, config.parameters)
     keys = [*named, *derivations]
     notes += _edges(params, keys, integrator)
     baseline = None if config.baseline is None else _gradient_integrator(config.baseline)
@@ -263,15 +262,11 @@ def build_problem(
     if config.target.alpha == "scene":
         require_known(scene, params, keys)
     require_films(scene, sensors, {"spp": config.most_spp, "eval_spp": config.eval_spp})
-    unsolved, unsolved_poses = make_variables(
-        scene,
-        params,
-        {key: config.completed_entry(entry) for key, entry in (named | free).items()},
-        base,
-        modules,
-        given.starts,
-        config.optimizer.type != "sgd",
-    )
+    entries = {
+        key: config.completed_entry(entry) for key, entry in (named | free_of(params, config.parameters)).items()
+    }
+    bounded = config.optimizer.type != "sgd"
+    unsolved, unsolved_poses = make_variables(scene, params, entries, base, modules, given.starts, bounded)
     derived = make_derived(params, derivations, unsolved, modules)
     parameter_limits.require_values({variable.key: variable.start.size for variable in unsolved})
 
