@@ -153,7 +153,7 @@ def _start(ray: Any, stack: contextlib.ExitStack, cores: int) -> Cluster:
     folder = tempfile.mkdtemp(prefix="pathreplay-", dir=temporary if len(temporary) <= _LONGEST_FOLDER else "/tmp")
     guard = Guard(Path(folder))
     stack.callback(guard.close)
-    before = _sessions()  # sessions that the caller has started are not Ray's
+    before = _sessions()  # process sessions that exist already, and are not to be ended with Ray's
     with _private_environment(ray), _own_sessions(ray):
         try:
             ray.init(

@@ -19,7 +19,7 @@ class TermResult:
     image: mi.TensorXf | None = None  # tangent of the image (forward mode), or the image itself (pixel sweep)
     stats: BaselineStats | None = None  # statistics of media, from which later passes learn
     lost: mi.UInt32 | None = None  # number of paths that lost a part of their gradient, if counted
-    paths: int = 0  # number of all paths in that count
+    paths: int = 0  # number of paths among which ``lost`` were counted
     moves: bool = False  # hit points, directions or emitter samples depend on parameters with gradients
 
     def __add__(self, other: TermResult) -> TermResult:

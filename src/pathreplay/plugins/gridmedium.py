@@ -40,7 +40,7 @@ FAR = 1e6
 class GridMedium:
     """A heterogeneous medium on grids, with local majorants; a template, see `on_base`."""
 
-    phase_function: Callable[[], mi.PhaseFunction]  # Mitsuba's
+    phase_function: Callable[[], mi.PhaseFunction]  # a method of Mitsuba's class
 
     def __init__(self, props: Any) -> None:
         mi.Medium.__init__(self, props)

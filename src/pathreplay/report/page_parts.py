@@ -62,7 +62,7 @@ def plots(history: Sequence[Entry]) -> tuple[Plot, ...]:
     x = tuple(float(entry.iteration) for entry in entries)
 
     def plot(title: str, code: str, **lines: Iterable[float | None]) -> Plot:
-        """Several lines get names, a single one does not."""
+        """Make a plot of ``lines`` over the iterations; a legend names them if there are several."""
         series = (Series(name * (len(lines) > 1), x, tuple(_rounded(v) for v in y)) for name, y in lines.items())
         return Plot(title, tuple(series), code=code)
 

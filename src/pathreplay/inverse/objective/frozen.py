@@ -164,7 +164,7 @@ def _differentiate(
     share = loss.share if batch is None else loss.share * batch.share
     if loss.swept:
         offset, slope = (term * share for term in linear_derivative(loss.loss, target.target, target.weight))
-        # By the chain rule, of what is linear in the factor times the image.
+        # The exposed image is factor * image: by the chain rule, offset takes one factor, and slope two.
         wanted = _times(offset, factor), _times(_times(slope, factor), factor)
         image, state = integrator.pixel_pass(view, wanted, None if batch is None else batch.pixels, state)
         value = target.compared(loss.loss, image) * share

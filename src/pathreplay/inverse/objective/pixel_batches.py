@@ -26,7 +26,7 @@ class Batch:
 
     @staticmethod
     def of(weight: Array | None, size: tuple[int, int], most: int, seed: int) -> Batch | None:
-        """At most so many pixels of a picture of this height and width; None where that is all of it."""
+        """Draw at most ``most`` pixels of an image of ``size`` (height, width); None if the image has no more."""
         height, width = size
         n = height * width
         if most >= n:
