@@ -171,7 +171,7 @@ class BaselineState:
         if shapes != wanted or not 0 < learned["branching"][0] <= 1:
             raise PathreplayError(
                 f"the learned baseline of the media has the shapes {shapes} instead of {wanted}, "
-                "or a branching weight outside (0, 1]: start the job from its config"
+                "or a branching weight outside (0, 1]: start a new run"
             )
         # Copy into memory of Dr.Jit: recorded passes require the same alignment.
         one = dr.opaque(mi.Float, 1)

@@ -249,7 +249,7 @@ def open_run_folder(path: Path, in_python: bool = False) -> tuple[Job, RunFolder
     require_writable_name(path, "--resume")
     copy = _config_in(path)
     if not (path / CHECKPOINT).is_file():
-        raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start the job from its config")
+        raise PathreplayError(f"Run folder {path} has no checkpoint to resume from; start a new run")
     job = _job(path, copy)
     if job.in_python != in_python:
         what = "was started in Python, with objects" if job.in_python else "was started from the file of a job"
@@ -292,7 +292,7 @@ def _job(path: Path, copy: Path) -> Job:
             raise ValueError("a path contains a null character")
     except (OSError, ValueError) as error:
         what = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
-        raise PathreplayError(f"{path / 'run.json'} cannot be used ({what}); start the job from its config") from None
+        raise PathreplayError(f"{path / 'run.json'} cannot be used ({what}); start a new run") from None
     source = None if origin.config is None else Path(origin.config)
     return Job(load_config(copy), source, Path(origin.base), tuple(origin.changes), origin.in_python)
 

@@ -106,7 +106,7 @@ def go_on(folder: Path, problem: Problem, run: Run, held: Collection[str] = ()) 
             if image.shape != wanted:
                 raise PathreplayError(
                     f"{path} has shape {image.shape} (height, width, channels), sensor '{view.name}' renders {wanted}; "
-                    "start the job from its config"
+                    "start a new run"
                 )
             require_finite_array(str(path), image)
     for name, saved in _runs(run).items():

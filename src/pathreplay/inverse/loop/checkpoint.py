@@ -119,7 +119,7 @@ def restore(path: Path, run: Run, levels: Mapping[str, Levels | None], held: Col
         why = f"{'.'.join(map(str, first['loc']))}: {first['msg'].lower()}"
     except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         why = str(error)
-    raise PathreplayError(f"Checkpoint {path} cannot be read ({why}); start the job from its config")
+    raise PathreplayError(f"Checkpoint {path} cannot be read ({why}); start a new run")
 
 
 def _read(

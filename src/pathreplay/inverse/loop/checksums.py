@@ -25,7 +25,7 @@ SEAL = "sha256"
 
 _SEAL_BYTES = hashlib.sha256().digest_size
 _AT_ONCE, _MOST_BYTES = 2**20, 64 * 2**20
-_REMEDY = "start the job from its config"
+_REMEDY = "start a new run"
 
 
 @dataclass(frozen=True)

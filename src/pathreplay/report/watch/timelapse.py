@@ -94,7 +94,7 @@ def _opened(path: Path) -> PIL.Image.Image:
     try:
         return PIL.Image.open(io.BytesIO(read_own(path) or b"")).convert("RGB")
     except (OSError, ValueError, PIL.Image.DecompressionBombError):
-        raise PathreplayError(f"Image {path} is missing or damaged; start the job from its config") from None
+        raise PathreplayError(f"Image {path} is missing or damaged; start a new run") from None
 
 
 def _mp4(pictures: list[PIL.Image.Image], path: Path, rate: float) -> None:
