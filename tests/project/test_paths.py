@@ -1,4 +1,4 @@
-"""docs/architecture.md: the three ways through the code are as short as wanted, and are the ways that code takes."""
+"""docs/architecture.md: the three paths through the code are short, and are those that the code takes."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from places import ROOT
 
 SRC = ROOT / "src/pathreplay"
 SECTION = re.search(
-    r"^## Three ways through the code$(.*?)^## ",
+    r"^## Three paths through the code$(.*?)^## ",
     (ROOT / "docs/architecture.md").read_text(encoding="utf-8"),
     re.M | re.S,
 )
 assert SECTION is not None
 TEXTS = dict(re.findall(r"^### (.*?)$\n(.*?)(?=^### |\Z)", SECTION[1], re.M | re.S))
-WAYS = {name: re.findall(r"^\d+\. `([\w/.]+)`: `(\w+)`$", text, re.M) for name, text in TEXTS.items()}
+PATHS = {name: re.findall(r"^\d+\. `([\w/.]+)`: `(\w+)`$", text, re.M) for name, text in TEXTS.items()}
 CONFIG, GRADIENT, EDGE = "A job's config", "A gradient request", "A boundary edge"
 MOST = {CONFIG: 12, GRADIENT: 18, EDGE: 14}
-"""Modules on a way."""
+"""Maximum number of modules on a path."""
 
 
 def called(action: Callable[[], Any]) -> list[tuple[str, str]]:
@@ -62,23 +62,23 @@ def request(key: str, boundary: str) -> list[tuple[str, str]]:
     return called(lambda: dr.backward(dr.mean(image)))
 
 
-def in_order(way: list[tuple[str, str]], calls: list[tuple[str, str]]) -> None:
-    assert [stop for stop in calls if stop in way] == way
+def in_order(listed: list[tuple[str, str]], calls: list[tuple[str, str]]) -> None:
+    assert [stop for stop in calls if stop in listed] == listed
 
 
-def test_ways_are_short() -> None:
-    assert WAYS.keys() == MOST.keys() and all(WAYS.values())
-    assert {name: len(way) for name, way in WAYS.items() if len(way) > MOST[name]} == {}
-    # Actors are a part of the way where a job has them.
-    assert len(WAYS[CONFIG]) + len(set(re.findall(r"`(distributed/\w+\.py)`", TEXTS[CONFIG]))) <= MOST[CONFIG]
+def test_paths_are_short() -> None:
+    assert PATHS.keys() == MOST.keys() and all(PATHS.values())
+    assert {name: len(listed) for name, listed in PATHS.items() if len(listed) > MOST[name]} == {}
+    # Actors are a part of the path where a job has them.
+    assert len(PATHS[CONFIG]) + len(set(re.findall(r"`(distributed/\w+\.py)`", TEXTS[CONFIG]))) <= MOST[CONFIG]
 
 
-def test_a_gradient_goes_the_way_of_the_page() -> None:
-    in_order(WAYS[GRADIENT], request("red.reflectance.value", "none"))
+def test_a_gradient_takes_the_path_of_the_page() -> None:
+    in_order(PATHS[GRADIENT], request("red.reflectance.value", "none"))
 
 
-def test_an_edge_goes_the_way_of_the_page() -> None:
-    in_order(WAYS[EDGE], request("sensor.to_world", "all"))
+def test_an_edge_takes_the_path_of_the_page() -> None:
+    in_order(PATHS[EDGE], request("sensor.to_world", "all"))
 
 
 def test_no_other_module_follows_the_config() -> None:
@@ -93,4 +93,4 @@ def test_no_other_module_follows_the_config() -> None:
                 follow.add(str(path.relative_to(SRC)))
     said = set(re.findall(r"`([\w/]+\.py)`", TEXTS[CONFIG]))
     assert follow <= said, follow - said
-    assert said <= follow | {module for module, _ in WAYS[CONFIG]}, said - follow
+    assert said <= follow | {module for module, _ in PATHS[CONFIG]}, said - follow
