@@ -1,4 +1,4 @@
-"""The loss of a problem and its gradient as a function of values and shard, and who computes them, and where."""
+"""Evaluates loss and gradient of a problem: shards of an iteration, the evaluator of a scene, and executors."""
 
 from __future__ import annotations
 
@@ -34,49 +34,49 @@ from pathreplay.platform import memory
 from pathreplay.scenes.parameters import get_array
 
 LARGE = 2**22
-"""Entries of a variable from which on its memory is looked after."""
+"""Number of entries of a variable from which its memory is managed explicitly."""
 MOST_SENSORS = 64
-"""Of a scene whose passes are recorded: what is recorded of a view holds all sensors, so that memory grows with the
-square of their number (by measurement 3 MB a view where there are 50, and 11 MB where there are 200)."""
+"""Maximum number of sensors of a scene whose passes are recorded. The recording of each view holds all sensors, so that
+memory grows with the square of their number (measured: 3 MB per view with 50 sensors, 11 MB with 200)."""
 
 
 @dataclass(frozen=True)
 class Shard:
-    """A part of an iteration: views (places in the problem), samples per pixel, and a seed for each view."""
+    """A part of an iteration: indices of views, samples per pixel, and a seed for each view."""
 
     views: tuple[int, ...]
     samples: int
     seeds: tuple[int, ...]
     stage: int = 0
-    """Of the job, whose views these are, and which says what is differentiated."""
+    """Index of the job's stage, which determines targets and trainable variables."""
     pixels: int | None = None
-    """Of each view, drawn by its seed; None: all."""
+    """Number of random pixels per view; None: all pixels."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a shard adds to the loss (the mean over views that are learned from) and to its gradient, by key.
+    """Contribution of a shard to the loss (the mean over training views) and to its gradients, by key.
 
-    And what is known after it. Unbiased for the losses in `QUADRATIC`; the loss itself carries the variance of the
-    pictures on top.
+    Gradients are unbiased for the losses in `QUADRATIC`. The loss itself includes the variance of the images.
     """
 
     loss: float
     gradients: dict[str, Array]
     dropped: dict[str, int]
-    """By key, how many entries of its gradient were NaN or infinite in a view, and count as zero there."""
+    """Number of gradient entries by key that were NaN or infinite in a view, and were replaced by zero."""
     learned: Arrays
+    """State of the integrator after the shard."""
 
 
 Evaluate = Callable[[Arrays, Shard, Arrays], Evaluation]
-"""evaluate(values, shard, learned): a pure function, but for rounding where threads add.
+"""evaluate(values, shard, learned): a pure function, up to rounding in sums over threads.
 
-The values are those of all variables, as people see them; ``learned`` is what evaluations before have learned, by name.
+``values`` are the decoded values of all variables, and ``learned`` is the integrator's state after earlier evaluations.
 """
 
 
 class Total:
-    """A sum of evaluations as they come, of which only the sum is held."""
+    """Running sum of evaluations; keeps no summand."""
 
     def __init__(self, owned: bool = False) -> None:
         self._owned, self._count, self._loss = owned, 0, 0.0
@@ -85,7 +85,7 @@ class Total:
         self._dropped: Counter[str] = Counter()
 
     def add(self, each: Evaluation) -> None:
-        """Add gradients in place, to those of the first evaluation, too, where these are ``owned`` by nobody else."""
+        """Add an evaluation in place. If ``owned``, the arrays of the first evaluation are overwritten."""
         for key, gradient in each.gradients.items():
             if self._count:
                 gradient = np.add(self._sums[key], gradient, out=self._room(key))
@@ -98,14 +98,14 @@ class Total:
         self._count += 1
 
     def _room(self, key: str) -> Array | None:
-        """Where a sum may be written: what came from another process may only be read."""
+        """Return a writable array for the sum: arrays from another process are read-only."""
         here = self._sums[key]
         return here if self._owned and here.flags.writeable else None
 
     def of(self, share: float = 1.0) -> Evaluation:
-        """The sum times ``share``; what is known is the mean of what each of them knows.
+        """Return the sum times ``share``. The learned state is the mean of the evaluations' states.
 
-        They began with the same knowledge, so that none had to wait for another.
+        All evaluations of an iteration start from the same state, so they can run concurrently.
         """
         sums, known = self._sums, self._known
         if share != 1:
@@ -116,7 +116,7 @@ class Total:
 
 
 def total(evaluations: Iterable[Evaluation], share: float = 1.0, owned: bool = False) -> Evaluation:
-    """The sum, added up in the order given, times ``share``: see `Total`."""
+    """Sum evaluations in the given order, and multiply by ``share``: see `Total`."""
     found = Total(owned)
     for each in evaluations:
         found.add(each)
@@ -125,18 +125,18 @@ def total(evaluations: Iterable[Evaluation], share: float = 1.0, owned: bool = F
 
 
 class Executor(Protocol):
-    """Evaluates the shards of an iteration. Results come in the order of the shards, whoever was ready first.
+    """Evaluates the shards of an iteration, and yields results in the order of the shards.
 
-    Each is given when it is asked for and none is wanted back: memory holds one gradient and the sum, however many
-    shards there are.
+    The caller drops each result before it requests the next one. Memory therefore holds one gradient and the sum,
+    for any number of shards.
     """
 
     def run(self, values: Arrays, shards: Sequence[Shard], learned: Arrays) -> Iterator[Evaluation]:
-        """One evaluation for each shard, in their order; each begins with what was ``learned`` before all of them."""
+        """Yield one evaluation per shard, in order; each starts from the same state ``learned``."""
 
 
 class Local:
-    """In this process, one after the other."""
+    """Executor that evaluates shards sequentially in this process."""
 
     def __init__(self, evaluate: Evaluate) -> None:
         self.evaluate = evaluate
@@ -148,35 +148,31 @@ class Local:
 
 
 def _taken(gradient: Any) -> Array:
-    """A gradient as NumPy's; one of a large grid in the memory that Dr.Jit has made it in."""
+    """Convert a gradient to NumPy; large grids share memory with Dr.Jit."""
     if dr.is_tensor_v(gradient) and dr.width(gradient) >= LARGE and dr.type_v(gradient) == dr.VarType.Float32:
         return gradient.numpy()
     return get_array(gradient)
 
 
 def release(values: Arrays) -> None:
-    """Give memory back that Dr.Jit has done with and keeps for later, where it is much; hold the run to its budget.
-
-    Raises PathreplayError where that is not kept.
-    """
+    """Free Dr.Jit's cache of unused memory if it may be large. Raises PathreplayError beyond the memory limit."""
     if any(value.size >= LARGE for value in values.values()) or memory.is_crowded():
         dr.flush_malloc_cache()
     memory.require_kept()
 
 
-def held_tensor(picture: Array) -> Any:
-    """A picture in memory of Dr.Jit's own: see `variables_of`."""
+def owned_tensor(picture: Array) -> Any:
+    """Copy an image into memory that Dr.Jit owns: see `variables_of`."""
     tensor = mi.TensorXf(np.ascontiguousarray(picture)) * dr.opaque(mi.Float, 1)
     dr.eval(tensor)
     return tensor
 
 
 class Evaluator:
-    """Evaluates shards of a problem by one integrator, in its scene, which keeps the values of the last shard.
+    """Evaluates shards of a problem with one integrator. The scene keeps the values of the last shard.
 
-    ``moving`` are the variables that are differentiated (default: all).
-
-    One view is rendered and back-propagated after the other: memory holds the graph of one.
+    Only the variables ``moving`` (default: all) are differentiated. Views are rendered and back-propagated one after
+    the other, so that memory holds the AD graph of one view.
     """
 
     def __init__(
@@ -190,18 +186,18 @@ class Evaluator:
         self._moving = frozenset((v.key for v in problem.variables) if moving is None else moving)
         self._reached = problem.reached(self._moving)
         has_media = facts_of(problem.scene).has_media
-        # Recorded kernels are cut otherwise than traced ones, and round otherwise in the last bit.
+        # Recorded kernels are split differently from traced ones, and their rounding differs in the last bit.
         known = len(problem.scene.sensors()) <= MOST_SENSORS
         self.freezes = known and record and is_recordable(self.integrator, has_media) and problem.loss not in ELSEWHERE
         self._recordings: defaultdict[int, Recordings] = defaultdict(Recordings)  # by samples per pixel
-        # Of each view and number of samples that was seen, whole or a batch of it: whether pixels can be swept.
+        # By view, samples per pixel, and whether pixels are batched: whether a pixel sweep is possible.
         self._sweeps: dict[tuple[int, int, bool], bool] = {}
         self._learned: Arrays = {}  # state of the integrator after the last evaluation
-        self._at: Any = None  # its state then, which another evaluator may have changed since
+        self._at: Any = None  # the same state in the integrator, which another evaluator may have replaced
         self._begun = False
 
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
-        """See `Evaluate`. Raises what the integrator raises; warns as it does."""
+        """See `Evaluate`. Errors and warnings of the integrator pass through."""
         if self.freezes and not self._begun:
             for about in self.problem.views:
                 make_ready(sensor_of(self.problem, about))
@@ -215,7 +211,7 @@ class Evaluator:
         return total(each(), owned=True)
 
     def _know(self, learned: Arrays) -> None:
-        """Go on with what an evaluation has learned. Raises PathreplayError if it is none of this integrator's."""
+        """Restore the integrator's state. Raises PathreplayError if it is that of another kind of integrator."""
         held = self.integrator.baseline
         if (learned is self._learned and held is self._at) or (held is None and not learned):
             return
@@ -234,17 +230,17 @@ class Evaluator:
             factor = factor_of(values, view, about.target.shape[2])
             batch = None if pixels is None else Batch.of(about.weight, about.target.shape[:2], pixels, seed)
             loss, by_factor = self._differentiated(view, seed, spp, factor, batch)
-        except NotRecordable:  # a part of the gradient may be there: once more, with variables of its own
+        except NotRecordable:  # a part of the gradient may have been added: start again with new variables
             self.freezes = False
             return self._view(values, view, seed, spp, pixels)
         gradients = {}
         for key, value in moving.items():
-            gradients[key] = _taken(dr.grad(value))  # zero in a view that nothing reaches
-            dr.clear_grad(value)  # which the scene holds
+            gradients[key] = _taken(dr.grad(value))  # zero if no parameter affects the view
+            dr.clear_grad(value)  # the scene holds the variable
         release(values)
         if by_factor is not None and EXPOSURE in gradients:
             gradients[EXPOSURE] = exposure_gradient(values, view, np.array(by_factor).ravel())
-        # One bad path does not end a long run. (A sum is finite where all is: it takes no memory.)
+        # One bad path must not end a long run. The sum is finite if and only if all entries are, and needs no memory.
         broken = [key for key, gradient in gradients.items() if not np.isfinite(gradient.sum(dtype=np.float64))]
         dropped = {key: int((~np.isfinite(gradients[key])).sum()) for key in broken}
         for key in broken:
@@ -255,13 +251,16 @@ class Evaluator:
     def _differentiated(
         self, view: int, seed: int, spp: int, factor: Array | None, batch: Batch | None
     ) -> tuple[float, Any]:
-        """What the view adds to the loss, and the derivative by its ``factor``; the rest is added to the parameters."""
+        """Return the view's contribution to the loss, and the derivative with respect to its ``factor``.
+
+        Gradients of the scene's parameters are accumulated in the parameters.
+        """
         problem, about = self.problem, self.problem.views[view]
         sensor, picture, counts = about.sensor, about.target, about.weight
         if batch is not None:
             picture, counts = batch.rows(picture), None if counts is None else batch.rows(counts)
-        target = ViewTarget(*(None if part is None else held_tensor(part) for part in (picture, counts, factor)))
-        # The first call is not recorded: scenes make some of their parts when they are first rendered.
+        target = ViewTarget(*(None if part is None else owned_tensor(part) for part in (picture, counts, factor)))
+        # The first call is not recorded, because scenes create some parts when they are first rendered.
         which = view, spp, batch is not None
         records = self.freezes and which in self._sweeps
         if which not in self._sweeps:
@@ -269,7 +268,7 @@ class Evaluator:
             if why and batch is not None:
                 raise refused(about.name, why)
             self._sweeps[which] = not why and view in self._reached
-        # Of recorded passes seeds are inputs; of others they are best numbers, which nobody has to read back.
+        # Seeds are inputs of recorded passes. Traced passes use plain integers, which need not be read back.
         number: Any = dr.opaque(mi.UInt32, seed) if self.freezes else seed
         request = RenderRequest(sensor, number, spp, batch)
         loss = ViewLoss(problem.loss, about.share / len(problem.trained()), self._sweeps[which])

@@ -1,8 +1,8 @@
-"""The loss of one view and its gradient by the scene's parameters: traced anew, or recorded as a frozen function.
+"""Computes loss and gradient of one view, with traced kernels or in a frozen function that replays recorded ones.
 
-A loss whose derivative is linear in each pixel can be back-propagated while its image is rendered, see `pixel_sweep`;
-for the others an image is rendered first, and paths of their own are differentiated. Where Dr.Jit can record all that
-as a frozen function, later calls launch its kernels without tracing them again.
+If the derivative of the loss is linear in each pixel, image and gradient come from one pass (see `pixel_sweep`). Other
+losses need the image first, and then a gradient pass with independent paths. If Dr.Jit can record both as a frozen
+function, later calls launch the kernels without tracing them again.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from pathreplay.inverse.parameters.exposures import derivative
 from pathreplay.samplers.streams import Stream
 from pathreplay.scenes.parameters import keep_only
 
-# What Dr.Jit says, whatever the cause, where a function cannot be frozen. Plugins do not show beforehand whether they
-# can: the arrays of some (Mitsuba 3.9.1: `orthographic`, `thinlens`) are hidden from it.
+# Part of every error message of Dr.Jit about a function that cannot be frozen. It is not known beforehand which plugins
+# prevent it: those of Mitsuba 3.9.1 that hide arrays from Dr.Jit (`orthographic`, `thinlens`).
 _RECORDING = "while recording a frozen function"
 
 
 MOST_RECORDINGS = 8
-"""Of a view: where what kernels take for constants changes more often, recording is not worth its time."""
+"""Maximum number of recordings per view. If constants of the kernels change more often, recording does not pay off."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class RenderRequest:
     seed: int | mi.UInt32
     spp: int
     batch: Batch | None = None
-    """Pixels that are rendered, which are the rows of the target (None: all). Requires ``ViewLoss.swept``."""
+    """Pixels to render, one per row of the target; None: all. Requires ``ViewLoss.swept``."""
 
 
 @dataclass(frozen=True)
@@ -81,22 +81,21 @@ class ViewResult:
 
 
 class NotRecordable(Exception):
-    """A plugin of the scene keeps Dr.Jit from recording a pass."""
+    """A plugin of the scene prevents Dr.Jit from recording a pass."""
 
 
 def is_recordable(integrator: StatefulIntegrator, has_media: bool) -> bool:
     """Whether passes of the integrator can be recorded in a scene with or without media, as far as that is known."""
-    # Spectral variants look up the eye's response in tables of Mitsuba's library: no input of ours, as a recorded
-    # function must have them, leads there.
+    # Spectral variants read Mitsuba's tables of colour matching functions, which are not inputs of the function.
     return not mi.is_spectral and integrator.is_recordable(has_media)
 
 
 class Recordings:
-    """Frozen functions for `differentiate`, by view, shapes of the parameters, and what kernels take for constants."""
+    """Frozen versions of `differentiate`, by view, shapes of the parameters, and constants of the kernels."""
 
     def __init__(self) -> None:
         self._frozen: dict[Any, Callable[..., Any]] = {}
-        self._made: Counter[Any] = Counter()  # of each view with such shapes
+        self._made: Counter[Any] = Counter()  # recordings by view and shapes
 
     def differentiate(
         self,
@@ -107,16 +106,16 @@ class Recordings:
         target: ViewTarget,
         loss: ViewLoss,
     ) -> ViewResult:
-        """As the function of that name. Raises NotRecordable; a part of the gradient may be there, then."""
+        """See the function `differentiate`. Raises NotRecordable, possibly after a part of the gradient was added."""
         keys = list(params.keys())
-        # By view, since Dr.Jit thinks that something is wrong with a function that it has to record often.
+        # One function per view, because Dr.Jit warns about functions that are recorded often.
         view = (request.sensor, *(dr.shape(params[key]) for key in keys))
         which = view, facts_of(scene).constants()
         if which not in self._frozen:
             self._made[view] += 1
             if self._made[view] > MOST_RECORDINGS:
                 raise NotRecordable
-            gc.collect()  # scenes of the past would be traced, too
+            gc.collect()  # otherwise Dr.Jit also traces scenes that are no longer in use
             self._frozen[which] = _recording(keys)
         try:
             return self._frozen[which](scene, integrator, integrator.begin(scene).to_record(), request, target, loss)
@@ -127,7 +126,7 @@ class Recordings:
 
 
 def _recording(keys: list[str]) -> Callable[..., Any]:
-    """`differentiate` as a frozen function, which holds neither scene nor problem when the run is over."""
+    """Return `differentiate` as a frozen function that references neither scene nor problem."""
 
     def frozen(scene: mi.Scene, *args: Any) -> ViewResult:
         params = mi.traverse(scene)
@@ -158,7 +157,7 @@ def _differentiate(
     target: ViewTarget,
     loss: ViewLoss,
 ) -> ViewResult:
-    """Compute loss and gradient by passes that begin with the ``state``: see `differentiate`."""
+    """Compute loss and gradient in passes that start from ``state``: see `differentiate`."""
     view = integrator.pass_of(scene, request.sensor, request.seed, request.spp)
     batch, factor = request.batch, target.factor
     share = loss.share if batch is None else loss.share * batch.share
@@ -175,7 +174,7 @@ def _differentiate(
         value = target.compared(loss.loss, image) * share
         if dr.grad_enabled(value):
             dr.backward(value)
-            apart = replace(view, seed=mi.sample_tea_32(view.seed, 1)[0])  # as `mi.render` has it
+            apart = replace(view, seed=mi.sample_tea_32(view.seed, 1)[0])  # as in `mi.render`
             state = integrator.gradient_pass(apart, dr.grad(image), state)
     by_factor = None
     if factor is not None:
@@ -190,14 +189,14 @@ def _times(tensor: Any, factor: Any) -> Any:
 
 
 def linear_derivative(loss: Loss, target: Any, weight: Any = None) -> tuple[Any, Any]:
-    """Offset and slope of the derivative of a quadratic loss by the image, from two images far apart."""
+    """Return offset and slope of the derivative of a quadratic loss with respect to the image."""
     bright = 1 + dr.abs(target)
     offset = _derivative(loss, dr.zeros(mi.TensorXf, target.shape), target, weight)
     return offset, (_derivative(loss, mi.TensorXf(bright), target, weight) - offset) / bright
 
 
 def _derivative(loss: Loss, image: Any, target: Any, weight: Any) -> Any:
-    """Derivative of a loss by the image, a tensor like it."""
+    """Return the derivative of a loss with respect to the image."""
     dr.enable_grad(image)
     dr.backward(mean_loss(loss, image, target, weight))
     return dr.grad(image)

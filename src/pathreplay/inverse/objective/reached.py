@@ -1,4 +1,4 @@
-"""Whether a job, and each of its stages, moves anything that its views depend on; told before the first iteration."""
+"""Checks before the first iteration that the variables of each stage affect at least one of its views."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ def require_possible(problem: Problem) -> None:
 
 
 def require_reached(problem: Problem) -> None:
-    """Raise PathreplayError where all that moves in a stage, or in the job, reaches none of its views.
+    """Raise PathreplayError if the variables of the job, or of a stage, affect none of its views.
 
-    An integrator of ours is asked, too, whether it differentiates what moves.
+    Also raised if the integrator does not differentiate them.
     """
     parts = parts_of(problem)
     for part in parts:
         where = f"stages: stage {part.number + 1}: " if len(parts) > 1 else ""
         views = part.problem.trained()
         reached = sorted(views.keys() & part.problem.reached(part.moving))
-        if not reached and EXPOSURE not in part.moving:  # by which every picture is multiplied
+        if not reached and EXPOSURE not in part.moving:  # an exposure scales every image
             names = _listed(view.name for view in views.values())
             raise PathreplayError(
                 f"{where}{_listed(sorted(part.problem.moves(part.moving)))} reaches none of the views that are learned "
@@ -48,7 +48,7 @@ def require_reached(problem: Problem) -> None:
 
 
 def _require_differentiated(part: Part, sensor: int, where: str) -> None:
-    """Raise PathreplayError where the integrator, or its baseline, takes what moves for constant."""
+    """Raise PathreplayError if the integrator, or its baseline, treats the variables as constants."""
     problem = part.problem
     variables = variables_of(problem, {v.key: v.start for v in problem.variables})
     dr.enable_grad({key: value for key, value in variables.items() if key in part.moving})

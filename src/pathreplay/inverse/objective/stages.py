@@ -1,4 +1,4 @@
-"""What a stage makes of a job: other views, smaller films, shorter paths, parameters that are held."""
+"""Stages of a job: subsets of views and parameters, smaller films, shorter paths, and other options."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from pathreplay.scenes.descriptions import load_integrator
 
 @dataclass(frozen=True)
 class Part:
-    """The job as it is in a stage, or throughout, if it has none."""
+    """The problem in one stage, or in the whole job if it has no stages."""
 
     number: int
     problem: Problem
     """With the options of the stage, and the views that it trains on; their images are whole (see `scaled`)."""
     moving: frozenset[str]
-    """Variables that are stepped, and differentiated."""
+    """Variables that are differentiated and updated."""
     factor: float
-    """On all learning rates."""
+    """Factor on all learning rates."""
 
 
 def part_at(problem: Problem, iteration: int) -> Part:
-    """The part of an iteration."""
+    """Return the part that an iteration belongs to."""
     stages = problem.config.stages
     if stages is None:
         return Part(0, problem, frozenset(v.key for v in problem.variables), 1.0)
@@ -63,7 +63,7 @@ def _part(problem: Problem, number: int, stage: Stage) -> Part:
 
 
 def _views(problem: Problem, stage: Stage) -> set[str] | None:
-    """The names of the views that the stage asks for; None for all. Raises PathreplayError."""
+    """Return the names of the views of a stage; None: all. Raises PathreplayError for an unknown or test view."""
     if stage.sensors is None:
         return None
     ids = {view.name: problem.scene.sensors()[view.sensor].id() for view in problem.views}
@@ -79,11 +79,11 @@ def _views(problem: Problem, stage: Stage) -> set[str] | None:
 
 
 def _moving(problem: Problem, stage: Stage) -> list[str]:
-    """The variables that are stepped in a stage. Raises PathreplayError where a key is none of the job's."""
+    """Return the variables of a stage. Raises PathreplayError if a key is not a parameter of the job."""
     keys = [v.key for v in problem.variables]
     if stage.parameters is None:
         return keys
-    # What makes a pose or a derived parameter is named by that, too.
+    # The key of a pose or of a derived parameter also names the variables from which it is computed.
     owners: dict[str, set[str]] = {key: {key} for key in keys}
     for each in problem.made():
         for part in each.of:
@@ -97,7 +97,7 @@ def _moving(problem: Problem, stage: Stage) -> list[str]:
 
 
 def require_stages(problem: Problem) -> None:
-    """Raise PathreplayError unless all stages can be done with this scene."""
+    """Raise PathreplayError unless all stages are possible with this scene."""
     config = problem.config
     for number, stage in enumerate(config.stages or []):
         part = _part(problem, number, stage)
@@ -112,7 +112,7 @@ def require_stages(problem: Problem) -> None:
 
 
 def require_single_pixels(problem: Problem) -> None:
-    """Raise PathreplayError unless all views can be rendered pixel by pixel where stages, or the job, ask for that."""
+    """Raise PathreplayError if pixels are batched in a view that does not support it."""
     config = problem.config
     for part in parts_of(problem):
         if part.problem.config.pixel_batch_size is None:
@@ -159,7 +159,7 @@ def _integrator(plugin: Plugin, max_depth: int) -> mi.Integrator:
 
 
 def scaled(view: View, downscale: int) -> View:
-    """The view with means of squares of pixels in place of them: those of what counts, where there is a mask."""
+    """Downscale target and weight of a view by box averages; masked pixels do not contribute."""
     if downscale == 1:
         return view
     if view.weight is None:
@@ -177,7 +177,7 @@ def _means(image: Image, n: int) -> Image:
 
 
 class Staged:
-    """Evaluates shards as their stages want it: an `Evaluate`. It holds what it needs for one stage at a time."""
+    """An `Evaluate` that applies the stage of each shard; keeps the evaluator of one stage at a time."""
 
     def __init__(self, problem: Problem, integrator: mi.Integrator, plugin: Plugin, record: bool = True) -> None:
         self.problem, self.integrator, self.plugin, self.record = problem, integrator, plugin, record
@@ -187,7 +187,7 @@ class Staged:
     def __call__(self, values: Arrays, shard: Shard, learned: Arrays) -> Evaluation:
         """See `Evaluate`."""
         if self._number != shard.stage or self._evaluate is None:
-            self._evaluate, self._number = None, shard.stage  # the old one goes before there is a new one
+            self._evaluate, self._number = None, shard.stage  # free the old one first
             self._evaluate = self._evaluator(shard.stage)
         return self._evaluate(values, shard, learned)
 
@@ -197,7 +197,7 @@ class Staged:
         part = _part(self.problem, number, stage)
         if stage.max_depth is not None:
             integrator = _integrator(self.plugin, stage.max_depth)
-            stateful(integrator).silence(stateful(self.integrator).warned)  # what has been said need not be said again
+            stateful(integrator).silence(stateful(self.integrator).warned)  # do not repeat its warnings
         views = tuple(scaled(view, stage.downscale) if not view.is_test else view for view in part.problem.views)
         return Evaluator(replace(part.problem, views=views), integrator, self.record, part.moving)
 
