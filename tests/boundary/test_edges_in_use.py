@@ -113,7 +113,7 @@ def test_a_check_of_an_outline_passes_with_edges_and_fails_without() -> None:
     passed = CliRunner().invoke(app, scene)
     assert passed.exit_code == 0 and "pathreplay (backward)" in passed.output
     failed = CliRunner().invoke(app, [*scene, "--boundary", "none"])
-    assert failed.exit_code == 1 and "pathreplay, edges none (backward)" in failed.output
+    assert failed.exit_code == 1 and "pathreplay, boundary none (backward)" in failed.output
 
 
 # ------------------------------ What is told ------------------------------

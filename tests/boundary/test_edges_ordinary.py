@@ -50,7 +50,7 @@ def test_batch_sensors_are_refused() -> None:
 def test_grids_of_distances_are_refused() -> None:
     z, y, x = np.meshgrid(*3 * [np.linspace(-0.5, 0.5, 8)], indexing="ij")
     grid = {"type": "sdfgrid", "grid": mi.TensorXf((np.sqrt(x * x + y * y + z * z) - 0.3)[..., None])}
-    hold_refusal({**one_film(PINHOLE), "body": grid}, "film", "shape 'body' of type 'sdfgrid'")
+    hold_refusal({**one_film(PINHOLE), "body": grid}, "primary", "shape 'body' of type 'sdfgrid'")
 
 
 def hold(name: str, found: Measured) -> None:
