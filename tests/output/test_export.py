@@ -25,7 +25,7 @@ from pathreplay.output.export import export_run, write_files
 from pathreplay.output.scene_folder import Exported, Source, exported, require_same
 from pathreplay.scenes.builtin import BUILTINS
 from pathreplay.scenes.parameters import get_array
-from pathreplay.scenes.volume_files import load_volume
+from pathreplay.scenes.volume_files import load_volume, save_vol
 from room_job import JOB, SCENE
 
 
@@ -109,6 +109,20 @@ def test_values_come_out_with_the_scene(case: str, tmp_path: Path) -> None:
     plain = pictures(before, mi.load_dict({"type": "volpath", "max_depth": 4}))
     assert any(alike(a, b) < 0.9 for a, b in zip(changed, plain, strict=True))
     same_pictures(found, tmp_path / "out")
+
+
+@pytest.mark.parametrize("source", ["a file", "a grid"])
+def test_a_grid_in_the_box_of_its_file_comes_out_in_that_box(source: str, tmp_path: Path) -> None:
+    box = (-1.0, -0.5, -1.0), (1.0, 0.75, 1.0)
+    save_vol(tmp_path / "cloud.vol", np.linspace(0, 4, 27, dtype=np.float32).reshape(3, 3, 3), box)
+    file = str(tmp_path / "cloud.vol")
+    scene = BUILTINS["cloud"](resolution=8, grid=4, views=1)
+    values = {"filename": file} if source == "a file" else {"grid": mi.VolumeGrid(file)}
+    scene["cloud"]["interior"]["sigma_t"] = {"type": "gridvolume", "use_grid_bbox": True, **values}
+    key = "cloud.interior_medium.sigma_t.data"
+    found = exported(Source(scene, {}, {}, {}), {key: np.full((3, 3, 3, 1), 2, np.float32)})
+    same_pictures(found, tmp_path / "out")
+    assert load_volume(tmp_path / f"out/volumes/{key}.vol").bounds() == box
 
 
 def test_the_index_of_glass_comes_out_as_that_of_mitsubas_plugin(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pathreplay.output.nodes import Described, Node, Owner
 from pathreplay.platform.traversal import traversed
 from pathreplay.scenes.parameters import get_array
 from pathreplay.scenes.stored import form_of
-from pathreplay.scenes.volume_files import UNIT_CUBE, Bounds, vol_bytes
+from pathreplay.scenes.volume_files import UNIT_CUBE, Bounds, vol_bounds, vol_bytes
 
 _PICTURES = ("bitmap", "envmap")
 _OF_A_MESH = ("vertex_", "faces", "face_")
@@ -92,9 +92,9 @@ class Placing:
         grid = node.props.get("grid") if "grid" in node.props else None
         if grid is None:
             grid = mi.VolumeGrid(str(self.described.find_file(node.props.get("filename"))))
-        box = grid.bbox()
-        low, high = ((float(p[0]), float(p[1]), float(p[2])) for p in (box.min, box.max))
-        return low, high
+        stream = mi.MemoryStream()
+        grid.write(stream)  # the box is in the file, and has no accessor in Python
+        return vol_bounds(stream.raw_buffer())
 
     def _mesh(self, mesh: Any, node: Node) -> None:
         _remove(node.props, *_MADE_BY, "to_world")

@@ -107,6 +107,12 @@ def vol_bytes(data: NDArray[Any], bounds: Bounds = UNIT_CUBE) -> bytes:
     return header + np.ascontiguousarray(grid, "<f4").tobytes()
 
 
+def vol_bounds(vol: bytes) -> Bounds:
+    """The box that the grid of a `.vol` file fills if `use_grid_bbox` is set."""
+    x, y, z, X, Y, Z = _VOL_HEADER.unpack_from(vol)[6:]
+    return (x, y, z), (X, Y, Z)
+
+
 def grid_volume(path: str | Path, grid: str | None = None, **options: Any) -> dict[str, Any]:
     """A volume file as a `gridvolume` for a scene dictionary, positioned in the world space of the file.
 
