@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import backward
 from pathreplay.adjoint.primal import walk_on
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.path import PathState, next_arrival
 from pathreplay.transport.step import Visit, choose_step
 from pathreplay.transport.vertex import Arrival, Flight, SampledStep, TraceConfig, VertexSamples

@@ -7,6 +7,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.arrive import background
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart

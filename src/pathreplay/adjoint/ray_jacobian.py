@@ -10,6 +10,8 @@ previous vertex. They affect only the next vertex, through the MIS weight of its
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 
 import drjit as dr
 import mitsuba as mi
@@ -176,8 +178,8 @@ def linearise(
             e, w, x_next = local_terms(trace, v, at, δL * v.β, slope, frame_next, active)
             columns.append(tangents(e, w, *x_next))
     A = [columns[k][2 + j] for j in range(4) for k in range(4)]
-    e, log_w = mi.Vector4f(*[c[0] for c in columns]), [c[1] for c in columns]
-    return Linearised(mi.Matrix4f(*A), e, log_w, slope, frame_next)
+    δe, log_w = mi.Vector4f(*[c[0] for c in columns]), [c[1] for c in columns]
+    return Linearised(mi.Matrix4f(*A), δe, log_w, slope, frame_next)
 
 
 def _unit_tangent(value: mi.Float) -> mi.Float:
@@ -220,4 +222,4 @@ def independence(A: mi.Matrix4f) -> mi.Float64:
 
 
 def _dot(a: list[mi.Float64], b: list[mi.Float64]) -> mi.Float64:
-    return sum(x * y for x, y in zip(a, b, strict=True))
+    return reduce(add, (x * y for x, y in zip(a, b, strict=True)))

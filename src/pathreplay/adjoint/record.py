@@ -6,6 +6,7 @@ table.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, make_dataclass, replace
 from functools import cache, reduce
 from typing import Any
@@ -187,7 +188,8 @@ def record(layout: Layout, v: VertexRecord) -> Any:
     for k, (place, remembered) in enumerate(BITS):
         if getattr(layout, remembered):
             word |= dr.select(reduce(getattr, place.split("."), v), mi.UInt32(1 << k), 0)
-    return record_type(layout)(**kept, word=word)
+    make: Callable[..., object] = record_type(layout)
+    return make(**kept, word=word)
 
 
 def read_back(layout: Layout, records: Any, index: mi.UInt32, last: mi.UInt32, ray0: mi.Ray3f) -> VertexRecord:

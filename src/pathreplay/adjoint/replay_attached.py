@@ -11,6 +11,9 @@ and Jakob (2021). It serves as a baseline for comparison: the sweep driver needs
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import add
+
 import drjit as dr
 import mitsuba as mi
 
@@ -24,6 +27,7 @@ from pathreplay.adjoint.ray_jacobian import (
     local_terms,
     random_sign,
 )
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.path import PathState
 from pathreplay.transport.start import CameraStart
 from pathreplay.transport.vertex import TraceConfig
@@ -49,13 +53,13 @@ def replay_attached(
             dr.eval(q, L, overflow)  # else each entry of the camera matrix runs the first pass again
             x = RayFrame.of(path.at.ray, scale).coordinates(o, d)
             q0 = mi.Vector4f(q)
-            backward(sum(q0[k] * x[k] for k in range(4)))
+            backward(reduce(add, (q0[k] * x[k] for k in range(4))))
     _peel(trace, again, path, PeeledPath(δL, L, q, overflow), lost, recovery, scale)
 
 
 @dr.syntax
 def _tangents(
-    trace: TraceConfig, sampler: mi.Sampler, path: PathState, δL: mi.Spectrum, recovery: Recovery, scale: float
+    trace: TraceConfig, sampler: Sampler, path: PathState, δL: mi.Spectrum, recovery: Recovery, scale: float
 ) -> tuple[mi.Spectrum, mi.Vector4f]:
     """Run the first pass: compute L_0 and q_0 = δL·∂L_0/∂r_0."""
     Spectrum, Matrix, Vector = map(recovery.real, (mi.Spectrum, mi.Matrix4f, mi.Vector4f))
@@ -82,7 +86,7 @@ def _tangents(
 @dr.syntax
 def _peel(
     trace: TraceConfig,
-    sampler: mi.Sampler,
+    sampler: Sampler,
     path: PathState,
     peeled: PeeledPath,
     lost: NonFiniteCounter,

@@ -12,6 +12,7 @@ from pathreplay.adjoint.autodiff import NonFiniteCounter, RayDerivative, backwar
 from pathreplay.adjoint.baseline import BaselineStats
 from pathreplay.adjoint.null_branching import Branch
 from pathreplay.adjoint.record import Layout, read_back, record, room_for
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.arrive import background
 from pathreplay.transport.path import PathState
 from pathreplay.transport.vertex import TraceConfig
@@ -20,7 +21,7 @@ from pathreplay.transport.vertex import TraceConfig
 @dr.syntax
 def first_walk(
     trace: TraceConfig,
-    sampler: mi.Sampler,
+    sampler: Sampler,
     path: PathState,
     layout: Layout,
     records: Any,

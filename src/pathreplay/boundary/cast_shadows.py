@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from pathreplay.boundary.edges import FilmDomain
 from pathreplay.samplers.counter_sampler import CounterSampler, key_of
+from pathreplay.transport.facts.nodes import is_mesh
 from pathreplay.transport.meet import meet
 from pathreplay.transport.vertex import TraceConfig
 

@@ -91,6 +91,7 @@ def choose_vertex(
         )
         onward, v = path.advance(trace, u, step)
         if dr.hint(records is not None, mode="scalar"):
+            assert layout is not None
             records[count] = record(layout, v)
         path = onward
         count += 1
@@ -118,7 +119,8 @@ class ObserverVertex:
         if trace.media is None:
             self.origin = self.si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All, active)
         else:
-            self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)
+            # The flight is known, so that no sampler is asked.
+            self.vertex = arrive.choose(trace, at, None, mi.Spectrum(1), active, flight)  # type: ignore[arg-type]
             self.si, self.origin, self.event = self.vertex.si, self.vertex.origin, self.vertex.inside.event
         self.keeps_direction = scatter.keeps_direction(trace, self.si, active)  # such continuations slide over facets
 
@@ -211,7 +213,7 @@ class ObserverVertex:
     def medium(self, d: mi.Vector3f) -> mi.MediumPtr | None:
         """Return the medium in direction ``d``; None in scenes without media."""
         if self.trace.media is None:
-            return None
+            return None  # type: ignore[return-value]  # as in `Arrival`
         turns = self.vertex.surface & self.si.is_medium_transition()
         return dr.select(turns, self.si.target_medium(d), self.at.medium)
 

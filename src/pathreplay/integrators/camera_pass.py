@@ -14,6 +14,7 @@ from pathreplay.integrators.lifetimes import is_recording
 from pathreplay.platform.registration import mitsuba_integrator
 from pathreplay.samplers.owen_sobol import OwenSobolSampler, key_of, morton_index
 from pathreplay.samplers.pixel_samples import IndependentSets, PixelSamples, SobolSets
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.start import CameraStart
 
 Seed: TypeAlias = "int | mi.UInt32"
@@ -25,7 +26,7 @@ Which: TypeAlias = "int | mi.Sensor"
 class Rays:
     """The camera rays of a pass, one per sample of each pixel."""
 
-    sampler: mi.Sampler  # positioned after the dimensions of the camera ray
+    sampler: Sampler  # positioned after the dimensions of the camera ray
     ray: mi.RayDifferential3f  # attached to the camera, if that has gradients
     weight: mi.Spectrum
     position: mi.Vector2f  # film position in pixels, where the sample is splatted

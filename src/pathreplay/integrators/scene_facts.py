@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from pathreplay.integrators.lifetimes import SCENES, is_recording
-from pathreplay.transport.facts.nodes import nodes_of, with_gradients
+from pathreplay.transport.facts.nodes import is_mesh, nodes_of, with_gradients
 from pathreplay.transport.facts.seams import has_seams
 from pathreplay.transport.facts.traits import (
     INSTANCE,
@@ -114,7 +114,7 @@ class SceneFacts:
 
 
 def _sizes(shapes: list[mi.Shape]) -> list[tuple[int, int]]:
-    return [(shape.vertex_count(), shape.face_count()) for shape in shapes if shape.is_mesh()]
+    return [(shape.vertex_count(), shape.face_count()) for shape in shapes if is_mesh(shape)]
 
 
 def _replaceable(scene: mi.Scene) -> list[mi.Object]:

@@ -149,7 +149,7 @@ def _transformed(m: NDArray[np.float64], ray: mi.Ray3f) -> tuple[mi.Vector3f, mi
 
 
 def free_flight(
-    cells: Cells, box: mi.BoundingBox3f, ray: mi.Ray3f, u: mi.Float, active: mi.Bool
+    cells: Cells, box: mi.BoundingBox3f, ray: mi.Ray3f, u: mi.Float, active: mi.Bool | bool
 ) -> tuple[mi.Float, mi.Float]:
     """Sample the distance of the next tentative collision; return it and its majorant, or infinity and 0 without one.
 

@@ -31,6 +31,7 @@ from pathreplay.plugins.supergrid import (
     mean_chord,
     voxel_bounds,
 )
+from pathreplay.samplers.sampler import Sampler
 
 #: Half extent of a constant density given as a number: larger than any scene, and far from overflow. (A `constvolume`
 #: by default fills the unit cube only.)
@@ -122,7 +123,7 @@ class GridMedium:
 
     # ---------------------------------------- interface of Mitsuba's media ----------------------------------------
 
-    def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool = True) -> mi.UnpolarizedSpectrum:
+    def get_majorant(self, mei: mi.MediumInteraction3f, active: mi.Bool | bool = True) -> mi.UnpolarizedSpectrum:
         return mi.UnpolarizedSpectrum(self.majorant)
 
     def get_scattering_coefficients(self, mei: Any, active: Any = True) -> tuple[Any, Any, Any]:

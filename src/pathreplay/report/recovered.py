@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import mitsuba as mi
@@ -37,7 +38,9 @@ def recovered_of(problem: Problem, run: Run) -> tuple[Recovered, ...]:
 
 def with_faces(problem: Problem, items: tuple[Recovered, ...]) -> tuple[Recovered, ...]:
     """Add the faces of the mesh to parameters that are mesh vertices."""
-    params = mi.traverse(problem.scene) if any(item.key.endswith(VERTICES) for item in items) else {}
+    params: Mapping[str, object] = (
+        mi.traverse(problem.scene) if any(item.key.endswith(VERTICES) for item in items) else {}
+    )
     names = {item.key: item.key.removesuffix(VERTICES) + ".faces" for item in items if item.key.endswith(VERTICES)}
     faces = {key: np.array(params[name]) for key, name in names.items() if name in params}
     return tuple(replace(item, faces=faces.get(item.key)) for item in items)

@@ -39,6 +39,9 @@ class CounterSampler:
         """Create a sampler at vertex k of the path with this key (six dimensions each, see `VertexSamples.draw`)."""
         return CounterSampler(mi.UInt32(key), mi.UInt32(6 * k))
 
+    def clone(self) -> CounterSampler:
+        return CounterSampler(mi.UInt32(self.key), mi.UInt32(self.index))
+
     def next_1d(self, active: bool | mi.Bool = True) -> mi.Float:
         x = mi.sample_tea_float32(self.key, self.index, ROUNDS)
         self.index += 1

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.emitters import emission, vertex_glow
 from pathreplay.transport.facts.traits import is_null
 from pathreplay.transport.surface import met, steady
@@ -45,7 +46,7 @@ class InMedium:
 
 
 def choose(
-    trace: TraceConfig, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: mi.Bool, flight: Flight | None = None
+    trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, active: mi.Bool, flight: Flight | None = None
 ) -> Vertex:
     """Arrive in the sampling pass. Nothing is differentiated.
 
@@ -106,7 +107,7 @@ def _on_surface(
     si: mi.SurfaceInteraction3f,
     attached: bool,
     active: mi.Bool,
-    known: mi.Spectrum = None,
+    known: mi.Spectrum | None = None,
 ) -> Vertex:
     if known is None:
         known = vertex_glow(trace, at, si, attached, sees_lights(trace, at, si, active))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.arrive import Vertex
 from pathreplay.transport.emitters import draw_emitter, redraw_emitter
 from pathreplay.transport.scatter import towards
@@ -35,7 +36,7 @@ class Connection:
 
 
 def choose(
-    trace: TraceConfig, v: Vertex, medium: mi.MediumPtr, u: VertexSamples, sampler: mi.Sampler, go_on: mi.Bool
+    trace: TraceConfig, v: Vertex, medium: mi.MediumPtr, u: VertexSamples, sampler: Sampler, go_on: mi.Bool
 ) -> Connection:
     """Sample an emitter where the vertex can scatter its light, and with media trace a shadow ray. Detached.
 

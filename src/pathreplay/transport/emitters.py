@@ -59,7 +59,7 @@ def redraw_emitter(
     trace: TraceConfig,
     origin: mi.Interaction3f,
     u: mi.Point2f,
-    light: mi.DirectionSample3f,
+    light: mi.DirectionSample3f | None,
     attached: bool,
     lit: mi.Bool,
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:

@@ -73,7 +73,7 @@ def _depends(trace: TraceConfig, start: CameraStart, at: Arrival, painted: bool)
         return False
     with dr.resume_grad():
         si = at.hit.compute_surface_interaction(at.ray, mi.RayFlags.All)
-        moving = [*start.repeat(), si.p, si.n, si.sh_frame.n]
+        moving: list[dr.ArrayBase] = [*start.repeat(), si.p, si.n, si.sh_frame.n]
         if painted:
             moving += [si.uv, si.dp_du, si.dp_dv]
         still = dr.detach(si)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.meet import meet
 from pathreplay.transport.start import CameraStart, behind_emitters
 from pathreplay.transport.step import Visit, choose_step
@@ -37,7 +38,7 @@ class PathState:
         β_alive = mi.Spectrum(1) if sustained else None
         return PathState(start.choose(trace, active), mi.Spectrum(1), β_alive, mi.Float(1), mi.UInt32(0), active)
 
-    def choose(self, trace: TraceConfig, sampler: mi.Sampler) -> tuple[VertexSamples, SampledStep]:
+    def choose(self, trace: TraceConfig, sampler: Sampler) -> tuple[VertexSamples, SampledStep]:
         """Draw the random numbers of this vertex, and sample its step from them."""
         u = VertexSamples.draw(sampler)
         β = self.β if self.β_alive is None else self.β_alive

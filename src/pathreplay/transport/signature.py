@@ -24,10 +24,10 @@ def place_met(
     flat-shaded mesh is its own group.
     """
     met = active & hit.is_valid()
-    shape = dr.reinterpret_array(mi.UInt32, shape)
-    place = mixed(shape, dr.reinterpret_array(mi.UInt32, hit.instance))
+    number = dr.reinterpret_array(mi.UInt32, shape)
+    place = mixed(number, dr.reinterpret_array(mi.UInt32, hit.instance))
     if facets:
-        place = mixed(place, _group(trace.traits.tables, shape, hit.prim_index, met))
+        place = mixed(place, _group(trace.traits.tables, number, hit.prim_index, met))
     return dr.select(met, place | 1, 0)
 
 

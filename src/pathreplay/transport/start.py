@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.meet import meet, short_of_end
 from pathreplay.transport.vertex import Arrival, TraceConfig
 from pathreplay.transport.volume.passage import skip_null
@@ -17,7 +18,7 @@ class CameraStart:
     """Paths that begin with camera rays. The rays are the differentiable function whose adjoint is q_0."""
 
     ray: mi.Ray3f  # attached to the camera's parameters, if these have gradients
-    sampler: mi.Sampler  # source of the random numbers of the paths
+    sampler: Sampler  # source of the random numbers of the paths
     active: mi.Bool
 
     def choose(self, trace: TraceConfig, active: mi.Bool) -> Arrival:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport import arrive, connect, scatter
 from pathreplay.transport.vertex import (
     Arrival,
@@ -42,7 +43,7 @@ def choose_step(
     trace: TraceConfig,
     visit: Visit,
     u: VertexSamples,
-    sampler: mi.Sampler,
+    sampler: Sampler,
     flight: Flight | None = None,
     ctx: mi.BSDFContext | None = None,
 ) -> SampledStep:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.facts.traits import Traits
 from pathreplay.transport.volume.media import Media
+
+Real = TypeVar("Real", "mi.Float", "mi.Spectrum")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +44,7 @@ class TraceConfig:
     baseline: Callable[..., mi.Spectrum] | None = None
     """Maps (MediumInteraction3f, extinction, majorant, Bool) to a Spectrum, an estimate of the radiance that arrives at
     a point of a medium from the rest of the ray (None: zero). Its quality affects noise only, not the mean."""
-    branching: mi.Float = None
+    branching: mi.Float | None = None
     """Relative weight of null collisions (Float, see `branch_weight`) if one null collision per path is kept, for
     derivatives where collisions are never real; else None."""
     may_slide: bool = False
@@ -86,7 +90,7 @@ class VertexSamples:
     roulette: mi.Float  # Russian roulette
 
     @staticmethod
-    def draw(sampler: mi.Sampler) -> VertexSamples:
+    def draw(sampler: Sampler) -> VertexSamples:
         """Draw the random numbers of one vertex, in the order that all drivers share."""
         return VertexSamples(sampler.next_2d(), sampler.next_1d(), sampler.next_2d(), sampler.next_1d())
 
@@ -101,8 +105,8 @@ class Arrival:
     delta: mi.Bool  # the direction comes from a delta lobe or from the camera
     camera: mi.Bool  # the previous vertex is the camera
     # None in scenes without media:
-    medium: mi.MediumPtr = None  # the medium around the ray
-    behind: mi.Float = None  # distance from the ray's origin back to the previous vertex, through null boundaries
+    medium: mi.MediumPtr = None  # type: ignore[assignment]  # the medium around the ray
+    behind: mi.Float = None  # type: ignore[assignment]  # distance from the ray's origin back to the previous vertex, through null boundaries
 
 
 @dataclass
@@ -117,7 +121,7 @@ class SampledContinuation:
     lit: mi.Bool  # the emitter sample is valid and unoccluded
     media: SampledInMedia = None  # type: ignore[assignment]  # None in scenes without media
     known: KnownLight | None = None  # on surfaces, if no emitter parameter has gradients; else None
-    light: mi.DirectionSample3f = None  # the emitter sample, if it is still available
+    light: mi.DirectionSample3f | None = None  # the emitter sample, if it is still available
 
 
 @dataclass
@@ -138,13 +142,13 @@ class Flight:
     density: mi.Float  # its probability density p σ̄; 1 without a collision
     W: mi.Spectrum  # weight of the null collisions before it; 1 in grey media
     along: mi.Float  # random offset in [0, 1) of the points at which the derivative is taken
-    p: mi.Float = None  # probability that the collision was real (None if no null collisions are kept)
+    p: mi.Float = None  # type: ignore[assignment]  # probability that the collision was real (None if no null collisions are kept)
     # None without emissive media:
-    E: mi.Spectrum = None  # emission accumulated along the flight
-    t_emit: mi.Float = None  # distance of the tentative collision at which emission is differentiated
-    c_emit: mi.Spectrum = None  # weight of the emission at that distance
+    E: mi.Spectrum = None  # type: ignore[assignment]  # emission accumulated along the flight
+    t_emit: mi.Float = None  # type: ignore[assignment]  # distance of the tentative collision at which emission is differentiated
+    c_emit: mi.Spectrum = None  # type: ignore[assignment]  # weight of the emission at that distance
     # Used by the sampling pass only; None when read from a record:
-    σ_s: mi.Spectrum = None  # scattering coefficient at the collision
+    σ_s: mi.Spectrum = None  # type: ignore[assignment]  # scattering coefficient at the collision
     null: NullCollision = None  # type: ignore[assignment]  # a null collision of the flight, if one is kept
 
     @staticmethod
@@ -245,7 +249,7 @@ class SampledStep(Step):
     eta: mi.Float  # relative index of refraction across the continuation
     null: mi.Bool  # the continuation passes through without scattering
     active: mi.Bool  # there is a continuation
-    medium: mi.MediumPtr = None  # medium along the continuation; None in scenes without media
+    medium: mi.MediumPtr = None  # type: ignore[assignment]  # medium along the continuation; None in scenes without media
     lighting: Lighting = None  # type: ignore[assignment]  # on surfaces, if emitters have gradients; else None
 
     @property

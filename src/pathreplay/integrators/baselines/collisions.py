@@ -9,13 +9,14 @@ import drjit as dr
 import mitsuba as mi
 
 from pathreplay.adjoint.autodiff import backward
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.vertex import Arrival, Flight, TraceConfig, reciprocal
 from pathreplay.transport.volume.media import interaction, majorant, span
 from pathreplay.transport.volume.shadow import Stretch
 
 
 @dr.syntax
-def differentiate_flight(at: Arrival, flight: Flight, past: mi.Sampler, active: mi.Bool, weight: mi.Spectrum) -> None:
+def differentiate_flight(at: Arrival, flight: Flight, past: Sampler, active: mi.Bool, weight: mi.Spectrum) -> None:
     """Differentiate the collisions of a flight; ``past`` is the sampler state before the flight."""
     medium, ray = at.medium, at.ray
     flying = active & (medium != None)  # noqa: E711 (an array of pointers)
@@ -36,7 +37,7 @@ def differentiate_flight(at: Arrival, flight: Flight, past: mi.Sampler, active: 
 
 @dr.syntax
 def differentiate_shadow(
-    trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, past: mi.Sampler, active: mi.Bool, weight: mi.Spectrum
+    trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, past: Sampler, active: mi.Bool, weight: mi.Spectrum
 ) -> None:
     """Differentiate the tentative collisions of an unoccluded shadow ray. Homogeneous media have no collisions."""
     stretch = Stretch.begin(ray, medium, active)

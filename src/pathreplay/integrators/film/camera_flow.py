@@ -47,7 +47,7 @@ RayDerivatives: TypeAlias = "tuple[list[mi.Vector3f], list[mi.Vector3f]]"
 class Sample:
     """The sample of a camera ray: see Mitsuba's Sensor. Positions are in units of the film's width and height."""
 
-    time: mi.Float
+    time: mi.Float | float
     wavelength: mi.Float
     position: mi.Point2f
     aperture: mi.Point2f

@@ -116,7 +116,7 @@ def pixel_loss(
                 f"pathreplay: 'pixels' contains a repeated index, or one outside the film of {width} x {height} pixels"
             )
     row = dr.arange(mi.UInt32, shape[0] * shape[1])
-    return PixelLoss(*(dr.gather(mi.Color3f, tensor.array, row) for tensor in (offset, slope)))
+    return PixelLoss(*(dr.gather(mi.Spectrum, tensor.array, row) for tensor in (offset, slope)))
 
 
 def scatter_rows(pixels: mi.UInt32, rows: mi.TensorXf, size: tuple[int, int]) -> mi.TensorXf:

@@ -8,10 +8,13 @@ created once per variant, with an empty closure.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs
 
 _COLLECTORS: dict[type, type] = {}
 """Traversal classes by the variant's base class."""
@@ -40,6 +43,11 @@ def _contents(node: mi.Object) -> tuple[list[tuple[str, mi.Object]], list[tuple[
     return callback.children, callback.values
 
 
+def is_mesh(shape: mi.Shape) -> TypeIs[mi.Mesh]:
+    """Whether a shape is a mesh, for type checkers too."""
+    return shape.is_mesh()
+
+
 def nodes_of(root: mi.Object) -> set[mi.Object]:
     """Find all objects reachable from ``root``, a scene or one of its objects."""
     seen: set[mi.Object] = set()
@@ -52,13 +60,13 @@ def nodes_of(root: mi.Object) -> set[mi.Object]:
     return seen
 
 
-def with_gradients(root: mi.Object, *names: str) -> list[dr.ArrayBase]:
+def with_gradients(root: mi.Object, *names: str) -> list[Any]:
     """Find the parameters of an object and its descendants that have gradients.
 
     If ``names`` are given, only parameters under one of them count: a parameter ``a.b`` is under ``a.b`` and under
     ``a``.
     """
-    parameters: list[dr.ArrayBase] = []
+    parameters: list[Any] = []
     seen, waiting = {root}, [("", root)]
     while waiting:
         prefix, node = waiting.pop()

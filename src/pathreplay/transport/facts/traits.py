@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pathreplay.errors import PathreplayError
-from pathreplay.transport.facts.nodes import nodes_of
+from pathreplay.transport.facts.nodes import is_mesh, nodes_of
 from pathreplay.transport.facts.seams import CHECKERBOARD
 from pathreplay.transport.facts.smoothing_groups import mesh_smoothing_groups
 from pathreplay.transport.velocity import blend_length
@@ -36,6 +37,7 @@ MOST_RUNS = 4096
 
 T = TypeVar("T")
 V = TypeVar("V")
+A = TypeVar("A", bound="dr.ArrayBase")
 
 
 @dataclass
@@ -97,7 +99,7 @@ def fixed_traits(nodes: set[mi.Object], scene: mi.Scene) -> Traits:
     shapes = [node for node in nodes if isinstance(node, mi.Shape)]
     attachables = _attachables(nodes, shapes)
     others = [bsdf for bsdf in bsdfs if not _is_attachable(bsdf) and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)]
-    coarse = [shape for shape in shapes if shape.is_mesh() and is_coarse(shape)]
+    coarse = [shape for shape in shapes if is_mesh(shape) and is_coarse(shape)]
     return Traits(
         mirrors=tuple(bsdf for bsdf in bsdfs if _delta_lobes(bsdf)),
         lobes=max((_delta_lobes(bsdf) for bsdf in bsdfs), default=0),
@@ -168,7 +170,7 @@ def smoothing_groups_of(shapes: list[mi.Shape]) -> tuple[mi.UInt32, mi.UInt32]:
     blocks: list[np.ndarray] = [np.zeros(1, np.uint32)]
 
     def begin(shape: mi.Shape) -> int:
-        if not shape.is_mesh():
+        if not is_mesh(shape):
             return WHOLE
         if shape.has_face_normals() or not shape.has_vertex_normals():
             return FACETS
@@ -213,8 +215,8 @@ def emitter_bounds(emitters: list[mi.Emitter], shapes: list[mi.Shape]) -> mi.Flo
     return _array(mi.Float, np.ravel(balls or [np.zeros(4)]))  # an empty array would crash the process
 
 
-def _mesh_lamps(shapes: list[mi.Shape]) -> list[mi.Shape]:
-    return [shape for shape in shapes if shape.is_emitter() and shape.is_mesh()]
+def _mesh_lamps(shapes: list[mi.Shape]) -> list[mi.Mesh]:
+    return [shape for shape in shapes if shape.is_emitter() and is_mesh(shape)]
 
 
 def _ball(mesh: mi.Mesh) -> np.ndarray:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.vertex import Arrival, Flight, NullCollision, TraceConfig, reciprocal
 from pathreplay.transport.volume.media import Media, carried, interaction, is_grid, majorant, span
 
@@ -37,7 +38,7 @@ def branch_weight(p: mi.Float, c: mi.Float) -> mi.Float:
 
 
 @dr.syntax
-def fly(trace: TraceConfig, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, active: mi.Bool) -> Flight:
+def fly(trace: TraceConfig, at: Arrival, sampler: Sampler, β: mi.Spectrum, active: mi.Bool) -> Flight:
     """Sample the flight along ``at.ray``, in ``at.medium``, up to the surface ``at.hit``. Detached.
 
     ``β`` is the throughput. In chromatic media a collision is real with probability p = Σ_k β_k σ_k / (σ̄ Σ_k β_k),
@@ -86,6 +87,7 @@ def fly(trace: TraceConfig, at: Arrival, sampler: mi.Sampler, β: mi.Spectrum, a
         real = inside & (sampler.next_1d(inside) < p)
         flying = inside & ~real
         if dr.hint(trace.branch, mode="scalar"):
+            assert trace.branching is not None
             share = trace.branching * branch_weight(p, trace.branching) / σ_bar
             m = share * dr.mean(dr.abs(β) * dr.maximum(dr.abs(W), 1))
             mass += dr.select(flying, m, 0)
@@ -210,9 +212,9 @@ def fly_again(
                     at_e = interaction(medium, ray, t)
                     at_y = interaction(medium, ray, a + flight.along * length)
                 ε = grid.emission_at(at_e, glows) * flight.c_emit * J
-                _, _, σ_y = medium.get_scattering_coefficients(at_y, glows)
-                if dr.grad_enabled(σ_y, length):
-                    ε *= dr.replace_grad(mi.Spectrum(1), -length * σ_y)
+                _, _, σ_here = medium.get_scattering_coefficients(at_y, glows)
+                if dr.grad_enabled(σ_here, length):
+                    ε *= dr.replace_grad(mi.Spectrum(1), -length * σ_here)
                 emitted += dr.select(glows, ε, 0)
         e += dr.replace_grad(flight.E, emitted)
     return Flown(mei=mei, w=w, e=e)

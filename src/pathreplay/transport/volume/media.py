@@ -4,18 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeGuard
 
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.facts.nodes import nodes_of, with_gradients
+
+
+class Grid(Protocol):
+    """A medium with its own free flight and transmittance: see `gridmedium`."""
+
+    emission: mi.Volume | None
+    is_chromatic: bool
+
+    def free_flight(self, ray: mi.Ray3f, u: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Float]: ...
+
+    def transmittance(self, ray: mi.Ray3f, sampler: Sampler, active: mi.Bool) -> mi.Spectrum: ...
+
+    def emission_at(self, mei: mi.MediumInteraction3f, active: mi.Bool) -> mi.Spectrum: ...
 
 
 @dataclass(frozen=True)
 class Media:
     """Facts about the media of a scene on which the trace depends."""
 
-    grids: tuple[mi.Medium, ...]  # media with their own free flight and transmittance (`gridmedium`)
+    grids: tuple[Grid, ...]  # media with their own free flight and transmittance (`gridmedium`)
     plain: bool  # there are other media, accessible only through Mitsuba's interface
     homogeneous: bool  # some of these other media have constant coefficients
     chromatic: bool  # some extinction differs between channels
@@ -34,8 +49,8 @@ def scene_media(
     """
     if not media:
         return None
-    grids = tuple(medium for medium in media if hasattr(medium, "free_flight"))
-    plain = [medium for medium in media if not hasattr(medium, "free_flight")]
+    grids = tuple(medium for medium in media if _is_grid(medium))
+    plain = [medium for medium in media if not _is_grid(medium)]
     below = set() if sensor is None else nodes_of(sensor)
     return Media(
         grids=grids,
@@ -60,6 +75,10 @@ def _is_chromatic(medium: mi.Medium) -> bool:
         if dr.is_tensor_v(value) or dr.is_diff_v(value)
     ]
     return not one_number or not all(one_number)
+
+
+def _is_grid(medium: mi.Medium) -> TypeGuard[Grid]:
+    return hasattr(medium, "free_flight")
 
 
 def wants_branch(media: Sequence[mi.Medium]) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.facts.traits import is_null
 from pathreplay.transport.meet import meet
 from pathreplay.transport.vertex import TraceConfig
@@ -44,7 +45,7 @@ def _is_boundary(hit: mi.PreliminaryIntersection3f) -> mi.Bool:
 
 @dr.syntax
 def transmittance_up_to(
-    trace: TraceConfig, ray: mi.Ray3f, reach: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
+    trace: TraceConfig, ray: mi.Ray3f, reach: mi.Float, medium: mi.MediumPtr, sampler: Sampler, active: mi.Bool
 ) -> tuple[mi.Spectrum, mi.MediumPtr]:
     """Estimate the transmittance up to ``reach``, from inside ``medium``; also return the last medium. Detached."""
     ray = mi.Ray3f(ray)
@@ -59,7 +60,7 @@ def transmittance_up_to(
 
 
 def transmittance_past_edge(
-    trace: TraceConfig, ray: mi.Ray3f, t: mi.Float, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool
+    trace: TraceConfig, ray: mi.Ray3f, t: mi.Float, medium: mi.MediumPtr, sampler: Sampler, active: mi.Bool
 ) -> mi.Spectrum:
     """Estimate the transmittance of a shadow ray that passes an edge at distance ``t``. Detached.
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from pathreplay.samplers.sampler import Sampler
 from pathreplay.transport.meet import meet
 from pathreplay.transport.vertex import Shadow, TraceConfig
 from pathreplay.transport.volume.media import carried, interaction, is_grid, majorant, span
@@ -54,7 +55,7 @@ class Stretch:
 
 
 @dr.syntax
-def shadow(trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: mi.Sampler, active: mi.Bool) -> Shadow:
+def shadow(trace: TraceConfig, ray: mi.Ray3f, medium: mi.MediumPtr, sampler: Sampler, active: mi.Bool) -> Shadow:
     """Estimate the transmittance along a shadow ray that starts in ``medium``. Detached."""
     stretch = Stretch.begin(ray, medium, active)
     T = mi.Spectrum(1)
@@ -79,7 +80,7 @@ def transmittance(
     ray: mi.Ray3f,
     a: mi.Float,
     b: mi.Float,
-    sampler: mi.Sampler,
+    sampler: Sampler,
     active: mi.Bool,
 ) -> mi.Spectrum:
     """Estimate the transmittance of one medium between the distances a and b, without bias."""
@@ -104,7 +105,7 @@ def transmittance(
 
 @dr.syntax
 def ratio_tracking(
-    medium: mi.MediumPtr, ray: mi.Ray3f, a: mi.Float, b: mi.Float, sampler: mi.Sampler, active: mi.Bool
+    medium: mi.MediumPtr, ray: mi.Ray3f, a: mi.Float, b: mi.Float, sampler: Sampler, active: mi.Bool
 ) -> mi.Spectrum:
     """Estimate T = Π (1 - σ_t/σ̄) over tentative collisions between a and b, with Mitsuba's global majorant."""
     σ_bar = majorant(medium, ray, active)

@@ -1,0 +1,19 @@
+"""What paths ask of their source of random numbers."""
+
+from __future__ import annotations
+
+from typing import Protocol, TypeVar
+
+import mitsuba as mi
+
+S = TypeVar("S")
+
+
+class Sampler(Protocol):
+    """A source of random numbers in [0, 1): a sampler of Mitsuba or one of this package."""
+
+    def clone(self: S) -> S: ...
+
+    def next_1d(self, active: bool | mi.Bool = True) -> mi.Float: ...
+
+    def next_2d(self, active: bool | mi.Bool = True) -> mi.Point2f: ...

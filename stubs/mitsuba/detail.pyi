@@ -1,0 +1,3 @@
+from collections.abc import Callable
+
+def add_variant_callback(callback: Callable[[str | None, str], object]) -> None: ...
